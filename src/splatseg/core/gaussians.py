@@ -1,0 +1,183 @@
+"""The Gaussians of a scene: aligned arrays, one row a Gaussian."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from dataclasses import replace as _replace
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg._check import check_finite, check_shape, check_values
+from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
+from splatseg.core.sh import SH_C0, degree_of, rotate_sh
+from splatseg.errors import InputError, RangeError, ShapeError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gaussians:
+    """3D Gaussians with colour, and any further columns, sliced and saved together.
+
+    The covariance of Gaussian i is R diag(s)^2 R^T with R the rotation of its quaternion and s
+    its scales (Kerbl et al. 2023, eq. 6). Values are physical: linear scales and opacities,
+    not the logs and logits of files.
+
+    Shapes are checked when one is made; values are checked by `check_values`, which readers
+    and renderers call, because a scan of millions of rows on every slice is not free.
+
+    Example:
+        >>> g = Gaussians(means=torch.zeros(2, 3), rotations=torch.eye(4)[:1].expand(2, 4),
+        ...               scales=torch.ones(2, 3), opacities=torch.ones(2),
+        ...               sh=torch.zeros(2, 1, 3), extra={"class_id": torch.tensor([4, 7])})
+        >>> g[1:].extra["class_id"]
+        tensor([7])
+    """
+
+    means: Float[Tensor, "n 3"]
+    """Centres in the world, scene units."""
+
+    rotations: Float[Tensor, "n 4"]
+    """Unit quaternions (w, x, y, z), world_from_gaussian."""
+
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the Gaussian's own axes, scene units, not negative."""
+
+    opacities: Float[Tensor, "n"]
+    """Opacity at the centre, in [0, 1]."""
+
+    sh: Float[Tensor, "n coefficients 3"]
+    """Spherical harmonics of the colour, 1, 4, 9 or 16 a channel, see `core.sh`."""
+
+    extra: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
+    """Further columns by name, (n,) or (n, c): they survive slicing, joining and saving."""
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0] if self.means.ndim else 0
+        check_shape("means", self.means, (None, 3))
+        check_shape("rotations", self.rotations, (n, 4))
+        check_shape("scales", self.scales, (n, 3))
+        check_shape("opacities", self.opacities, (n,))
+        check_shape("sh", self.sh, (n, None, 3))
+        degree_of(self.sh.shape[1])
+        for name, column in self.extra.items():
+            if column.ndim not in (1, 2) or column.shape[0] != n:
+                raise ShapeError(
+                    f"extra[{name!r}]: expected ({n},) or ({n}, c), got {tuple(column.shape)}."
+                )
+        object.__setattr__(self, "extra", MappingProxyType(dict(self.extra)))
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, index: slice | Tensor) -> "Gaussians":
+        """Rows by slice, boolean mask (n,) or integer ids, extra columns included."""
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            check_shape("index", index, (len(self),))
+        return Gaussians(
+            means=self.means[index],
+            rotations=self.rotations[index],
+            scales=self.scales[index],
+            opacities=self.opacities[index],
+            sh=self.sh[index],
+            extra={name: column[index] for name, column in self.extra.items()},
+        )
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the harmonics, 0 to 3."""
+        return degree_of(self.sh.shape[1])
+
+    @property
+    def colours(self) -> Float[Tensor, "n 3"]:
+        """The mean colour over directions (degree 0), not clamped."""
+        return 0.5 + SH_C0 * self.sh[:, 0]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the arrays are."""
+        return self.means.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of the floating-point arrays."""
+        return self.means.dtype
+
+    def replace(self, **changes: Any) -> "Gaussians":
+        """The same Gaussians with some columns exchanged."""
+        return _replace(self, **changes)
+
+    def to(
+        self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> "Gaussians":
+        """Move to a device, or change the floating-point type (extra columns keep theirs)."""
+        core = {
+            f.name: getattr(self, f.name).to(device=device, dtype=dtype)
+            for f in fields(self)
+            if f.name != "extra"
+        }
+        extra = {name: column.to(device=device) for name, column in self.extra.items()}
+        return Gaussians(**core, extra=extra)
+
+    def check_values(self) -> None:
+        """Raise `RangeError` unless every row can be rendered.
+
+        Means, rotations, scales, opacities and harmonics are finite, scales are not negative,
+        opacities lie in [0, 1] and no quaternion is zero.
+        """
+        check_finite("means", self.means)
+        check_finite("rotations", self.rotations)
+        check_values("scales", self.scales, 0.0, float("inf"))
+        check_values("opacities", self.opacities, 0.0, 1.0)
+        check_finite("sh", self.sh)
+        zero = (self.rotations == 0).all(dim=1)
+        if bool(zero.any()):
+            row = int(torch.nonzero(zero)[0])
+            raise RangeError(
+                f"rotations: expected quaternions that are not zero, got zero in row {row} "
+                f"({int(zero.sum())} of {len(self)} rows)."
+            )
+
+    def transformed(self, target_from_source: Similarity) -> "Gaussians":
+        """The Gaussians moved by a similarity: centres, axes, sizes and harmonics.
+
+        Rendering the result from a camera moved the same way gives the same picture.
+        """
+        turn = quaternion_from_rotation(target_from_source.rotation.double()).to(self.means)
+        return self.replace(
+            means=target_from_source.apply(self.means),
+            rotations=quaternion_multiply(turn.expand_as(self.rotations), self.rotations),
+            scales=self.scales * target_from_source.scale,
+            sh=rotate_sh(self.sh, target_from_source.rotation),
+        )
+
+    @staticmethod
+    def concatenate(parts: "Sequence[Gaussians]") -> "Gaussians":
+        """Join scenes row by row. All must have the same harmonics and extra columns.
+
+        Raises:
+            InputError: If there is nothing to join or the columns differ.
+        """
+        if not parts:
+            raise InputError("parts: expected at least one set of Gaussians, got none.")
+        names = set(parts[0].extra)
+        for i, part in enumerate(parts):
+            if set(part.extra) != names:
+                raise InputError(
+                    f"parts[{i}]: expected the extra columns {sorted(names)}, "
+                    f"got {sorted(part.extra)}."
+                )
+            if part.sh.shape[1] != parts[0].sh.shape[1]:
+                raise ShapeError(
+                    f"parts[{i}]: expected harmonics of degree {parts[0].sh_degree}, "
+                    f"got {part.sh_degree}."
+                )
+        return Gaussians(
+            means=torch.cat([p.means for p in parts]),
+            rotations=torch.cat([p.rotations for p in parts]),
+            scales=torch.cat([p.scales for p in parts]),
+            opacities=torch.cat([p.opacities for p in parts]),
+            sh=torch.cat([p.sh for p in parts]),
+            extra={name: torch.cat([p.extra[name] for p in parts]) for name in parts[0].extra},
+        )

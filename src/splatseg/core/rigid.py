@@ -1,0 +1,175 @@
+"""Rotations, quaternions and similarity transforms.
+
+Quaternions are (w, x, y, z) with the Hamilton product; transforms are named
+``target_from_source``, see ``docs/conventions.md``.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg._check import check_finite, check_shape
+from splatseg.errors import RangeError
+
+
+def normalised(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Scale quaternions to unit length.
+
+    Raises:
+        RangeError: If one has zero length or is not finite.
+    """
+    length = torch.linalg.vector_norm(quaternions, dim=-1, keepdim=True)
+    if not bool((length > 0).all()) or not bool(torch.isfinite(length).all()):
+        raise RangeError("quaternions: expected finite, non-zero quaternions, got one that is not.")
+    return quaternions / length
+
+
+def rotation_from_quaternion(
+    quaternions: Float[Tensor, "*batch 4"],
+) -> Float[Tensor, "*batch 3 3"]:
+    r"""Rotation matrices of quaternions, which need not have unit length.
+
+    .. math:: R = I + 2 w [v]_\times + 2 [v]_\times^2, \quad q = (w, v) / |q|
+
+    Differentiable; a zero quaternion gives NaN (see `normalised` for the check).
+    """
+    q = quaternions / torch.linalg.vector_norm(quaternions, dim=-1, keepdim=True)
+    w, x, y, z = q.unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+    return torch.stack(rows, dim=-1).reshape(*q.shape[:-1], 3, 3)
+
+
+def quaternion_from_rotation(
+    rotation: Float[Tensor, "*batch 3 3"],
+) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternions of rotation matrices, with w >= 0.
+
+    The largest of the four components is found from the diagonal and the others are divided
+    by it, so that no small number is ever a divisor (Shepperd 1978).
+    """
+    r = rotation
+    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    squares = torch.stack(
+        (1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2), dim=-1
+    )
+    wx, wy, wz = (
+        r[..., 2, 1] - r[..., 1, 2],
+        r[..., 0, 2] - r[..., 2, 0],
+        r[..., 1, 0] - r[..., 0, 1],
+    )
+    xy, xz, yz = (
+        r[..., 0, 1] + r[..., 1, 0],
+        r[..., 0, 2] + r[..., 2, 0],
+        r[..., 1, 2] + r[..., 2, 1],
+    )
+    # Row k is 4 q_k (w, x, y, z): whichever k is largest gives the best-conditioned answer.
+    candidates = torch.stack(
+        (
+            torch.stack((squares[..., 0], wx, wy, wz), -1),
+            torch.stack((wx, squares[..., 1], xy, xz), -1),
+            torch.stack((wy, xy, squares[..., 2], yz), -1),
+            torch.stack((wz, xz, yz, squares[..., 3]), -1),
+        ),
+        dim=-2,
+    )
+    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    q = candidates.gather(-2, best).squeeze(-2)
+    q = q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def quaternion_multiply(
+    left: Float[Tensor, "*batch 4"], right: Float[Tensor, "*batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """Hamilton product: the rotation `right` followed by the rotation `left`."""
+    aw, ax, ay, az = left.unbind(-1)
+    bw, bx, by, bz = right.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def check_rotation(name: str, rotation: Tensor, *, tolerance: float = 1e-3) -> None:
+    """Raise `RangeError` unless `rotation` (3, 3) is orthonormal with determinant +1."""
+    check_shape(name, rotation, (3, 3))
+    check_finite(name, rotation)
+    r = rotation.detach().double()
+    error = float((r @ r.T - torch.eye(3, dtype=torch.float64, device=r.device)).abs().max())
+    determinant = float(torch.linalg.det(r))
+    if error > tolerance or determinant < 0:
+        raise RangeError(
+            f"{name}: expected a rotation, got a matrix with |R R^T - I| = {error:.3g} "
+            f"and determinant {determinant:.3g}."
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Similarity:
+    """A similarity transform ``target_from_source``: x -> scale * rotation @ x + translation."""
+
+    rotation: Float[Tensor, "3 3"]
+    translation: Float[Tensor, "3"]
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_rotation("rotation", self.rotation)
+        check_shape("translation", self.translation, (3,))
+        check_finite("translation", self.translation)
+        if not 0 < self.scale < float("inf"):
+            raise RangeError(f"scale: expected a positive finite number, got {self.scale}.")
+
+    @classmethod
+    def identity(cls) -> "Similarity":
+        """The transform that changes nothing."""
+        return cls(
+            rotation=torch.eye(3, dtype=torch.float64),
+            translation=torch.zeros(3, dtype=torch.float64),
+        )
+
+    @property
+    def matrix(self) -> Float[Tensor, "4 4"]:
+        """The homogeneous matrix, float64."""
+        out = torch.eye(4, dtype=torch.float64)
+        out[:3, :3] = self.rotation.double() * self.scale
+        out[:3, 3] = self.translation.double()
+        return out
+
+    def apply(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Move points from the source frame to the target frame, in their own dtype."""
+        rotation = self.rotation.to(points)
+        return self.scale * (points @ rotation.T) + self.translation.to(points)
+
+    def inverse(self) -> "Similarity":
+        """The transform ``source_from_target``."""
+        rotation = self.rotation.T
+        return Similarity(
+            rotation=rotation,
+            translation=-(rotation @ self.translation) / self.scale,
+            scale=1 / self.scale,
+        )
+
+    def compose(self, inner: "Similarity") -> "Similarity":
+        """``target_from_source @ source_from_inner``: first `inner`, then this."""
+        return Similarity(
+            rotation=self.rotation.double() @ inner.rotation.double(),
+            translation=self.apply(inner.translation.double()),
+            scale=self.scale * inner.scale,
+        )
