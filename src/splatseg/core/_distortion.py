@@ -1,0 +1,152 @@
+r"""Lens distortion: OpenCV's polynomial and fisheye models, and their inverses.
+
+Points are on the normalised image plane: :math:`(x, y) = (X / Z, Y / Z)`, before focal length
+and principal point.
+
+opencv (k1 k2 p1 p2 k3 k4 k5 k6), :math:`r^2 = x^2 + y^2`:
+
+.. math::
+    x' = x \frac{1 + k_1 r^2 + k_2 r^4 + k_3 r^6}{1 + k_4 r^2 + k_5 r^4 + k_6 r^6}
+         + 2 p_1 x y + p_2 (r^2 + 2 x^2)
+
+(y' alike with p1 and p2 exchanged). fisheye (k1 k2 k3 k4), :math:`\theta = \arctan r`:
+
+.. math:: (x', y') = \theta (1 + k_1 \theta^2 + k_2 \theta^4 + k_3 \theta^6 + k_4 \theta^8)
+          \, (x, y) / r
+
+References: OpenCV documentation, calib3d and fisheye modules.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.errors import InputError
+
+OPENCV_PARAMETERS = 8
+FISHEYE_PARAMETERS = 4
+_NEWTON_STEPS = 50
+_TOLERANCE = 1e-10
+_MAX_RADIUS = 1e4
+
+
+def distort_opencv(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    """Distort points of the normalised plane with OpenCV's rational and tangential model."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = parameters
+    x, y = plane.unbind(-1)
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return torch.stack(
+        (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ),
+        dim=-1,
+    )
+
+
+def distort_fisheye(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    """Distort points of the normalised plane with the equidistant polynomial model."""
+    radius = torch.linalg.vector_norm(plane, dim=-1, keepdim=True)
+    theta = torch.atan(radius)
+    stretched = theta * _theta_polynomial(theta, parameters)
+    # The limit at the centre is 1, where the quotient would be 0 / 0.
+    factor = torch.where(radius > 1e-12, stretched / radius.clamp_min(1e-12), 1.0)
+    return plane * factor
+
+
+def _theta_polynomial(theta: Tensor, parameters: Sequence[float]) -> Tensor:
+    k1, k2, k3, k4 = parameters
+    t2 = theta * theta
+    return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+
+def undistort_opencv(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    """Invert `distort_opencv` by damped Newton steps from the distorted point.
+
+    Raises:
+        InputError: If a point has no inverse: the polynomial folds over inside the image.
+    """
+    target = plane.double()
+    guess = target.clone()
+    eye = torch.eye(2, dtype=torch.float64, device=plane.device)
+
+    def residual(at: Tensor) -> Tensor:
+        return distort_opencv(at, parameters) - target
+
+    error = residual(guess)
+    for _ in range(_NEWTON_STEPS):
+        if not error.numel() or float(error.abs().max()) < _TOLERANCE:
+            break
+        jacobian = _numerical_jacobian(lambda at: distort_opencv(at, parameters), guess)
+        step = torch.linalg.solve(jacobian + 1e-15 * eye, error.unsqueeze(-1)).squeeze(-1)
+        # A full step may jump over the fold of the polynomial; halve it until it helps.
+        fraction = torch.ones_like(error[..., :1])
+        before = torch.linalg.vector_norm(error, dim=-1, keepdim=True)
+        for _ in range(8):
+            after = torch.linalg.vector_norm(residual(guess - fraction * step), dim=-1)
+            worse = after.unsqueeze(-1) > before
+            if not bool(worse.any()):
+                break
+            fraction = torch.where(worse, fraction / 2, fraction)
+        guess = guess - fraction * step
+        error = residual(guess)
+    _require_converged(error)
+    return guess.to(plane)
+
+
+def _numerical_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    step = 1e-6
+    columns: list[Tensor] = []
+    for axis in range(2):
+        shift = torch.zeros(2, dtype=at.dtype, device=at.device)
+        shift[axis] = step
+        columns.append((function(at + shift) - function(at - shift)) / (2 * step))
+    return torch.stack(columns, dim=-1)
+
+
+def undistort_fisheye(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    """Invert `distort_fisheye` by Newton steps on the angle.
+
+    Raises:
+        InputError: If a point lies beyond 90 degrees from the axis, which no plane holds, or
+            the polynomial has no inverse there.
+    """
+    target = torch.linalg.vector_norm(plane.double(), dim=-1, keepdim=True)
+    theta = target.clone()
+    k1, k2, k3, k4 = parameters
+    for _ in range(_NEWTON_STEPS):
+        error = theta * _theta_polynomial(theta, parameters) - target
+        if not error.numel() or float(error.abs().max()) < _TOLERANCE:
+            break
+        t2 = theta * theta
+        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        theta = theta - error / slope.clamp_min(1e-6)
+    _require_converged(theta * _theta_polynomial(theta, parameters) - target)
+    radius = torch.tan(theta)
+    if bool(((theta >= torch.pi / 2 - 1e-3) | (theta < 0) | (radius > _MAX_RADIUS)).any()):
+        raise InputError(
+            "distortion: expected a view narrower than 180 degrees, got pixels at "
+            f"{float(theta.max()) * 180 / torch.pi:.1f} degrees from the axis."
+        )
+    factor = torch.where(target > 1e-12, radius / target.clamp_min(1e-12), 1.0)
+    return (plane.double() * factor).to(plane)
+
+
+def _require_converged(error: Tensor) -> None:
+    worst = float(error.abs().max()) if error.numel() else 0.0
+    if not worst < 1e-6:
+        raise InputError(
+            "distortion: the lens model has no inverse at some pixels "
+            f"(error {worst:.2g} on the normalised plane); check its parameters."
+        )

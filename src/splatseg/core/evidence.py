@@ -1,0 +1,126 @@
+"""What 2D models see in one view: masks, label maps, feature maps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatseg._check import check_shape
+from splatseg.core.rle import Rle
+from splatseg.errors import RangeError, ShapeError
+
+UNLABELLED = -1
+"""The id of a pixel or Gaussian without a label. Files write it as 0."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MaskSet:
+    """Masks of one view. They may overlap and need not cover the image."""
+
+    height: int
+    width: int
+    masks: tuple[Rle, ...]
+    """Run-length masks, each of height x width pixels."""
+
+    scores: Float[Tensor, "m"]
+    """How sure the model is of each mask, in [0, 1]."""
+
+    levels: Int[Tensor, "m"]
+    """Granularity, 0 the finest; all 0 where the model has no levels."""
+
+    def __post_init__(self) -> None:
+        check_shape("scores", self.scores, (len(self.masks),))
+        check_shape("levels", self.levels, (len(self.masks),))
+        for i, mask in enumerate(self.masks):
+            if (mask.height, mask.width) != (self.height, self.width):
+                raise ShapeError(
+                    f"masks[{i}]: expected {self.height} x {self.width} pixels, "
+                    f"got {mask.height} x {mask.width}."
+                )
+
+    def __len__(self) -> int:
+        return len(self.masks)
+
+    def dense(self, index: int) -> Bool[Tensor, "height width"]:
+        """One mask as booleans."""
+        return self.masks[index].decode()
+
+    @classmethod
+    def from_dense(
+        cls,
+        masks: Bool[Tensor, "m height width"],
+        *,
+        scores: Sequence[float] | Tensor | None = None,
+        levels: Sequence[int] | Tensor | None = None,
+    ) -> "MaskSet":
+        """Encode boolean masks; scores default to 1 and levels to 0."""
+        check_shape("masks", masks, (None, None, None))
+        count, height, width = (int(s) for s in masks.shape)
+        return cls(
+            height=height,
+            width=width,
+            masks=tuple(Rle.encode(mask) for mask in masks),
+            scores=torch.ones(count)
+            if scores is None
+            else torch.as_tensor(scores, dtype=torch.float32),
+            levels=torch.zeros(count, dtype=torch.int32)
+            if levels is None
+            else torch.as_tensor(levels, dtype=torch.int32),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LabelMap:
+    """One id a pixel."""
+
+    ids: Int[Tensor, "height width"]
+    """int32 ids, -1 where a pixel has none."""
+
+    confidence: Float[Tensor, "height width"] | None = None
+    """How sure the id is, in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        check_shape("ids", self.ids, (None, None))
+        if self.ids.numel() and int(self.ids.min()) < UNLABELLED:
+            raise RangeError(f"ids: expected -1 or more, got {int(self.ids.min())}.")
+        object.__setattr__(self, "ids", self.ids.to(torch.int32))
+        if self.confidence is not None:
+            check_shape("confidence", self.confidence, tuple(self.ids.shape))
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.ids.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Pixels a row."""
+        return int(self.ids.shape[1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FeatureMap:
+    """Dense features on a grid of square cells; cell (i, j) starts at pixel (i, j) * stride."""
+
+    features: Float[Tensor, "rows columns channels"]
+
+    stride: int
+    """Pixels a cell, along both axes."""
+
+    height: int
+    """Rows of the image that the grid covers, at least in part."""
+
+    width: int
+    """Columns of the image that the grid covers, at least in part."""
+
+    def __post_init__(self) -> None:
+        check_shape("features", self.features, (None, None, None))
+        if self.stride < 1:
+            raise RangeError(f"stride: expected at least 1, got {self.stride}.")
+
+    @property
+    def channels(self) -> int:
+        """Width of a feature."""
+        return int(self.features.shape[2])

@@ -1,0 +1,161 @@
+"""What is known of each Gaussian: labels, features, selections. One row a Gaussian."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatseg._check import check_shape
+from splatseg.core.evidence import UNLABELLED
+from splatseg.errors import InputError, RangeError, ShapeError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Labels:
+    """One id a Gaussian, with how sure it is."""
+
+    ids: Int[Tensor, "n"]
+    """int32 ids, -1 where there is none."""
+
+    confidence: Float[Tensor, "n"]
+    """The winner's share of the evidence, in [0, 1]; 0 where there was none."""
+
+    background: int = UNLABELLED
+    """Label of what no Gaussian covers (the sky); -1 is none."""
+
+    candidates: Int[Tensor, "n k"] | None = None
+    """The strongest ids of each Gaussian, strongest first, -1 where there are fewer."""
+
+    shares: Float[Tensor, "n k"] | None = None
+    """Their shares of the evidence, which add up to at most 1."""
+
+    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """How it was made, in values that JSON holds: method, options, evidence, id names."""
+
+    def __post_init__(self) -> None:
+        check_shape("ids", self.ids, (None,))
+        n = len(self.ids)
+        check_shape("confidence", self.confidence, (n,))
+        if n and int(self.ids.min()) < UNLABELLED:
+            raise RangeError(f"ids: expected -1 or more, got {int(self.ids.min())}.")
+        object.__setattr__(self, "ids", self.ids.to(torch.int32))
+        if (self.candidates is None) != (self.shares is None):
+            raise InputError("candidates, shares: expected both or neither, got one of them.")
+        if self.candidates is not None and self.shares is not None:
+            check_shape("candidates", self.candidates, (n, None))
+            check_shape("shares", self.shares, tuple(self.candidates.shape))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, index: slice | Tensor) -> "Labels":
+        """Rows, in step with `Gaussians.__getitem__`."""
+        return Labels(
+            ids=self.ids[index],
+            confidence=self.confidence[index],
+            background=self.background,
+            candidates=None if self.candidates is None else self.candidates[index],
+            shares=None if self.shares is None else self.shares[index],
+            metadata=self.metadata,
+        )
+
+    @property
+    def present(self) -> Int[Tensor, "m"]:
+        """The ids in use, ascending, without -1; the background's is among them."""
+        ids = torch.unique(self.ids)
+        if self.background != UNLABELLED:
+            ids = torch.unique(torch.cat((ids, ids.new_tensor([self.background]))))
+        return ids[ids != UNLABELLED]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Features:
+    """One feature vector a Gaussian."""
+
+    values: Float[Tensor, "n channels"]
+
+    weights: Float[Tensor, "n"] | None = None
+    """How much of it was seen: blending weight summed over pixels and views."""
+
+    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """How it was made, in values that JSON holds."""
+
+    def __post_init__(self) -> None:
+        check_shape("values", self.values, (None, None))
+        if self.weights is not None:
+            check_shape("weights", self.weights, (len(self.values),))
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, index: slice | Tensor) -> "Features":
+        """Rows, in step with `Gaussians.__getitem__`."""
+        return Features(
+            values=self.values[index],
+            weights=None if self.weights is None else self.weights[index],
+            metadata=self.metadata,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Selection:
+    """A set of Gaussians. Immutable; ``& | ^ - ~`` give new ones.
+
+    Example:
+        >>> a = Selection(mask=torch.tensor([True, True, False]))
+        >>> (a - ~a).ids
+        tensor([0, 1])
+    """
+
+    mask: Bool[Tensor, "n"]
+    """True where a Gaussian is selected."""
+
+    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """How it was made, in values that JSON holds. Algebra drops it."""
+
+    def __post_init__(self) -> None:
+        check_shape("mask", self.mask, (None,))
+        if self.mask.dtype != torch.bool:
+            raise InputError(f"mask: expected booleans, got {self.mask.dtype}.")
+
+    def __len__(self) -> int:
+        return len(self.mask)
+
+    def __getitem__(self, index: slice | Tensor) -> "Selection":
+        """Rows, in step with `Gaussians.__getitem__`."""
+        return Selection(mask=self.mask[index], metadata=self.metadata)
+
+    @property
+    def count(self) -> int:
+        """How many Gaussians are selected."""
+        return int(self.mask.sum())
+
+    @property
+    def ids(self) -> Int[Tensor, "m"]:
+        """Rows of the selected Gaussians, ascending."""
+        return torch.nonzero(self.mask).squeeze(1)
+
+    def __and__(self, other: "Selection") -> "Selection":
+        return Selection(mask=self.mask & self._same_length(other))
+
+    def __or__(self, other: "Selection") -> "Selection":
+        return Selection(mask=self.mask | self._same_length(other))
+
+    def __xor__(self, other: "Selection") -> "Selection":
+        return Selection(mask=self.mask ^ self._same_length(other))
+
+    def __sub__(self, other: "Selection") -> "Selection":
+        return Selection(mask=self.mask & ~self._same_length(other))
+
+    def __invert__(self) -> "Selection":
+        return Selection(mask=~self.mask)
+
+    def _same_length(self, other: "Selection") -> Tensor:
+        if len(self) != len(other):
+            raise ShapeError(
+                f"selection: expected one over {len(self)} Gaussians, got one over {len(other)}."
+            )
+        return other.mask

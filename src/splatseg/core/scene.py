@@ -1,0 +1,203 @@
+"""Views, captures and scenes: what was photographed, and what was made of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from splatseg._check import check_shape
+from splatseg.core.camera import Camera
+from splatseg.core.gaussians import Gaussians
+from splatseg.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """One photograph with its camera. The pixels stay on disk until somebody asks."""
+
+    name: str
+    """The file's stem, or its relative path without suffix where stems clash."""
+
+    camera: Camera
+    """In the photograph's own pixels, after its EXIF orientation was applied."""
+
+    image: Path | None = None
+    """The photograph; None for a view that has none."""
+
+    split: str = "train"
+    """``train``, ``test`` or a further name of the capture's own."""
+
+    mask: Path | None = None
+    """Image whose zero pixels are to be ignored."""
+
+    depth: Path | None = None
+    """Depth map of the capture."""
+
+    depth_unit: float | None = None
+    """Scene units of one step of the depth map."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointCloud:
+    """Start points of a capture, in the world."""
+
+    points: Float[Tensor, "n 3"]
+
+    colours: UInt8[Tensor, "n 3"] | None = None
+    """Red, green, blue, 0 to 255."""
+
+    def __post_init__(self) -> None:
+        check_shape("points", self.points, (None, 3))
+        if self.colours is not None:
+            check_shape("colours", self.colours, (len(self.points), 3))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClassInfo:
+    """One row of a class table."""
+
+    id: int
+    name: str
+
+    isthing: bool = True
+    """True where single objects are counted, False for stuff such as a wall."""
+
+    colour: tuple[int, int, int] | None = None
+    """Red, green, blue, 0 to 255, for pictures."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClassTable:
+    """The names behind ids."""
+
+    rows: tuple[ClassInfo, ...]
+
+    def __post_init__(self) -> None:
+        ids = [row.id for row in self.rows]
+        if len(set(ids)) != len(ids):
+            twice = sorted({i for i in ids if ids.count(i) > 1})
+            raise InputError(f"classes: expected distinct ids, got {twice} more than once.")
+
+    def name_of(self, id: int) -> str:
+        """Name of an id, or ``id N`` where the table does not know it."""
+        return next((row.name for row in self.rows if row.id == id), f"id {id}")
+
+    def by_name(self, name: str) -> ClassInfo:
+        """The row with this name.
+
+        Raises:
+            InputError: If there is none.
+        """
+        for row in self.rows:
+            if row.name == name:
+                return row
+        known = ", ".join(row.name for row in self.rows)
+        raise InputError(f"class: expected one of {known}, got {name!r}.")
+
+
+def _find(views: tuple[View, ...], name: str) -> View:
+    for view in views:
+        if view.name == name:
+            return view
+    shown = ", ".join(view.name for view in views[:5])
+    raise InputError(f"view: there is no {name!r} among {len(views)} views ({shown}, ...).")
+
+
+def _check_names(views: tuple[View, ...]) -> None:
+    names = [view.name for view in views]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"views: expected distinct names, got {twice!r} more than once.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Capture:
+    """What a capture folder holds: photographs with poses, and what else came with them."""
+
+    path: Path
+    format: str
+    """Which reader took it: nerfstudio, colmap, llff, ..."""
+
+    views: tuple[View, ...]
+    points: PointCloud | None = None
+    classes: ClassTable | None = None
+
+    up: tuple[float, float, float] | None = None
+    """Direction away from the ground in the world, where the capture says."""
+
+    metres_per_unit: float | None = None
+    """Length of a scene unit, where the capture says."""
+
+    splats: Path | None = None
+    """A splat file that lies beside the photographs."""
+
+    notes: tuple[str, ...] = ()
+    """What a person should know of how it was read."""
+
+    def __post_init__(self) -> None:
+        _check_names(self.views)
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """Views that methods may learn from."""
+        return tuple(view for view in self.views if view.split == "train")
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        """Held-out views of the split ``test``."""
+        return tuple(view for view in self.views if view.split == "test")
+
+    def view(self, name: str) -> View:
+        """The view of this name.
+
+        Raises:
+            InputError: If there is none.
+        """
+        return _find(self.views, name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """Gaussians with the views they came from."""
+
+    gaussians: Gaussians
+    views: tuple[View, ...] = ()
+    classes: ClassTable | None = None
+    up: tuple[float, float, float] | None = None
+    metres_per_unit: float | None = None
+
+    source: Path | None = None
+    """Folder of the capture; evidence recorded there goes by its folder names."""
+
+    root: Path | None = None
+    """Folder of the scene, once it was saved."""
+
+    provenance: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """How it was made, in values that JSON holds."""
+
+    def __post_init__(self) -> None:
+        _check_names(self.views)
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """Views that methods may learn from."""
+        return tuple(view for view in self.views if view.split == "train")
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        """Held-out views of the split ``test``."""
+        return tuple(view for view in self.views if view.split == "test")
+
+    def view(self, name: str) -> View:
+        """The view of this name.
+
+        Raises:
+            InputError: If there is none.
+        """
+        return _find(self.views, name)
