@@ -1,0 +1,166 @@
+"""What a backend does, and what it gives back: the matrix W of a view and its adjoint.
+
+With the geometry frozen a view is a sparse linear map (DESIGN, "One idea carries everything"):
+
+    w[p, i] = alpha_i(p) * prod_{j before i} (1 - alpha_j(p))      W: pixels x Gaussians
+
+`render` is ``W @ signal``, `back_project` is ``W.T @ image``, `contributors` reads rows of W
+and `weights` keeps W.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from jaxtyping import Float, Float16, Int, Int32, Int64
+from torch import Tensor
+
+from splatseg.core import Camera, Gaussians
+from splatseg.render._options import RenderOptions
+
+Layout = Literal["csr", "blocks"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rendered:
+    """What a view shows."""
+
+    image: Float[Tensor, "height width channels"]
+    """``W @ signal``, over black: a pixel that nothing covers is 0."""
+
+    alpha: Float[Tensor, "height width"]
+    """Sum of the weights, ``W @ 1``; 1 minus it is the light that passes everything."""
+
+    depth: Float[Tensor, "height width"]
+    """Expected z-depth, sum(w z) / sum(w), scene units; 0 where alpha is 0."""
+
+    median_depth: Float[Tensor, "height width"]
+    """z of the Gaussian at which the transmittance first falls to 0.5 or less; 0 where it
+    never does. Not differentiable."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BackProjected:
+    """What an image says of each Gaussian."""
+
+    sums: Float[Tensor, "n channels"]
+    """``W.T @ image``: the image summed over pixels with the blending weights."""
+
+    weights: Float[Tensor, "n"]
+    """``W.T @ 1``: how much each Gaussian was seen; one fully visible pixel counts 1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Contributors:
+    """Which Gaussians make some pixels."""
+
+    ids: Int32[Tensor, "p k"]
+    """The strongest Gaussians of each pixel, strongest first; -1 where there are fewer."""
+
+    weights: Float[Tensor, "p k"]
+    """Their blending weights, 0 where there are fewer."""
+
+    first: Int32[Tensor, "p"]
+    """The front-most Gaussian with a weight; -1 where there is none."""
+
+    median: Int32[Tensor, "p"]
+    """The Gaussian at which the transmittance first falls to 0.5 or less; -1 where it never
+    does."""
+
+
+class ViewWeights(ABC):
+    """W of one view, kept for reuse. Half-precision weights, float32 products."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Pixels and Gaussians."""
+
+    @property
+    @abstractmethod
+    def nbytes(self) -> int:
+        """Memory it holds."""
+
+    @abstractmethod
+    def render(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
+        """``W @ signal``, row by row of the image (or of the pixels asked for)."""
+
+    @abstractmethod
+    def back_project(self, image: Float[Tensor, "pixels channels"]) -> BackProjected:
+        """``W.T @ image`` and ``W.T @ 1``."""
+
+
+class SparseWeights(ViewWeights):
+    """W as compressed sparse rows: the ids and weights of pixel p are
+    ``ids[indptr[p]:indptr[p + 1]]`` and ``weights[...]``, front to back."""
+
+    @property
+    @abstractmethod
+    def indptr(self) -> Int64[Tensor, "pixels_plus_1"]:
+        """Where each pixel's entries begin."""
+
+    @property
+    @abstractmethod
+    def ids(self) -> Int32[Tensor, "entries"]:
+        """Gaussians, front to back in each row."""
+
+    @property
+    @abstractmethod
+    def weights(self) -> Float16[Tensor, "entries"]:
+        """Blending weights."""
+
+
+class Backend(ABC):
+    """One way to compute W. Cameras are pinhole; inputs were checked by the caller."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        signal: Float[Tensor, "n channels"] | None,
+        *,
+        options: RenderOptions,
+    ) -> Rendered:
+        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+
+    @abstractmethod
+    def back_project(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        image: Float[Tensor, "height width channels"],
+        *,
+        options: RenderOptions,
+    ) -> BackProjected:
+        """``W.T @ image`` and ``W.T @ 1``. No gradient."""
+
+    @abstractmethod
+    def contributors(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"],
+        k: int,
+        *,
+        options: RenderOptions,
+    ) -> Contributors:
+        """The k strongest Gaussians of pixels (column, row), ties front to back."""
+
+    @abstractmethod
+    def weights(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"] | None,
+        k: int | None,
+        *,
+        layout: Layout,
+        options: RenderOptions,
+    ) -> ViewWeights:
+        """W itself: all pixels or some, all entries or each pixel's k strongest.
+
+        ``layout="blocks"`` holds 4 x 4 pixel blocks, all pixels and entries only.
+        """
