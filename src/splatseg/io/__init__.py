@@ -1,0 +1,1 @@
+"""Files and what they become: splats, captures, evidence, layers, scene folders."""
