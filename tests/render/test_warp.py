@@ -18,9 +18,7 @@ PINCUSHION = ("opencv", (0.15,))
 FISHEYE = ("fisheye", (0.02, -0.01))
 
 
-def camera_of(
-    model="pinhole", distortion=(), *, width=40, height=30, **changes
-) -> Camera:
+def camera_of(model="pinhole", distortion=(), *, width=40, height=30, **changes) -> Camera:
     values = {"fx": 30.0, "fy": 31.0, "cx": 19.0, "cy": 15.5} | changes
     return Camera(
         width=width,
@@ -74,9 +72,9 @@ def test_bilinear_reads_where_the_ray_meets_the_pinhole_image(lens) -> None:
     """Bilinear resampling is exact on the coordinates themselves."""
     camera = camera_of(*lens)
     pinhole = camera.undistorted()
-    points = torch.cat(
-        (camera.rays()[1], torch.ones(30, 40, 1, dtype=torch.float64)), dim=-1
-    )[..., :3]
+    points = torch.cat((camera.rays()[1], torch.ones(30, 40, 1, dtype=torch.float64)), dim=-1)[
+        ..., :3
+    ]
     expected, _ = pinhole.project(points)
     read = Warp.between(camera, pinhole).apply(pinhole.pixel_centres())
     torch.testing.assert_close(read, expected, rtol=0, atol=2e-5)
@@ -142,9 +140,7 @@ def test_gradients_are_the_adjoint(rng) -> None:
 def test_a_smooth_photograph_survives_there_and_back(lens) -> None:
     camera = camera_of(*lens)
     centres = camera.pixel_centres()
-    image = torch.stack(
-        (torch.sin(centres[..., 0] / 9), torch.cos(centres[..., 1] / 7)), -1
-    )
+    image = torch.stack((torch.sin(centres[..., 0] / 9), torch.cos(centres[..., 1] / 7)), -1)
     straight, mask = photograph_to_pinhole(image, camera)
     assert straight.shape[:2] == mask.shape
     assert 0.5 < float(mask.double().mean()) < 1
@@ -155,9 +151,7 @@ def test_a_smooth_photograph_survives_there_and_back(lens) -> None:
 
 def test_a_folded_lens_shows_no_ghosts() -> None:
     """Beyond the fold of a strong barrel, plane points fall back into the photograph."""
-    camera = camera_of(
-        "opencv", (-0.25,), width=40, height=30, fx=36.0, fy=36.0, cx=20, cy=15
-    )
+    camera = camera_of("opencv", (-0.25,), width=40, height=30, fx=36.0, fy=36.0, cx=20, cy=15)
     wide = camera_of(width=400, height=300, fx=36.0, fy=36.0, cx=200, cy=150)
     warp = Warp.between(wide, camera)
     rows, columns = np.nonzero(warp.valid.numpy())
@@ -167,9 +161,7 @@ def test_a_folded_lens_shows_no_ghosts() -> None:
 
 
 def test_float32_and_threads_give_the_same_bits(rng) -> None:
-    camera = camera_of(
-        *BARREL, width=120, height=90, fx=90.0, fy=90.0, cx=60.0, cy=45.0
-    )
+    camera = camera_of(*BARREL, width=120, height=90, fx=90.0, fy=90.0, cx=60.0, cy=45.0)
     warp = Warp.between(camera, camera.undistorted())
     image = torch.from_numpy(rng.random((90, 120, 5), dtype=np.float32))
     before = torch.get_num_threads()
@@ -201,9 +193,7 @@ def test_bad_input_is_refused() -> None:
     camera = camera_of(*BARREL)
     pose = torch.eye(4, dtype=torch.float64)
     pose[2, 3] = 1.0
-    elsewhere = Camera(
-        width=40, height=30, fx=30.0, fy=31.0, cx=19.0, cy=15.5, cam_from_world=pose
-    )
+    elsewhere = Camera(width=40, height=30, fx=30.0, fy=31.0, cx=19.0, cy=15.5, cam_from_world=pose)
     with pytest.raises(InputError, match="same pose"):
         Warp.between(camera, elsewhere)
     with pytest.raises(InputError, match="bilinear, nearest"):

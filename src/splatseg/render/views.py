@@ -82,9 +82,7 @@ def back_project_view(
     """
     check_shape("image", image, (camera.height, camera.width, None))
     if camera.is_pinhole:
-        return backend.back_project(
-            gaussians, straightened(camera), image, options=options
-        )
+        return backend.back_project(gaussians, straightened(camera), image, options=options)
     lens = warp_into_photograph(camera, warp)
     # The backend's own weights count pinhole pixels; a channel of ones counts the photograph's.
     with_ones = torch.cat((image, torch.ones_like(image[..., :1])), dim=-1)

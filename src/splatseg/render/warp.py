@@ -60,9 +60,7 @@ class Warp:
     _transposed: "_Rows"
 
     @classmethod
-    def between(
-        cls, target: Camera, source: Camera, mode: WarpMode = "bilinear"
-    ) -> "Warp":
+    def between(cls, target: Camera, source: Camera, mode: WarpMode = "bilinear") -> "Warp":
         """The matrix that shows what `source` saw in the pixels of `target`.
 
         Every pixel centre of `target` is a ray; the source image is read where that ray meets
@@ -92,9 +90,7 @@ class Warp:
         pixels = target.height * target.width
         rows = torch.arange(pixels).reshape(valid.shape)[valid]
         rows = rows.unsqueeze(-1).expand_as(columns)
-        forward = _Rows.of(
-            rows.reshape(-1), columns.reshape(-1), values.reshape(-1), pixels
-        )
+        forward = _Rows.of(rows.reshape(-1), columns.reshape(-1), values.reshape(-1), pixels)
         source_pixels = source.height * source.width
         transposed = _Rows.of(
             columns.reshape(-1), rows.reshape(-1), values.reshape(-1), source_pixels
@@ -266,9 +262,9 @@ def _taps(at: Tensor, source: Camera, mode: WarpMode) -> tuple[Tensor, Tensor]:
     at = torch.nan_to_num(at).clamp(at.new_zeros(2), size.to(at))
     if mode == "nearest":
         cell = torch.minimum(at.floor().long(), size - 1)
-        return (cell[..., 1] * source.width + cell[..., 0]).unsqueeze(
-            -1
-        ), torch.ones_like(at[..., :1], dtype=torch.float32)
+        return (cell[..., 1] * source.width + cell[..., 0]).unsqueeze(-1), torch.ones_like(
+            at[..., :1], dtype=torch.float32
+        )
     corner = torch.floor(at - 0.5)
     fraction = at - 0.5 - corner
     columns: list[Tensor] = []
