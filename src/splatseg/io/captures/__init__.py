@@ -1,0 +1,106 @@
+"""Captures: posed photographs in the layouts people have, read without their pixels.
+
+One module a layout; `read_capture` finds out which. Where a folder has several descriptions
+the first of `FORMATS` wins.
+"""
+
+from pathlib import Path
+
+from splatseg._check import check_choice
+from splatseg.core import Capture
+from splatseg.errors import InputError, MissingFileError
+from splatseg.io.captures.blender import find_blender, read_blender
+from splatseg.io.captures.colmap import find_colmap, read_colmap
+from splatseg.io.captures.idr import FILES as _IDR_FILES
+from splatseg.io.captures.idr import find_idr, read_idr
+from splatseg.io.captures.llff import FILE as _LLFF_FILE
+from splatseg.io.captures.llff import read_llff
+from splatseg.io.captures.nerfstudio import FILE as _NERFSTUDIO_FILE
+from splatseg.io.captures.nerfstudio import read_nerfstudio
+from splatseg.io.images import find_images
+
+FORMATS = ("nerfstudio", "blender", "colmap", "llff", "idr")
+"""Layouts that are read, in the order in which they are looked for."""
+
+
+def read_capture(path: Path | str, *, format: str = "auto") -> Capture:
+    """Read a capture: cameras, split, start points and classes, not the photographs themselves.
+
+    Views are sorted by name. The split is the capture's own, else every 8th view by sorted
+    name (0, 8, 16, ...) is a test view. Photographs are checked to be there and to have the
+    size their intrinsics say, or a uniform scale of it, which is noted.
+
+    Args:
+        path: The capture's folder, or its transforms.json, poses_bounds.npy or
+            cameras_sphere.npz, or the folder of a COLMAP model.
+        format: One of `FORMATS`, or ``auto`` for the first of them that is found.
+
+    Returns:
+        The capture, with `notes` on what a person should know of how it was read.
+
+    Raises:
+        MissingFileError: If there is no such folder, or photographs are missing.
+        InputError: If no layout is found, or what it says cannot be; one sentence with the
+            reason.
+    """
+    check_choice("format", format, ("auto", *FORMATS))
+    folder = Path(path)
+    if folder.is_file():
+        folder, named = _from_file(folder)
+        format = named if format == "auto" else format
+    if not folder.is_dir():
+        raise MissingFileError(f"{path}: there is no such capture.")
+    if format == "auto":
+        found = find_formats(folder)
+        if not found:
+            raise InputError(_nothing_found(folder))
+        format = found[0]
+    match format:
+        case "nerfstudio":
+            return read_nerfstudio(folder)
+        case "blender":
+            return read_blender(folder)
+        case "colmap":
+            return read_colmap(folder)
+        case "llff":
+            return read_llff(folder)
+        case _:
+            return read_idr(folder)
+
+
+def find_formats(folder: Path) -> tuple[str, ...]:
+    """Layouts that a folder has, the one that would be read first."""
+    found = {
+        "nerfstudio": (folder / _NERFSTUDIO_FILE).is_file(),
+        "blender": find_blender(folder),
+        "colmap": find_colmap(folder) is not None,
+        "llff": (folder / _LLFF_FILE).is_file(),
+        "idr": find_idr(folder) is not None,
+    }
+    return tuple(format for format in FORMATS if found[format])
+
+
+def bare_photographs(folder: Path) -> tuple[Path, ...]:
+    """Photographs of a folder that has no poses: in it, or in its folder ``images``."""
+    return find_images(folder) or find_images(folder / "images")
+
+
+def _from_file(path: Path) -> tuple[Path, str]:
+    named = {_NERFSTUDIO_FILE: "nerfstudio", "transforms_train.json": "blender"}
+    named |= {_LLFF_FILE: "llff"} | dict.fromkeys(_IDR_FILES, "idr")
+    if path.name not in named:
+        raise InputError(f"{path}: expected a capture's folder or one of {', '.join(named)}.")
+    return path.parent, named[path.name]
+
+
+def _nothing_found(folder: Path) -> str:
+    photographs = len(bare_photographs(folder))
+    if photographs:
+        return (
+            f"{folder}: expected photographs with poses, got {photographs} photographs without; "
+            "poses come from COLMAP or another tool."
+        )
+    return (
+        f"{folder}: expected a capture (transforms.json, a COLMAP model, poses_bounds.npy or "
+        "cameras_sphere.npz), got none of them."
+    )

@@ -1,0 +1,291 @@
+"""From what a layout says of each photograph to checked views.
+
+Every reader of a layout only parses: it gives one `RawView` a photograph. Names, splits,
+missing photographs, sizes and poses are dealt with here, once, so that every layout refuses
+the same mistakes in the same words.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
+from splatseg.errors import InputError, MissingFileError
+from splatseg.io.captures._metadata import read_metadata
+from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
+
+TEST_EVERY = 8
+"""Without a split of its own, views 0, 8, 16 ... of a capture by sorted name are test views."""
+
+_ROTATION_TOLERANCE = 1e-3
+# A matrix this close to a rotation is kept to the last bit; others are made exact.
+_ROTATION_EXACT = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Intrinsics:
+    """What a layout says of a lens, in pixels of an image of `width` x `height`."""
+
+    model: CameraModel = "pinhole"
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    width: int | None
+    """None where the layout does not say: the photograph's own size is meant."""
+
+    height: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawView:
+    """One photograph as a layout describes it, unchecked."""
+
+    image: Path
+    """Where the photograph should be."""
+
+    relative: str
+    """The photograph's path as the layout writes it; names come from it."""
+
+    intrinsics: Intrinsics
+    cam_from_world: NDArray[np.float64]
+    """4 x 4, OpenCV axes."""
+
+    split: str | None = None
+    mask: Path | None = None
+    depth: Path | None = None
+    depth_unit: float | None = None
+
+
+def build_capture(
+    path: Path,
+    raw: Sequence[RawView],
+    *,
+    format: str,
+    points: PointCloud | None = None,
+    splats: Path | None = None,
+    notes: Sequence[str] = (),
+) -> Capture:
+    """Check what a reader found and make the capture of it.
+
+    Raises:
+        InputError: If there is no photograph, one is listed twice, a pose or focal length is
+            impossible, or a photograph's size is not that of its intrinsics.
+        MissingFileError: If photographs, masks or depth maps are missing; five are named.
+    """
+    if not raw:
+        raise InputError(
+            f"{path}: expected photographs with poses, got a {format} capture of none."
+        )
+    names = view_names([view.relative for view in raw])
+    order = sorted(range(len(raw)), key=lambda i: names[i])
+    raw, names = [raw[i] for i in order], [names[i] for i in order]
+    _check_files(path, raw)
+    splits, split_note = _splits(raw)
+    scaled: Counter[str] = Counter()
+    views: list[View] = []
+    for view, name, split in zip(raw, names, splits, strict=True):
+        width, height = image_size(view.image)
+        intrinsics = scaled_to(view.intrinsics, (width, height), where=str(view.image))
+        if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
+            before = f"{view.intrinsics.width}x{view.intrinsics.height}"
+            scaled[f"intrinsics of {before} were scaled to photographs of {width}x{height}"] += 1
+        views.append(
+            View(
+                name=name,
+                camera=_camera(view, intrinsics, width, height, where=f"{path}: {view.relative}"),
+                image=view.image,
+                split=split,
+                mask=view.mask,
+                depth=view.depth,
+                depth_unit=view.depth_unit,
+            )
+        )
+    metadata = read_metadata(path)
+    found = [*notes, *scaled, *([split_note] if split_note else []), *_size_notes(views)]
+    return Capture(
+        path=path,
+        format=format,
+        views=tuple(views),
+        points=points,
+        classes=metadata.classes,
+        up=metadata.up,
+        metres_per_unit=metadata.metres_per_unit,
+        splats=splats,
+        notes=tuple(found),
+    )
+
+
+def view_names(relatives: Sequence[str]) -> list[str]:
+    """Names of views: the file's stem, or its relative path where stems clash.
+
+    Relative paths start below the folder that all photographs share, and lose their suffix
+    unless only the suffix tells two photographs apart.
+
+    Raises:
+        InputError: If a photograph is listed twice.
+
+    Example:
+        >>> view_names(["images/left/1.jpg", "images/right/1.jpg", "images/left/2.jpg"])
+        ['left/1', 'right/1', '2']
+    """
+    paths = [PurePosixPath(relative) for relative in relatives]
+    twice = [str(path) for path, count in Counter(paths).items() if count > 1]
+    if twice:
+        raise InputError(
+            f"photographs: expected each once, got {len(twice)} more than once ({_first(twice)})."
+        )
+    parents = [path.parent.parts for path in paths]
+    shared = 0
+    while all(len(p) > shared and p[shared] == parents[0][shared] for p in parents):
+        shared += 1
+    below = [PurePosixPath(*path.parts[shared:]) for path in paths]
+    stems = Counter(path.stem for path in below)
+    bare = Counter(path.with_suffix("") for path in below)
+    return [
+        path.stem
+        if stems[path.stem] == 1
+        else str(path if bare[path.with_suffix("")] > 1 else path.with_suffix(""))
+        for path in below
+    ]
+
+
+def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Intrinsics:
+    """Intrinsics in pixels of a photograph of another size but the same shape.
+
+    A photograph made smaller has whole pixels, so its sides may differ by up to one pixel from
+    a uniform scale; each axis is scaled by its own ratio.
+
+    Raises:
+        InputError: If no uniform scale leads from one size to the other.
+    """
+    if intrinsics.width is None or intrinsics.height is None:
+        return replace(intrinsics, width=size[0], height=size[1])
+    if (intrinsics.width, intrinsics.height) == size:
+        return intrinsics
+    sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
+    uniform = (
+        abs(sx * intrinsics.height - size[1]) <= 1 or abs(sy * intrinsics.width - size[0]) <= 1
+    )
+    if not uniform:
+        turned = abs(size[1] / intrinsics.width * intrinsics.height - size[0]) <= 1
+        hint = "; turned by its EXIF orientation, perhaps" if turned else ""
+        raise InputError(
+            f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or "
+            f"a uniform scale of it, as its intrinsics say, got {size[0]}x{size[1]}{hint}."
+        )
+    return replace(
+        intrinsics,
+        width=size[0],
+        height=size[1],
+        fx=intrinsics.fx * sx,
+        fy=intrinsics.fy * sy,
+        cx=intrinsics.cx * sx,
+        cy=intrinsics.cy * sy,
+    )
+
+
+def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64]:
+    """A rigid 4 x 4 transform, with its rotation made exact where digits were lost.
+
+    Raises:
+        InputError: If it is not 4 x 4, holds NaN or infinity, or does not rotate.
+    """
+    if pose.shape != (4, 4):
+        raise InputError(f"{where}: expected a 4 x 4 pose, got shape {pose.shape}.")
+    bad = int((~np.isfinite(pose)).sum())
+    if bad:
+        raise InputError(f"{where}: expected a finite pose, got {bad} values of 16 that are not.")
+    rotation = pose[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(rotation))
+    if error > _ROTATION_TOLERANCE or determinant < 0:
+        raise InputError(
+            f"{where}: expected a rotation in its pose, got a matrix with |R R^T - I| = "
+            f"{error:.3g} and determinant {determinant:.3g}."
+        )
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > _ROTATION_EXACT:
+        raise InputError(f"{where}: expected a pose whose last row is 0 0 0 1, got {pose[3]}.")
+    exact = pose.copy()
+    exact[3] = (0, 0, 0, 1)
+    if error > _ROTATION_EXACT:
+        left, _, right = np.linalg.svd(rotation)
+        exact[:3, :3] = left @ right
+    return exact
+
+
+def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back)."""
+    return np.linalg.inv(world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
+def _camera(
+    view: RawView, intrinsics: Intrinsics, width: int, height: int, *, where: str
+) -> Camera:
+    for name in ("fx", "fy"):
+        value = float(getattr(intrinsics, name))
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"{where}: expected a positive focal length, got {name} = {value:g}.")
+    rest = (intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
+    if not all(math.isfinite(value) for value in rest):
+        raise InputError(f"{where}: expected finite intrinsics, got {rest}.")
+    pose = checked_pose(view.cam_from_world, where=where)
+    distorted = intrinsics.model == "fisheye" or any(intrinsics.distortion)
+    return Camera(
+        width=width,
+        height=height,
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        cam_from_world=torch.from_numpy(pose),
+        model=intrinsics.model if distorted else "pinhole",
+        distortion=intrinsics.distortion if distorted else (),
+    )
+
+
+def _check_files(path: Path, raw: Sequence[RawView]) -> None:
+    for what, files in (
+        ("photographs", [view.image for view in raw]),
+        ("masks", [view.mask for view in raw if view.mask is not None]),
+        ("depth maps", [view.depth for view in raw if view.depth is not None]),
+    ):
+        missing = [str(file) for file in files if not file.is_file()]
+        if missing:
+            raise MissingFileError(
+                f"{path}: {len(missing)} of {len(files)} {what} are missing ({_first(missing)})."
+            )
+
+
+def _first(names: Sequence[str], count: int = 5) -> str:
+    return ", ".join(names[:count]) + (", ..." if len(names) > count else "")
+
+
+def _splits(raw: Sequence[RawView]) -> tuple[list[str], str | None]:
+    """Splits of views that are already sorted by name."""
+    if any(view.split is not None for view in raw):
+        return [view.split or "train" for view in raw], None
+    if len(raw) == 1:
+        return ["train"], None
+    splits = ["test" if i % TEST_EVERY == 0 else "train" for i in range(len(raw))]
+    return splits, f"no split of its own: every {TEST_EVERY}th view by name is a test view"
+
+
+def _size_notes(views: Sequence[View]) -> list[str]:
+    large = [v for v in views if max(v.camera.width, v.camera.height) > DEFAULT_LONGEST]
+    if not large:
+        return []
+    camera = large[0].camera
+    width, height = reduced_size(camera.width, camera.height, DEFAULT_LONGEST)
+    return [
+        f"{len(large)} photographs are larger than {DEFAULT_LONGEST} pixels "
+        f"({camera.width}x{camera.height}); they are worked on at {width}x{height}"
+    ]

@@ -1,0 +1,172 @@
+"""A COLMAP model in memory, and what its camera models mean.
+
+Camera models and their parameter order are those of COLMAP's ``sensor/models.h``; ids are what
+the binary files hold.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core import PointCloud
+from splatseg.errors import InputError
+from splatseg.io.captures._build import Intrinsics
+
+MODELS: dict[int, tuple[str, int]] = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}
+"""Name and number of parameters by the id of the binary files."""
+
+PARAMETER_COUNTS = dict(MODELS.values())
+"""Number of parameters by name."""
+
+_READ = (
+    "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, "
+    "SIMPLE_RADIAL_FISHEYE and RADIAL_FISHEYE"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColmapCamera:
+    """One lens as COLMAP stores it."""
+
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColmapImage:
+    """One registered photograph."""
+
+    name: str
+    camera_id: int
+    cam_from_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColmapRig:
+    """Cameras that are mounted together: cam_from_rig by camera id."""
+
+    cam_from_rig: dict[int, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColmapFrame:
+    """One moment of a rig and the images taken at it."""
+
+    rig_id: int
+    rig_from_world: NDArray[np.float64]
+
+    images: tuple[tuple[int, int], ...]
+    """Pairs of camera id and image id."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColmapModel:
+    """A sparse model. Rigs and frames are empty in the older layout of three files."""
+
+    cameras: dict[int, ColmapCamera]
+    images: dict[int, ColmapImage]
+    points: PointCloud | None
+    rigs: dict[int, ColmapRig] = field(default_factory=dict[int, ColmapRig])
+    frames: tuple[ColmapFrame, ...] = ()
+
+
+def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
+    """The lens of a COLMAP camera as ours.
+
+    SIMPLE_RADIAL and RADIAL are OpenCV's k1 and k2; the fisheye models are OpenCV's polynomial
+    in the angle, theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
+
+    Raises:
+        InputError: If the model is one that cannot be undistorted here, or parameters lack.
+    """
+    p = camera.parameters
+    expected = PARAMETER_COUNTS.get(camera.model)
+    if expected is not None and len(p) != expected:
+        raise InputError(
+            f"{where}: expected {expected} parameters of a {camera.model} camera, got {len(p)}."
+        )
+    size = {"width": camera.width, "height": camera.height}
+    match camera.model:
+        case "SIMPLE_PINHOLE":
+            return Intrinsics(fx=p[0], fy=p[0], cx=p[1], cy=p[2], **size)
+        case "PINHOLE":
+            return Intrinsics(fx=p[0], fy=p[1], cx=p[2], cy=p[3], **size)
+        case "SIMPLE_RADIAL" | "RADIAL":
+            return Intrinsics(
+                model="opencv", fx=p[0], fy=p[0], cx=p[1], cy=p[2], distortion=p[3:], **size
+            )
+        case "OPENCV" | "FULL_OPENCV":
+            return Intrinsics(
+                model="opencv", fx=p[0], fy=p[1], cx=p[2], cy=p[3], distortion=p[4:], **size
+            )
+        case "OPENCV_FISHEYE":
+            return Intrinsics(
+                model="fisheye", fx=p[0], fy=p[1], cx=p[2], cy=p[3], distortion=p[4:], **size
+            )
+        case "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE":
+            return Intrinsics(
+                model="fisheye", fx=p[0], fy=p[0], cx=p[1], cy=p[2], distortion=p[3:], **size
+            )
+        case _:
+            raise InputError(
+                f"{where}: expected a camera model that can be undistorted ({_READ}), "
+                f"got {camera.model}; undistort the photographs with COLMAP first."
+            )
+
+
+def rigid_matrix(values: tuple[float, ...]) -> NDArray[np.float64]:
+    """4 x 4 transform of qw qx qy qz tx ty tz; a zero quaternion gives NaN, found later."""
+    w, x, y, z = values[:4]
+    length = float(np.sqrt(w * w + x * x + y * y + z * z))
+    w, x, y, z = (v / length if length > 0 else float("nan") for v in (w, x, y, z))
+    matrix = np.eye(4)
+    matrix[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    matrix[:3, 3] = values[4:7]
+    return matrix
+
+
+def poses_of(model: ColmapModel, *, where: str) -> dict[int, NDArray[np.float64]]:
+    """cam_from_world by image id; frames of rigs, where there are any, come before images.
+
+    COLMAP does the same when it opens the newer layout:
+    cam_from_world = cam_from_rig @ rig_from_world.
+
+    Raises:
+        InputError: If a frame names a rig, a camera or an image that the model does not have.
+    """
+    poses = {id: image.cam_from_world for id, image in model.images.items()}
+    for frame in model.frames:
+        rig = model.rigs.get(frame.rig_id)
+        if rig is None:
+            raise InputError(f"{where}: a frame names rig {frame.rig_id}, which is not there.")
+        for camera_id, image_id in frame.images:
+            if image_id not in poses:
+                # An image of the frame that was not registered has no row of its own.
+                continue
+            if camera_id not in rig.cam_from_rig:
+                raise InputError(
+                    f"{where}: image {image_id} was taken by camera {camera_id}, whose place in "
+                    f"rig {frame.rig_id} is not known."
+                )
+            poses[image_id] = rig.cam_from_rig[camera_id] @ frame.rig_from_world
+    return poses

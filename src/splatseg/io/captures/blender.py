@@ -1,0 +1,69 @@
+"""Reads NeRF-synthetic captures: transforms_train.json and its like, as Blender wrote them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Capture
+from splatseg.errors import FileFormatError
+from splatseg.io.captures._build import Intrinsics, RawView, build_capture
+from splatseg.io.captures._metadata import read_json
+from splatseg.io.captures._points_beside import points_beside
+from splatseg.io.captures.nerfstudio import cam_from_world_of, focal_of, number
+from splatseg.io.images import IMAGE_SUFFIXES, image_size
+
+SPLITS = ("train", "val", "test")
+
+
+def find_blender(folder: Path) -> bool:
+    """Whether a folder has transforms_train.json."""
+    return (folder / "transforms_train.json").is_file()
+
+
+def read_blender(folder: Path) -> Capture:
+    """Read a NeRF-synthetic capture; see `read_capture`.
+
+    One file a split; ``camera_angle_x`` (radians) gives the focal length, the principal point
+    is the middle, and ``file_path`` has no suffix (png is tried first). Poses are as in
+    transforms.json. Transparent pixels are blended over white when a photograph is read.
+
+    Raises:
+        InputError: If a file is broken, or what it says cannot be.
+        MissingFileError: If photographs are missing.
+    """
+    raw: list[RawView] = []
+    for split in SPLITS:
+        path = folder / f"transforms_{split}.json"
+        if not path.is_file():
+            continue
+        content = read_json(path)
+        frames = content.get("frames")
+        if not isinstance(frames, list):
+            raise FileFormatError(f"{path}: expected a list of frames, got none.")
+        raw += [_raw_view(content, frame, split, path=path) for frame in frames]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    return build_capture(folder, raw, format="blender", points=points_beside(folder))
+
+
+def _raw_view(content: Mapping[str, Any], frame: object, split: str, *, path: Path) -> RawView:
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):  # pyright: ignore[reportUnknownMemberType]
+        raise FileFormatError(f"{path}: expected frames with a file_path, got {frame!r:.60}.")
+    entry: dict[str, Any] = frame  # pyright: ignore[reportUnknownVariableType]
+    relative = entry["file_path"].replace("\\", "/").removeprefix("./")
+    where = f"{path}: frame {relative!r}"
+    image = path.parent / relative
+    if image.suffix.lower() not in IMAGE_SUFFIXES:
+        tried = [image.parent / f"{image.name}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
+        image = next((file for file in tried if file.is_file()), tried[0])
+        relative += image.suffix
+    # The layout does not tell the size; a photograph that is missing is reported later.
+    width, height = image_size(image) if image.is_file() else (1, 1)
+    focal = focal_of(number({**content, **entry}, "camera_angle_x", None, where=where), width)
+    return RawView(
+        image=image,
+        relative=relative,
+        intrinsics=Intrinsics(
+            fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height
+        ),
+        cam_from_world=cam_from_world_of(entry, where=where),
+        split=split,
+    )

@@ -1,0 +1,142 @@
+"""Reads IDR captures: cameras_sphere.npz, photographs and object masks (DTU as IDR ships it)."""
+
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core import Capture
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.captures._build import Intrinsics, RawView, build_capture
+from splatseg.io.captures._points_beside import points_beside
+from splatseg.io.images import find_images, image_size
+
+FILES = ("cameras_sphere.npz", "cameras.npz")
+_IMAGE_FOLDERS = ("images", "image")
+_MASK_FOLDERS = ("masks", "mask")
+_SCALES = (1.0, 0.5, 0.25, 0.125, 2.0)
+# A principal point this far from the middle, as a share of the image, is no match.
+_OFF_CENTRE = 0.15
+
+
+def find_idr(folder: Path) -> Path | None:
+    """The file of projection matrices of an IDR capture, or None."""
+    return next((folder / name for name in FILES if (folder / name).is_file()), None)
+
+
+def read_idr(folder: Path) -> Capture:
+    """Read an IDR capture; see `read_capture`.
+
+    ``world_mat_i`` holds the 3 x 4 projection P = K [R | t] of the photograph i by name, in
+    the world's own units (``scale_mat_i``, the region of interest, is not applied). The layout
+    does not say for which image size K is meant: of 1, 1/2, 1/4, 1/8 and 2 the scale is taken
+    that brings the principal points closest to the middle of the photographs. An object mask of
+    the same stem in ``masks`` or ``mask`` becomes the view's mask.
+
+    Raises:
+        MissingFileError: If there is no such file, or photographs are missing.
+        InputError: If a matrix is no projection, or no scale fits the photographs.
+    """
+    path = find_idr(folder)
+    if path is None:
+        raise MissingFileError(f"{folder}: expected {' or '.join(FILES)}, got neither.")
+    matrices = _matrices(path)
+    images = next((found for name in _IMAGE_FOLDERS if (found := find_images(folder / name))), ())
+    if len(images) != len(matrices):
+        raise InputError(
+            f"{path}: expected one world_mat a photograph, got {len(matrices)} for "
+            f"{len(images)} photographs."
+        )
+    if not images:
+        raise InputError(f"{path}: expected photographs with poses, got none.")
+    masks = {mask.stem: mask for name in _MASK_FOLDERS for mask in find_images(folder / name)}
+    parts = [
+        decompose(p, where=f"{path}: world_mat of {i.name}")
+        for p, i in zip(matrices, images, strict=True)
+    ]
+    sizes = [image_size(image) for image in images]
+    scale = _scale([k for k, _ in parts], sizes, path)
+    raw = [
+        RawView(
+            image=image,
+            relative=image.name,
+            intrinsics=Intrinsics(
+                fx=float(k[0, 0]) * scale,
+                fy=float(k[1, 1]) * scale,
+                cx=float(k[0, 2]) * scale,
+                cy=float(k[1, 2]) * scale,
+                width=width,
+                height=height,
+            ),
+            cam_from_world=pose,
+            mask=masks.get(image.stem),
+        )
+        for image, (k, pose), (width, height) in zip(images, parts, sizes, strict=True)
+    ]
+    notes = [] if scale == 1 else [f"intrinsics were scaled by {scale:g} to fit the photographs"]
+    return build_capture(folder, raw, format="idr", points=points_beside(folder), notes=notes)
+
+
+def decompose(
+    projection: NDArray[np.float64], *, where: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """K (3 x 3, K[2, 2] = 1) and cam_from_world (4 x 4) of a projection K [R | t].
+
+    K is upper triangular with a positive diagonal: the RQ factorisation of the left 3 x 3,
+    whose overall sign is chosen so that R is a rotation and not a reflection.
+
+    Raises:
+        InputError: If it is singular, not finite, or skewed by more than a pixel in a thousand.
+    """
+    left = projection[:3, :3]
+    if not np.isfinite(projection).all() or abs(np.linalg.det(left)) < 1e-12:
+        raise InputError(f"{where}: expected a projection matrix, got a singular or infinite one.")
+    sign = np.sign(np.linalg.det(left))
+    flip = np.eye(3)[::-1]
+    q, r = np.linalg.qr((flip @ (sign * left)).T)
+    k, rotation = flip @ r.T @ flip, flip @ q.T
+    signs = np.diag(np.sign(np.diag(k)))
+    k, rotation = k @ signs, signs @ rotation
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = np.linalg.solve(k, sign * projection[:3, 3])
+    k = k / k[2, 2]
+    if abs(k[0, 1]) > 1e-3 * k[0, 0]:
+        raise InputError(f"{where}: expected square pixels, got a skew of {k[0, 1]:g}.")
+    return k, pose
+
+
+def _matrices(path: Path) -> list[NDArray[np.float64]]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            indices = sorted(
+                int(found[1])
+                for key in archive.files
+                if (found := re.fullmatch(r"world_mat_(\d+)", key))
+            )
+            matrices = [archive[f"world_mat_{i}"].astype(np.float64) for i in indices]
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise FileFormatError(f"{path}: expected a NumPy archive, it cannot be read.") from error
+    for index, matrix in zip(indices, matrices, strict=True):
+        if matrix.shape not in ((4, 4), (3, 4)):
+            raise FileFormatError(
+                f"{path}: expected world_mat_{index} of 4 x 4, got shape {matrix.shape}."
+            )
+    return matrices
+
+
+def _scale(ks: list[NDArray[np.float64]], sizes: list[tuple[int, int]], path: Path) -> float:
+    points = np.array([(k[0, 2], k[1, 2]) for k in ks])
+    middles = np.array(sizes) / 2
+    errors = [float(np.abs(points * s / middles - 1).mean()) for s in _SCALES]
+    best = int(np.argmin(errors))
+    if errors[best] > _OFF_CENTRE:
+        middle = points.mean(axis=0)
+        raise InputError(
+            f"{path}: expected principal points near the middle of photographs of "
+            f"{sizes[0][0]}x{sizes[0][1]} at a scale of {', '.join(f'{s:g}' for s in _SCALES)}, "
+            f"got ({middle[0]:.0f}, {middle[1]:.0f})."
+        )
+    return _SCALES[best]

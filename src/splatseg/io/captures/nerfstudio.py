@@ -1,0 +1,206 @@
+"""Reads nerfstudio's transforms.json: poses in OpenGL axes, intrinsics per file or frame."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core import Capture, CameraModel, PointCloud
+from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.io.captures._build import Intrinsics, RawView, build_capture, opencv_from_opengl
+from splatseg.io.captures._metadata import read_json
+from splatseg.io.captures._nerfstudio_split import frame_splits
+from splatseg.io.captures._points import ply_holds_splats, read_ply_points
+from splatseg.io.captures._points_beside import points_beside
+
+FILE = "transforms.json"
+MILLIMETRE = 0.001
+"""Unit of depth maps where the file does not say: nerfstudio's default, in scene units."""
+
+_MODELS: dict[str, CameraModel] = {
+    "OPENCV": "opencv",
+    "PINHOLE": "opencv",
+    "SIMPLE_PINHOLE": "opencv",
+    "SIMPLE_RADIAL": "opencv",
+    "RADIAL": "opencv",
+    "PERSPECTIVE": "opencv",
+    "FULL_OPENCV": "opencv",
+    "OPENCV_FISHEYE": "fisheye",
+}
+_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE = ("k1", "k2", "k3", "k4")
+
+
+def read_nerfstudio(folder: Path, *, file: str = FILE) -> Capture:
+    """Read a capture with a transforms.json; see `read_capture`.
+
+    Intrinsics stand at the top or in a frame, which wins: ``fl_x fl_y cx cy w h`` in pixels
+    (or ``camera_angle_x`` in radians), ``camera_model``, and distortion as OpenCV names it.
+    ``transform_matrix`` is world_from_cam with OpenGL axes (x right, y up, z backwards).
+    ``mask_path``, ``depth_file_path`` and ``split`` of a frame are taken over. Start points
+    come from ``ply_file_path``, else from points3D.ply, sparse_pc.ply or points3D.bin beside
+    it. A ply_file_path that holds Gaussians is the capture's splat file as well.
+
+    Raises:
+        MissingFileError: If transforms.json, or a file that it names, is missing.
+        InputError: If it is broken, or what it says cannot be.
+    """
+    path = folder / file
+    content = read_json(path)
+    frames = _frames(content, path)
+    splits = frame_splits(content, frames)
+    raw = [
+        _raw_view(content, frame, split, path=path, index=i)
+        for i, (frame, split) in enumerate(zip(frames, splits, strict=True))
+    ]
+    points, splats = _points(content, folder)
+    return build_capture(folder, raw, format="nerfstudio", points=points, splats=splats)
+
+
+def frame_matrix(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]:
+    """The 4 x 4 ``transform_matrix`` of a frame: world_from_cam, OpenGL axes.
+
+    Raises:
+        FileFormatError: If it is no matrix of numbers of 4 x 4 or 3 x 4.
+    """
+    try:
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{where}: expected a transform_matrix of 4 x 4 numbers.") from error
+    if matrix.shape == (3, 4):
+        matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+    if matrix.shape != (4, 4):
+        raise FileFormatError(
+            f"{where}: expected a transform_matrix of 4 x 4 numbers, got shape {matrix.shape}."
+        )
+    return matrix
+
+
+def cam_from_world_of(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]:
+    """cam_from_world with OpenCV axes of a frame; NaN where the matrix cannot be inverted."""
+    matrix = frame_matrix(frame, where=where)
+    if not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
+        # `checked_pose` refuses it in its own words: nothing is lost here.
+        return matrix
+    return opencv_from_opengl(matrix)
+
+
+def number(source: Mapping[str, Any], key: str, default: float | None, *, where: str) -> float:
+    """A number of a JSON object.
+
+    Raises:
+        FileFormatError: If it lacks and has no default, or is something else.
+    """
+    value = source.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise FileFormatError(f"{where}: expected a number for {key}, got {value!r:.40}.")
+    return float(value)
+
+
+def lens_of(source: Mapping[str, Any], *, where: str) -> tuple[CameraModel, tuple[float, ...]]:
+    """Lens model and distortion of a transforms.json or of one frame of it.
+
+    Raises:
+        FileFormatError: If the camera model is not one that can be undistorted.
+    """
+    default = "OPENCV_FISHEYE" if source.get("is_fisheye") is True else "OPENCV"
+    name = source.get("camera_model", default)
+    if name not in _MODELS:
+        known = ", ".join(sorted(_MODELS))
+        raise FileFormatError(f"{where}: expected a camera_model of {known}, got {name!r}.")
+    model = _MODELS[name]
+    keys = _FISHEYE if model == "fisheye" else _OPENCV
+    return model, tuple(number(source, key, 0.0, where=where) for key in keys)
+
+
+def _frames(content: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
+    frames = content.get("frames")
+    if not isinstance(frames, list):
+        raise FileFormatError(f"{path}: expected a list of frames, got none.")
+    for i, frame in enumerate(cast(list[object], frames)):
+        if not isinstance(frame, dict) or not isinstance(
+            cast(dict[str, Any], frame).get("file_path"), str
+        ):
+            raise FileFormatError(f"{path}: expected a file_path in frames[{i}], got none.")
+    return cast(list[Mapping[str, Any]], frames)
+
+
+def _raw_view(
+    content: Mapping[str, Any],
+    frame: Mapping[str, Any],
+    split: str | None,
+    *,
+    path: Path,
+    index: int,
+) -> RawView:
+    relative = str(frame["file_path"]).replace("\\", "/")
+    where = f"{path}: frame {relative!r}"
+    merged = {**content, **frame}
+    return RawView(
+        image=path.parent / relative,
+        relative=relative,
+        intrinsics=_intrinsics(merged, where=where),
+        cam_from_world=cam_from_world_of(frame, where=where),
+        split=split,
+        mask=_beside(path, frame.get("mask_path")),
+        depth=_beside(path, frame.get("depth_file_path")),
+        depth_unit=number(merged, "depth_unit_scale_factor", MILLIMETRE, where=where)
+        if frame.get("depth_file_path")
+        else None,
+    )
+
+
+def _beside(path: Path, name: object) -> Path | None:
+    return path.parent / name.replace("\\", "/") if isinstance(name, str) and name else None
+
+
+def _intrinsics(source: Mapping[str, Any], *, where: str) -> Intrinsics:
+    model, distortion = lens_of(source, where=where)
+    if "w" not in source or "h" not in source:
+        raise FileFormatError(f"{where}: expected the image size as w and h, got none.")
+    width, height = number(source, "w", None, where=where), number(source, "h", None, where=where)
+    if "fl_x" in source:
+        fx = number(source, "fl_x", None, where=where)
+    else:
+        angle = number(source, "camera_angle_x", None, where=where)
+        fx = focal_of(angle, width)
+    if "fl_y" in source:
+        fy = number(source, "fl_y", None, where=where)
+    elif "camera_angle_y" in source and "fl_x" not in source:
+        fy = focal_of(number(source, "camera_angle_y", None, where=where), height)
+    else:
+        fy = fx
+    return Intrinsics(
+        model=model,
+        fx=fx,
+        fy=fy,
+        cx=number(source, "cx", width / 2, where=where),
+        cy=number(source, "cy", height / 2, where=where),
+        distortion=distortion,
+        width=int(width),
+        height=int(height),
+    )
+
+
+def focal_of(angle: float, size: float) -> float:
+    """Focal length in pixels of a field of view in radians; 0 (refused later) if impossible.
+
+    Example:
+        >>> round(focal_of(math.pi / 2, 800), 6)
+        400.0
+    """
+    tangent = math.tan(angle / 2) if math.isfinite(angle) else 0.0
+    return 0.5 * size / tangent if tangent > 0 else 0.0
+
+
+def _points(content: Mapping[str, Any], folder: Path) -> tuple[PointCloud | None, Path | None]:
+    name = content.get("ply_file_path")
+    if isinstance(name, str) and name:
+        path = folder / name.replace("\\", "/")
+        if not path.is_file():
+            raise MissingFileError(f"{path}: the start points that {FILE} names are not there.")
+        return read_ply_points(path), path if ply_holds_splats(path) else None
+    return points_beside(folder), None

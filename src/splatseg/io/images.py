@@ -1,0 +1,236 @@
+"""Photographs: read upright, made smaller where asked, and pictures written.
+
+A photograph is read as a person sees it: its EXIF orientation is applied, and a camera refers
+to the pixels after that (see ``docs/conventions.md``).
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
+from PIL import Image, ImageOps, UnidentifiedImageError
+from torch import Tensor
+
+from splatseg.core import Camera, View
+from splatseg.errors import FileFormatError, InputError, MissingFileError, ShapeError
+from splatseg.io._atomic import atomic_file
+
+DEFAULT_LONGEST = 1600
+"""Longest side, in pixels, that commands which read photographs work at unless told otherwise."""
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+"""Suffixes, in lower case, of the files that are taken for photographs."""
+
+_EXIF_ORIENTATION = 0x0112
+# Of the eight EXIF orientations, these four exchange rows and columns.
+_TURNED = frozenset({5, 6, 7, 8})
+
+
+def find_images(folder: Path) -> tuple[Path, ...]:
+    """Image files directly inside a folder, sorted by name; empty where there is no folder."""
+    if not folder.is_dir():
+        return ()
+    return tuple(
+        sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    )
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels after the EXIF orientation, from the header alone.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is not an image.
+    """
+    with open_image(path) as image:
+        width, height = image.size
+        return (height, width) if _orientation(image) in _TURNED else (width, height)
+
+
+def reduced_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
+    """Width and height once the longest side is at most `longest`; never enlarged.
+
+    Example:
+        >>> reduced_size(4000, 3000, 1600)
+        (1600, 1200)
+        >>> reduced_size(512, 384, 1600)
+        (512, 384)
+    """
+    if longest is None or max(width, height) <= longest:
+        return width, height
+    if longest < 1:
+        raise InputError(f"longest: expected at least 1 pixel, got {longest}.")
+    scale = longest / max(width, height)
+    return max(1, math.floor(width * scale + 0.5)), max(1, math.floor(height * scale + 0.5))
+
+
+def load_image(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width 3"]:
+    """The photograph of a view, upright, 8 bit sRGB.
+
+    Transparent pixels are blended over white, as the NeRF-synthetic scenes are by custom.
+
+    Args:
+        view: The view whose photograph to read.
+        longest: Longest side in pixels; a larger photograph is reduced to it (area-weighted).
+            None keeps every pixel. `image_camera` gives the camera of the result.
+
+    Raises:
+        InputError: If the view has no photograph.
+        MissingFileError: If the photograph is not where it was.
+        FileFormatError: If it cannot be decoded, or its size is not the camera's.
+    """
+    path = _photograph(view)
+    camera = view.camera
+    with open_image(path) as image:
+        pixels = _decode(image, path)
+    if pixels.size != (camera.width, camera.height):
+        raise FileFormatError(
+            f"{path}: expected {camera.width}x{camera.height} pixels as the camera of view "
+            f"{view.name!r} has, got {pixels.size[0]}x{pixels.size[1]}."
+        )
+    target = reduced_size(*pixels.size, longest)
+    if target != pixels.size:
+        pixels = pixels.resize(target, Image.Resampling.BOX)
+    return torch.from_numpy(np.array(pixels, dtype=np.uint8))
+
+
+def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width"] | None:
+    """The mask of a view as 0 (ignore) and 1 (use); None where the view has none.
+
+    It is reduced with the photograph: a pixel that mixes both is one to ignore.
+
+    Raises:
+        MissingFileError: If the mask is not where it was.
+        FileFormatError: If it cannot be decoded, or its size is not the photograph's.
+    """
+    if view.mask is None:
+        return None
+    camera = view.camera
+    with open_image(view.mask) as image:
+        try:
+            upright = ImageOps.exif_transpose(image)
+        except (OSError, SyntaxError, ValueError) as error:
+            raise FileFormatError(f"{view.mask}: cannot be decoded ({error}).") from error
+    grey = np.asarray(upright)
+    if upright.mode in ("RGBA", "LA"):
+        grey = grey[..., -1]
+    grey = grey.max(axis=2) if grey.ndim == 3 else grey
+    if grey.shape != (camera.height, camera.width):
+        raise FileFormatError(
+            f"{view.mask}: expected {camera.width}x{camera.height} pixels as the photograph of "
+            f"view {view.name!r} has, got {grey.shape[1]}x{grey.shape[0]}."
+        )
+    keep = Image.fromarray(np.where(grey > 0, 255, 0).astype(np.uint8))
+    target = reduced_size(camera.width, camera.height, longest)
+    if target != keep.size:
+        keep = keep.resize(target, Image.Resampling.BOX)
+    return torch.from_numpy((np.asarray(keep) == 255).astype(np.uint8))
+
+
+def image_camera(view: View, longest: int | None = None) -> Camera:
+    """The camera of the pixels that `load_image` returns for the same `longest`."""
+    camera = view.camera
+    target = reduced_size(camera.width, camera.height, longest)
+    return camera if target == (camera.width, camera.height) else camera.resized(*target)
+
+
+def save_png(
+    image: Float[Tensor, "height width *channels"] | UInt8[Tensor, "height width *channels"],
+    path: Path,
+) -> None:
+    """Write a picture: (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA; atomic.
+
+    Floats are taken as [0, 1], clamped and rounded to 8 bit; int32 and uint16 single-channel
+    images are written with 16 bit and must fit.
+
+    Raises:
+        ShapeError: If the shape is none of these.
+        InputError: If a value is NaN, or does not fit.
+    """
+    array = image.detach().cpu().numpy()
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[..., 0]
+    if not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] in (3, 4))):
+        raise ShapeError(f"image: expected (H, W), (H, W, 3) or (H, W, 4), got {array.shape}.")
+    if array.size == 0:
+        raise ShapeError(f"image: expected at least one pixel, got {array.shape}.")
+    write_png(_to_integers(array), path)
+
+
+def write_png(array: NDArray[np.uint8] | NDArray[np.uint16], path: Path) -> None:
+    """Write an 8 bit picture or a 16 bit single-channel one as it stands; atomic."""
+    with atomic_file(path) as temporary:
+        Image.fromarray(array).save(temporary, format="PNG")
+
+
+def open_image(path: Path) -> Image.Image:
+    """Open an image for reading; the caller closes it.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is not an image that Pillow reads.
+    """
+    try:
+        return Image.open(path)
+    except FileNotFoundError as error:
+        raise MissingFileError(f"{path}: there is no such image.") from error
+    except IsADirectoryError as error:
+        raise FileFormatError(f"{path}: expected an image, got a folder.") from error
+    except UnidentifiedImageError as error:
+        raise FileFormatError(f"{path}: expected an image, got something else.") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FileFormatError(f"{path}: cannot be read as an image ({error}).") from error
+
+
+def _photograph(view: View) -> Path:
+    if view.image is None:
+        raise InputError(f"view {view.name!r}: expected a view with a photograph, got one without.")
+    if not view.image.is_file():
+        raise MissingFileError(
+            f"{view.image}: the photograph of view {view.name!r} is not there; if the photographs "
+            "moved, name their new folder with --data (data= in Python)."
+        )
+    return view.image
+
+
+def _orientation(image: Image.Image) -> int:
+    # Image.getexif of a PNG decodes the whole picture unless the tag came before the pixels.
+    if image.format == "PNG" and "exif" not in image.info:
+        return 1
+    return int(image.getexif().get(_EXIF_ORIENTATION, 1))
+
+
+def _decode(image: Image.Image, path: Path) -> Image.Image:
+    try:
+        upright = ImageOps.exif_transpose(image)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise FileFormatError(f"{path}: cannot be decoded ({error}).") from error
+    if upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info:
+        upright = upright.convert("RGBA")
+        white = Image.new("RGBA", upright.size, (255, 255, 255, 255))
+        return Image.alpha_composite(white, upright).convert("RGB")
+    if upright.mode.startswith(("I", "F")):
+        raise FileFormatError(
+            f"{path}: expected a photograph of 8 bits a channel, got mode {upright.mode}."
+        )
+    return upright.convert("RGB")
+
+
+def _to_integers(array: NDArray[np.generic]) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    if np.issubdtype(array.dtype, np.floating):
+        if np.isnan(array).any():
+            raise InputError("image: expected values in [0, 1], got NaN.")
+        return np.floor(np.clip(array, 0, 1).astype(np.float64) * 255 + 0.5).astype(np.uint8)
+    if array.dtype == np.bool_:
+        return np.where(array, 255, 0).astype(np.uint8)
+    if array.dtype == np.uint8:
+        return array.astype(np.uint8)
+    if array.ndim != 2:
+        raise InputError(f"image: expected uint8 or floats for colours, got {array.dtype}.")
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high > 65535:
+        raise InputError(f"image: expected values in [0, 65535], got [{low}, {high}].")
+    return array.astype(np.uint16)
