@@ -16,7 +16,7 @@ from splatseg.core.sh import SH_C0, degree_of, rotate_sh
 from splatseg.errors import InputError, RangeError, ShapeError
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
 class Gaussians:
     """3D Gaussians with colour, and any further columns, sliced and saved together.
 

@@ -1,0 +1,34 @@
+// The kernels of one instruction set, gathered. Compiled once for each.
+#include <type_traits>
+
+#include "frame.h"
+
+#define SPLATSEG_TEXT_OF(x) #x
+#define SPLATSEG_TEXT(x) SPLATSEG_TEXT_OF(x)
+
+namespace splatseg::SPLATSEG_ISA {
+
+// Declares a kernel with the signature the table asks for; the linker finds its body.
+#define SPLATSEG_KERNEL(name) std::remove_pointer_t<decltype(Kernels::name)> name;
+SPLATSEG_KERNEL(project)
+SPLATSEG_KERNEL(find_tiles)
+SPLATSEG_KERNEL(forward_colour)
+SPLATSEG_KERNEL(forward_features)
+SPLATSEG_KERNEL(adjoint)
+SPLATSEG_KERNEL(backward_colour)
+SPLATSEG_KERNEL(backward_features)
+SPLATSEG_KERNEL(chain)
+SPLATSEG_KERNEL(block_weights)
+SPLATSEG_KERNEL(blocks_forward)
+SPLATSEG_KERNEL(blocks_adjoint)
+SPLATSEG_KERNEL(tile_weights)
+
+const Kernels& table() {
+  static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, find_tiles, forward_colour,
+                                  forward_features, adjoint, backward_colour, backward_features,
+                                  chain, block_weights, blocks_forward, blocks_adjoint,
+                                  tile_weights};
+  return kernels;
+}
+
+}  // namespace splatseg::SPLATSEG_ISA

@@ -1,0 +1,55 @@
+// W of one view, kept: 4 x 4 blocks with half-precision weights, or rows of single pixels.
+#pragma once
+
+#include <vector>
+
+#include "view.h"
+
+namespace splatseg {
+
+class BlockMatrix {
+ public:
+  void build(View& view, int64_t gaussians);
+
+  int64_t entries() const { return begin_.empty() ? 0 : begin_.back(); }
+  int64_t gaussians() const { return gaussians_; }
+  int width() const { return width_; }
+  int height() const { return height_; }
+  int64_t bytes() const { return entries() * 36 + static_cast<int64_t>(begin_.size()) * 8; }
+
+  // image (h x w x image_channels) = W @ signal; `channels` is image_channels rounded up to 16.
+  void render(const float* signal, int channels, int64_t stride, int image_channels,
+              float* image) const;
+  // Adds to sums (n x stride, at least `channels` columns) and weights (n).
+  void back_project(const float* image, int channels, int image_channels, float* sums,
+                    int64_t stride, float* weights) const;
+
+  // Compressed sparse rows of all pixels; indptr has pixels + 1 entries.
+  void count_rows(int64_t* indptr) const;
+  void fill_rows(const int64_t* indptr, int32_t* ids, uint16_t* weights) const;
+
+ private:
+  int width_ = 0, height_ = 0, tiles_x_ = 0, tiles_y_ = 0;
+  int64_t gaussians_ = 0;
+  std::vector<int64_t> begin_;  // per block (tile-major), entries before it
+  Buffer<int32_t> ids_;
+  Buffer<uint16_t> weights_;
+};
+
+// Rows of W of some pixels (x, y), front to back; with k > 0 only each pixel's k strongest.
+struct PixelRows {
+  std::vector<int64_t> indptr;
+  std::vector<int32_t> ids;
+  std::vector<float> weights;
+  std::vector<int32_t> first, median;
+};
+PixelRows pixel_rows(View& view, const int64_t* pixels, int64_t count, int64_t k);
+
+// Products with compressed sparse rows; deterministic for any number of threads.
+void csr_render(const int64_t* indptr, const int32_t* ids, const uint16_t* weights, int64_t rows,
+                const float* signal, int channels, float* out);
+void csr_back_project(const int64_t* indptr, const int32_t* ids, const uint16_t* weights,
+                      int64_t rows, const float* image, int channels, float* sums,
+                      float* weight_sums);
+
+}  // namespace splatseg

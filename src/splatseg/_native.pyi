@@ -1,0 +1,165 @@
+"""CPU kernels, see native/module.cpp. Arrays are C-contiguous, on the CPU, and not checked here
+beyond what memory safety asks for."""
+
+from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
+
+ALPHA_MIN: float
+TRANSMITTANCE_MIN: float
+MEDIAN_TRANSMITTANCE: float
+FRUSTUM_MARGIN: float
+TILE: int
+
+def threads() -> int: ...
+def set_threads(count: int, /) -> None: ...
+def isa() -> str: ...
+def set_isa(name: str, /) -> bool: ...
+
+class Cloud:
+    def __init__(
+        self,
+        means: Tensor,
+        rotations: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor | None,
+        signal: Tensor | None,
+    ) -> None: ...
+
+class View:
+    visible: int
+    tile_pairs: int
+    evaluated: int
+    def prepare(
+        self,
+        cloud: Cloud,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        pose: Tensor,
+        near: float,
+        alpha_max: float,
+        low_pass: float,
+        antialiased: bool,
+        sh_degree: int,
+        /,
+    ) -> None: ...
+    def forward_colour(
+        self,
+        channels: int,
+        image: Tensor,
+        alpha: Tensor,
+        depth_sum: Tensor,
+        median: Tensor,
+        record: bool,
+        /,
+    ) -> None: ...
+    def forward_features(
+        self,
+        signal: Tensor,
+        image_channels: int,
+        image: Tensor,
+        alpha: Tensor,
+        depth_sum: Tensor,
+        median: Tensor,
+        record: bool,
+        /,
+    ) -> None: ...
+    def adjoint(
+        self, image: Tensor, image_channels: int, sums: Tensor, weights: Tensor, /
+    ) -> None: ...
+    def backward_colour(
+        self,
+        channels: int,
+        image: Tensor,
+        alpha: Tensor,
+        depth_sum: Tensor,
+        v_image: Tensor,
+        v_alpha: Tensor | None,
+        v_depth_sum: Tensor | None,
+        /,
+    ) -> None: ...
+    def backward_features(
+        self,
+        signal: Tensor,
+        image_channels: int,
+        image: Tensor,
+        alpha: Tensor,
+        depth_sum: Tensor,
+        v_image: Tensor,
+        v_alpha: Tensor | None,
+        v_depth_sum: Tensor | None,
+        v_signal: Tensor | None,
+        /,
+    ) -> None: ...
+    def chain(
+        self,
+        cloud: Cloud,
+        means: Tensor | None,
+        rotations: Tensor | None,
+        scales: Tensor | None,
+        opacities: Tensor | None,
+        sh: Tensor | None,
+        screen: Tensor | None,
+        pose: Tensor | None,
+        /,
+    ) -> None: ...
+    def narrow_signal_gradient(self, channels: int, v_signal: Tensor, /) -> None: ...
+    def visible_ids(self, ids: Tensor, /) -> None: ...
+    def pixel_rows(
+        self, pixels: Tensor, k: int, /
+    ) -> tuple[
+        NDArray[np.int64],
+        NDArray[np.int32],
+        NDArray[np.float32],
+        NDArray[np.int32],
+        NDArray[np.int32],
+    ]: ...
+
+class BlockMatrix:
+    entries: int
+    nbytes: int
+    def __init__(self) -> None: ...
+    def build(self, view: View, /) -> None: ...
+    def render(self, signal: Tensor, image_channels: int, image: Tensor, /) -> None: ...
+    def back_project(
+        self, image: Tensor, image_channels: int, sums: Tensor, weights: Tensor, /
+    ) -> None: ...
+    def count_rows(self, indptr: Tensor, /) -> None: ...
+    def fill_rows(self, indptr: Tensor, ids: Tensor, weights: Tensor, /) -> None: ...
+
+def csr_render(
+    indptr: Tensor, ids: Tensor, weights: Tensor, signal: Tensor, image: Tensor, /
+) -> None: ...
+def csr_back_project(
+    indptr: Tensor,
+    ids: Tensor,
+    weights: Tensor,
+    image: Tensor,
+    sums: Tensor,
+    weight_sums: Tensor,
+    /,
+) -> None: ...
+def l1_dssim(
+    image: Tensor,
+    photograph: Tensor,
+    mask: Tensor | None,
+    gradient: Tensor,
+    dssim_weight: float,
+) -> tuple[float, float]: ...
+def adam_step(
+    value: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    rows: Tensor | None,
+    rates: Tensor,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    step: int,
+) -> None: ...

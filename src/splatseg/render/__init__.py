@@ -1,0 +1,15 @@
+"""W of a view and its adjoint: one rasteriser with one signal argument of any width."""
+
+from splatseg.render._backend import Backend as Backend
+from splatseg.render._backend import BackProjected as BackProjected
+from splatseg.render._backend import Contributors as Contributors
+from splatseg.render._backend import Rendered as Rendered
+from splatseg.render._backend import SparseWeights as SparseWeights
+from splatseg.render._backend import ViewWeights as ViewWeights
+from splatseg.render._options import RenderOptions as RenderOptions
+from splatseg.render._public import back_project as back_project
+from splatseg.render._public import contributors as contributors
+from splatseg.render._public import render as render
+from splatseg.render._public import weights as weights
+from splatseg.render._registry import BackendName as BackendName
+from splatseg.render._registry import get_backend as get_backend

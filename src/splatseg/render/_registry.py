@@ -1,0 +1,47 @@
+"""Which backend computes W. Asking for one by name never gives another."""
+
+from functools import cache
+from typing import Literal, cast
+
+from torch import Tensor
+
+from splatseg._check import check_choice
+from splatseg.render._backend import Backend
+
+BackendName = Literal["auto", "cpu", "cuda", "reference"]
+BACKENDS: tuple[BackendName, ...] = ("auto", "cpu", "cuda", "reference")
+
+
+def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
+    """The backend of this name.
+
+    ``auto`` is ``cuda`` for tensors on a CUDA device and ``cpu`` for all others: it follows the
+    data and never falls back.
+
+    Args:
+        name: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        like: A tensor of the scene; ``auto`` asks where it is.
+
+    Raises:
+        InputError: If there is no backend of this name.
+        MissingPackageError: If ``cuda`` is asked for without gsplat or without a GPU.
+    """
+    check_choice("backend", name, BACKENDS)
+    if name == "auto":
+        name = "cuda" if like is not None and like.device.type == "cuda" else "cpu"
+    return _backend(cast(BackendName, name))
+
+
+@cache
+def _backend(name: BackendName) -> Backend:
+    if name == "cuda":
+        from splatseg.render.cuda import CudaBackend
+
+        return CudaBackend()
+    if name == "reference":
+        from splatseg.render.reference import ReferenceBackend
+
+        return ReferenceBackend()
+    from splatseg.render.cpu import CpuBackend
+
+    return CpuBackend()

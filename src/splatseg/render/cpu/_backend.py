@@ -1,0 +1,201 @@
+"""The CPU backend: glue between torch's autograd and the kernels."""
+
+from typing import Any, ClassVar, cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatseg.core import Camera, Gaussians
+from splatseg.render._backend import (
+    Backend,
+    BackProjected,
+    Contributors,
+    Layout,
+    Rendered,
+    ViewWeights,
+)
+from splatseg.render._options import RenderOptions
+from splatseg.render.cpu._view import NARROW, CpuView
+from splatseg.render.cpu._weights import CpuBlockWeights, CpuSparseWeights
+
+_INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose")
+
+
+class _Render(torch.autograd.Function):
+    """Forward and backward of one view. Outputs: image, alpha, depth sum, median depth."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: Tensor,
+        rotations: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor | None,
+        signal: Tensor | None,
+        pose: Tensor,
+        camera: Camera,
+        options: RenderOptions,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        needs: tuple[bool, ...] = ctx.needs_input_grad[: len(_INPUTS)]
+        wide = signal is not None and signal.shape[1] > NARROW
+        view = CpuView(
+            means,
+            rotations,
+            scales,
+            opacities,
+            camera=camera,
+            options=options,
+            sh=sh,
+            signal=None if wide else signal,
+        )
+        image, alpha, depth_sum, median = view.render(signal if wide else None, record=any(needs))
+        ctx.view = view if any(needs) else view.close()
+        ctx.dtypes = tuple(
+            None if t is None else t.dtype
+            for t in (means, rotations, scales, opacities, sh, signal, pose)
+        )
+        ctx.mark_non_differentiable(median)
+        return image, alpha, depth_sum, median
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        view = cast(CpuView, ctx.view)
+        needs: tuple[bool, ...] = ctx.needs_input_grad
+        wanted = frozenset(name for name, need in zip(_INPUTS, needs, strict=False) if need)
+        v_image, v_alpha, v_depth_sum = slopes[:3]
+        found = view.backward(
+            v_image,
+            v_alpha=v_alpha,
+            v_depth_sum=v_depth_sum if bool(v_depth_sum.any()) else None,
+            wanted=wanted,
+        )
+        gradients = (
+            found.means,
+            found.rotations,
+            found.scales,
+            found.opacities,
+            found.sh,
+            found.signal,
+            found.cam_from_world,
+        )
+        typed = [
+            g.to(dtype) if need and g is not None else None
+            for g, dtype, need in zip(gradients, ctx.dtypes, needs, strict=False)
+        ]
+        return (*typed, None, None)
+
+
+class CpuBackend(Backend):
+    """C++ kernels for CPUs; tensors on other devices are refused by the caller."""
+
+    name: ClassVar[str] = "cpu"
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        signal: Float[Tensor, "n channels"] | None,
+        *,
+        options: RenderOptions,
+    ) -> Rendered:
+        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        image, alpha, depth_sum, median = cast(
+            tuple[Tensor, Tensor, Tensor, Tensor],
+            _Render.apply(
+                gaussians.means,
+                gaussians.rotations,
+                gaussians.scales,
+                gaussians.opacities,
+                gaussians.sh if signal is None else None,
+                signal,
+                camera.cam_from_world,
+                camera,
+                options,
+            ),
+        )
+        covered = alpha > 0
+        depth = torch.where(covered, depth_sum / torch.where(covered, alpha, 1.0), 0.0)
+        return Rendered(image=image, alpha=alpha, depth=depth, median_depth=median)
+
+    def back_project(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        image: Float[Tensor, "height width channels"],
+        *,
+        options: RenderOptions,
+    ) -> BackProjected:
+        """``W.T @ image`` and ``W.T @ 1``. No gradient."""
+        with _view(gaussians, camera, options) as view:
+            sums, weights = view.back_project(image)
+        return BackProjected(sums=sums, weights=weights)
+
+    def contributors(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"],
+        k: int,
+        *,
+        options: RenderOptions,
+    ) -> Contributors:
+        """The k strongest Gaussians of pixels (column, row), ties front to back."""
+        with _view(gaussians, camera, options) as view:
+            indptr, ids, weights, first, median = view.pixel_rows(pixels, k)
+        count = len(pixels)
+        lengths = indptr[1:] - indptr[:-1]
+        row = torch.repeat_interleave(torch.arange(count), lengths)
+        column = torch.arange(len(ids)) - indptr[:-1].repeat_interleave(lengths)
+        padded_ids = torch.full((count, k), -1, dtype=torch.int32)
+        padded = torch.zeros(count, k)
+        padded_ids[row, column] = ids
+        padded[row, column] = weights
+        strongest = padded.argsort(dim=1, descending=True, stable=True)
+        return Contributors(
+            ids=padded_ids.gather(1, strongest),
+            weights=padded.gather(1, strongest),
+            first=first,
+            median=median,
+        )
+
+    def weights(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"] | None,
+        k: int | None,
+        *,
+        layout: Layout,
+        options: RenderOptions,
+    ) -> ViewWeights:
+        """W itself: all pixels or some, all entries or each pixel's k strongest."""
+        n = len(gaussians)
+        with _view(gaussians, camera, options) as view:
+            if pixels is None and k is None:
+                matrix = view.block_matrix()
+                if layout == "blocks":
+                    return CpuBlockWeights(
+                        matrix, gaussians=n, height=camera.height, width=camera.width
+                    )
+                return CpuSparseWeights.from_blocks(
+                    matrix, gaussians=n, pixels=camera.height * camera.width
+                )
+            if pixels is None:
+                pixels = camera.pixel_centres().reshape(-1, 2).to(torch.int64)
+            indptr, ids, weights, _, _ = view.pixel_rows(pixels, k or 0)
+        return CpuSparseWeights(indptr, ids, weights.to(torch.float16), gaussians=n)
+
+
+def _view(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> CpuView:
+    return CpuView(
+        gaussians.means,
+        gaussians.rotations,
+        gaussians.scales,
+        gaussians.opacities,
+        camera=camera,
+        options=options,
+    )
+
+
