@@ -1,0 +1,6 @@
+"""2D evidence to per-Gaussian layers, and layers back to label maps of views."""
+
+from splatseg.lift.label_maps import label_map as label_map
+from splatseg.lift.uplift import LabelSource as LabelSource
+from splatseg.lift.uplift import UpliftOptions as UpliftOptions
+from splatseg.lift.uplift import uplift as uplift

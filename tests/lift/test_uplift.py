@@ -1,0 +1,214 @@
+"""Votes of label maps on Gaussians."""
+
+import json
+
+import pytest
+import torch
+
+from splatseg.core import ClassInfo, ClassTable, LabelMap, View
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift import UpliftOptions, uplift
+from splatseg.render.warp import warp_into_photograph
+
+from .conftest import (
+    BACKEND,
+    BARREL,
+    Maps,
+    camera_at,
+    gaussians_at,
+    matrix_of,
+    random_gaussians,
+    random_maps,
+)
+
+IDS = (1, 4, 5, 900)
+
+
+def votes_of(gaussians, views, maps: Maps, ids) -> torch.Tensor:
+    """The definition, from the spelt-out matrix: (n, ids) in float64."""
+    votes = torch.zeros(len(gaussians), len(ids), dtype=torch.float64)
+    for view in views:
+        onehot = maps.label_map(view.name).ids.unsqueeze(-1) == torch.tensor(ids)
+        image = onehot.double()
+        if not view.camera.is_pinhole:
+            image = warp_into_photograph(view.camera, "nearest").adjoint(image)
+        votes += torch.einsum("hwn,hwc->nc", matrix_of(gaussians, view.camera), image)
+    return votes
+
+
+@pytest.mark.parametrize("lens", [{}, BARREL])
+def test_labels_are_the_strongest_votes(rng, lens) -> None:
+    views = [View(name=f"v{i}", camera=camera_at(x, **lens)) for i, x in enumerate((-0.2, 0.1))]
+    gaussians = random_gaussians(rng)
+    maps = random_maps(rng, views, IDS)
+    votes = votes_of(gaussians, views, maps, IDS)
+
+    labels = uplift(gaussians, views, maps, backend=BACKEND)
+
+    seen = votes.sum(dim=1) > 0
+    assert 5 < int(seen.sum())
+    shares = votes / votes.sum(dim=1, keepdim=True).clamp_min(1e-30)
+    confidence, column = shares.max(dim=1)
+    expected = torch.where(seen, torch.tensor(IDS)[column], -1)
+    assert labels.ids.tolist() == expected.tolist()
+    torch.testing.assert_close(labels.confidence.double(), confidence, rtol=0, atol=1e-5)
+    assert labels.candidates is None and labels.shares is None
+
+
+@pytest.mark.parametrize("memory", [1, 14 * 4 * 2, 1 << 30])
+def test_passes_over_the_ids_change_nothing(rng, views, memory) -> None:
+    gaussians = random_gaussians(rng)
+    maps = random_maps(rng, views, IDS)
+    votes = votes_of(gaussians, views, maps, IDS)
+    shares = votes / votes.sum(dim=1, keepdim=True).clamp_min(1e-30)
+    expected, order = shares.sort(dim=1, descending=True, stable=True)
+
+    calls = []
+    labels = uplift(
+        gaussians,
+        views,
+        maps,
+        options=UpliftOptions(candidates=3, memory=memory),
+        backend=BACKEND,
+        progress=lambda done, total: calls.append((done, total)),
+    )
+
+    assert labels.shares is not None and labels.candidates is not None
+    torch.testing.assert_close(labels.shares.double(), expected[:, :3], rtol=0, atol=1e-5)
+    real = expected[:, :3] > 0
+    assert torch.equal(labels.candidates[real].long(), torch.tensor(IDS)[order[:, :3]][real])
+    assert bool((labels.candidates[~real] == -1).all())
+    passes = {1: 4, 14 * 4 * 2: 2, 1 << 30: 1}[memory]
+    assert calls == [(i + 1, 3 * passes) for i in range(3 * passes)]
+
+
+def test_voids_cast_no_vote_and_unseen_gaussians_have_no_label(views) -> None:
+    """One Gaussian in the middle, one behind the camera; half of the view is void."""
+    gaussians = gaussians_at([[0, 0, 2], [0, 0, -2]])
+    ids = torch.full((12, 16), -1)
+    ids[:, 8:] = 3
+    one = [View(name="v", camera=camera_at())]
+    labels = uplift(gaussians, one, Maps({"v": LabelMap(ids=ids)}), backend=BACKEND)
+    assert labels.ids.tolist() == [3, -1]
+    assert labels.confidence.tolist() == [1.0, 0.0]
+
+
+def test_a_pixel_votes_with_its_confidence() -> None:
+    gaussians = gaussians_at([[0, 0, 2]])
+    ids = torch.ones(12, 16, dtype=torch.int32)
+    ids[:, 8:] = 2
+    confidence = torch.full((12, 16), 0.9)
+    confidence[:, 8:] = 0.3
+    maps = Maps({"v": LabelMap(ids=ids, confidence=confidence)})
+    labels = uplift(gaussians, [View(name="v", camera=camera_at())], maps, backend=BACKEND)
+    assert labels.ids.tolist() == [1]
+    assert labels.confidence.tolist() == pytest.approx([0.75], abs=1e-6)
+
+
+def test_equal_votes_go_to_the_smaller_id() -> None:
+    gaussians = gaussians_at([[0, 0, 2]])
+    view = View(name="v", camera=camera_at())
+    for left, right in ((7, 2), (2, 7)):
+        ids = torch.full((12, 16), left)
+        ids[:, 8:] = right
+        maps = Maps({"v": LabelMap(ids=ids)})
+        for memory in (1, 1 << 20):
+            labels = uplift(
+                gaussians, [view], maps, options=UpliftOptions(memory=memory), backend=BACKEND
+            )
+            assert labels.confidence.tolist() == pytest.approx([0.5], abs=1e-6)
+            assert labels.ids.tolist() == [2]
+
+
+def test_thresholds_take_labels_away() -> None:
+    gaussians = gaussians_at([[0, 0, 2]])
+    view = View(name="v", camera=camera_at())
+    ids = torch.ones(12, 16, dtype=torch.int32)
+    ids[:, 8:] = 2
+    maps = Maps({"v": LabelMap(ids=ids)})
+    weight = float(matrix_of(gaussians, view.camera).sum())
+
+    def label(**changes) -> int:
+        options = UpliftOptions(**changes)
+        return int(uplift(gaussians, [view], maps, options=options, backend=BACKEND).ids[0])
+
+    assert label(min_share=0.4) == 1
+    assert label(min_share=0.6) == -1
+    assert label(min_weight=0.99 * weight) == 1
+    assert label(min_weight=1.01 * weight) == -1
+
+
+def test_the_sky_is_what_passes() -> None:
+    """Sky above, a wall of Gaussians below: the light that passes is nearly all sky's."""
+    wall = [[x, y, 2.0] for x in torch.arange(-1.4, 1.5, 0.2) for y in torch.arange(0.1, 1.2, 0.2)]
+    gaussians = gaussians_at(wall, opacity=0.99)
+    view = View(name="v", camera=camera_at())
+    ids = torch.full((12, 16), 5)
+    ids[:6] = 2
+    maps = Maps({"v": LabelMap(ids=ids)})
+    labels = uplift(gaussians, [view], maps, backend=BACKEND)
+    assert labels.background == 2
+
+    matrix = matrix_of(gaussians, view.camera)
+    residual = 1 - matrix.sum(dim=-1)
+    facts = labels.metadata["background_votes"]
+    assert facts["light"] == pytest.approx(float(residual.mean()), abs=1e-6)
+    assert facts["share"] == pytest.approx(float(residual[:6].sum() / residual.sum()), abs=1e-6)
+
+    def background(**changes) -> int:
+        options = UpliftOptions(**changes)
+        return uplift(gaussians, [view], maps, options=options, backend=BACKEND).background
+
+    assert background(min_background=facts["light"] * 0.99) == 2
+    assert background(min_background=facts["light"] * 1.01) == -1
+    assert background(min_background_share=facts["share"] * 0.99) == 2
+    assert background(min_background_share=min(1.0, facts["share"] * 1.01)) == -1
+
+
+def test_reduced_label_maps_vote_through_a_reduced_camera(rng) -> None:
+    gaussians = random_gaussians(rng)
+    full = View(name="v", camera=camera_at(width=32, height=24))
+    half = View(name="v", camera=camera_at(width=16, height=12))
+    maps = random_maps(rng, [half], IDS)
+    a = uplift(gaussians, [full], maps, backend=BACKEND)
+    b = uplift(gaussians, [half], maps, backend=BACKEND)
+    assert torch.equal(a.ids, b.ids)
+    assert torch.equal(a.confidence, b.confidence)
+
+
+def test_metadata_says_how_it_was_made(rng, views) -> None:
+    classes = ClassTable(rows=(ClassInfo(id=4, name="chair"), ClassInfo(id=77, name="unseen")))
+    labels = uplift(
+        random_gaussians(rng), views, random_maps(rng, views, IDS), classes=classes, backend=BACKEND
+    )
+    metadata = json.loads(json.dumps(dict(labels.metadata)))
+    assert metadata["method"] == "uplift"
+    assert metadata["options"]["candidates"] == 1
+    assert metadata["views"] == ["v0", "v1", "v2"]
+    assert metadata["names"] == {"4": "chair"}
+
+
+def test_bad_input_is_refused(rng, views) -> None:
+    gaussians = random_gaussians(rng)
+    maps = random_maps(rng, views[:2], IDS)
+    with pytest.raises(InputError, match="at least one view"):
+        uplift(gaussians, [], maps, backend=BACKEND)
+    with pytest.raises(InputError, match="1 of 3 have none, the first is v2"):
+        uplift(gaussians, views, maps, backend=BACKEND)
+    void = Maps({"v0": LabelMap(ids=torch.full((12, 16), -1))})
+    with pytest.raises(InputError, match="expected a labelled pixel in 1 views"):
+        uplift(gaussians, views[:1], void, backend=BACKEND)
+    stretched = Maps({"v0": LabelMap(ids=torch.ones(12, 12, dtype=torch.int32))})
+    with pytest.raises(ShapeError, match="v0: expected a map of 16x12 .* got 12x12"):
+        uplift(gaussians, views[:1], stretched, backend=BACKEND)
+    for wrong in (
+        {"candidates": 0},
+        {"min_weight": -1.0},
+        {"min_weight": float("nan")},
+        {"min_share": 1.1},
+        {"min_background": -0.1},
+        {"min_background_share": 2.0},
+        {"memory": 0},
+    ):
+        with pytest.raises(RangeError, match=next(iter(wrong))):
+            UpliftOptions(**wrong)
