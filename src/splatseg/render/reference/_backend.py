@@ -1,0 +1,188 @@
+"""The readable backend: every product is written out as in DESIGN, in float64."""
+
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatseg.core import Camera, Gaussians
+from splatseg.core.sh import evaluate_sh
+from splatseg.render._backend import (
+    Backend,
+    BackProjected,
+    Contributors,
+    Layout,
+    Rendered,
+    ViewWeights,
+)
+from splatseg.render._options import RenderOptions
+from splatseg.render.reference._composite import Entries, entries, tiles
+from splatseg.render.reference._project import Projected, project
+from splatseg.render.reference._weights import blocks_from_csr, csr_from_entries
+
+
+class ReferenceBackend(Backend):
+    """Plain torch, made to be read and to be right; good for about a thousand Gaussians.
+
+    It computes in float64 and returns the Gaussians' own type. Autograd differentiates
+    `render` with respect to the signal, all arrays of the Gaussians and the camera's pose.
+    """
+
+    name: ClassVar[str] = "reference"
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        signal: Float[Tensor, "n channels"] | None,
+        *,
+        options: RenderOptions,
+    ) -> Rendered:
+        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        projected = project(gaussians, camera, options=options)
+        if signal is None:
+            signal = _colours(gaussians, camera, projected, degree=options.sh_degree)
+        else:
+            signal = signal[projected.ids].double()
+        # Rows of `projected`, so that the rows of a tile's subset are found by Gaussian.
+        row = torch.zeros(len(gaussians), dtype=torch.int64, device=gaussians.device)
+        row[projected.ids] = torch.arange(len(projected), device=gaussians.device)
+
+        size = (camera.height, camera.width)
+        zeros = torch.zeros(*size, dtype=torch.float64, device=gaussians.device)
+        image = torch.zeros(*size, signal.shape[1], dtype=torch.float64, device=gaussians.device)
+        alpha, depth_sum, median = zeros.clone(), zeros.clone(), zeros.clone()
+        for tile in tiles(projected, camera.width, camera.height, alpha_max=options.alpha_max):
+            weights, z = tile.matrix.weights, tile.projected.depths
+            place = (tile.rows, tile.columns)
+            image[place] = (weights @ signal[row[tile.projected.ids]]).reshape(*tile.size, -1)
+            alpha[place] = weights.sum(dim=1).reshape(tile.size)
+            depth_sum[place] = (weights @ z).reshape(tile.size)
+            median[place] = (tile.matrix.median.double() @ z.detach()).reshape(tile.size)
+        covered = alpha > 0
+        depth = torch.where(covered, depth_sum / torch.where(covered, alpha, 1.0), 0.0)
+        dtype = gaussians.dtype
+        return Rendered(
+            image=image.to(dtype),
+            alpha=alpha.to(dtype),
+            depth=depth.to(dtype),
+            median_depth=median.to(dtype),
+        )
+
+    @torch.no_grad()
+    def back_project(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        image: Float[Tensor, "height width channels"],
+        *,
+        options: RenderOptions,
+    ) -> BackProjected:
+        """``W.T @ image`` and ``W.T @ 1``. No gradient."""
+        projected = project(gaussians, camera, options=options)
+        image = image.double()
+        sums = image.new_zeros(len(gaussians), image.shape[2])
+        seen = image.new_zeros(len(gaussians))
+        for tile in tiles(projected, camera.width, camera.height, alpha_max=options.alpha_max):
+            weights, ids = tile.matrix.weights, tile.projected.ids
+            pixels = image[tile.rows, tile.columns].reshape(-1, image.shape[2])
+            sums.index_add_(0, ids, weights.T @ pixels)
+            seen.index_add_(0, ids, weights.sum(dim=0))
+        return BackProjected(sums=sums.to(gaussians.dtype), weights=seen.to(gaussians.dtype))
+
+    @torch.no_grad()
+    def contributors(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"],
+        k: int,
+        *,
+        options: RenderOptions,
+    ) -> Contributors:
+        """The k strongest Gaussians of pixels (column, row), ties front to back."""
+        projected = project(gaussians, camera, options=options)
+        found = entries(projected, pixels.long(), alpha_max=options.alpha_max)
+        return contributors_from_entries(found, len(pixels), k, dtype=gaussians.dtype)
+
+    @torch.no_grad()
+    def weights(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"] | None,
+        k: int | None,
+        *,
+        layout: Layout,
+        options: RenderOptions,
+    ) -> ViewWeights:
+        """W itself: all pixels or some, all entries or each pixel's k strongest."""
+        if pixels is None:
+            pixels = all_pixels(camera).to(gaussians.device)
+        projected = project(gaussians, camera, options=options)
+        found = entries(projected, pixels.long(), alpha_max=options.alpha_max)
+        return weights_from_entries(
+            found, camera, k, layout=layout, shape=(len(pixels), len(gaussians))
+        )
+
+
+def _colours(
+    gaussians: Gaussians, camera: Camera, projected: Projected, *, degree: int | None
+) -> Tensor:
+    """Colours of the harmonics along the rays to the centres, for the rows of `projected`."""
+    centre = camera.centre.to(device=gaussians.device, dtype=torch.float64)
+    rays = gaussians.means[projected.ids].double() - centre
+    directions = rays / torch.linalg.vector_norm(rays, dim=1, keepdim=True)
+    return evaluate_sh(gaussians.sh[projected.ids].double(), directions, degree=degree)
+
+
+def all_pixels(camera: Camera) -> Int[Tensor, "p 2"]:
+    """(column, row) of every pixel of the image, row by row."""
+    row, column = torch.meshgrid(
+        torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
+    )
+    return torch.stack((column, row), dim=-1).reshape(-1, 2)
+
+
+def contributors_from_entries(
+    found: Entries, pixel_count: int, k: int, *, dtype: torch.dtype
+) -> Contributors:
+    """Rank the entries of each pixel."""
+    device = found.ids.device
+    order, rank = _strongest_first(found)
+    kept = rank < k
+    order, rank = order[kept], rank[kept]
+    ids = torch.full((pixel_count, k), -1, dtype=torch.int32, device=device)
+    weights = torch.zeros(pixel_count, k, dtype=dtype, device=device)
+    ids[found.pixels[order], rank] = found.ids[order].to(torch.int32)
+    weights[found.pixels[order], rank] = found.weights[order].to(dtype)
+
+    first = torch.full((pixel_count,), -1, dtype=torch.int32, device=device)
+    new_pixel = torch.ones_like(found.median)
+    new_pixel[1:] = found.pixels[1:] != found.pixels[:-1]
+    first[found.pixels[new_pixel]] = found.ids[new_pixel].to(torch.int32)
+    median = torch.full_like(first, -1)
+    median[found.pixels[found.median]] = found.ids[found.median].to(torch.int32)
+    return Contributors(ids=ids, weights=weights, first=first, median=median)
+
+
+def weights_from_entries(
+    found: Entries, camera: Camera, k: int | None, *, layout: Layout, shape: tuple[int, int]
+) -> ViewWeights:
+    """Keep each pixel's k strongest entries (None: all), in the layout asked for."""
+    kept = torch.arange(len(found.ids), device=found.ids.device)
+    if k is not None:
+        order, rank = _strongest_first(found)
+        kept = order[rank < k].sort().values
+    csr = csr_from_entries(found.pixels[kept], found.ids[kept], found.weights[kept], shape=shape)
+    return csr if layout == "csr" else blocks_from_csr(csr, camera.width, camera.height)
+
+
+def _strongest_first(found: Entries) -> tuple[Tensor, Tensor]:
+    """Entries by pixel, then falling weight, then front to back; and the rank in the pixel."""
+    order = torch.argsort(found.weights, descending=True, stable=True)
+    order = order[torch.argsort(found.pixels[order], stable=True)]
+    pixels = found.pixels[order]
+    position = torch.arange(len(pixels), device=pixels.device)
+    return order, position - torch.searchsorted(pixels, pixels)
