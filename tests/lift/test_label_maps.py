@@ -109,9 +109,11 @@ def test_residual_light_by_hand() -> None:
 def test_no_label_loses_ties() -> None:
     """Opacity one half, no background: the label and nothing share the pixel equally."""
     gaussians = gaussians_at([[0, 0, 2]], scale=500.0, opacity=0.5)
-    shown = label_map(gaussians, camera_at(width=1, height=1), hard([3]), backend=BACKEND)
-    assert float(shown.confidence) == pytest.approx(0.5, abs=1e-6)
-    assert shown.ids.tolist() == [[3]]
+    camera = camera_at(width=1, height=1)
+    for channels in (1, 2):
+        shown = label_map(gaussians, camera, hard([3]), backend=BACKEND, channels=channels)
+        assert float(shown.confidence) == pytest.approx(0.5, abs=1e-6)
+        assert shown.ids.tolist() == [[3]]
 
 
 def test_many_ids_draw_only_those_in_view(rng, monkeypatch) -> None:

@@ -88,9 +88,14 @@ def test_voids_cast_no_vote_and_unseen_gaussians_have_no_label(views) -> None:
     ids = torch.full((12, 16), -1)
     ids[:, 8:] = 3
     one = [View(name="v", camera=camera_at())]
-    labels = uplift(gaussians, one, Maps({"v": LabelMap(ids=ids)}), backend=BACKEND)
+    maps = Maps({"v": LabelMap(ids=ids)})
+    labels = uplift(gaussians, one, maps, backend=BACKEND)
     assert labels.ids.tolist() == [3, -1]
     assert labels.confidence.tolist() == [1.0, 0.0]
+    soft = uplift(gaussians, one, maps, options=UpliftOptions(candidates=2), backend=BACKEND)
+    assert soft.candidates is not None and soft.shares is not None
+    assert soft.candidates.tolist() == [[3, -1], [-1, -1]]
+    assert soft.shares.tolist() == [[1.0, 0.0], [0.0, 0.0]]
 
 
 def test_a_pixel_votes_with_its_confidence() -> None:
@@ -103,6 +108,12 @@ def test_a_pixel_votes_with_its_confidence() -> None:
     labels = uplift(gaussians, [View(name="v", camera=camera_at())], maps, backend=BACKEND)
     assert labels.ids.tolist() == [1]
     assert labels.confidence.tolist() == pytest.approx([0.75], abs=1e-6)
+    passing = 1 - matrix_of(gaussians, camera_at()).sum(dim=-1)
+    facts = labels.metadata["background_votes"]
+    assert labels.background == 1
+    assert facts["share"] == pytest.approx(0.75, abs=1e-6)
+    light = float((passing * confidence).sum() / confidence.sum())
+    assert facts["light"] == pytest.approx(light, abs=1e-6)
 
 
 def test_equal_votes_go_to_the_smaller_id() -> None:
@@ -136,6 +147,11 @@ def test_thresholds_take_labels_away() -> None:
     assert label(min_share=0.6) == -1
     assert label(min_weight=0.99 * weight) == 1
     assert label(min_weight=1.01 * weight) == -1
+    options = UpliftOptions(min_weight=1.01 * weight, candidates=2)
+    unsure = uplift(gaussians, [view], maps, options=options, backend=BACKEND)
+    assert unsure.candidates is not None and unsure.shares is not None
+    assert unsure.candidates.tolist() == [[-1, -1]]
+    assert unsure.shares.tolist() == [[0.0, 0.0]]
 
 
 def test_the_sky_is_what_passes() -> None:
