@@ -1,0 +1,99 @@
+"""From a capture's points to the Gaussians a fit starts from."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import Capture, View
+from splatseg.core.sh import SH_C0
+from splatseg.errors import InputError
+from splatseg.fit._options import FitOptions
+from splatseg.fit._parameters import Parameters
+
+_NEIGHBOURS = 3
+# Points alone in space would start as balls that fill the view: none is larger than this share
+# of its distance to the nearest camera, nor smaller than the other, so that every one is drawn.
+_LARGEST_SHARE = 0.1
+_SMALLEST_SHARE = 1e-5
+# A capture from one spot has no extent of its own; the distance of what it shows stands for it.
+_LEAST_EXTENT_SHARE = 1e-3
+
+
+def scene_extent(views: tuple[View, ...], points: Float[Tensor, "n 3"]) -> float:
+    """Size of a scene: 1.1 times the largest distance of a camera from their mean.
+
+    It is what 3DGS scales the position rate by. Where the cameras stand in one spot, it is a
+    thousandth of the median distance of the points.
+    """
+    centres = torch.stack([view.camera.centre for view in views]).double()
+    mean = centres.mean(dim=0)
+    radius = float((centres - mean).norm(dim=1).max())
+    reach = float((points.double() - mean).norm(dim=1).median())
+    return max(1.1 * radius, _LEAST_EXTENT_SHARE * reach, 1e-6)
+
+
+def initial_parameters(
+    capture: Capture, *, options: FitOptions, generator: torch.Generator
+) -> Parameters:
+    """A ball at each start point: its colour, the mean distance of its three nearest as scale.
+
+    Of more points than `max_gaussians`, so many are drawn at random.
+
+    Raises:
+        InputError: If the capture has no start points.
+    """
+    cloud = capture.points
+    if cloud is None or len(cloud) == 0:
+        raise InputError(
+            f"{capture.path}: expected a capture with start points (a COLMAP model, or "
+            "'ply_file_path' in transforms.json), got one without."
+        )
+    points = cloud.points.float()
+    finite = points.isfinite().all(dim=1)
+    if not bool(finite.all()):
+        raise InputError(
+            f"{capture.path}: {int((~finite).sum())} of {len(points)} start points are not finite."
+        )
+    colours = torch.full_like(points, 0.5) if cloud.colours is None else cloud.colours / 255.0
+    if len(points) > options.max_gaussians:
+        order = torch.randperm(len(points), generator=generator)
+        chosen = order[: options.max_gaussians].sort().values
+        points, colours = points[chosen], colours[chosen]
+
+    spacing = _spacing(points)
+    centres = torch.stack([view.camera.centre for view in capture.train_views]).float()
+    distance = _nearest(points, centres, 1)[:, 0].clamp_min(1e-6)
+    scales = torch.maximum(
+        torch.minimum(spacing, _LARGEST_SHARE * distance), _SMALLEST_SHARE * distance
+    )
+    count, coefficients = len(points), (options.sh_degree + 1) ** 2
+    rotations = torch.zeros(count, 4)
+    rotations[:, 0] = 1
+    sh = torch.zeros(count, 3 * coefficients)
+    sh[:, :3] = (colours - 0.5) / SH_C0
+    logit = math.log(options.start_opacity / (1 - options.start_opacity))
+    return Parameters(
+        means=points.clone(),
+        log_scales=scales.log()[:, None].repeat(1, 3),
+        rotations=rotations,
+        logits=torch.full((count, 1), logit),
+        sh=sh,
+    )
+
+
+def _spacing(points: Tensor) -> Tensor:
+    """Mean distance of each point to its three nearest others; infinite for a lone point."""
+    neighbours = min(_NEIGHBOURS, len(points) - 1)
+    if neighbours == 0:
+        return torch.full((len(points),), math.inf)
+    return _nearest(points, points, neighbours + 1)[:, 1:].mean(dim=1)
+
+
+def _nearest(points: Tensor, others: Tensor, k: int) -> Float[Tensor, "n k"]:
+    """Distances of each point to its k nearest of `others`, nearest first."""
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(others.numpy()).query(points.numpy(), k=list(range(1, k + 1)))
+    return torch.from_numpy(distances).float()

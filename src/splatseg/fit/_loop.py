@@ -1,0 +1,326 @@
+"""The fit itself: one view after another, render, compare, step."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from splatseg.core import Capture, Gaussians
+from splatseg.errors import InputError, SplatsegError
+from splatseg.fit._adam import adam_step
+from splatseg.fit._densify import relocated, wander
+from splatseg.fit._initialise import initial_parameters, scene_extent
+from splatseg.fit._loss import Loss, l1_dssim
+from splatseg.fit._options import FitOptions
+from splatseg.fit._parameters import Parameters, rates_by_name, rows_in_view
+from splatseg.fit._photographs import Example, Photographs
+from splatseg.fit._schedule import count_at, degree_at, rates_at, reduction_at
+from splatseg.render import Backend, RenderOptions, get_backend
+
+_RECORD_EVERY = 50  # steps
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitProgress:
+    """Where a fit is, after a step."""
+
+    step: int
+    """Steps done."""
+
+    progress: float
+    """Share of the whole that is done, [0, 1]."""
+
+    seconds: float
+    """Since the fit began."""
+
+    seconds_left: float
+    """Estimate."""
+
+    loss: float
+    """Of this step's view."""
+
+    psnr: float
+    """Of this step's view, dB, at the resolution of the stage."""
+
+    count: int
+    """Gaussians."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitRecord:
+    """Means over some consecutive steps of a fit."""
+
+    step: int
+    """The last of them."""
+
+    seconds: float
+    """Since the fit began."""
+
+    loss: float
+    psnr: float
+    """dB."""
+
+    count: int
+    """Gaussians at the end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitResult:
+    """What a fit gives."""
+
+    gaussians: Gaussians
+    """On the CPU, float32, without those too faint to matter."""
+
+    steps: int
+    """Steps done."""
+
+    seconds: float
+    """Wall-clock time, reading the photographs included."""
+
+    history: tuple[FitRecord, ...]
+    """One record for every 50 steps."""
+
+    interrupted: bool
+    """True if Ctrl-C ended it early; the Gaussians are those of that moment."""
+
+    stages: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Seconds spent in each part of a step: read, gather, render, loss, backward, update,
+    densify."""
+
+
+def fit(
+    capture: Capture,
+    *,
+    options: FitOptions = FitOptions(),
+    backend: str = "auto",
+    progress: Callable[[FitProgress], None] | None = None,
+) -> FitResult:
+    """Optimise Gaussians so that they look like the training photographs of a capture.
+
+    Starts from the capture's points, minimises L1 + D-SSIM with Adam, one view a step, from
+    coarse to fine, and moves and adds Gaussians as it goes. Test views are not looked at.
+    With `FitOptions.steps` the result depends on the seed alone, not on the number of threads
+    or on how fast the machine is.
+
+    Args:
+        capture: Photographs with cameras and start points.
+        options: Length, size and rates.
+        backend: Which renderer: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        progress: Called after every step. A `KeyboardInterrupt` out of it, or from the keyboard
+            at any time, ends the fit, which returns what it has.
+
+    Raises:
+        InputError: If the capture has no training photographs or no start points.
+        MissingFileError: If a photograph is not where it was.
+        SplatsegError: If the loss is no longer a number.
+    """
+    renderer = get_backend(backend)
+    views = tuple(view for view in capture.train_views if view.image is not None)
+    if not views:
+        raise InputError(
+            f"{capture.path}: expected training views with photographs, got none "
+            f"among {len(capture.views)} views."
+        )
+    run = _Fit(capture, options, renderer, Photographs(views, longest=options.longest))
+    interrupted = False
+    try:
+        while not run.finished:
+            status = run.step()
+            if progress is not None:
+                progress(status)
+    except KeyboardInterrupt:
+        interrupted = True
+    return FitResult(
+        gaussians=run.gaussians(),
+        steps=run.steps,
+        seconds=run.seconds,
+        history=tuple(run.history),
+        interrupted=interrupted,
+        stages=dict(run.stages),
+    )
+
+
+class _Fit:
+    """State of a fit under way. Every attribute is replaced as a whole or updated by rows, so
+    that an interruption at any moment leaves Gaussians that can be used."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        options: FitOptions,
+        backend: Backend,
+        photographs: Photographs,
+    ) -> None:
+        self._begin = time.monotonic()
+        self._options = options
+        self._backend = backend
+        self._photographs = photographs
+        self._generator = torch.Generator().manual_seed(options.seed)
+        start = initial_parameters(capture, options=options, generator=self._generator)
+        self._extent = scene_extent(capture.train_views, start.means)
+        self._start_count = len(start)
+        device = torch.device("cuda" if backend.name == "cuda" else "cpu")
+        start = Parameters(**{name: tensor.to(device) for name, tensor in start.tensors()})
+        self._device = device
+        self._state = (start, start.zeros_like(), start.zeros_like())
+        self._order: list[int] = []
+        self._batch: list[FitProgress] = []
+        self.steps = 0
+        self.history: list[FitRecord] = []
+        self.stages: dict[str, float] = {}
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._begin
+
+    @property
+    def progress(self) -> float:
+        if self._options.steps is not None:
+            return min(1.0, self.steps / self._options.steps)
+        minutes = self._options.minutes or math.inf
+        return min(1.0, self.seconds / (60 * minutes))
+
+    @property
+    def finished(self) -> bool:
+        return self.progress >= 1.0
+
+    def gaussians(self) -> Gaussians:
+        parameters = self._state[0]
+        alive = parameters.logits.sigmoid().squeeze(1) > self._options.dead_opacity
+        return parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
+
+    def step(self) -> FitProgress:
+        done = self.progress
+        with self._timed("read"):
+            example = self._next_example(done)
+        parameters = self._state[0]
+        render_options = RenderOptions(sh_degree=degree_at(done, options=self._options))
+        with self._timed("gather"):
+            rows = rows_in_view(parameters, example.camera, near=render_options.near)
+            leaves = parameters.rows(rows).requires_grad()
+        with self._timed("render"):
+            gaussians = leaves.gaussians()
+            rendered = self._backend.render(gaussians, example.camera, None, options=render_options)
+        with self._timed("loss"):
+            loss = l1_dssim(
+                rendered.image,
+                example.photograph,
+                mask=example.mask,
+                dssim_weight=self._options.dssim_weight,
+            )
+        if not math.isfinite(loss.value):
+            raise SplatsegError(
+                f"fit: expected a finite loss, got {loss.value} at step {self.steps}; lower rates "
+                "may help."
+            )
+        with self._timed("backward"):
+            torch.autograd.backward([rendered.image], [loss.gradient])
+        with self._timed("update"), torch.no_grad():
+            self._update(leaves, rows, done)
+        self.steps += 1
+        with self._timed("densify"), torch.no_grad():
+            self._densify(done)
+        return self._report(loss)
+
+    def _next_example(self, progress: float) -> Example:
+        """The next view: all of them in random order, then all again in another."""
+        if not self._order:
+            self._order = torch.randperm(len(self._photographs), generator=self._generator).tolist()
+        index = self._order.pop()
+        camera = self._photographs.camera(index)
+        reduction = reduction_at(
+            progress, options=self._options, width=camera.width, height=camera.height
+        )
+        example = self._photographs.example(index, reduction=reduction)
+        mask = example.mask
+        return Example(
+            camera=example.camera,
+            photograph=example.photograph.to(self._device),
+            mask=None if mask is None else mask.to(self._device),
+        )
+
+    def _update(self, leaves: Parameters, rows: Tensor, progress: float) -> None:
+        """Adam on the rows that the view showed; what no pixel depends on stays as it is."""
+        parameters, first, second = self._state
+        gradients = {name: _gradient(tensor) for name, tensor in leaves.tensors()}
+        shown = (gradients["logits"] != 0).squeeze(1) | (gradients["sh"][:, :3] != 0).any(dim=1)
+        rows = torch.where(shown, rows, -1)
+
+        count = len(parameters)
+        opacities = leaves.logits.detach().sigmoid()
+        gradients["logits"] += self._options.opacity_penalty / count * opacities * (1 - opacities)
+        gradients["log_scales"] += (
+            self._options.scale_penalty / (3 * count) * leaves.log_scales.detach().exp()
+        )
+        rates = rates_at(progress, options=self._options, extent=self._extent)
+        columns = rates_by_name(rates, parameters)
+        moments = dict(first.tensors()), dict(second.tensors())
+        for name, tensor in parameters.tensors():
+            adam_step(
+                tensor,
+                gradients[name],
+                moments[0][name],
+                moments[1][name],
+                rows=rows,
+                rates=columns[name],
+                step=self.steps + 1,
+            )
+        if self._options.noise:
+            wander(
+                parameters,
+                rows,
+                strength=self._options.noise * rates.means,
+                generator=self._generator,
+            )
+
+    def _densify(self, progress: float) -> None:
+        options = self._options
+        due = self.steps >= options.densify_from and self.steps % options.densify_every == 0
+        if not due or progress >= options.densify_until:
+            return
+        count = count_at(progress, options=options, start=self._start_count)
+        self._state = relocated(
+            *self._state, count=count, options=options, generator=self._generator
+        )
+
+    def _report(self, loss: Loss) -> FitProgress:
+        seconds, done = self.seconds, self.progress
+        psnr = -10 * math.log10(max(loss.squared_error, 1e-10))
+        status = FitProgress(
+            step=self.steps,
+            progress=done,
+            seconds=seconds,
+            seconds_left=seconds * (1 - done) / max(done, 1e-6),
+            loss=loss.value,
+            psnr=psnr,
+            count=len(self._state[0]),
+        )
+        self._batch.append(status)
+        if self.steps % _RECORD_EVERY == 0:
+            size = len(self._batch)
+            record = FitRecord(
+                step=self.steps,
+                seconds=seconds,
+                loss=sum(one.loss for one in self._batch) / size,
+                psnr=sum(one.psnr for one in self._batch) / size,
+                count=status.count,
+            )
+            self.history.append(record)
+            self._batch = []
+        return status
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin
+
+
+def _gradient(leaf: Tensor) -> Tensor:
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad

@@ -1,0 +1,115 @@
+"""What is optimised: raw tensors whose every value is a valid Gaussian, and Adam's moments."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from splatseg.core import Camera, Gaussians
+from splatseg.fit._schedule import Rates
+
+# 2 ln 255: beyond this Mahalanobis distance squared even an opaque Gaussian's alpha is < 1/255.
+_REACH = 3.34
+# More than the square root of the low-pass variance of 0.3 square pixels.
+_LOW_PASS_REACH = 0.55
+# The Jacobian is taken at most this far outside the image, in half image sizes.
+_FRUSTUM_MARGIN = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Parameters:
+    """Gaussians as the optimiser sees them, one row each.
+
+    Scales are exp(log_scales), opacities sigmoid(logits), rotations quaternions / length.
+    """
+
+    means: Float[Tensor, "n 3"]
+    log_scales: Float[Tensor, "n 3"]
+    rotations: Float[Tensor, "n 4"]
+    logits: Float[Tensor, "n 1"]
+    sh: Float[Tensor, "n coefficients_3"]
+    """Harmonics, the three channels of a coefficient side by side."""
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def tensors(self) -> Iterator[tuple[str, Tensor]]:
+        """The tensors by name."""
+        for field in fields(self):
+            yield field.name, getattr(self, field.name)
+
+    def rows(self, index: Int64[Tensor, "m"]) -> "Parameters":
+        """Copies of some rows."""
+        return Parameters(
+            **{name: tensor.index_select(0, index) for name, tensor in self.tensors()}
+        )
+
+    def with_zeros(self, count: int) -> "Parameters":
+        """The same with `count` rows of zeros behind."""
+        return Parameters(
+            **{
+                name: torch.cat((tensor, tensor.new_zeros(count, tensor.shape[1])))
+                for name, tensor in self.tensors()
+            }
+        )
+
+    def zeros_like(self) -> "Parameters":
+        """Zeros of the same shapes: fresh moments."""
+        return Parameters(**{name: torch.zeros_like(tensor) for name, tensor in self.tensors()})
+
+    def requires_grad(self) -> "Parameters":
+        """The same tensors, as leaves of a graph."""
+        return Parameters(
+            **{name: tensor.detach().requires_grad_() for name, tensor in self.tensors()}
+        )
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians these rows stand for. Differentiable."""
+        return Gaussians(
+            means=self.means,
+            rotations=torch.nn.functional.normalize(self.rotations, dim=1),
+            scales=self.log_scales.exp(),
+            opacities=self.logits.sigmoid().squeeze(1),
+            sh=self.sh.view(len(self), -1, 3),
+        )
+
+
+def rates_by_name(rates: Rates, parameters: Parameters) -> dict[str, Tensor]:
+    """Learning rate of each column of each tensor."""
+    columns = {name: tensor.shape[1] for name, tensor in parameters.tensors()}
+    harmonics = torch.full((columns["sh"],), rates.harmonics)
+    harmonics[:3] = rates.colour
+    device = parameters.means.device
+    return {
+        "means": torch.full((3,), rates.means, device=device),
+        "log_scales": torch.full((3,), rates.log_scales, device=device),
+        "rotations": torch.full((4,), rates.rotations, device=device),
+        "logits": torch.full((1,), rates.logits, device=device),
+        "sh": harmonics.to(device),
+    }
+
+
+def rows_in_view(parameters: Parameters, camera: Camera, *, near: float) -> Int64[Tensor, "m"]:
+    """Rows that may show in a pinhole view, ascending; none that does is left out.
+
+    A Gaussian reaches at most as far as a ball of its largest scale: its projected standard
+    deviation along x is at most ``fx / z * s * sqrt(1 + (x / z)^2)`` with x / z clamped as the
+    projection clamps it, plus the low-pass.
+    """
+    pose = camera.cam_from_world.to(parameters.means)
+    x, y, z = (parameters.means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    inside = z > near
+    inverse = 1 / torch.where(inside, z, 1.0)
+    largest = parameters.log_scales.amax(dim=1).exp() * inverse
+    for along, focal, centre, size in (
+        (x * inverse, camera.fx, camera.cx, camera.width),
+        (y * inverse, camera.fy, camera.cy, camera.height),
+    ):
+        margin = _FRUSTUM_MARGIN * 0.5 * size / focal
+        slope = along.clamp(-centre / focal - margin, (size - centre) / focal + margin)
+        reach = _REACH * (largest * focal * (1 + slope * slope).sqrt() + _LOW_PASS_REACH)
+        at = along * focal + centre
+        inside &= (at + reach >= 0) & (at - reach <= size)
+    return inside.nonzero().squeeze(1)

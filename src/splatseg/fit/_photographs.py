@@ -1,0 +1,130 @@
+"""The photographs a fit learns from: straightened, in memory while there is room, and reduced."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatseg.core import Camera, View
+from splatseg.io.images import image_camera, load_image, load_mask, reduced_size
+from splatseg.render.warp import photograph_to_pinhole, straightened
+
+_MEMORY = 6 * 2**30
+"""Bytes of photographs that are kept; those that do not fit are read again each time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Example:
+    """One view to learn from."""
+
+    camera: Camera
+    """Pinhole."""
+
+    photograph: Float[Tensor, "height width 3"]
+    """[0, 1]; 0 where the mask is False."""
+
+    mask: Bool[Tensor, "height width"] | None
+    """Pixels that count; None is all."""
+
+
+class Photographs:
+    """Training views by number. Pixels are read when they are first asked for.
+
+    Photographs with distortion are resampled into ``camera.undistorted()``; what lies outside
+    them, or is 0 in the view's own mask, has no loss.
+
+    Example:
+        photographs = Photographs(capture.train_views, longest=1600)
+        example = photographs.example(0, reduction=2)
+    """
+
+    def __init__(self, views: Sequence[View], *, longest: int) -> None:
+        self._views = tuple(views)
+        self._longest = longest
+        self._kept: dict[int, tuple[Tensor, Tensor | None]] = {}
+        self._bytes = 0
+        self._cameras = [straightened(image_camera(view, longest)) for view in self._views]
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def camera(self, index: int) -> Camera:
+        """The pinhole camera of a view at full size."""
+        return self._cameras[index]
+
+    def example(self, index: int, *, reduction: int = 1) -> Example:
+        """A view with its sides divided by `reduction`: means of square blocks of pixels.
+
+        Rows and columns that do not fill a block are cut off. A block counts if all its pixels
+        do.
+        """
+        pixels, mask = self._pixels(index)
+        photograph = pixels.float() / 255
+        camera = self._cameras[index]
+        if reduction == 1:
+            return Example(camera=camera, photograph=photograph, mask=mask)
+        photograph = torch.nn.functional.avg_pool2d(photograph.movedim(-1, 0), reduction)
+        if mask is not None:
+            least = torch.nn.functional.avg_pool2d(mask[None].float(), reduction)[0]
+            mask = least == 1
+        return Example(
+            camera=reduced_camera(camera, reduction),
+            photograph=photograph.movedim(0, -1).contiguous(),
+            mask=mask,
+        )
+
+    def _pixels(self, index: int) -> tuple[Tensor, Tensor | None]:
+        kept = self._kept.get(index)
+        if kept is None:
+            kept = self._read(index)
+            size = sum(tensor.nbytes for tensor in kept if tensor is not None)
+            if self._bytes + size <= _MEMORY:
+                self._kept[index] = kept
+                self._bytes += size
+        return kept
+
+    def _read(self, index: int) -> tuple[Tensor, Tensor | None]:
+        view = self._views[index]
+        camera = image_camera(view, self._longest)
+        pixels = load_image(view, longest=self._longest)
+        own_mask = load_mask(view, longest=self._longest)
+        if camera.is_pinhole:
+            if own_mask is None:
+                return pixels, None
+            mask = own_mask.bool()
+            return pixels * mask[..., None], mask
+        straight, mask = photograph_to_pinhole(pixels.float(), camera)
+        if own_mask is not None:
+            used, _ = photograph_to_pinhole(own_mask.float()[..., None], camera)
+            mask = mask & (used[..., 0] > 1 - 1e-3)
+        straight = (straight + 0.5).clamp(0, 255).to(torch.uint8)
+        return straight * mask[..., None], mask
+
+
+def reduced_camera(camera: Camera, reduction: int) -> Camera:
+    """The camera of an image whose pixels are blocks of `reduction` x `reduction`."""
+    return replace(
+        camera,
+        width=camera.width // reduction,
+        height=camera.height // reduction,
+        fx=camera.fx / reduction,
+        fy=camera.fy / reduction,
+        cx=camera.cx / reduction,
+        cy=camera.cy / reduction,
+    )
+
+
+def reduction_note(views: Sequence[View], *, longest: int) -> str | None:
+    """One sentence on photographs that are larger than the fit works at; None if none is."""
+    sizes = [(view.camera.width, view.camera.height) for view in views]
+    larger = [size for size in sizes if max(size) > longest]
+    if not larger:
+        return None
+    width, height = max(larger)
+    new_width, new_height = reduced_size(width, height, longest)
+    return (
+        f"{len(larger)} of {len(sizes)} photographs are reduced to a longest side of {longest} "
+        f"pixels (the largest from {width}x{height} to {new_width}x{new_height})."
+    )
