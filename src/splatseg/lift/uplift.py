@@ -287,15 +287,14 @@ class _Ranking:
         for rows in _row_blocks(len(votes)):
             block = votes[rows]
             self._total[rows] += block.sum(dim=1)
-            # `max` takes the first of equals: what was ranked before, then the smaller id.
+            # `max` takes the first of equals: what was ranked before, then the smaller id. So an
+            # id without votes never wins: an empty slot without votes stands before it.
             table = torch.cat((self._votes[rows], block), dim=1)
             labels = torch.cat((self.ids[rows], names.expand(len(block), -1)), dim=1)
             for rank in range(self.ids.shape[1]):
                 value, column = table.max(dim=1, keepdim=True)
-                won = value.squeeze(1) > 0
-                chosen = labels.gather(1, column).squeeze(1)
-                self._votes[rows, rank] = torch.where(won, value.squeeze(1), 0.0)
-                self.ids[rows, rank] = torch.where(won, chosen, UNLABELLED)
+                self._votes[rows, rank] = value.squeeze(1)
+                self.ids[rows, rank] = labels.gather(1, column).squeeze(1)
                 table.scatter_(1, column, -1.0)
 
     def result(self, options: UpliftOptions) -> tuple[Tensor, Tensor, Tensor]:
