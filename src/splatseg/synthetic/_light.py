@@ -1,0 +1,166 @@
+"""Light in a generated scene: a coarse volume of what reaches each place, and the sun.
+
+The volume is computed once. At each voxel it holds the summed direction of daylight (from the
+planes that glow) and of lamplight (from the other glowing solids), both weakened by the solids
+in between, and how open the place is. Surfaces read it smoothly, a little above themselves,
+which gives soft shadows and dark corners without noise.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from splatseg.synthetic._scene import SyntheticScene
+from splatseg.synthetic._shapes import Primitive
+
+_CELL = 0.06
+_STEPS = 28
+_ABSORPTION = 45.0
+_DAYLIGHT = (1.0, 0.98, 0.95)
+_LAMPLIGHT = (1.0, 0.80, 0.55)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LightVolume:
+    """Seven values on a grid over the scene's bounds."""
+
+    low: Float[Tensor, "3"]
+    high: Float[Tensor, "3"]
+
+    values: Float[Tensor, "1 7 nz ny nx"]
+    """Daylight (x, y, z), lamplight (x, y, z), openness in [0, 1]."""
+
+    def irradiance(
+        self,
+        points: Float[Tensor, "n 3"],
+        normals: Float[Tensor, "n 3"],
+        *,
+        ambient: float,
+    ) -> Float[Tensor, "n 3"]:
+        """Red, green and blue light that falls on surfaces, without the sun."""
+        value = _sample(self.values, points + 0.09 * normals, self.low, self.high)
+        day, lamp, open_ = value[:, :3], value[:, 3:6], value[:, 6:]
+        sky = 0.5 + 0.12 * normals[:, 2:]
+        out = ambient * sky * (0.25 + 0.75 * open_)
+        for vector, colour in ((day, _DAYLIGHT), (lamp, _LAMPLIGHT)):
+            length = (vector * vector).sum(-1, keepdim=True).sqrt()
+            # A wide source lights a surface that faces slightly away from it, too.
+            facing = 0.5 * (length + (vector * normals).sum(-1, keepdim=True))
+            soft = facing * facing / length.clamp_min(1e-6)
+            out = out + soft * torch.tensor(colour).to(soft)
+        return out
+
+
+@lru_cache(maxsize=4)
+def light_volume(scene: SyntheticScene) -> LightVolume:
+    """The light of a scene, computed at the first call."""
+    low, high = (torch.tensor(corner, dtype=torch.float32) for corner in scene.bounds)
+    shape = [max(2, int(n)) for n in ((high - low) / (2 * _CELL)).ceil().tolist()]
+    solid = _occupancy(scene, low, high, [2 * n for n in shape])
+    places = _cell_centres(low, high, shape)
+    day, lamp = torch.zeros_like(places), torch.zeros_like(places)
+    for primitive in scene.primitives:
+        if primitive.texture.glow <= 0:
+            continue
+        if primitive.shape == "plane":
+            day += _from_plane(primitive, places, solid, low, high)
+        else:
+            centre = torch.tensor(primitive.centre, dtype=torch.float32)
+            lamp += 0.35 * primitive.texture.glow * _from_point(centre, places, solid, low, high)
+    return LightVolume(
+        low=low,
+        high=high,
+        values=torch.cat(
+            (_volume(day, shape), _volume(lamp, shape), _openness(solid)), dim=1
+        ).contiguous(),
+    )
+
+
+def _cell_centres(low: Tensor, high: Tensor, shape: list[int]) -> Float[Tensor, "n 3"]:
+    axes = [
+        low[i] + (torch.arange(n, dtype=torch.float32) + 0.5) * (high[i] - low[i]) / n
+        for i, n in enumerate(shape)
+    ]
+    z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    return torch.stack((x, y, z), dim=-1).reshape(-1, 3)
+
+
+def _volume(values: Float[Tensor, "n c"], shape: list[int]) -> Float[Tensor, "1 c nz ny nx"]:
+    return values.reshape(1, shape[2], shape[1], shape[0], -1).permute(0, 4, 1, 2, 3)
+
+
+def _occupancy(
+    scene: SyntheticScene, low: Tensor, high: Tensor, shape: list[int]
+) -> Float[Tensor, "1 1 nz ny nx"]:
+    """1 where a solid that gives no light is; planes are too thin to count."""
+    places = _cell_centres(low, high, shape)
+    inside = torch.zeros(len(places), dtype=torch.bool)
+    for primitive in scene.primitives:
+        if primitive.shape == "plane" or primitive.texture.glow > 0:
+            continue
+        centre = torch.tensor(primitive.centre, dtype=torch.float32)
+        near = ((places - centre).abs() <= primitive.radius + 0.03).all(dim=-1).nonzero()[:, 0]
+        inside[near] |= primitive.contains(places[near], 0.02)
+    return _volume(inside.float().unsqueeze(-1), shape)
+
+
+def _openness(solid: Float[Tensor, "1 1 nz ny nx"]) -> Float[Tensor, "1 1 mz my mx"]:
+    """Share of free space within about half a metre; outside the bounds nothing is free."""
+    coarse = functional.avg_pool3d(solid, 2)
+    padded = functional.pad(coarse, (4,) * 6, value=1.0)
+    blurred = functional.avg_pool3d(functional.avg_pool3d(padded, 5, stride=1), 5, stride=1)
+    return 1 - blurred
+
+
+def _sample(volume: Tensor, points: Tensor, low: Tensor, high: Tensor) -> Float[Tensor, "n c"]:
+    where = 2 * (points.float() - low) / (high - low) - 1
+    grid = where.reshape(1, 1, 1, -1, 3)
+    found = functional.grid_sample(volume, grid, padding_mode="border", align_corners=False)
+    return found.reshape(volume.shape[1], -1).T
+
+
+def _from_point(
+    light: Float[Tensor, "3"],
+    places: Float[Tensor, "n 3"],
+    solid: Tensor,
+    low: Tensor,
+    high: Tensor,
+) -> Float[Tensor, "n 3"]:
+    """Direction to a light of unit power, divided by the squared distance, times visibility."""
+    way = light - places
+    distance = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
+    # The first decimetre is left out, so that a surface does not shade itself.
+    start = (0.1 / distance).clamp(max=1.0)
+    passed = torch.zeros_like(distance)
+    for step in range(_STEPS):
+        share = start + (1 - start) * (step + 0.5) / _STEPS
+        passed += _sample(solid, places + share * way, low, high) * (1 - start) / _STEPS
+    seen = torch.exp(-_ABSORPTION * passed * distance)
+    return way / distance.clamp_min(1e-6) * seen / (distance * distance + 0.15)
+
+
+def _from_plane(
+    primitive: Primitive,
+    places: Float[Tensor, "n 3"],
+    solid: Tensor,
+    low: Tensor,
+    high: Tensor,
+) -> Float[Tensor, "n 3"]:
+    """Daylight through a window, from six places of it, each with Lambert's cosine."""
+    turn = primitive.rotation.float()
+    centre = torch.tensor(primitive.centre, dtype=torch.float32)
+    half = torch.tensor(primitive.half_size, dtype=torch.float32)
+    power = primitive.texture.glow * 4 * float(half[0] * half[1]) / 6
+    total = torch.zeros_like(places)
+    for u in (-2 / 3, 0.0, 2 / 3):
+        for v in (-0.5, 0.5):
+            light = centre + turn[:, 0] * u * half[0] + turn[:, 1] * v * half[1]
+            vector = _from_point(light, places, solid, low, high)
+            length = torch.linalg.vector_norm(vector, dim=-1, keepdim=True).clamp_min(1e-9)
+            cosine = (vector @ turn[:, 2:]).abs() / length
+            total += power * cosine * vector
+    return total
