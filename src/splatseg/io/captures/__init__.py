@@ -89,7 +89,9 @@ def _from_file(path: Path) -> tuple[Path, str]:
     named = {_NERFSTUDIO_FILE: "nerfstudio", "transforms_train.json": "blender"}
     named |= {_LLFF_FILE: "llff"} | dict.fromkeys(_IDR_FILES, "idr")
     if path.name not in named:
-        raise InputError(f"{path}: expected a capture's folder or one of {', '.join(named)}.")
+        raise InputError(
+            f"{path}: expected a capture's folder or one of {', '.join(named)}."
+        )
     return path.parent, named[path.name]
 
 

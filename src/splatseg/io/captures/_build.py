@@ -97,11 +97,15 @@ def build_capture(
         intrinsics = scaled_to(view.intrinsics, (width, height), where=str(view.image))
         if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
             before = f"{view.intrinsics.width}x{view.intrinsics.height}"
-            scaled[f"intrinsics of {before} were scaled to photographs of {width}x{height}"] += 1
+            scaled[
+                f"intrinsics of {before} were scaled to photographs of {width}x{height}"
+            ] += 1
         views.append(
             View(
                 name=name,
-                camera=_camera(view, intrinsics, width, height, where=f"{path}: {view.relative}"),
+                camera=_camera(
+                    view, intrinsics, width, height, where=f"{path}: {view.relative}"
+                ),
                 image=view.image,
                 split=split,
                 mask=view.mask,
@@ -110,7 +114,12 @@ def build_capture(
             )
         )
     metadata = read_metadata(path)
-    found = [*notes, *scaled, *([split_note] if split_note else []), *_size_notes(views)]
+    found = [
+        *notes,
+        *scaled,
+        *([split_note] if split_note else []),
+        *_size_notes(views),
+    ]
     return Capture(
         path=path,
         format=format,
@@ -158,7 +167,9 @@ def view_names(relatives: Sequence[str]) -> list[str]:
     ]
 
 
-def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Intrinsics:
+def scaled_to(
+    intrinsics: Intrinsics, size: tuple[int, int], *, where: str
+) -> Intrinsics:
     """Intrinsics in pixels of a photograph of another size but the same shape.
 
     A photograph made smaller has whole pixels, so its sides may differ by up to one pixel from
@@ -173,7 +184,8 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
         return intrinsics
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
     uniform = (
-        abs(sx * intrinsics.height - size[1]) <= 1 or abs(sy * intrinsics.width - size[0]) <= 1
+        abs(sx * intrinsics.height - size[1]) <= 1
+        or abs(sy * intrinsics.width - size[0]) <= 1
     )
     if not uniform:
         turned = abs(size[1] / intrinsics.width * intrinsics.height - size[0]) <= 1
@@ -203,7 +215,9 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
         raise InputError(f"{where}: expected a 4 x 4 pose, got shape {pose.shape}.")
     bad = int((~np.isfinite(pose)).sum())
     if bad:
-        raise InputError(f"{where}: expected a finite pose, got {bad} values of 16 that are not.")
+        raise InputError(
+            f"{where}: expected a finite pose, got {bad} values of 16 that are not."
+        )
     rotation = pose[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
@@ -213,7 +227,9 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
             f"{error:.3g} and determinant {determinant:.3g}."
         )
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > _ROTATION_EXACT:
-        raise InputError(f"{where}: expected a pose whose last row is 0 0 0 1, got {pose[3]}.")
+        raise InputError(
+            f"{where}: expected a pose whose last row is 0 0 0 1, got {pose[3]}."
+        )
     exact = pose.copy()
     exact[3] = (0, 0, 0, 1)
     if error > _ROTATION_EXACT:
@@ -224,7 +240,8 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
 
 def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back)."""
-    return np.linalg.inv(world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    world_from_opencv = world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return np.linalg.inv(world_from_opencv).astype(np.float64)
 
 
 def _camera(
@@ -233,7 +250,9 @@ def _camera(
     for name in ("fx", "fy"):
         value = float(getattr(intrinsics, name))
         if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{where}: expected a positive focal length, got {name} = {value:g}.")
+            raise InputError(
+                f"{where}: expected a positive focal length, got {name} = {value:g}."
+            )
     rest = (intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
     if not all(math.isfinite(value) for value in rest):
         raise InputError(f"{where}: expected finite intrinsics, got {rest}.")
@@ -276,7 +295,10 @@ def _splits(raw: Sequence[RawView]) -> tuple[list[str], str | None]:
     if len(raw) == 1:
         return ["train"], None
     splits = ["test" if i % TEST_EVERY == 0 else "train" for i in range(len(raw))]
-    return splits, f"no split of its own: every {TEST_EVERY}th view by name is a test view"
+    return (
+        splits,
+        f"no split of its own: every {TEST_EVERY}th view by name is a test view",
+    )
 
 
 def _size_notes(views: Sequence[View]) -> list[str]:
@@ -285,7 +307,8 @@ def _size_notes(views: Sequence[View]) -> list[str]:
         return []
     camera = large[0].camera
     width, height = reduced_size(camera.width, camera.height, DEFAULT_LONGEST)
-    return [
+    note = (
         f"{len(large)} photographs are larger than {DEFAULT_LONGEST} pixels "
         f"({camera.width}x{camera.height}); they are worked on at {width}x{height}"
-    ]
+    )
+    return [note]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.core import PointCloud
+from splatseg.core import CameraModel, PointCloud
 from splatseg.errors import InputError
 from splatseg.io.captures._build import Intrinsics
 
@@ -32,10 +32,19 @@ MODELS: dict[int, tuple[str, int]] = {
 PARAMETER_COUNTS = dict(MODELS.values())
 """Number of parameters by name."""
 
-_READ = (
-    "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, "
-    "SIMPLE_RADIAL_FISHEYE and RADIAL_FISHEYE"
-)
+_LENSES: dict[str, tuple[CameraModel, int]] = {
+    "SIMPLE_PINHOLE": ("pinhole", 1),
+    "PINHOLE": ("pinhole", 2),
+    "SIMPLE_RADIAL": ("opencv", 1),
+    "RADIAL": ("opencv", 1),
+    "OPENCV": ("opencv", 2),
+    "FULL_OPENCV": ("opencv", 2),
+    "OPENCV_FISHEYE": ("fisheye", 2),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1),
+    "RADIAL_FISHEYE": ("fisheye", 1),
+}
+# Our lens model and the number of focal lengths. The principal point follows them, then the
+# distortion in OpenCV's order, of which the simpler models give the first values.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,39 +104,29 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
     Raises:
         InputError: If the model is one that cannot be undistorted here, or parameters lack.
     """
-    p = camera.parameters
-    expected = PARAMETER_COUNTS.get(camera.model)
-    if expected is not None and len(p) != expected:
+    if camera.model not in _LENSES:
         raise InputError(
-            f"{where}: expected {expected} parameters of a {camera.model} camera, got {len(p)}."
+            f"{where}: expected a camera model that can be undistorted ({', '.join(_LENSES)}), "
+            f"got {camera.model}; undistort the photographs with COLMAP first."
         )
-    size = {"width": camera.width, "height": camera.height}
-    match camera.model:
-        case "SIMPLE_PINHOLE":
-            return Intrinsics(fx=p[0], fy=p[0], cx=p[1], cy=p[2], **size)
-        case "PINHOLE":
-            return Intrinsics(fx=p[0], fy=p[1], cx=p[2], cy=p[3], **size)
-        case "SIMPLE_RADIAL" | "RADIAL":
-            return Intrinsics(
-                model="opencv", fx=p[0], fy=p[0], cx=p[1], cy=p[2], distortion=p[3:], **size
-            )
-        case "OPENCV" | "FULL_OPENCV":
-            return Intrinsics(
-                model="opencv", fx=p[0], fy=p[1], cx=p[2], cy=p[3], distortion=p[4:], **size
-            )
-        case "OPENCV_FISHEYE":
-            return Intrinsics(
-                model="fisheye", fx=p[0], fy=p[1], cx=p[2], cy=p[3], distortion=p[4:], **size
-            )
-        case "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE":
-            return Intrinsics(
-                model="fisheye", fx=p[0], fy=p[0], cx=p[1], cy=p[2], distortion=p[3:], **size
-            )
-        case _:
-            raise InputError(
-                f"{where}: expected a camera model that can be undistorted ({_READ}), "
-                f"got {camera.model}; undistort the photographs with COLMAP first."
-            )
+    expected, values = PARAMETER_COUNTS[camera.model], camera.parameters
+    if len(values) != expected:
+        raise InputError(
+            f"{where}: expected {expected} parameters of a {camera.model} camera, "
+            f"got {len(values)}."
+        )
+    model, focals = _LENSES[camera.model]
+    cx, cy, *distortion = values[focals:]
+    return Intrinsics(
+        model=model,
+        fx=values[0],
+        fy=values[focals - 1],
+        cx=cx,
+        cy=cy,
+        distortion=tuple(distortion),
+        width=camera.width,
+        height=camera.height,
+    )
 
 
 def rigid_matrix(values: tuple[float, ...]) -> NDArray[np.float64]:
@@ -158,7 +157,9 @@ def poses_of(model: ColmapModel, *, where: str) -> dict[int, NDArray[np.float64]
     for frame in model.frames:
         rig = model.rigs.get(frame.rig_id)
         if rig is None:
-            raise InputError(f"{where}: a frame names rig {frame.rig_id}, which is not there.")
+            raise InputError(
+                f"{where}: a frame names rig {frame.rig_id}, which is not there."
+            )
         for camera_id, image_id in frame.images:
             if image_id not in poses:
                 # An image of the frame that was not registered has no row of its own.

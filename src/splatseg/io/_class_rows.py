@@ -1,0 +1,54 @@
+"""Class tables as JSON rows: ``{"id": 1, "name": "wall", "isthing": false, "colour": [r, g, b]}``."""
+
+from typing import Any, cast
+
+from splatseg.core import ClassInfo, ClassTable
+from splatseg.errors import FileFormatError
+
+
+def class_table(rows: object, *, where: str) -> ClassTable:
+    """A class table from its JSON rows; ``isthing`` (true) and ``colour`` may lack.
+
+    A row of id 0 is left out: 0 is void in files.
+
+    Raises:
+        FileFormatError: If a row has no integer id or no name; the message starts with `where`.
+    """
+    if not isinstance(rows, list):
+        raise FileFormatError(f"{where}: expected a list of classes, got {type(rows).__name__}.")
+    table = [
+        _class_info(row, where=f"{where}: classes[{i}]")
+        for i, row in enumerate(cast(list[object], rows))
+    ]
+    ids = [row.id for row in table]
+    if len(set(ids)) != len(ids):
+        raise FileFormatError(f"{where}: expected classes of distinct ids, got one twice.")
+    return ClassTable(rows=tuple(row for row in table if row.id != 0))
+
+
+def class_rows(table: ClassTable) -> list[dict[str, Any]]:
+    """JSON rows of a class table. Inverse of `class_table`."""
+    return [
+        {
+            "id": row.id,
+            "name": row.name,
+            "isthing": row.isthing,
+            **({} if row.colour is None else {"colour": list(row.colour)}),
+        }
+        for row in table.rows
+    ]
+
+
+def _class_info(row: object, *, where: str) -> ClassInfo:
+    if not isinstance(row, dict):
+        raise FileFormatError(f"{where}: expected an object, got {type(row).__name__}.")
+    entry = cast(dict[str, Any], row)
+    id, name, colour = entry.get("id"), entry.get("name"), entry.get("colour")
+    if isinstance(id, bool) or not isinstance(id, int) or id < 0 or not isinstance(name, str):
+        raise FileFormatError(f"{where}: expected an integer id and a name, got {entry!r:.80}.")
+    if colour is not None:
+        values = cast(list[object], colour) if isinstance(colour, list) else []
+        if len(values) != 3 or not all(isinstance(v, int) and 0 <= v <= 255 for v in values):
+            raise FileFormatError(f"{where}: expected a colour of three bytes, got {colour!r:.80}.")
+        colour = cast(tuple[int, int, int], tuple(values))
+    return ClassInfo(id=id, name=name, isthing=bool(entry.get("isthing", True)), colour=colour)

@@ -1,0 +1,186 @@
+"""Layers on disk: one npz a layer, version 1; byte for byte in ``docs/formats.md``.
+
+An npz is a ZIP archive of NumPy arrays. Entries are stored uncompressed and without time
+stamps, so that the same layer gives the same bytes.
+"""
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg.core import UNLABELLED, Features, Labels, Selection
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io._atomic import atomic_file
+from splatseg.io._json import json_text, parse_object
+
+FORMAT = "splatseg-layer"
+VERSION = 1
+"""Version of the files written; all versions up to it are read."""
+
+Layer = Labels | Features | Selection
+_HEADER = "header"
+_VOID = 0
+
+
+def save_layer(path: Path, layer: Layer) -> None:
+    """Write a layer; atomic. Inverse of `load_layer`.
+
+    In the file 0 is the id of what has no label, so -1 is written as 0.
+
+    Raises:
+        InputError: If an id is 0 (ids in use start at 1), or the metadata has no place in JSON.
+        MissingFileError: If the folder of `path` does not exist.
+    """
+    header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "count": len(layer)}
+    match layer:
+        case Labels():
+            header |= {"kind": "labels", "background": _void(layer.background)}
+            arrays = {"ids": _ids(layer.ids), "confidence": _floats(layer.confidence)}
+            if layer.candidates is not None and layer.shares is not None:
+                arrays |= {"candidates": _ids(layer.candidates), "shares": _floats(layer.shares)}
+        case Features():
+            header |= {"kind": "features"}
+            arrays = {"values": _floats(layer.values)}
+            if layer.weights is not None:
+                arrays |= {"weights": _floats(layer.weights)}
+        case Selection():
+            header |= {"kind": "selection"}
+            arrays = {"mask": layer.mask.cpu().numpy()}
+    header["metadata"] = dict(layer.metadata)
+    text = json_text(f"{path}: metadata", header)
+    arrays = {_HEADER: np.frombuffer(text.encode(), np.uint8)} | arrays
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def load_layer(path: Path) -> Layer:
+    """Read a layer. Inverse of `save_layer`.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no layer, cut short, or of a later version.
+    """
+    arrays = _arrays(path)
+    header = _header(path, arrays)
+    count, metadata = int(header["count"]), header["metadata"]
+    match header.get("kind"):
+        case "labels":
+            pair = "candidates" in arrays or "shares" in arrays
+            return Labels(
+                ids=_from_file(_array(path, arrays, "ids", "i4", (count,))),
+                confidence=torch.from_numpy(_array(path, arrays, "confidence", "f4", (count,))),
+                background=_background(path, header),
+                candidates=_from_file(_array(path, arrays, "candidates", "i4", (count, None)))
+                if pair
+                else None,
+                shares=torch.from_numpy(_array(path, arrays, "shares", "f4", (count, None)))
+                if pair
+                else None,
+                metadata=metadata,
+            )
+        case "features":
+            return Features(
+                values=torch.from_numpy(_array(path, arrays, "values", "f", (count, None))),
+                weights=torch.from_numpy(_array(path, arrays, "weights", "f", (count,)))
+                if "weights" in arrays
+                else None,
+                metadata=metadata,
+            )
+        case "selection":
+            mask = torch.from_numpy(_array(path, arrays, "mask", "?", (count,)))
+            return Selection(mask=mask, metadata=metadata)
+        case kind:
+            raise FileFormatError(
+                f"{path}: expected a layer of labels, features or a selection, got {kind!r}."
+            )
+
+
+def _void(id: int) -> int:
+    if id == _VOID:
+        raise InputError("ids: expected -1 (none) or 1 and more, got 0, which is void in files.")
+    return _VOID if id == UNLABELLED else id
+
+
+def _ids(ids: torch.Tensor) -> NDArray[Any]:
+    array = ids.cpu().numpy().astype(np.int32)
+    if (array == _VOID).any():
+        _void(_VOID)
+    return np.where(array == UNLABELLED, np.int32(_VOID), array)
+
+
+def _floats(values: torch.Tensor) -> NDArray[Any]:
+    return values.detach().cpu().numpy()
+
+
+def _from_file(ids: NDArray[Any]) -> torch.Tensor:
+    return torch.from_numpy(np.where(ids == _VOID, np.int32(UNLABELLED), ids))
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    if not path.is_file():
+        raise MissingFileError(f"{path}: there is no such layer.")
+    try:
+        # NumPy takes a file that is no archive for a single array, or for a pickle.
+        with zipfile.ZipFile(path):
+            pass
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise FileFormatError(
+            f"{path}: expected a layer, but it cannot be read as one ({error})."
+        ) from error
+
+
+def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    raw = arrays.get(_HEADER)
+    if raw is None or raw.dtype != np.uint8 or raw.ndim != 1:
+        raise FileFormatError(f"{path}: expected a layer, got an archive without a header.")
+    header = parse_object(raw.tobytes(), where=str(path))
+    version, count = header.get("version"), header.get("count")
+    if header.get("format") != FORMAT or not isinstance(version, int):
+        raise FileFormatError(f"{path}: expected a layer, got {header.get('format')!r}.")
+    if not 1 <= version <= VERSION:
+        raise FileFormatError(
+            f"{path}: expected a layer of version {VERSION} or less, got version {version}; "
+            "a later splatseg wrote it."
+        )
+    if not isinstance(count, int) or count < 0 or not isinstance(header.get("metadata"), dict):
+        raise FileFormatError(f"{path}: expected a header with a count and metadata.")
+    return header
+
+
+def _background(path: Path, header: Mapping[str, Any]) -> int:
+    value = header.get("background")
+    if not isinstance(value, int) or value < 0:
+        raise FileFormatError(f"{path}: expected a background id of 0 or more, got {value!r}.")
+    return UNLABELLED if value == _VOID else value
+
+
+def _array(
+    path: Path,
+    arrays: Mapping[str, NDArray[Any]],
+    name: str,
+    kind: str,
+    shape: tuple[int | None, ...],
+) -> NDArray[Any]:
+    """An array of a layer after checking its type (exact, or its kind letter) and shape."""
+    array = arrays.get(name)
+    if array is None:
+        raise FileFormatError(f"{path}: expected an array {name!r}, which is not there.")
+    fits = array.dtype.kind == kind if kind == "f" else array.dtype == np.dtype(kind)
+    if (
+        not fits
+        or array.ndim != len(shape)
+        or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True))
+    ):
+        wanted = ", ".join("any" if want is None else str(want) for want in shape)
+        raise FileFormatError(
+            f"{path}: expected {name!r} of type {kind} and shape ({wanted}), "
+            f"got {array.dtype} of {array.shape}."
+        )
+    return array

@@ -1,0 +1,286 @@
+"""Scene folders: Gaussians, cameras, layers and where they came from; see ``docs/formats.md``.
+
+    SCENE/
+      scene.json                format version, source capture, split, up, metres, classes
+      gaussians.ply             the Gaussians
+      cameras/transforms.json   views, in nerfstudio's layout
+      evidence/<name>/          what 2D models saw
+      layers/<name>.npz         what is known of each Gaussian
+      reports/
+
+Photographs stay where they are: a scene knows its capture by a path relative to itself and an
+absolute one, and opens without it.
+"""
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+from splatseg.core import Scene, View
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io._atomic import atomic_folder
+from splatseg.io._cameras import (
+    cameras_content,
+    relative_path,
+    source_paths,
+    views_from_content,
+)
+from splatseg.io._class_rows import class_rows, class_table
+from splatseg.io._json import read_json, write_json
+from splatseg.io.layers import Layer, load_layer, save_layer
+from splatseg.io.splats import read_splats, write_splats
+
+FORMAT = "splatseg-scene"
+VERSION = 1
+"""Version of the folders written; all versions up to it are read."""
+
+SCENE_FILE = "scene.json"
+GAUSSIANS_FILE = "gaussians.ply"
+CAMERAS_FILE = "cameras/transforms.json"
+FOLDERS = ("cameras", "evidence", "layers", "reports")
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a folder is a scene folder."""
+    return (path / SCENE_FILE).is_file()
+
+
+def save_scene(scene: Scene, root: Path | str) -> Scene:
+    """Write a scene folder; layers, evidence and reports that are there stay.
+
+    A new folder appears whole or not at all. In one that is there each file is replaced whole,
+    scene.json last.
+
+    Returns:
+        The scene with `root` set.
+
+    Raises:
+        InputError: If `root` is a folder of something else, or a value has no place in JSON.
+        MissingFileError: If the parent of `root` does not exist.
+    """
+    root = Path(root)
+    if root.is_dir() and not is_scene(root) and any(root.iterdir()):
+        raise InputError(f"{root}: expected an empty folder or a scene to write to, got neither.")
+    if is_scene(root):
+        _write(scene, root, final=root)
+    else:
+        with atomic_folder(root) as temporary:
+            _write(scene, temporary, final=root)
+    return replace(scene, root=root)
+
+
+def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
+    """Read a scene folder. Inverse of `save_scene`.
+
+    Args:
+        root: The scene folder.
+        data: The capture's folder, where its photographs moved. None looks where they were,
+            seen from the scene first, then by the absolute path. Without them the scene opens
+            all the same; reading a photograph then fails.
+
+    Raises:
+        MissingFileError: If there is no scene, or `data` lacks photographs of it.
+        FileFormatError: If a file of it is broken, or of a later version.
+    """
+    root = Path(root)
+    content = _scene_content(root)
+    cameras = read_json(root / CAMERAS_FILE)
+    source = _source(root, content, cameras, None if data is None else Path(data))
+    views = views_from_content(
+        cameras, folder=root / "cameras", source=source, path=root / CAMERAS_FILE
+    )
+    gaussians = read_splats(root / GAUSSIANS_FILE)
+    if len(gaussians) != content["gaussians"]:
+        raise FileFormatError(
+            f"{root / GAUSSIANS_FILE}: expected {content['gaussians']} Gaussians as {SCENE_FILE} "
+            f"says, got {len(gaussians)}."
+        )
+    classes, metres = content.get("classes"), content.get("metres_per_unit")
+    return Scene(
+        gaussians=gaussians,
+        views=_with_splits(root, content, views),
+        classes=None if classes is None else class_table(classes, where=str(root / SCENE_FILE)),
+        up=_up(root, content),
+        metres_per_unit=None if metres is None else float(metres),
+        source=source,
+        root=root,
+        provenance=cast(dict[str, Any], content.get("provenance") or {}),
+    )
+
+
+def scene_layer_names(root: Path | str) -> tuple[str, ...]:
+    """Names of the layers of a scene folder, sorted."""
+    return tuple(sorted(path.stem for path in (Path(root) / "layers").glob("*.npz")))
+
+
+def load_scene_layer(root: Path | str, name: str) -> Layer:
+    """A layer of a scene folder.
+
+    Raises:
+        InputError: If the scene has no layer of this name, or it belongs to other Gaussians.
+    """
+    root = Path(root)
+    names = scene_layer_names(root)
+    if name not in names:
+        known = ", ".join(names) if names else "it has none"
+        raise InputError(f"layer: expected one of {root} ({known}), got {name!r}.")
+    layer = load_layer(root / "layers" / f"{name}.npz")
+    count = _scene_content(root)["gaussians"]
+    if len(layer) != count:
+        raise FileFormatError(
+            f"{root / 'layers' / name}.npz: expected {count} rows as the scene has Gaussians, "
+            f"got {len(layer)}; the layer is from before the Gaussians changed."
+        )
+    return layer
+
+
+def save_scene_layer(root: Path | str, name: str, layer: Layer) -> Path:
+    """Write a layer into a scene folder; gives the file.
+
+    Raises:
+        InputError: If the name cannot be a file's, or the layer has not one row a Gaussian.
+        MissingFileError: If there is no scene.
+    """
+    root = Path(root)
+    check_name("layer", name)
+    count = _scene_content(root)["gaussians"]
+    if len(layer) != count:
+        raise InputError(
+            f"layer {name!r}: expected {count} rows as the scene has Gaussians, got {len(layer)}."
+        )
+    folder = root / "layers"
+    folder.mkdir(exist_ok=True)
+    save_layer(folder / f"{name}.npz", layer)
+    return folder / f"{name}.npz"
+
+
+def check_name(what: str, name: str) -> None:
+    """Raise `InputError` unless `name` can be that of a layer or of evidence."""
+    if not _NAME.fullmatch(name):
+        raise InputError(
+            f"{what}: expected a name of letters, digits and _ . + - that does not start with "
+            f"a point or a sign, got {name!r}."
+        )
+
+
+def _write(scene: Scene, folder: Path, *, final: Path) -> None:
+    """Write into `folder`, with paths as they will be seen from `final`."""
+    for name in FOLDERS:
+        (folder / name).mkdir(exist_ok=True)
+    final, source = final.absolute(), scene.source and scene.source.absolute()
+    views = [_absolute(view) for view in scene.views]
+    cameras = cameras_content(views, folder=final / "cameras", source=source)
+    write_splats(scene.gaussians, folder / GAUSSIANS_FILE)
+    write_json(folder / CAMERAS_FILE, cameras)
+    splits = sorted({view.split for view in scene.views})
+    write_json(
+        folder / SCENE_FILE,
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "gaussians": len(scene.gaussians),
+            "source": None
+            if source is None
+            else {
+                "relative": relative_path(source, start=final),
+                "absolute": source.as_posix(),
+            },
+            "split": {
+                split: [view.name for view in scene.views if view.split == split]
+                for split in splits
+            },
+            "up": None if scene.up is None else list(scene.up),
+            "metres_per_unit": scene.metres_per_unit,
+            "classes": None if scene.classes is None else class_rows(scene.classes),
+            "provenance": dict(scene.provenance),
+        },
+    )
+
+
+def _absolute(view: View) -> View:
+    return replace(
+        view,
+        image=view.image and view.image.absolute(),
+        mask=view.mask and view.mask.absolute(),
+        depth=view.depth and view.depth.absolute(),
+    )
+
+
+def _scene_content(root: Path) -> dict[str, Any]:
+    path = root / SCENE_FILE
+    if not path.is_file():
+        raise MissingFileError(f"{root}: expected a scene folder, got none (no {SCENE_FILE}).")
+    content = read_json(path)
+    version = content.get("version")
+    if content.get("format") != FORMAT or not isinstance(version, int):
+        raise FileFormatError(f"{path}: expected a scene, got {content.get('format')!r}.")
+    if not 1 <= version <= VERSION:
+        raise FileFormatError(
+            f"{path}: expected a scene of version {VERSION} or less, got version {version}; "
+            "a later splatseg wrote it."
+        )
+    if not isinstance(content.get("gaussians"), int):
+        raise FileFormatError(f"{path}: expected the number of Gaussians, got none.")
+    return content
+
+
+def _source(
+    root: Path, content: Mapping[str, Any], cameras: Mapping[str, Any], data: Path | None
+) -> Path | None:
+    photographs = source_paths(cameras)
+    if data is not None:
+        if not data.is_dir():
+            raise MissingFileError(f"{data}: there is no such folder of photographs.")
+        missing = [name for name in photographs if not (data / name).is_file()]
+        if missing:
+            raise MissingFileError(
+                f"{data}: {len(missing)} of {len(photographs)} photographs of the scene are not "
+                f"there ({', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''})."
+            )
+        return data
+    source = content.get("source")
+    if not isinstance(source, dict):
+        return None
+    entry = cast(dict[str, Any], source)
+    places = [
+        Path(os.path.normpath(root / str(entry.get("relative")))),
+        Path(str(entry.get("absolute"))),
+    ]
+    there = [place for place in places if place.is_dir()]
+    with_photographs = [p for p in there if not photographs or (p / photographs[0]).is_file()]
+    return next(iter([*with_photographs, *there, places[1]]))
+
+
+def _with_splits(
+    root: Path, content: Mapping[str, Any], views: tuple[View, ...]
+) -> tuple[View, ...]:
+    """Views with the splits of scene.json, which come before those of the cameras file."""
+    split = content.get("split")
+    if not isinstance(split, dict) or not all(isinstance(v, list) for v in split.values()):  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]
+        raise FileFormatError(f"{root / SCENE_FILE}: expected a split of lists of view names.")
+    lists = cast(dict[str, list[str]], split)
+    of_view = {name: key for key, names in lists.items() for name in names}
+    names = {view.name for view in views}
+    if set(of_view) != names or sum(len(n) for n in lists.values()) != len(names):
+        raise FileFormatError(
+            f"{root / SCENE_FILE}: expected a split that names each view of {CAMERAS_FILE} once."
+        )
+    return tuple(
+        view if view.split == of_view[view.name] else replace(view, split=of_view[view.name])
+        for view in views
+    )
+
+
+def _up(root: Path, content: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    up = content.get("up")
+    if up is None:
+        return None
+    values = cast(list[object], up) if isinstance(up, list) else []
+    if len(values) != 3 or not all(isinstance(v, (int, float)) for v in values):
+        raise FileFormatError(f"{root / SCENE_FILE}: expected up as three numbers, got {up!r:.60}.")
+    x, y, z = (float(cast(float, v)) for v in values)
+    return (x, y, z)
