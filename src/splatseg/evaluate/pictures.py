@@ -1,0 +1,218 @@
+"""Label maps, depth and errors as pictures, and pictures side by side on one sheet."""
+
+import colorsys
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from splatseg._check import check_shape
+from splatseg.core import ClassTable
+from splatseg.errors import InputError
+
+Colour = tuple[int, int, int]
+
+_NOTHING: Colour = (24, 24, 28)
+_WRONG: Colour = (226, 48, 48)
+_UNKNOWN: Colour = (90, 120, 220)
+# From far to near: dark blue, teal, sand. Its brightness grows steadily.
+_DEPTH_STEPS = ((22, 24, 60), (26, 74, 118), (38, 132, 138), (126, 184, 126), (244, 226, 150))
+
+_PAPER: Colour = (250, 249, 246)
+_INK: Colour = (32, 34, 40)
+_QUIET: Colour = (112, 114, 122)
+_MARGIN = 20
+_GAP = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Picture:
+    """An image for a page or sheet."""
+
+    image: UInt8[Tensor, "height width 3"]
+    """sRGB."""
+
+    caption: str = ""
+    """A few words under it; also what is read out for it."""
+
+    kind: Literal["photo", "chart"] = "photo"
+    """A photo is embedded as JPEG, a chart (few flat colours) as PNG without loss."""
+
+    def __post_init__(self) -> None:
+        check_shape("image", self.image, (None, None, 3))
+        if self.image.dtype != torch.uint8:
+            raise InputError(f"image: expected 8-bit colours (uint8), got {self.image.dtype}.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gallery:
+    """Rows of pictures under common column titles: one row a view, say."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, tuple[Picture, ...]], ...]
+    """Label and pictures of each row."""
+
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        for label, pictures in self.rows:
+            if len(pictures) != len(self.columns):
+                raise InputError(
+                    f"rows: expected {len(self.columns)} pictures as there are columns, "
+                    f"row {label!r} has {len(pictures)}."
+                )
+
+
+def colour_of(id: int, classes: ClassTable | None = None) -> Colour:
+    """The class table's colour of an id, else a colour of its own; -1 is nearly black.
+
+    Colours that are made up walk round the hues by the golden ratio, and through brightness by
+    another irrational step, so that no two of the first forty look alike.
+    """
+    if id < 0:
+        return _NOTHING
+    if classes is not None:
+        for row in classes.rows:
+            if row.id == id and row.colour is not None:
+                return row.colour
+    hue = (id * 0.6180339887) % 1.0
+    light = 0.40 + 0.38 * ((id * 0.7548776662) % 1.0)
+    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.62)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def colour_labels(
+    ids: Int[Tensor, "height width"], classes: ClassTable | None = None
+) -> UInt8[Tensor, "height width 3"]:
+    """A label map in colours, see `colour_of`."""
+    check_shape("ids", ids, (None, None))
+    found, index = torch.unique(ids, return_inverse=True)
+    colours = [colour_of(int(id), classes) for id in found]
+    return torch.tensor(colours, dtype=torch.uint8)[index]
+
+
+def colour_depth(
+    depth: Float[Tensor, "height width"], *, near: float | None = None, far: float | None = None
+) -> UInt8[Tensor, "height width 3"]:
+    """Depth from dark blue (far) to sand (near); nearly black where it is 0, nothing.
+
+    Args:
+        depth: z-depth, scene units.
+        near: Depth that is shown lightest; None is the nearest hundredth of the map.
+        far: Depth that is shown darkest; None is the farthest hundredth.
+    """
+    check_shape("depth", depth, (None, None))
+    known = depth > 0
+    values = depth[known].double()
+    if not len(values):
+        return torch.tensor(_NOTHING, dtype=torch.uint8).expand(*depth.shape, 3).clone()
+    if near is None:
+        near = float(torch.quantile(_thinned(values), 0.01))
+    if far is None:
+        far = float(torch.quantile(_thinned(values), 0.99))
+    share = ((far - depth.double()) / max(far - near, 1e-9)).clamp(0, 1)
+    steps = torch.tensor(_DEPTH_STEPS, dtype=torch.float64)
+    place = share * (len(steps) - 1)
+    low = place.floor().long().clamp(max=len(steps) - 2)
+    mixed = torch.lerp(steps[low], steps[low + 1], (place - low).unsqueeze(-1))
+    return torch.where(
+        known.unsqueeze(-1), mixed.round(), torch.tensor(_NOTHING, dtype=torch.float64)
+    ).to(torch.uint8)
+
+
+def mark_errors(
+    image: UInt8[Tensor, "height width 3"],
+    ids: Int[Tensor, "height width"],
+    *,
+    truth: Int[Tensor, "height width"],
+) -> UInt8[Tensor, "height width 3"]:
+    """A grey photograph with wrong pixels in red, unlabelled ones in blue.
+
+    Pixels whose truth is not known (-1) stay grey.
+    """
+    check_shape("ids", ids, image.shape[:2])
+    check_shape("truth", truth, image.shape[:2])
+    grey = image.double().mean(dim=-1, keepdim=True).expand(*image.shape) * 0.75 + 50
+    wrong = (ids != truth) & (truth >= 0)
+    out = torch.where(wrong.unsqueeze(-1), 0.25 * grey + 0.75 * torch.tensor(_WRONG).double(), grey)
+    missing = wrong & (ids < 0)
+    out = torch.where(
+        missing.unsqueeze(-1), 0.25 * grey + 0.75 * torch.tensor(_UNKNOWN).double(), out
+    )
+    return out.clamp(0, 255).round().to(torch.uint8)
+
+
+def contact_sheet(
+    gallery: Gallery, *, subtitle: str = "", cell_width: int = 320
+) -> UInt8[Tensor, "height width 3"]:
+    """All pictures of a gallery on one sheet, with its title and labels.
+
+    Args:
+        gallery: What is shown.
+        subtitle: A line under the title.
+        cell_width: Width of each picture on the sheet, pixels.
+
+    Raises:
+        InputError: If there are no pictures.
+    """
+    if not gallery.rows or not gallery.columns:
+        raise InputError("gallery: expected at least one row and one column of pictures.")
+    title_font, text_font, label_font = (ImageFont.load_default(size) for size in (26, 16, 13))
+    head = _MARGIN + 36 + (24 if subtitle else 0) + 26
+    heights = [max(_scaled_height(p, cell_width) for p in pics) for _, pics in gallery.rows]
+    label_height = 20
+    width = 2 * _MARGIN + len(gallery.columns) * (cell_width + _GAP) - _GAP
+    height = head + sum(heights) + len(heights) * (label_height + _GAP) + _MARGIN
+    sheet = Image.new("RGB", (width, height), _PAPER)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((_MARGIN, _MARGIN - 4), gallery.title, fill=_INK, font=title_font)
+    if subtitle:
+        draw.text((_MARGIN, _MARGIN + 32), subtitle, fill=_QUIET, font=text_font)
+    for column, name in enumerate(gallery.columns):
+        x = _MARGIN + column * (cell_width + _GAP)
+        draw.text((x, head - 22), name, fill=_INK, font=text_font)
+    y = head
+    for (label, pictures), row_height in zip(gallery.rows, heights, strict=True):
+        for column, picture in enumerate(pictures):
+            x = _MARGIN + column * (cell_width + _GAP)
+            small = _resized(picture, cell_width)
+            sheet.paste(small, (x, y))
+            words = label if column == 0 else picture.caption
+            words = _fitting(draw, words, label_font, cell_width)
+            draw.text((x, y + row_height + 2), words, fill=_QUIET, font=label_font)
+        y += row_height + label_height + _GAP
+    return torch.from_numpy(np.array(sheet))
+
+
+def _thinned(values: Tensor) -> Tensor:
+    """At most about a million values: `torch.quantile` takes no more than 16 million."""
+    return values[:: max(1, len(values) // 1_000_000)]
+
+
+def _scaled_height(picture: Picture, width: int) -> int:
+    return max(1, round(picture.image.shape[0] * width / picture.image.shape[1]))
+
+
+def _resized(picture: Picture, width: int) -> Image.Image:
+    """A photo smoothly, a chart without mixing its colours."""
+    method = Image.Resampling.LANCZOS if picture.kind == "photo" else Image.Resampling.NEAREST
+    image = Image.fromarray(picture.image.cpu().numpy())
+    return image.resize((width, _scaled_height(picture, width)), method)
+
+
+def _fitting(
+    draw: ImageDraw.ImageDraw,
+    text: str,
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
+    width: int,
+) -> str:
+    if draw.textlength(text, font=font) <= width:
+        return text
+    while text and draw.textlength(text + "...", font=font) > width:
+        text = text[:-1]
+    return text.rstrip() + "..."

@@ -1,0 +1,105 @@
+"""Colours of ids, depth and errors; sheets of pictures."""
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import ClassInfo, ClassTable
+from splatseg.errors import InputError, ShapeError
+from splatseg.evaluate.pictures import (
+    Gallery,
+    Picture,
+    colour_depth,
+    colour_labels,
+    colour_of,
+    contact_sheet,
+    mark_errors,
+)
+
+CLASSES = ClassTable(
+    rows=(ClassInfo(id=2, name="a", colour=(1, 2, 3)), ClassInfo(id=4, name="b", colour=None))
+)
+
+
+def plain(colour, height=30, width=40, **more) -> Picture:
+    image = torch.tensor(colour, dtype=torch.uint8).expand(height, width, 3)
+    return Picture(image=image, **more)
+
+
+def test_ids_take_the_tables_colours():
+    ids = torch.tensor([[2, -1], [4, 2]], dtype=torch.int32)
+    image = colour_labels(ids, CLASSES)
+    assert image.dtype == torch.uint8
+    assert image[0, 0].tolist() == image[1, 1].tolist() == [1, 2, 3]
+    assert tuple(image[1, 0].tolist()) == colour_of(4, CLASSES) == colour_of(4)
+    assert max(image[0, 1].tolist()) < 40  # none is nearly black
+
+
+def test_made_up_colours_differ_from_each_other():
+    colours = np.array([colour_of(i) for i in range(40)], dtype=float)
+    gaps = np.linalg.norm(colours[:, None] - colours[None], axis=-1)
+    np.fill_diagonal(gaps, np.inf)
+    assert gaps.min() > 20
+    assert np.diagonal(gaps, offset=1).min() > 100  # neighbours clearly
+
+
+def test_depth_gets_darker_with_distance():
+    depth = torch.linspace(1.0, 5.0, 50).repeat(4, 1)
+    image = colour_depth(depth, near=1.0, far=5.0).float()
+    grey = image[0].mean(dim=-1)
+    assert bool((grey[1:] < grey[:-1] + 1e-6).all())
+    assert image[0, 0].tolist() == [244, 226, 150]
+    assert image[0, -1].tolist() == [22, 24, 60]
+    # Beyond the range the ends stay.
+    ends = colour_depth(torch.tensor([[0.5, 9.0]]), near=1.0, far=5.0)
+    assert ends[0].tolist() == [[244, 226, 150], [22, 24, 60]]
+
+
+def test_depth_zero_is_nothing():
+    image = colour_depth(torch.tensor([[0.0, 2.0, 3.0]]))
+    assert image[0, 0].tolist() == [24, 24, 28]
+    assert colour_depth(torch.zeros(2, 2)).float().std(dim=(0, 1)).max() == 0
+    assert colour_depth(torch.full((2, 2), 3.0)).shape == (2, 2, 3)  # one depth has no range
+
+
+def test_errors_are_red_missing_ones_blue_and_void_is_left_alone():
+    image = torch.full((1, 4, 3), 100, dtype=torch.uint8)
+    ids = torch.tensor([[1, 2, -1, 1]])
+    truth = torch.tensor([[1, 1, 1, -1]])
+    right, wrong, missing, void = mark_errors(image, ids, truth=truth)[0].tolist()
+    assert right == void == [125, 125, 125]
+    assert wrong[0] > wrong[2] + 80
+    assert missing[2] > missing[0] + 80
+    with pytest.raises(ShapeError, match="^truth"):
+        mark_errors(image, ids, truth=truth[:, :2])
+
+
+def test_a_sheet_shows_each_picture_in_its_place():
+    red, green = plain((250, 0, 0), kind="chart"), plain((0, 250, 0), caption="g", kind="chart")
+    gallery = Gallery(
+        title="T", columns=("left", "right"), rows=(("one", (red, green)), ("two", (green, red)))
+    )
+    sheet = contact_sheet(gallery, cell_width=80).int()
+    assert sheet.shape[1] == 2 * 20 + 2 * 80 + 6
+    reds = ((sheet[..., 0] == 250) & (sheet[..., 1] == 0)).nonzero().float()
+    greens = ((sheet[..., 1] == 250) & (sheet[..., 0] == 0)).nonzero().float()
+    assert len(reds) == len(greens) == 2 * 80 * 60
+    upper = reds[reds[:, 0] < sheet.shape[0] / 2 + 20]
+    assert float(upper[:, 1].max()) == 20 + 80 - 1
+    assert float(upper[:, 1].min()) == 20
+    # Words are drawn: the title's ink on paper.
+    assert int(sheet[:50].amin()) < 100
+
+
+def test_a_longer_subtitle_makes_room_and_long_labels_are_cut():
+    gallery = Gallery(title="T", columns=("c",), rows=(("long " * 40, (plain((9, 9, 9)),)),))
+    low = contact_sheet(gallery, cell_width=60)
+    high = contact_sheet(gallery, cell_width=60, subtitle="words")
+    assert high.shape[0] == low.shape[0] + 24
+    # Nothing is written into the margin on the right.
+    assert int(low[:, -20:].amin()) > 200
+
+
+def test_an_empty_sheet_is_refused():
+    with pytest.raises(InputError, match="at least one row"):
+        contact_sheet(Gallery(title="T", columns=("c",), rows=()))
