@@ -108,7 +108,11 @@ def _frame(view: View, *, folder: Path, source: Path | None) -> dict[str, Any]:
             frame[f"source_{key}"] = below
     if view.depth is not None and view.depth_unit is not None:
         frame["depth_unit_scale_factor"] = view.depth_unit
-    frame |= {"camera_model": _MODEL_NAMES[camera.model], "w": camera.width, "h": camera.height}
+    frame |= {
+        "camera_model": _MODEL_NAMES[camera.model],
+        "w": camera.width,
+        "h": camera.height,
+    }
     frame |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     frame |= dict(zip(_DISTORTION[camera.model], camera.distortion, strict=True))
     frame["transform_matrix"] = (world_from_cam @ _FLIP).tolist()
@@ -162,7 +166,8 @@ def _camera(merged: Mapping[str, Any], frame: Mapping[str, Any], *, where: str) 
     pinhole = merged.get("camera_model") == _MODEL_NAMES["pinhole"]
     matrix = frame_matrix(frame, where=where)
     pose = checked_pose(
-        matrix if not np.isfinite(matrix).all() else opencv_from_opengl(matrix), where=where
+        matrix if not np.isfinite(matrix).all() else opencv_from_opengl(matrix),
+        where=where,
     )
     return Camera(
         width=int(number(merged, "w", None, where=where)),

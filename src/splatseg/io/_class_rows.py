@@ -1,4 +1,4 @@
-"""Class tables as JSON rows: ``{"id": 1, "name": "wall", "isthing": false, "colour": [r, g, b]}``."""
+"""Class tables as JSON rows: id, name, isthing and, where there is one, colour [r, g, b]."""
 
 from typing import Any, cast
 

@@ -42,7 +42,10 @@ def save_layer(path: Path, layer: Layer) -> None:
             header |= {"kind": "labels", "background": _void(layer.background)}
             arrays = {"ids": _ids(layer.ids), "confidence": _floats(layer.confidence)}
             if layer.candidates is not None and layer.shares is not None:
-                arrays |= {"candidates": _ids(layer.candidates), "shares": _floats(layer.shares)}
+                arrays |= {
+                    "candidates": _ids(layer.candidates),
+                    "shares": _floats(layer.shares),
+                }
         case Features():
             header |= {"kind": "features"}
             arrays = {"values": _floats(layer.values)}

@@ -229,7 +229,10 @@ def _scene_content(root: Path) -> dict[str, Any]:
 
 
 def _source(
-    root: Path, content: Mapping[str, Any], cameras: Mapping[str, Any], data: Path | None
+    root: Path,
+    content: Mapping[str, Any],
+    cameras: Mapping[str, Any],
+    data: Path | None,
 ) -> Path | None:
     photographs = source_paths(cameras)
     if data is not None:

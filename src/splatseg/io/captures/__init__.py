@@ -9,6 +9,8 @@ from pathlib import Path
 from splatseg._check import check_choice
 from splatseg.core import Capture
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.captures._metadata import Metadata as Metadata
+from splatseg.io.captures._metadata import read_metadata as read_metadata
 from splatseg.io.captures.blender import find_blender, read_blender
 from splatseg.io.captures.colmap import find_colmap, read_colmap
 from splatseg.io.captures.idr import FILES as _IDR_FILES
@@ -89,9 +91,7 @@ def _from_file(path: Path) -> tuple[Path, str]:
     named = {_NERFSTUDIO_FILE: "nerfstudio", "transforms_train.json": "blender"}
     named |= {_LLFF_FILE: "llff"} | dict.fromkeys(_IDR_FILES, "idr")
     if path.name not in named:
-        raise InputError(
-            f"{path}: expected a capture's folder or one of {', '.join(named)}."
-        )
+        raise InputError(f"{path}: expected a capture's folder or one of {', '.join(named)}.")
     return path.parent, named[path.name]
 
 

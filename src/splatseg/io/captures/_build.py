@@ -97,15 +97,11 @@ def build_capture(
         intrinsics = scaled_to(view.intrinsics, (width, height), where=str(view.image))
         if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
             before = f"{view.intrinsics.width}x{view.intrinsics.height}"
-            scaled[
-                f"intrinsics of {before} were scaled to photographs of {width}x{height}"
-            ] += 1
+            scaled[f"intrinsics of {before} were scaled to photographs of {width}x{height}"] += 1
         views.append(
             View(
                 name=name,
-                camera=_camera(
-                    view, intrinsics, width, height, where=f"{path}: {view.relative}"
-                ),
+                camera=_camera(view, intrinsics, width, height, where=f"{path}: {view.relative}"),
                 image=view.image,
                 split=split,
                 mask=view.mask,
@@ -167,9 +163,7 @@ def view_names(relatives: Sequence[str]) -> list[str]:
     ]
 
 
-def scaled_to(
-    intrinsics: Intrinsics, size: tuple[int, int], *, where: str
-) -> Intrinsics:
+def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Intrinsics:
     """Intrinsics in pixels of a photograph of another size but the same shape.
 
     A photograph made smaller has whole pixels, so its sides may differ by up to one pixel from
@@ -184,8 +178,7 @@ def scaled_to(
         return intrinsics
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
     uniform = (
-        abs(sx * intrinsics.height - size[1]) <= 1
-        or abs(sy * intrinsics.width - size[0]) <= 1
+        abs(sx * intrinsics.height - size[1]) <= 1 or abs(sy * intrinsics.width - size[0]) <= 1
     )
     if not uniform:
         turned = abs(size[1] / intrinsics.width * intrinsics.height - size[0]) <= 1
@@ -215,9 +208,7 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
         raise InputError(f"{where}: expected a 4 x 4 pose, got shape {pose.shape}.")
     bad = int((~np.isfinite(pose)).sum())
     if bad:
-        raise InputError(
-            f"{where}: expected a finite pose, got {bad} values of 16 that are not."
-        )
+        raise InputError(f"{where}: expected a finite pose, got {bad} values of 16 that are not.")
     rotation = pose[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
@@ -227,9 +218,7 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
             f"{error:.3g} and determinant {determinant:.3g}."
         )
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > _ROTATION_EXACT:
-        raise InputError(
-            f"{where}: expected a pose whose last row is 0 0 0 1, got {pose[3]}."
-        )
+        raise InputError(f"{where}: expected a pose whose last row is 0 0 0 1, got {pose[3]}.")
     exact = pose.copy()
     exact[3] = (0, 0, 0, 1)
     if error > _ROTATION_EXACT:
@@ -250,9 +239,7 @@ def _camera(
     for name in ("fx", "fy"):
         value = float(getattr(intrinsics, name))
         if not (math.isfinite(value) and value > 0):
-            raise InputError(
-                f"{where}: expected a positive focal length, got {name} = {value:g}."
-            )
+            raise InputError(f"{where}: expected a positive focal length, got {name} = {value:g}.")
     rest = (intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
     if not all(math.isfinite(value) for value in rest):
         raise InputError(f"{where}: expected finite intrinsics, got {rest}.")

@@ -43,9 +43,7 @@ class _Cursor:
         try:
             self._data = path.read_bytes()
         except OSError as error:
-            raise FileFormatError(
-                f"{path}: cannot be read ({error.strerror})."
-            ) from error
+            raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from error
         self._offset = 0
 
     def read(self, layout: struct.Struct) -> tuple[float, ...]:
@@ -88,9 +86,7 @@ class _Cursor:
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise FileFormatError(
-                f"{self._path}: the name {raw!r:.80} is not UTF-8."
-            ) from error
+            raise FileFormatError(f"{self._path}: the name {raw!r:.80} is not UTF-8.") from error
 
     def finish(self) -> None:
         """Refuse bytes after the last record."""
@@ -126,9 +122,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             )
         name, count = MODELS[model]
         parameters = cursor.read(struct.Struct(f"<{count}d"))
-        cameras[id] = ColmapCamera(
-            model=name, width=width, height=height, parameters=parameters
-        )
+        cameras[id] = ColmapCamera(model=name, width=width, height=height, parameters=parameters)
     cursor.finish()
     return cameras
 
@@ -194,9 +188,7 @@ def read_frames(path: Path) -> tuple[ColmapFrame, ...]:
     for _ in range(cursor.count(_FRAME.size)):
         _, rig_id, *pose, count = cursor.read(_FRAME)
         data = [cursor.read(_DATA) for _ in range(int(count))]
-        images = tuple(
-            (int(s), int(i)) for kind, s, i in data if kind == _CAMERA_SENSOR
-        )
+        images = tuple((int(s), int(i)) for kind, s, i in data if kind == _CAMERA_SENSOR)
         frames.append(
             ColmapFrame(
                 rig_id=int(rig_id),

@@ -157,9 +157,7 @@ def poses_of(model: ColmapModel, *, where: str) -> dict[int, NDArray[np.float64]
     for frame in model.frames:
         rig = model.rigs.get(frame.rig_id)
         if rig is None:
-            raise InputError(
-                f"{where}: a frame names rig {frame.rig_id}, which is not there."
-            )
+            raise InputError(f"{where}: a frame names rig {frame.rig_id}, which is not there.")
         for camera_id, image_id in frame.images:
             if image_id not in poses:
                 # An image of the frame that was not registered has no row of its own.

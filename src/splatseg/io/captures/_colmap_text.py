@@ -40,9 +40,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             parameters=tuple(float(p) for p in parameters),
         )
 
-    return dict(
-        _parsed(path, _rows(path), parse, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
-    )
+    return dict(_parsed(path, _rows(path), parse, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"))
 
 
 def read_images(path: Path) -> dict[int, ColmapImage]:
@@ -66,9 +64,7 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
             cam_from_world=rigid_matrix(tuple(float(w) for w in words[1:8])),
         )
 
-    return dict(
-        _parsed(path, rows, parse, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-    )
+    return dict(_parsed(path, rows, parse, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"))
 
 
 def read_points(path: Path) -> PointCloud:
@@ -104,9 +100,7 @@ def read_rigs(path: Path) -> dict[int, ColmapRig]:
                 poses[sensor] = pose
         return int(id), ColmapRig(cam_from_rig=poses)
 
-    return dict(
-        _parsed(path, _rows(path), parse, "RIG_ID NUM_SENSORS REF_TYPE REF_ID SENSORS")
-    )
+    return dict(_parsed(path, _rows(path), parse, "RIG_ID NUM_SENSORS REF_TYPE REF_ID SENSORS"))
 
 
 def read_frames(path: Path) -> tuple[ColmapFrame, ...]:
@@ -127,20 +121,14 @@ def _lines(path: Path) -> list[str]:
     try:
         return path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
-        raise FileFormatError(
-            f"{path}: expected a text file in UTF-8 ({error})."
-        ) from error
+        raise FileFormatError(f"{path}: expected a text file in UTF-8 ({error}).") from error
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
 def _rows(path: Path) -> list[tuple[int, str]]:
-    lines = [
-        (number, line.strip()) for number, line in enumerate(_lines(path), start=1)
-    ]
-    return [
-        (number, line) for number, line in lines if line and not line.startswith("#")
-    ]
+    lines = [(number, line.strip()) for number, line in enumerate(_lines(path), start=1)]
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
 def _parsed(

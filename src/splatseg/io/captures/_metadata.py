@@ -46,9 +46,7 @@ def read_metadata(folder: Path) -> Metadata:
         return Metadata()
     content = read_json(path)
     return Metadata(
-        classes=class_table(content["classes"], where=str(path))
-        if "classes" in content
-        else None,
+        classes=class_table(content["classes"], where=str(path)) if "classes" in content else None,
         up=_UP_AXES.get(str(content.get("up_axis", ""))),
         metres_per_unit=_METRES.get(str(content.get("units", ""))),
     )

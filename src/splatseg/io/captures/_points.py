@@ -29,15 +29,11 @@ class _Element:
     """Name and NumPy type code of each scalar property."""
 
 
-def point_cloud(
-    points: NDArray[np.floating], colours: NDArray[np.uint8] | None
-) -> PointCloud:
+def point_cloud(points: NDArray[np.floating], colours: NDArray[np.uint8] | None) -> PointCloud:
     """A point cloud of NumPy arrays."""
     return PointCloud(
         points=torch.from_numpy(np.ascontiguousarray(points, np.float32)),
-        colours=None
-        if colours is None
-        else torch.from_numpy(np.ascontiguousarray(colours)),
+        colours=None if colours is None else torch.from_numpy(np.ascontiguousarray(colours)),
     )
 
 
@@ -60,9 +56,7 @@ def read_ply_points(path: Path) -> PointCloud:
     vertex = elements[0]
     names = [name for name, _ in vertex.fields]
     if not {"x", "y", "z"} <= set(names) or len(set(names)) != len(names):
-        raise FileFormatError(
-            f"{path}: expected vertices with x, y and z, got {', '.join(names)}."
-        )
+        raise FileFormatError(f"{path}: expected vertices with x, y and z, got {', '.join(names)}.")
     rows = _rows(path, order, vertex, offset)
     points = np.stack([rows[axis] for axis in "xyz"], axis=1)
     if not np.isfinite(points).all():
@@ -80,9 +74,7 @@ def _header(path: Path) -> tuple[str, list[_Element], int]:
     end = head.find(b"end_header")
     newline = head.find(b"\n", end)
     if not head.startswith(b"ply") or end < 0 or newline < 0:
-        raise FileFormatError(
-            f"{path}: expected a PLY file, but its header is not one."
-        )
+        raise FileFormatError(f"{path}: expected a PLY file, but its header is not one.")
     order, elements = "", list[_Element]()
     for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
@@ -98,13 +90,9 @@ def _header(path: Path) -> tuple[str, list[_Element], int]:
                 fields = (*last.fields, (words[2], _TYPES[words[1]]))
                 elements[-1] = _Element(name=last.name, count=last.count, fields=fields)
             elif last.name == "vertex" or len(words) != 5:
-                raise FileFormatError(
-                    f"{path}: PLY property {line.strip()!r} is not understood."
-                )
+                raise FileFormatError(f"{path}: PLY property {line.strip()!r} is not understood.")
         else:
-            raise FileFormatError(
-                f"{path}: PLY header line {line.strip()!r} is not understood."
-            )
+            raise FileFormatError(f"{path}: PLY header line {line.strip()!r} is not understood.")
     if not order:
         raise FileFormatError(f"{path}: expected a PLY file that names its format.")
     return order, elements, newline + 1
@@ -124,16 +112,12 @@ def _rows(path: Path, order: str, vertex: _Element, offset: int) -> NDArray[np.v
 
 
 def _ascii_rows(path: Path, vertex: _Element, offset: int) -> NDArray[np.void]:
-    dtype = np.dtype(
-        [(name, "f8" if code[0] == "f" else code) for name, code in vertex.fields]
-    )
+    dtype = np.dtype([(name, "f8" if code[0] == "f" else code) for name, code in vertex.fields])
     lines = path.read_bytes()[offset:].split(b"\n")[: vertex.count]
     rows = np.empty(vertex.count, dtype)
     try:
         values = [tuple(float(word) for word in line.split()) for line in lines]
-        if len(values) != vertex.count or any(
-            len(row) != len(vertex.fields) for row in values
-        ):
+        if len(values) != vertex.count or any(len(row) != len(vertex.fields) for row in values):
             raise ValueError("a row is missing or has the wrong number of values")
         rows[:] = values
     except (ValueError, OverflowError) as error:
@@ -156,7 +140,5 @@ def _colours(rows: NDArray[np.void], names: list[str]) -> NDArray[np.uint8] | No
             return np.clip(values, 0, 255).astype(np.uint8)
     if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(names):
         harmonics = np.stack([rows[f"f_dc_{i}"] for i in range(3)], axis=1)
-        return (
-            np.clip(0.5 + SH_C0 * np.nan_to_num(harmonics), 0, 1) * 255 + 0.5
-        ).astype(np.uint8)
+        return (np.clip(0.5 + SH_C0 * np.nan_to_num(harmonics), 0, 1) * 255 + 0.5).astype(np.uint8)
     return None

@@ -44,29 +44,20 @@ def read_blender(folder: Path) -> Capture:
     return build_capture(folder, raw, format="blender", points=points_beside(folder))
 
 
-def _raw_view(
-    content: Mapping[str, Any], frame: object, split: str, *, path: Path
-) -> RawView:
+def _raw_view(content: Mapping[str, Any], frame: object, split: str, *, path: Path) -> RawView:
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):  # pyright: ignore[reportUnknownMemberType]
-        raise FileFormatError(
-            f"{path}: expected frames with a file_path, got {frame!r:.60}."
-        )
+        raise FileFormatError(f"{path}: expected frames with a file_path, got {frame!r:.60}.")
     entry: dict[str, Any] = frame  # pyright: ignore[reportUnknownVariableType]
     relative = entry["file_path"].replace("\\", "/").removeprefix("./")
     where = f"{path}: frame {relative!r}"
     image = path.parent / relative
     if image.suffix.lower() not in IMAGE_SUFFIXES:
-        tried = [
-            image.parent / f"{image.name}{suffix}"
-            for suffix in (".png", ".jpg", ".jpeg")
-        ]
+        tried = [image.parent / f"{image.name}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
         image = next((file for file in tried if file.is_file()), tried[0])
         relative += image.suffix
     # The layout does not tell the size; a photograph that is missing is reported later.
     width, height = image_size(image) if image.is_file() else (1, 1)
-    focal = focal_of(
-        number({**content, **entry}, "camera_angle_x", None, where=where), width
-    )
+    focal = focal_of(number({**content, **entry}, "camera_angle_x", None, where=where), width)
     return RawView(
         image=image,
         relative=relative,

@@ -21,9 +21,7 @@ def find_colmap(folder: Path) -> Path | None:
     for name in _MODEL_FOLDERS:
         model = folder / name
         for suffix in (".bin", ".txt"):
-            if all(
-                (model / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")
-            ):
+            if all((model / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")):
                 return model
     return None
 
@@ -89,9 +87,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     reader, suffix = (_colmap_binary, ".bin") if binary else (_colmap_text, ".txt")
-    points, rigs, frames = (
-        folder / f"{stem}{suffix}" for stem in ("points3D", "rigs", "frames")
-    )
+    points, rigs, frames = (folder / f"{stem}{suffix}" for stem in ("points3D", "rigs", "frames"))
     five = rigs.is_file() and frames.is_file()
     return ColmapModel(
         cameras=reader.read_cameras(folder / f"cameras{suffix}"),
@@ -121,12 +117,8 @@ def _notes(root: Path, model: Path) -> list[str]:
     if parent.name != "sparse":
         return []
     others = sorted(
-        p.name
-        for p in parent.iterdir()
-        if p.is_dir() and p.name != model.name and find_colmap(p)
+        p.name for p in parent.iterdir() if p.is_dir() and p.name != model.name and find_colmap(p)
     )
     if not others:
         return []
-    return [
-        f"{parent.relative_to(root)} holds further models ({', '.join(others)}); 0 was read"
-    ]
+    return [f"{parent.relative_to(root)} holds further models ({', '.join(others)}); 0 was read"]

@@ -43,9 +43,7 @@ def read_idr(folder: Path) -> Capture:
     if path is None:
         raise MissingFileError(f"{folder}: expected {' or '.join(FILES)}, got neither.")
     matrices = _matrices(path)
-    images = next(
-        (found for name in _IMAGE_FOLDERS if (found := find_images(folder / name))), ()
-    )
+    images = next((found for name in _IMAGE_FOLDERS if (found := find_images(folder / name))), ())
     if len(images) != len(matrices):
         raise InputError(
             f"{path}: expected one world_mat a photograph, got {len(matrices)} for "
@@ -53,9 +51,7 @@ def read_idr(folder: Path) -> Capture:
         )
     if not images:
         raise InputError(f"{path}: expected photographs with poses, got none.")
-    masks = {
-        mask.stem: mask for name in _MASK_FOLDERS for mask in find_images(folder / name)
-    }
+    masks = {mask.stem: mask for name in _MASK_FOLDERS for mask in find_images(folder / name)}
     parts = [
         decompose(p, where=f"{path}: world_mat of {i.name}")
         for p, i in zip(matrices, images, strict=True)
@@ -79,14 +75,8 @@ def read_idr(folder: Path) -> Capture:
         )
         for image, (k, pose), (width, height) in zip(images, parts, sizes, strict=True)
     ]
-    notes = (
-        []
-        if scale == 1
-        else [f"intrinsics were scaled by {scale:g} to fit the photographs"]
-    )
-    return build_capture(
-        folder, raw, format="idr", points=points_beside(folder), notes=notes
-    )
+    notes = [] if scale == 1 else [f"intrinsics were scaled by {scale:g} to fit the photographs"]
+    return build_capture(folder, raw, format="idr", points=points_beside(folder), notes=notes)
 
 
 def decompose(
@@ -102,9 +92,7 @@ def decompose(
     """
     left = projection[:3, :3]
     if not np.isfinite(projection).all() or abs(np.linalg.det(left)) < 1e-12:
-        raise InputError(
-            f"{where}: expected a projection matrix, got a singular or infinite one."
-        )
+        raise InputError(f"{where}: expected a projection matrix, got a singular or infinite one.")
     sign = np.sign(np.linalg.det(left))
     flip = np.eye(3)[::-1]
     q, r = np.linalg.qr((flip @ (sign * left)).T)
@@ -130,9 +118,7 @@ def _matrices(path: Path) -> list[NDArray[np.float64]]:
             )
             matrices = [archive[f"world_mat_{i}"].astype(np.float64) for i in indices]
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise FileFormatError(
-            f"{path}: expected a NumPy archive, it cannot be read."
-        ) from error
+        raise FileFormatError(f"{path}: expected a NumPy archive, it cannot be read.") from error
     for index, matrix in zip(indices, matrices, strict=True):
         if matrix.shape not in ((4, 4), (3, 4)):
             raise FileFormatError(
@@ -141,9 +127,7 @@ def _matrices(path: Path) -> list[NDArray[np.float64]]:
     return matrices
 
 
-def _scale(
-    ks: list[NDArray[np.float64]], sizes: list[tuple[int, int]], path: Path
-) -> float:
+def _scale(ks: list[NDArray[np.float64]], sizes: list[tuple[int, int]], path: Path) -> float:
     points = np.array([(k[0, 2], k[1, 2]) for k in ks])
     middles = np.array(sizes) / 2
     errors = [float(np.abs(points * s / middles - 1).mean()) for s in _SCALES]

@@ -29,9 +29,7 @@ def read_llff(folder: Path) -> Capture:
         InputError: If it has not one row a photograph, or what it says cannot be.
     """
     rows = _rows(folder / FILE)
-    images = next(
-        (found for name in _IMAGE_FOLDERS if (found := find_images(folder / name))), ()
-    )
+    images = next((found for name in _IMAGE_FOLDERS if (found := find_images(folder / name))), ())
     if len(images) != len(rows):
         raise InputError(
             f"{folder / FILE}: expected one row a photograph, got {len(rows)} rows for "
@@ -41,9 +39,7 @@ def read_llff(folder: Path) -> Capture:
         RawView(
             image=image,
             relative=image.name,
-            intrinsics=_intrinsics(
-                row, where=f"{folder / FILE}: row {i} ({image.name})"
-            ),
+            intrinsics=_intrinsics(row, where=f"{folder / FILE}: row {i} ({image.name})"),
             cam_from_world=_cam_from_world(row),
         )
         for i, (image, row) in enumerate(zip(images, rows, strict=True))
@@ -57,12 +53,11 @@ def _rows(path: Path) -> NDArray[np.float64]:
     try:
         rows = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise FileFormatError(
-            f"{path}: expected a NumPy array, got something else."
-        ) from error
+        raise FileFormatError(f"{path}: expected a NumPy array, got something else.") from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17:
         raise FileFormatError(
-            f"{path}: expected an array of shape (n, 17), got {getattr(rows, 'shape', 'an archive')}."
+            f"{path}: expected an array of shape (n, 17), "
+            f"got {getattr(rows, 'shape', 'an archive')}."
         )
     return rows.astype(np.float64)
 
@@ -79,9 +74,7 @@ def _cam_from_world(row: NDArray[np.float64]) -> NDArray[np.float64]:
 def _intrinsics(row: NDArray[np.float64], *, where: str) -> Intrinsics:
     height, width, focal = (float(v) for v in row[:15].reshape(3, 5)[:, 4])
     if not (height >= 1 and width >= 1 and np.isfinite([height, width]).all()):
-        raise InputError(
-            f"{where}: expected a height and width, got {height:g} and {width:g}."
-        )
+        raise InputError(f"{where}: expected a height and width, got {height:g} and {width:g}.")
     return Intrinsics(
         fx=focal,
         fy=focal,

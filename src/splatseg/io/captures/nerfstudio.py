@@ -74,9 +74,7 @@ def frame_matrix(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]
     try:
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
     except (KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(
-            f"{where}: expected a transform_matrix of 4 x 4 numbers."
-        ) from error
+        raise FileFormatError(f"{where}: expected a transform_matrix of 4 x 4 numbers.") from error
     if matrix.shape == (3, 4):
         matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
     if matrix.shape != (4, 4):
@@ -95,9 +93,7 @@ def cam_from_world_of(frame: Mapping[str, Any], *, where: str) -> NDArray[np.flo
     return opencv_from_opengl(matrix)
 
 
-def number(
-    source: Mapping[str, Any], key: str, default: float | None, *, where: str
-) -> float:
+def number(source: Mapping[str, Any], key: str, default: float | None, *, where: str) -> float:
     """A number of a JSON object.
 
     Raises:
@@ -105,15 +101,11 @@ def number(
     """
     value = source.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise FileFormatError(
-            f"{where}: expected a number for {key}, got {value!r:.40}."
-        )
+        raise FileFormatError(f"{where}: expected a number for {key}, got {value!r:.40}.")
     return float(value)
 
 
-def lens_of(
-    source: Mapping[str, Any], *, where: str
-) -> tuple[CameraModel, tuple[float, ...]]:
+def lens_of(source: Mapping[str, Any], *, where: str) -> tuple[CameraModel, tuple[float, ...]]:
     """Lens model and distortion of a transforms.json or of one frame of it.
 
     Raises:
@@ -123,9 +115,7 @@ def lens_of(
     name = source.get("camera_model", default)
     if name not in _MODELS:
         known = ", ".join(sorted(_MODELS))
-        raise FileFormatError(
-            f"{where}: expected a camera_model of {known}, got {name!r}."
-        )
+        raise FileFormatError(f"{where}: expected a camera_model of {known}, got {name!r}.")
     model = _MODELS[name]
     keys = _FISHEYE if model == "fisheye" else _OPENCV
     return model, tuple(number(source, key, 0.0, where=where) for key in keys)
@@ -139,9 +129,7 @@ def _frames(content: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
         if not isinstance(frame, dict) or not isinstance(
             cast(dict[str, Any], frame).get("file_path"), str
         ):
-            raise FileFormatError(
-                f"{path}: expected a file_path in frames[{i}], got none."
-            )
+            raise FileFormatError(f"{path}: expected a file_path in frames[{i}], got none.")
     return cast(list[Mapping[str, Any]], frames)
 
 
@@ -171,11 +159,7 @@ def _raw_view(
 
 
 def _beside(path: Path, name: object) -> Path | None:
-    return (
-        path.parent / name.replace("\\", "/")
-        if isinstance(name, str) and name
-        else None
-    )
+    return path.parent / name.replace("\\", "/") if isinstance(name, str) and name else None
 
 
 def _intrinsics(source: Mapping[str, Any], *, where: str) -> Intrinsics:
@@ -220,15 +204,11 @@ def focal_of(angle: float, size: float) -> float:
     return 0.5 * size / tangent if tangent > 0 else 0.0
 
 
-def _points(
-    content: Mapping[str, Any], folder: Path
-) -> tuple[PointCloud | None, Path | None]:
+def _points(content: Mapping[str, Any], folder: Path) -> tuple[PointCloud | None, Path | None]:
     name = content.get("ply_file_path")
     if isinstance(name, str) and name:
         path = folder / name.replace("\\", "/")
         if not path.is_file():
-            raise MissingFileError(
-                f"{path}: the start points that {FILE} names are not there."
-            )
+            raise MissingFileError(f"{path}: the start points that {FILE} names are not there.")
         return read_ply_points(path), path if ply_holds_splats(path) else None
     return points_beside(folder), None

@@ -1,0 +1,104 @@
+"""What every kind of evidence can be asked, and how its files are found."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, NoReturn
+
+from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.errors import InputError
+
+EvidenceKind = Literal["labels", "panoptic", "tracked", "masks", "features"]
+
+HEADER_FILE = "evidence.json"
+CONFIDENCE_FOLDER = "_confidence"
+# Files of a folder of evidence that are not of a view.
+_TABLES = frozenset({HEADER_FILE, "segments.json", "tracks.json", "legend.json"})
+_SHARED_ARRAYS = frozenset({"quant.npz", "basis.npz"})
+
+
+class Evidence(ABC):
+    """What one 2D model saw in the views of a capture. Nothing is kept in memory."""
+
+    @property
+    @abstractmethod
+    def folder(self) -> Path:
+        """Where the files lie."""
+
+    @property
+    @abstractmethod
+    def kind(self) -> EvidenceKind:
+        """What a file holds."""
+
+    @property
+    @abstractmethod
+    def view_names(self) -> tuple[str, ...]:
+        """Views that have a file, sorted by name."""
+
+    @property
+    @abstractmethod
+    def classes(self) -> ClassTable | None:
+        """Names of the ids that `label_map` gives; of the categories where ids are segments."""
+
+    @property
+    @abstractmethod
+    def source_ids(self) -> Mapping[int, int] | None:
+        """Id in the files by id in memory, where they differ (a source whose 0 is a class)."""
+
+    @abstractmethod
+    def label_map(self, name: str) -> LabelMap:
+        """The ids of a view, -1 where there is none.
+
+        Raises:
+            InputError: If this kind of evidence has none, or there is no such view.
+            FileFormatError: If the file cannot be read as one.
+        """
+
+    @abstractmethod
+    def masks(self, name: str) -> MaskSet:
+        """The masks of a view; of a label map one mask an id, ascending.
+
+        Raises:
+            InputError: If this kind of evidence has none, or there is no such view.
+            FileFormatError: If the file cannot be read as one.
+        """
+
+    @abstractmethod
+    def features(self, name: str) -> FeatureMap:
+        """The features of a view, float32.
+
+        Raises:
+            InputError: If this kind of evidence has none, or there is no such view.
+            FileFormatError: If the file cannot be read as one.
+        """
+
+
+def refuse(evidence: Evidence, wanted: str) -> NoReturn:
+    """Say that evidence of this kind does not hold what was asked for."""
+    raise InputError(f"{evidence.folder}: expected evidence of {wanted}, got {evidence.kind}.")
+
+
+def view_files(folder: Path, suffix: str) -> dict[str, Path]:
+    """Files of views by view name: the path below the folder without its last suffix."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob(f"*{suffix}")):
+        below = path.relative_to(folder)
+        shared = len(below.parts) == 1 and below.name in _TABLES | _SHARED_ARRAYS
+        hidden = any(part.startswith(".") for part in below.parts)
+        if path.is_file() and not shared and not hidden and below.parts[0] != CONFIDENCE_FOLDER:
+            found[below.as_posix().removesuffix(suffix)] = path
+    return dict(sorted(found.items()))
+
+
+def file_of(files: Mapping[str, Path], name: str, folder: Path) -> Path:
+    """The file of a view.
+
+    Raises:
+        InputError: If there is none.
+    """
+    if name not in files:
+        first = ", ".join(list(files)[:3])
+        raise InputError(
+            f"{folder}: there is nothing of view {name!r} among {len(files)} views ({first}, ...)."
+        )
+    return files[name]

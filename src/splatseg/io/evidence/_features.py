@@ -1,0 +1,250 @@
+"""Feature maps: an npz a view. Our own are float16; recorded ones are quantised to 8 bit.
+
+A quantised value q stands for q * scale + offset, with scale and offset by channel (and block)
+in quant.npz or basis.npz. Text features are principal components on top of that: the full
+vector is ``normalise((q * scale + offset) @ basis + mean)``.
+"""
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from typing_extensions import override
+
+from splatseg._check import check_shape
+from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
+
+QUANTISATION_FILE = "quant.npz"
+BASIS_FILE = "basis.npz"
+
+
+def read_npz(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Named arrays of an npz.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no npz, or lacks one of them.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"{path}: there is no such file.")
+    try:
+        with zipfile.ZipFile(path):
+            pass
+        with np.load(path, allow_pickle=False) as archive:
+            missing = [name for name in names if name not in archive.files]
+            if missing:
+                found = ", ".join(archive.files)
+                raise FileFormatError(f"{path}: expected an array {missing[0]!r}, got {found}.")
+            return {name: archive[name] for name in names}
+    except FileFormatError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise FileFormatError(
+            f"{path}: expected an npz, but it cannot be read ({error})."
+        ) from error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FeatureEvidence(Evidence):
+    """Dense features of each view."""
+
+    root: Path
+    files: Mapping[str, Path]
+    scale: NDArray[np.float32] | None = None
+    """(channels,) or (blocks, channels); None where features are not quantised."""
+
+    offset: NDArray[np.float32] | None = None
+    stride: int = 1
+    """Pixels a cell of quantised features."""
+
+    blocks: tuple[str, ...] = ()
+    """Names of the network's blocks, where a file holds several."""
+
+    basis: NDArray[np.float32] | None = None
+    """(components, width): full vectors by principal component."""
+
+    mean: NDArray[np.float32] | None = None
+    """(width,): the mean full vector."""
+
+    @property
+    @override
+    def folder(self) -> Path:
+        return self.root
+
+    @property
+    @override
+    def kind(self) -> EvidenceKind:
+        return "features"
+
+    @property
+    @override
+    def view_names(self) -> tuple[str, ...]:
+        return tuple(self.files)
+
+    @property
+    @override
+    def classes(self) -> ClassTable | None:
+        return None
+
+    @property
+    @override
+    def source_ids(self) -> Mapping[int, int] | None:
+        return None
+
+    @override
+    def label_map(self, name: str) -> LabelMap:
+        refuse(self, "label maps")
+
+    @override
+    def masks(self, name: str) -> MaskSet:
+        refuse(self, "masks")
+
+    @override
+    def features(self, name: str) -> FeatureMap:
+        """The features of a view; of the last block where there are several.
+
+        Principal components stay components: `expand` gives full vectors.
+        """
+        return self.block_features(name, self.blocks[-1] if self.blocks else None)
+
+    def block_features(self, name: str, block: str | None) -> FeatureMap:
+        """The features of a view from a block of the network; None where there are no blocks.
+
+        Raises:
+            InputError: If there is no such block or view.
+            FileFormatError: If the file does not hold them.
+        """
+        path = file_of(self.files, name, self.root)
+        if self.scale is None or self.offset is None:
+            return _own_features(path)
+        codes = read_npz(path, ["f"])["f"]
+        if codes.ndim != self.scale.ndim + 2 or codes.shape[-1] != self.scale.shape[-1]:
+            raise FileFormatError(
+                f"{path}: expected features of {self.scale.shape} blocks and channels, "
+                f"got shape {codes.shape}."
+            )
+        scale, offset = self.scale, self.offset
+        if self.blocks:
+            if block not in self.blocks or len(codes) != len(self.blocks):
+                known = ", ".join(self.blocks)
+                raise InputError(f"{path}: expected one of the blocks {known}, got {block!r}.")
+            index = self.blocks.index(block)
+            codes, scale, offset = codes[index], scale[index], offset[index]
+        values = codes.astype(np.float32) * scale + offset
+        return FeatureMap(
+            features=torch.from_numpy(values),
+            stride=self.stride,
+            height=values.shape[0] * self.stride,
+            width=values.shape[1] * self.stride,
+        )
+
+    def expand(self, values: Float[Tensor, "*batch components"]) -> Float[Tensor, "*batch width"]:
+        """Full unit vectors of principal components, of pixels or of lifted Gaussians.
+
+        Raises:
+            InputError: If the features are no components.
+        """
+        if self.basis is None or self.mean is None:
+            raise InputError(f"{self.root}: expected features with {BASIS_FILE}, got none.")
+        check_shape("values", values, (*values.shape[:-1], self.basis.shape[0]))
+        full = values @ torch.from_numpy(self.basis).to(values)
+        full = full + torch.from_numpy(self.mean).to(values)
+        return torch.nn.functional.normalize(full, dim=-1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TextEmbeddings:
+    """Unit vectors of words, in the space of the full text features."""
+
+    labels: tuple[str, ...]
+    vectors: Float[Tensor, "n width"]
+    kinds: tuple[str, ...]
+    """``class``, ``synonym``, ``instance`` or ``negative``."""
+
+    target_ids: tuple[int, ...]
+    """The id of the class or instance meant, -1 where there is none."""
+
+    def vector(self, label: str) -> Float[Tensor, "width"]:
+        """The vector of a word.
+
+        Raises:
+            InputError: If there is none.
+        """
+        if label not in self.labels:
+            raise InputError(
+                f"text: expected one of the {len(self.labels)} recorded words "
+                f"({', '.join(self.labels[:5])}, ...), got {label!r}."
+            )
+        return self.vectors[self.labels.index(label)]
+
+
+def load_text_embeddings(path: Path) -> TextEmbeddings:
+    """Read text_embeddings.npz, or the one in a folder.
+
+    Raises:
+        MissingFileError: If there is none.
+        FileFormatError: If it holds something else.
+    """
+    path = path / "text_embeddings.npz" if path.is_dir() else path
+    arrays = read_npz(path, ["labels", "vectors", "kind", "target_id"])
+    count = len(arrays["labels"])
+    if arrays["vectors"].ndim != 2 or any(len(array) != count for array in arrays.values()):
+        raise FileFormatError(f"{path}: expected one vector, kind and target_id a label.")
+    return TextEmbeddings(
+        labels=tuple(str(label) for label in arrays["labels"]),
+        vectors=torch.from_numpy(arrays["vectors"].astype(np.float32)),
+        kinds=tuple(str(kind) for kind in arrays["kind"]),
+        target_ids=tuple(int(id) if id > 0 else -1 for id in arrays["target_id"]),
+    )
+
+
+def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
+    """Feature evidence of a folder, quantised where quant.npz or basis.npz says so."""
+    if (folder / BASIS_FILE).is_file():
+        path = folder / BASIS_FILE
+        shared = read_npz(path, ["scale", "offset", "stride", "basis", "mean"])
+        return FeatureEvidence(
+            root=folder,
+            files=files,
+            scale=shared["scale"],
+            offset=shared["offset"],
+            stride=int(shared["stride"]),
+            basis=shared["basis"].astype(np.float32),
+            mean=shared["mean"].astype(np.float32),
+        )
+    if (folder / QUANTISATION_FILE).is_file():
+        shared = read_npz(folder / QUANTISATION_FILE, ["scale", "offset", "stride", "blocks"])
+        return FeatureEvidence(
+            root=folder,
+            files=files,
+            scale=shared["scale"],
+            offset=shared["offset"],
+            stride=int(shared["stride"]),
+            blocks=tuple(str(block) for block in shared["blocks"]),
+        )
+    return FeatureEvidence(root=folder, files=files)
+
+
+def _own_features(path: Path) -> FeatureMap:
+    arrays = read_npz(path, ["features", "stride", "size"])
+    features, size = arrays["features"], arrays["size"]
+    if features.ndim != 3 or features.dtype.kind != "f" or size.shape != (2,):
+        raise FileFormatError(
+            f"{path}: expected features of shape (rows, columns, channels) and a size, "
+            f"got {features.dtype} of {features.shape}."
+        )
+    return FeatureMap(
+        features=torch.from_numpy(features.astype(np.float32)),
+        stride=int(arrays["stride"]),
+        height=int(size[0]),
+        width=int(size[1]),
+    )

@@ -1,0 +1,182 @@
+"""Label maps: a single-channel PNG a view, 8 or 16 bit, 0 for none."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Rle
+from splatseg.errors import FileFormatError, InputError
+from splatseg.io.evidence._base import (
+    CONFIDENCE_FOLDER,
+    Evidence,
+    EvidenceKind,
+    file_of,
+    refuse,
+)
+from splatseg.io.images import open_image
+
+CONFIDENCE_STEPS = 65535
+"""A confidence of 1 in a file of confidences, 16 bit."""
+
+_MAX_FILE_ID = 65535
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IdRule:
+    """How ids in files become ids in memory.
+
+    Without a change 0 is void and becomes -1, other ids stay. With `zero_is_class` every id
+    grows by 1, so that 0 stays free for void; `void` is then the file's id of void, if any.
+    """
+
+    zero_is_class: bool = False
+    void: int | None = None
+
+    def to_memory(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Ids as they are in memory."""
+        none = np.zeros(ids.shape, bool) if self.zero_is_class else ids == 0
+        if self.void is not None:
+            none |= ids == self.void
+        shifted = ids + 1 if self.zero_is_class else ids
+        return np.where(none, np.int32(UNLABELLED), shifted).astype(np.int32)
+
+    def classes(self, table: ClassTable | None) -> ClassTable | None:
+        """A class table of the file's ids as one of the ids in memory."""
+        if table is None or not self.zero_is_class:
+            return table
+        return ClassTable(rows=tuple(replace(row, id=row.id + 1) for row in table.rows))
+
+    @property
+    def source_ids(self) -> Mapping[int, int] | None:
+        """Id in files by id in memory, where they differ."""
+        if not self.zero_is_class:
+            return None
+        return {id + 1: id for id in range(256) if id != self.void}
+
+
+def read_id_map(path: Path) -> NDArray[np.int32]:
+    """The ids of a single-channel image as they stand in the file.
+
+    A palette image gives its indices, not its colours.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it has more than one channel, or cannot be decoded.
+    """
+    with open_image(path) as image:
+        if len(image.getbands()) != 1 or image.mode == "F":
+            raise FileFormatError(
+                f"{path}: expected one channel of ids, got {image.mode}; a coloured picture of "
+                "labels is no label map."
+            )
+        try:
+            array = np.asarray(image)
+        except (OSError, SyntaxError, ValueError) as error:
+            raise FileFormatError(f"{path}: cannot be decoded ({error}).") from error
+    ids = array.astype(np.int64)
+    if ids.size and (ids.min() < 0 or ids.max() > _MAX_FILE_ID):
+        raise FileFormatError(
+            f"{path}: expected ids in [0, {_MAX_FILE_ID}], got [{ids.min()}, {ids.max()}]."
+        )
+    return ids.astype(np.int32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LabelEvidence(Evidence):
+    """One label map a view."""
+
+    root: Path
+    files: Mapping[str, Path]
+    table: ClassTable | None
+    """Classes by the ids of the files."""
+
+    rule: IdRule = IdRule()
+
+    @property
+    @override
+    def folder(self) -> Path:
+        return self.root
+
+    @property
+    @override
+    def kind(self) -> EvidenceKind:
+        return "labels"
+
+    @property
+    @override
+    def view_names(self) -> tuple[str, ...]:
+        return tuple(self.files)
+
+    @property
+    @override
+    def classes(self) -> ClassTable | None:
+        return self.rule.classes(self.table)
+
+    @property
+    @override
+    def source_ids(self) -> Mapping[int, int] | None:
+        return self.rule.source_ids
+
+    @override
+    def label_map(self, name: str) -> LabelMap:
+        ids = self.rule.to_memory(read_id_map(file_of(self.files, name, self.root)))
+        return LabelMap(ids=torch.from_numpy(ids), confidence=self._confidence(name, ids.shape))
+
+    @override
+    def masks(self, name: str) -> MaskSet:
+        return masks_of_ids(self.label_map(name))[0]
+
+    @override
+    def features(self, name: str) -> FeatureMap:
+        refuse(self, "features")
+
+    def _confidence(self, name: str, shape: tuple[int, ...]) -> torch.Tensor | None:
+        path = self.root / CONFIDENCE_FOLDER / f"{name}.png"
+        if not path.is_file():
+            return None
+        steps = read_id_map(path)
+        if steps.shape != shape:
+            raise FileFormatError(
+                f"{path}: expected {shape[1]}x{shape[0]} pixels as the label map has, "
+                f"got {steps.shape[1]}x{steps.shape[0]}."
+            )
+        return torch.from_numpy((steps / CONFIDENCE_STEPS).astype(np.float32))
+
+
+def masks_of_ids(label_map: LabelMap) -> tuple[MaskSet, tuple[int, ...]]:
+    """A mask of each id of a label map, ascending, and the ids.
+
+    The score of a mask is the mean confidence of its pixels, 1 where there is none.
+    """
+    present = [int(i) for i in torch.unique(label_map.ids).tolist() if i != UNLABELLED]
+    dense = [label_map.ids == id for id in present]
+    scores = [
+        1.0 if label_map.confidence is None else float(label_map.confidence[mask].mean())
+        for mask in dense
+    ]
+    masks = MaskSet(
+        height=label_map.height,
+        width=label_map.width,
+        masks=tuple(Rle.encode(mask) for mask in dense),
+        scores=torch.tensor(scores, dtype=torch.float32),
+        levels=torch.zeros(len(present), dtype=torch.int32),
+    )
+    return masks, tuple(present)
+
+
+def check_rule(zero_is_class: bool, void: int | None) -> IdRule:
+    """An `IdRule` after checking that it makes sense.
+
+    Raises:
+        InputError: If void is not an id of files, or 0 is both void and a class.
+    """
+    if void is not None and not 0 <= void <= _MAX_FILE_ID:
+        raise InputError(f"void: expected an id in [0, {_MAX_FILE_ID}], got {void}.")
+    if zero_is_class and void == 0:
+        raise InputError("void: expected another id than 0, which zero_is_class makes a class.")
+    return IdRule(zero_is_class=zero_is_class, void=void)

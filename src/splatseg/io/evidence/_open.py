@@ -1,0 +1,144 @@
+"""Finds evidence by name and tells its kind."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import ClassTable
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io._class_rows import class_table
+from splatseg.io._json import read_json
+from splatseg.io.captures import read_metadata
+from splatseg.io.evidence._base import HEADER_FILE, Evidence, view_files
+from splatseg.io.evidence._features import open_features
+from splatseg.io.evidence._labels import LabelEvidence, check_rule
+from splatseg.io.evidence._masks import MaskEvidence
+from splatseg.io.evidence._segments import (
+    SEGMENTS_FILE,
+    TRACKS_FILE,
+    open_panoptic,
+    open_tracked,
+)
+
+FORMAT = "splatseg-evidence"
+VERSION = 1
+"""Version of the folders written; all versions up to it are read."""
+
+# Folders of a capture that hold what a model saw, as opposed to photographs and truth.
+_PREFIXES = ("labels_", "masks_", "features_")
+_SUFFIX = "_reference"
+
+
+def open_evidence(
+    folder: Path | str, *, zero_is_class: bool = False, void: int | None = None
+) -> Evidence:
+    """Open a folder of evidence, ours or recorded by others; no view is read yet.
+
+    Names of ids come from its evidence.json, else from the metadata.json of the capture that
+    the folder lies in.
+
+    Args:
+        folder: The folder.
+        zero_is_class: Of label maps whose 0 is a real class: every id grows by 1 in memory,
+            and `Evidence.source_ids` tells the ids of the files.
+        void: A further id of label maps that means none, such as 255.
+
+    Raises:
+        MissingFileError: If there is no such folder.
+        InputError: If it holds no evidence.
+        FileFormatError: If a table in it is broken, or of a later version.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise MissingFileError(f"{folder}: there is no such folder of evidence.")
+    header = _header(folder)
+    rule = check_rule(zero_is_class, void)
+    maps, arrays = view_files(folder, ".png"), view_files(folder, ".npz")
+    objects = view_files(folder, ".json")
+    kind = header.get("kind") or _kind(
+        folder, maps=bool(maps), arrays=bool(arrays), objects=bool(objects)
+    )
+    if kind in ("labels", "panoptic", "tracked"):
+        labels = LabelEvidence(root=folder, files=maps, table=_classes(folder, header), rule=rule)
+        if kind == "labels":
+            return labels
+        return open_panoptic(labels) if kind == "panoptic" else open_tracked(labels)
+    if kind == "masks":
+        return MaskEvidence(root=folder, files=objects)
+    if kind == "features":
+        return open_features(folder, arrays)
+    raise InputError(
+        f"{folder}: expected evidence (PNG label maps, JSON masks or npz features, one a view), "
+        "got a folder of something else."
+    )
+
+
+def find_evidence(places: Iterable[Path], name: str) -> Path:
+    """The folder of evidence of this name: in a scene's ``evidence``, or in a capture.
+
+    Args:
+        places: Folders of scenes and captures, the one to prefer first.
+        name: The folder's name, such as ``labels_semantic``.
+
+    Raises:
+        InputError: If there is none; the message lists those that are there.
+    """
+    places = tuple(places)
+    for place in places:
+        for folder in (place / "evidence" / name, place / name):
+            if folder.is_dir():
+                return folder
+    known = ", ".join(evidence_names(places)) or "there is none"
+    raise InputError(f"evidence: expected one of those at hand ({known}), got {name!r}.")
+
+
+def evidence_names(places: Iterable[Path]) -> tuple[str, ...]:
+    """Names of the evidence of scenes and captures, sorted.
+
+    Of a scene these are the folders in ``evidence``. Of a capture they are the folders called
+    labels_..., masks_..., features_... or ..._reference; truth and photographs are not
+    evidence.
+    """
+    names: set[str] = set()
+    for place in places:
+        if (place / "evidence").is_dir():
+            names |= {p.name for p in (place / "evidence").iterdir() if p.is_dir()}
+        if place.is_dir():
+            names |= {
+                p.name
+                for p in place.iterdir()
+                if p.is_dir() and (p.name.startswith(_PREFIXES) or p.name.endswith(_SUFFIX))
+            }
+    return tuple(sorted(name for name in names if not name.startswith(".")))
+
+
+def _header(folder: Path) -> dict[str, Any]:
+    path = folder / HEADER_FILE
+    if not path.is_file():
+        return {}
+    header = read_json(path)
+    version = header.get("version")
+    if header.get("format") != FORMAT or not isinstance(version, int):
+        raise FileFormatError(f"{path}: expected evidence, got {header.get('format')!r}.")
+    if not 1 <= version <= VERSION:
+        raise FileFormatError(
+            f"{path}: expected evidence of version {VERSION} or less, got version {version}; "
+            "a later splatseg wrote it."
+        )
+    return header
+
+
+def _kind(folder: Path, *, maps: bool, arrays: bool, objects: bool) -> str | None:
+    if maps:
+        if (folder / SEGMENTS_FILE).is_file():
+            return "panoptic"
+        return "tracked" if (folder / TRACKS_FILE).is_file() else "labels"
+    if objects:
+        return "masks"
+    return "features" if arrays else None
+
+
+def _classes(folder: Path, header: dict[str, Any]) -> ClassTable | None:
+    if header.get("classes") is not None:
+        return class_table(header["classes"], where=str(folder / HEADER_FILE))
+    return read_metadata(folder.absolute().parent).classes

@@ -1,0 +1,243 @@
+"""Panoptic and tracked evidence: label maps whose ids have a table beside them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from typing_extensions import override
+
+from splatseg.core import (
+    UNLABELLED,
+    ClassInfo,
+    ClassTable,
+    FeatureMap,
+    LabelMap,
+    MaskSet,
+)
+from splatseg.errors import FileFormatError
+from splatseg.io._json import read_json
+from splatseg.io.evidence._base import Evidence, EvidenceKind, refuse
+from splatseg.io.evidence._labels import LabelEvidence, masks_of_ids
+
+SEGMENTS_FILE = "segments.json"
+TRACKS_FILE = "tracks.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Segment:
+    """One segment of one view."""
+
+    id: int
+    category: int
+    isthing: bool
+    score: float
+    """How sure the model is of it, in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """One object followed through the views."""
+
+    id: int
+    votes: Mapping[str, int]
+    """Pixels under the track by the name of the class that a segmenter gave them."""
+
+    @property
+    def category(self) -> str | None:
+        """The class name with most votes; the first by name among equals."""
+        return min(self.votes, key=lambda name: (-self.votes[name], name)) if self.votes else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PanopticEvidence(Evidence):
+    """Segments of each view; an id means something in its own view only."""
+
+    maps: LabelEvidence
+    table: Mapping[str, Any]
+    """Content of segments.json."""
+
+    @property
+    @override
+    def folder(self) -> Path:
+        return self.maps.folder
+
+    @property
+    @override
+    def kind(self) -> EvidenceKind:
+        return "panoptic"
+
+    @property
+    @override
+    def view_names(self) -> tuple[str, ...]:
+        return self.maps.view_names
+
+    @property
+    @override
+    def classes(self) -> ClassTable | None:
+        return self.maps.table
+
+    @property
+    @override
+    def source_ids(self) -> Mapping[int, int] | None:
+        return None
+
+    @override
+    def label_map(self, name: str) -> LabelMap:
+        """Segment ids of a view, with each segment's score as confidence."""
+        ids = self.maps.label_map(name).ids
+        scores = {segment.id: segment.score for segment in self.segments(name)}
+        return LabelMap(ids=ids, confidence=_looked_up(ids, scores, torch.float32, 0.0))
+
+    def category_map(self, name: str) -> LabelMap:
+        """Category ids of a view, which mean the same in all views; scores as confidence."""
+        segments = self.segments(name)
+        maps = self.label_map(name)
+        categories = {segment.id: segment.category for segment in segments}
+        ids = _looked_up(maps.ids, categories, torch.int32, UNLABELLED)
+        return LabelMap(ids=ids, confidence=maps.confidence)
+
+    @override
+    def masks(self, name: str) -> MaskSet:
+        return masks_of_ids(self.label_map(name))[0]
+
+    @override
+    def features(self, name: str) -> FeatureMap:
+        refuse(self, "features")
+
+    def segments(self, name: str) -> tuple[Segment, ...]:
+        """Segments of a view by ascending id.
+
+        Raises:
+            FileFormatError: If segments.json does not tell them.
+        """
+        path = self.folder / SEGMENTS_FILE
+        entry = self.table.get(name)
+        rows = cast(dict[str, Any], entry).get("segments_info") if isinstance(entry, dict) else None
+        if not isinstance(rows, list):
+            raise FileFormatError(f"{path}: expected segments_info of view {name!r}, got none.")
+        segments: list[Segment] = []
+        for row in cast(list[object], rows):
+            fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
+            id, category = fields.get("id"), fields.get("category_id")
+            if not isinstance(id, int) or not isinstance(category, int):
+                raise FileFormatError(
+                    f"{path}: view {name!r}: expected segments with id and category_id, "
+                    f"got {row!r:.60}."
+                )
+            segments.append(
+                Segment(
+                    id=id,
+                    category=category if category > 0 else UNLABELLED,
+                    isthing=bool(fields.get("isthing", True)),
+                    score=min(1.0, max(0.0, float(fields.get("score", 1.0)))),
+                )
+            )
+        return tuple(sorted(segments, key=lambda segment: segment.id))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedEvidence(Evidence):
+    """Objects followed through the views; an id means the same object in all of them."""
+
+    maps: LabelEvidence
+    table: Mapping[str, Any]
+    """Content of tracks.json."""
+
+    @property
+    @override
+    def folder(self) -> Path:
+        return self.maps.folder
+
+    @property
+    @override
+    def kind(self) -> EvidenceKind:
+        return "tracked"
+
+    @property
+    @override
+    def view_names(self) -> tuple[str, ...]:
+        return self.maps.view_names
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Views in the order in which they were tracked."""
+        order = self.table.get("order")
+        if not isinstance(order, list):
+            return self.view_names
+        return tuple(str(name) for name in cast(list[object], order))
+
+    @property
+    def tracks(self) -> tuple[Track, ...]:
+        """All tracks by ascending id.
+
+        Raises:
+            FileFormatError: If tracks.json does not tell them.
+        """
+        rows = self.table.get("tracks")
+        path = self.folder / TRACKS_FILE
+        if not isinstance(rows, dict):
+            raise FileFormatError(f"{path}: expected an object of tracks, got none.")
+        found: list[Track] = []
+        for key, row in cast(dict[str, object], rows).items():
+            fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
+            votes = fields.get("category_votes", {})
+            if not key.isdecimal() or not isinstance(votes, dict):
+                raise FileFormatError(f"{path}: expected tracks by id, got {key!r}: {row!r:.60}.")
+            counts = cast(dict[str, int], votes)
+            found.append(Track(id=int(key), votes={n: int(v) for n, v in counts.items()}))
+        return tuple(sorted(found, key=lambda track: track.id))
+
+    @property
+    @override
+    def classes(self) -> ClassTable:
+        """One row a track, named after its class and id, such as ``desk 3``."""
+        things = {row.name: row.isthing for row in self.maps.table.rows} if self.maps.table else {}
+        return ClassTable(
+            rows=tuple(
+                ClassInfo(
+                    id=track.id,
+                    name=f"{track.category or 'track'} {track.id}",
+                    isthing=things.get(track.category or "", True),
+                )
+                for track in self.tracks
+                if track.id > 0
+            )
+        )
+
+    @property
+    @override
+    def source_ids(self) -> Mapping[int, int] | None:
+        return None
+
+    @override
+    def label_map(self, name: str) -> LabelMap:
+        return self.maps.label_map(name)
+
+    @override
+    def masks(self, name: str) -> MaskSet:
+        return self.maps.masks(name)
+
+    @override
+    def features(self, name: str) -> FeatureMap:
+        refuse(self, "features")
+
+
+def open_panoptic(maps: LabelEvidence) -> PanopticEvidence:
+    """Panoptic evidence of a folder of label maps with segments.json."""
+    return PanopticEvidence(maps=maps, table=read_json(maps.folder / SEGMENTS_FILE))
+
+
+def open_tracked(maps: LabelEvidence) -> TrackedEvidence:
+    """Tracked evidence of a folder of label maps with tracks.json."""
+    return TrackedEvidence(maps=maps, table=read_json(maps.folder / TRACKS_FILE))
+
+
+def _looked_up(
+    ids: torch.Tensor, values: Mapping[int, float], dtype: torch.dtype, default: float
+) -> torch.Tensor:
+    """Each pixel's value by its id; `default` where the id has none."""
+    present, place = torch.unique(ids, return_inverse=True)
+    table = torch.tensor([values.get(int(i), default) for i in present.tolist()], dtype=dtype)
+    return table[place]

@@ -1,0 +1,137 @@
+"""Writes evidence: a folder with evidence.json and one file a view, each whole or not there."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg._check import check_choice, check_finite, check_values
+from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.errors import InputError, RangeError
+from splatseg.io._atomic import atomic_file
+from splatseg.io._class_rows import class_rows
+from splatseg.io._json import json_text, write_json
+from splatseg.io.evidence._base import CONFIDENCE_FOLDER, HEADER_FILE, EvidenceKind
+from splatseg.io.evidence._labels import CONFIDENCE_STEPS
+from splatseg.io.evidence._masks import masks_content
+from splatseg.io.evidence._open import FORMAT, VERSION
+from splatseg.io.images import write_png
+
+_WRITTEN = ("labels", "masks", "features")
+_MAX_ID = 65535
+
+
+def create_evidence(
+    folder: Path | str,
+    *,
+    kind: EvidenceKind,
+    classes: ClassTable | None = None,
+    source_ids: Mapping[int, int] | None = None,
+    metadata: Mapping[str, Any] | None = None,
+) -> Path:
+    """Make a folder of evidence and write its evidence.json; views are saved one by one.
+
+    Files of views that are there stay, so that interrupted work can go on.
+
+    Args:
+        folder: The folder, usually SCENE/evidence/NAME. Its parent must exist.
+        kind: labels, masks or features.
+        classes: Names of the ids, where they have some.
+        source_ids: The model's own id by id written, where they differ.
+        metadata: How it was made, in values that JSON holds.
+
+    Raises:
+        InputError: If the kind is another, or a value has no place in JSON.
+    """
+    check_choice("kind", kind, _WRITTEN)
+    folder = Path(folder)
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "kind": kind,
+        "classes": None if classes is None else class_rows(classes),
+        "source_ids": None if source_ids is None else {str(k): v for k, v in source_ids.items()},
+        "metadata": dict(metadata or {}),
+    }
+    json_text("metadata", header)
+    folder.mkdir(exist_ok=True)
+    write_json(folder / HEADER_FILE, header)
+    return folder
+
+
+def save_label_map(folder: Path | str, name: str, label_map: LabelMap) -> None:
+    """Write a view's label map: 8 bit where all ids fit, else 16; -1 becomes 0.
+
+    Its confidence, if any, goes into a 16 bit PNG of its own.
+
+    Raises:
+        InputError: If an id is 0, which is void in files, or above 65535.
+    """
+    ids = label_map.ids.cpu().numpy()
+    path = _view_path(Path(folder), name, ".png")
+    if ids.size == 0:
+        raise InputError(f"{name}: expected a label map of at least one pixel, got none.")
+    if (ids == 0).any():
+        raise InputError(f"{name}: expected ids from 1 on (0 is void in files), got 0.")
+    highest = int(ids.max())
+    if highest > _MAX_ID:
+        raise RangeError(f"{name}: expected ids up to {_MAX_ID}, got {highest}.")
+    values = np.where(ids == UNLABELLED, 0, ids)
+    confidence: NDArray[np.uint16] | None = None
+    if label_map.confidence is not None:
+        check_values(f"{name}: confidence", label_map.confidence, 0.0, 1.0)
+        steps = label_map.confidence.double().cpu().numpy() * CONFIDENCE_STEPS
+        confidence = np.floor(steps + 0.5).astype(np.uint16)
+    beside = _view_path(Path(folder) / CONFIDENCE_FOLDER, name, ".png", make=False)
+    if confidence is not None:
+        write_png(confidence, _view_path(Path(folder) / CONFIDENCE_FOLDER, name, ".png"))
+    elif beside.is_file():
+        # It belongs to the label map that is about to be replaced.
+        beside.unlink()
+    write_png(values.astype(np.uint8) if highest <= 255 else values.astype(np.uint16), path)
+
+
+def save_masks(folder: Path | str, name: str, masks: MaskSet) -> None:
+    """Write a view's masks as compressed COCO run lengths.
+
+    Raises:
+        RangeError: If a score lies outside [0, 1].
+    """
+    check_values(f"{name}: scores", masks.scores, 0.0, 1.0)
+    text = json_text(name, masks_content(masks))
+    path = _view_path(Path(folder), name, ".json")
+    with atomic_file(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
+
+
+def save_features(folder: Path | str, name: str, features: FeatureMap) -> None:
+    """Write a view's features as float16.
+
+    Raises:
+        RangeError: If a value is NaN or infinite, or beyond the range of float16 (65504).
+    """
+    check_finite(f"{name}: features", features.features)
+    half = features.features.detach().cpu().to(torch.float16)
+    check_finite(f"{name}: features as float16", half)
+    path = _view_path(Path(folder), name, ".npz")
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            allow_pickle=False,
+            features=half.numpy(),
+            stride=np.int64(features.stride),
+            size=np.array([features.height, features.width], np.int64),
+        )
+
+
+def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Path:
+    parts = name.split("/")
+    if not name or any(part in ("", ".", "..") or part.startswith(".") for part in parts):
+        raise InputError(f"view: expected a name that can be a file's, got {name!r}.")
+    path = folder / f"{name}{suffix}"
+    if make:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return path
