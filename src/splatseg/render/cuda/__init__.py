@@ -1,0 +1,3 @@
+"""The CUDA backend: gsplat's kernels behind the same interface. Loaded only when asked for."""
+
+from splatseg.render.cuda._backend import CudaBackend as CudaBackend

@@ -1,0 +1,203 @@
+"""The CUDA backend: glue between our interface and gsplat (1.5.3 or later)."""
+
+import importlib
+from types import ModuleType
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatseg.core import Camera, Gaussians
+from splatseg.errors import BackendError, MissingPackageError
+from splatseg.render._backend import (
+    Backend,
+    BackProjected,
+    Contributors,
+    Layout,
+    Rendered,
+    ViewWeights,
+)
+from splatseg.render._options import RenderOptions
+from splatseg.render.cuda._view import GSPLAT_ALPHA_MAX, CudaView, colours
+from splatseg.render.reference._backend import contributors_from_entries, weights_from_entries
+from splatseg.render.reference._composite import Entries
+
+
+class CudaBackend(Backend):
+    """gsplat's kernels, float32. Inputs may be anywhere; results are where the Gaussians are.
+
+    gsplat caps alpha at 0.999 and cannot be told otherwise, so `RenderOptions.alpha_max` must
+    say 0.999; any other value is refused, never replaced. Sums over pixels are in the order the
+    GPU happens to take: `back_project` and gradients differ in the last digits between runs.
+    """
+
+    name: ClassVar[str] = "cuda"
+
+    def __init__(self, *, library: ModuleType | None = None, device: str = "cuda") -> None:
+        """Load gsplat.
+
+        Args:
+            library: What to use in place of gsplat (tests).
+            device: Where to compute.
+
+        Raises:
+            MissingPackageError: If gsplat, or a GPU that torch can use, is missing.
+            BackendError: If gsplat's kernels do not load.
+        """
+        self._device = torch.device(device)
+        self._gsplat: Any = load_gsplat() if library is None else library
+
+    def render(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        signal: Float[Tensor, "n channels"] | None,
+        *,
+        options: RenderOptions,
+    ) -> Rendered:
+        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        home, dtype = gaussians.device, gaussians.dtype
+        gaussians, view = self._project(gaussians, camera, options)
+        if signal is None:
+            signal = colours(view, gaussians, camera, options.sh_degree)
+        else:
+            signal = signal.to(device=self._device, dtype=torch.float32)
+        depths = view.only_seen(lambda rows: view.depths[0, rows, None])
+        drawn, alpha = view.product(torch.cat((signal, depths), dim=1))
+        covered = alpha > 0
+        depth = torch.where(covered, drawn[..., -1] / torch.where(covered, alpha, 1.0), 0.0)
+        found = view.entries()
+        median = torch.zeros(view.height * view.width, device=self._device)
+        median[found.pixels[found.median]] = view.depths.detach()[0, found.ids[found.median]]
+        return Rendered(
+            image=drawn[..., :-1].to(device=home, dtype=dtype),
+            alpha=alpha.to(device=home, dtype=dtype),
+            depth=depth.to(device=home, dtype=dtype),
+            median_depth=median.reshape(view.height, view.width).to(device=home, dtype=dtype),
+        )
+
+    @torch.no_grad()
+    def back_project(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        image: Float[Tensor, "height width channels"],
+        *,
+        options: RenderOptions,
+    ) -> BackProjected:
+        """``W.T @ image`` and ``W.T @ 1``: the gradient of a render towards its signal."""
+        home, dtype = gaussians.device, gaussians.dtype
+        _, view = self._project(gaussians, camera, options)
+        image = image.to(device=self._device, dtype=torch.float32)
+        sums = view.adjoint(torch.cat((image, torch.ones_like(image[..., :1])), dim=-1))
+        sums = sums.to(device=home, dtype=dtype)
+        return BackProjected(sums=sums[:, :-1], weights=sums[:, -1])
+
+    @torch.no_grad()
+    def contributors(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"],
+        k: int,
+        *,
+        options: RenderOptions,
+    ) -> Contributors:
+        """The k strongest Gaussians of pixels (column, row), ties front to back."""
+        found = self._rows(gaussians, camera, pixels, options)
+        return contributors_from_entries(found, len(pixels), k, dtype=gaussians.dtype)
+
+    @torch.no_grad()
+    def weights(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        pixels: Int[Tensor, "p 2"] | None,
+        k: int | None,
+        *,
+        layout: Layout,
+        options: RenderOptions,
+    ) -> ViewWeights:
+        """W itself: all pixels or some, all entries or each pixel's k strongest."""
+        found = self._rows(gaussians, camera, pixels, options)
+        rows = camera.width * camera.height if pixels is None else len(pixels)
+        return weights_from_entries(found, camera, k, layout=layout, shape=(rows, len(gaussians)))
+
+    def _project(
+        self, gaussians: Gaussians, camera: Camera, options: RenderOptions
+    ) -> tuple[Gaussians, CudaView]:
+        if options.alpha_max != GSPLAT_ALPHA_MAX:
+            raise BackendError(
+                f"alpha_max: the cuda backend (gsplat) has its opacity cap built in at "
+                f"{GSPLAT_ALPHA_MAX}, got {options.alpha_max}; pass RenderOptions(alpha_max="
+                f"{GSPLAT_ALPHA_MAX}), or use the cpu backend."
+            )
+        gaussians = gaussians.to(device=self._device, dtype=torch.float32)
+        view = CudaView.of(gaussians, camera, options=options, gsplat=self._gsplat)
+        return gaussians, view
+
+    def _rows(
+        self, gaussians: Gaussians, camera: Camera, pixels: Tensor | None, options: RenderOptions
+    ) -> Entries:
+        """Entries of the rows asked for, renumbered, where the Gaussians are."""
+        home = gaussians.device
+        _, view = self._project(gaussians, camera, options)
+        found = view.entries()
+        if pixels is not None:
+            pixels = pixels.to(device=self._device, dtype=torch.int64)
+            found = _take_rows(found, pixels[:, 1] * camera.width + pixels[:, 0])
+        return Entries(
+            pixels=found.pixels.to(home),
+            ids=found.ids.to(home),
+            weights=found.weights.to(home),
+            median=found.median.to(home),
+        )
+
+
+def _take_rows(found: Entries, rows: Tensor) -> Entries:
+    """Entries of some pixels, in the order asked for; a pixel may be asked for twice."""
+    start = torch.searchsorted(found.pixels, rows)
+    count = torch.searchsorted(found.pixels, rows, right=True) - start
+    asked = torch.repeat_interleave(torch.arange(len(rows), device=rows.device), count)
+    before = torch.cumsum(count, dim=0) - count
+    source = torch.arange(len(asked), device=rows.device) - before[asked] + start[asked]
+    return Entries(
+        pixels=asked,
+        ids=found.ids[source],
+        weights=found.weights[source],
+        median=found.median[source],
+    )
+
+
+def load_gsplat() -> ModuleType:
+    """Import gsplat and see that its kernels run.
+
+    Raises:
+        MissingPackageError: If gsplat, or a GPU that torch can use, is missing.
+        BackendError: If gsplat's kernels do not load.
+    """
+    try:
+        gsplat = importlib.import_module("gsplat")
+    except ImportError as error:
+        raise MissingPackageError(
+            "backend 'cuda' needs a package that is not installed (gsplat). "
+            "Try: pip install 'splatseg[cuda]'."
+        ) from error
+    if not torch.cuda.is_available():
+        raise MissingPackageError(
+            "backend 'cuda' needs an NVIDIA GPU and a torch that can use it, and torch sees "
+            "none; install a CUDA build of torch (pytorch.org/get-started) or use the cpu "
+            "backend."
+        )
+    try:
+        gsplat.quat_scale_to_covar_preci(
+            torch.ones(1, 4, device="cuda"), torch.ones(1, 3, device="cuda")
+        )
+    except (AttributeError, ImportError, OSError, RuntimeError) as error:
+        raise BackendError(
+            f"backend 'cuda': gsplat is installed but its kernels do not load ({error}); it "
+            f"compiles them at first use, which needs the CUDA toolkit (nvcc), or install a "
+            f"wheel of gsplat with kernels for this torch."
+        ) from error
+    return gsplat
