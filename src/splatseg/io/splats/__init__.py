@@ -1,0 +1,219 @@
+"""Splat files of every common tool, to and from `core.Gaussians`.
+
+Which layout a file has is told by its first bytes, and by its name only where those say
+nothing (``.splat`` has no header). Each format's bytes are described in docs/formats/splats.md.
+"""
+
+import json
+import zlib
+from pathlib import Path
+from typing import Literal
+
+from splatseg._check import check_choice
+from splatseg.core import Gaussians
+from splatseg.errors import FileFormatError, InputError
+from splatseg.io._atomic import atomic_file
+from splatseg.io.splats._common import Losses, StrPath, check_file
+from splatseg.io.splats._common import SplatWarning as SplatWarning
+
+SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "gltf"]
+WritableFormat = Literal["ply", "compressed.ply", "splat", "spz", "spz3"]
+
+_WRITABLE: dict[WritableFormat, str] = {
+    "compressed.ply": "a compressed PLY file",
+    "ply": "a PLY file",
+    "splat": "a .splat file",
+    "spz": "an SPZ file",
+    "spz3": "an SPZ file",
+}
+_PEEK = 4096
+
+
+def read_splats(path: StrPath) -> Gaussians:
+    """Read Gaussians from a splat file of any known format.
+
+    PLY (3DGS, any further columns kept), SuperSplat's compressed PLY, ``.splat``, SPZ versions
+    2 to 4, SOG versions 1 and 2 (bundled, or by ``meta.json`` or its folder), and glTF with
+    KHR_gaussian_splatting. In memory scales are linear, opacities in [0, 1], quaternions
+    wxyz of unit length.
+
+    Args:
+        path: The file; for unbundled SOG its ``meta.json`` or the folder of it.
+
+    Returns:
+        Float32 Gaussians on the CPU, rows in file order.
+
+    Raises:
+        FileFormatError: If the file is none of these, is truncated or damaged, or holds a
+            Gaussian that cannot be rendered (NaN, infinite, zero rotation); the sentence
+            starts with the path and says how many rows and which is the first.
+        MissingFileError: If there is no such file.
+
+    Warns:
+        SplatWarning: If the file says something that Gaussians in memory cannot hold.
+    """
+    source = Path(path)
+    match splat_format(source):
+        case "ply":
+            from splatseg.io.splats.ply import read_ply as read
+        case "compressed.ply":
+            from splatseg.io.splats.compressed_ply import read_compressed_ply as read
+        case "splat":
+            from splatseg.io.splats.splat import read_splat as read
+        case "spz":
+            from splatseg.io.splats.spz import read_spz as read
+        case "sog":
+            from splatseg.io.splats.sog import read_sog as read
+        case "gltf":
+            from splatseg.io.splats.gltf import read_gltf as read
+    return read(source)
+
+
+def write_splats(
+    gaussians: Gaussians, path: StrPath, *, format: WritableFormat | None = None
+) -> None:
+    """Write Gaussians to a splat file; the file appears whole or not at all.
+
+    Only PLY keeps everything, extra columns included. The others round values (their steps
+    are in docs/formats/splats.md), and compressed PLY also changes the order of rows.
+
+    Args:
+        gaussians: What to write; converted to float32 on the CPU.
+        path: The file. Its ending gives the format unless `format` does.
+        format: ``ply``, ``compressed.ply``, ``splat``, ``spz`` (version 4) or ``spz3``
+            (version 3, for readers that do not know zstd yet).
+
+    Raises:
+        InputError: If no format can be told, or an extra column has a name or type that PLY
+            cannot hold.
+        RangeError: If a row cannot be rendered, or a position is too far out for SPZ.
+        MissingFileError: If the folder of `path` does not exist.
+
+    Warns:
+        SplatWarning: If the format has no place for something, or values lay outside its
+            range and were clamped.
+
+    Example:
+        >>> import tempfile, torch
+        >>> g = Gaussians(means=torch.zeros(1, 3), rotations=torch.eye(4)[:1],
+        ...               scales=torch.ones(1, 3), opacities=torch.ones(1),
+        ...               sh=torch.zeros(1, 1, 3))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_splats(g, Path(folder) / "one.ply")
+        ...     read_splats(Path(folder) / "one.ply").opacities
+        tensor([1.])
+    """
+    target = Path(path)
+    chosen = _format_of_name(target) if format is None else format
+    check_choice("format", chosen, _WRITABLE)
+    losses = Losses(target, _WRITABLE[chosen])
+    with atomic_file(target) as temporary:
+        if chosen == "ply":
+            from splatseg.io.splats.ply import write_ply
+
+            write_ply(gaussians, temporary)
+        elif chosen == "compressed.ply":
+            from splatseg.io.splats.compressed_ply import write_compressed_ply
+
+            write_compressed_ply(gaussians, temporary, losses=losses)
+        elif chosen == "splat":
+            from splatseg.io.splats.splat import write_splat
+
+            write_splat(gaussians, temporary, losses=losses)
+        else:
+            from splatseg.io.splats.spz import write_spz
+
+            write_spz(
+                gaussians, temporary, version=4 if chosen == "spz" else 3, losses=losses
+            )
+    losses.tell()
+
+
+def _format_of_name(path: Path) -> WritableFormat:
+    """The format that a name's ending stands for."""
+    name = path.name.lower()
+    for known in _WRITABLE:
+        if name.endswith(f".{known}") and known != "spz3":
+            return known
+    raise InputError(
+        f"{path}: expected a name that ends in .ply, .compressed.ply, .splat or .spz, "
+        "or a format."
+    )
+
+
+def splat_format(path: StrPath) -> SplatFormat:
+    """Tell the format of a splat file by its first bytes, or by its name where those say nothing.
+
+    Returns:
+        ``ply``, ``compressed.ply``, ``splat``, ``spz``, ``sog`` or ``gltf``.
+
+    Raises:
+        FileFormatError: If it is none of them, is empty, or is a folder without ``meta.json``.
+        MissingFileError: If there is no such file.
+    """
+    source = Path(path)
+    if source.is_dir():
+        if (source / "meta.json").is_file():
+            return "sog"
+        raise FileFormatError(
+            f"{source}: expected a splat file, got a folder without the meta.json of SOG."
+        )
+    check_file(source)
+    with source.open("rb") as file:
+        head = file.read(_PEEK)
+    found = _format_of_content(source, head)
+    if found is not None:
+        return found
+    if source.suffix.lower() == ".splat":
+        return "splat"
+    raise FileFormatError(
+        f"{source}: expected a splat file (PLY, compressed PLY, .splat, SPZ, SOG or glTF with "
+        f"Gaussians), but it starts with {head[:8]!r}."
+    )
+
+
+def _format_of_content(path: Path, head: bytes) -> SplatFormat | None:
+    """The format that the first bytes tell, None if they tell nothing."""
+    if head.startswith((b"ply\n", b"ply\r\n")):
+        from splatseg.io.splats._ply_header import read_ply_header
+        from splatseg.io.splats.compressed_ply import is_compressed
+
+        return "compressed.ply" if is_compressed(read_ply_header(path)) else "ply"
+    if head.startswith(b"NGSP"):
+        return "spz"
+    if head.startswith(b"\x1f\x8b"):
+        return (
+            "spz"
+            if _gzip_start(head) == b"NGSP" or path.suffix.lower() == ".spz"
+            else None
+        )
+    if head.startswith(b"PK\x03\x04"):
+        return "sog"
+    if head.startswith(b"glTF"):
+        return "gltf"
+    if head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+        return _format_of_json(path)
+    return None
+
+
+def _gzip_start(head: bytes) -> bytes:
+    """The first four bytes inside gzip data, fewer if they are no gzip data."""
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 4)
+    except zlib.error:
+        return b""
+
+
+def _format_of_json(path: Path) -> SplatFormat | None:
+    """Which of the formats with JSON a document is."""
+    if path.suffix.lower() == ".gltf":
+        return "gltf"
+    if path.name == "meta.json":
+        return "sog"
+    try:
+        document = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        return None
+    if "means" in document and "quats" in document:
+        return "sog"
+    return "gltf" if "asset" in document else None

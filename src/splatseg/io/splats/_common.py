@@ -1,0 +1,282 @@
+"""What the splat formats share: the way from arrays in a file to `Gaussians` and back.
+
+Files hold logs of scales and logits of opacities (most of them), memory holds the values. The
+conversions and the checks of rows stand here once, so that every format says the same about
+the same fault.
+"""
+
+import inspect
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatseg.core import Gaussians
+from splatseg.errors import FileFormatError, MissingFileError
+
+StrPath: TypeAlias = str | PathLike[str]
+Array: TypeAlias = NDArray[np.float32]
+
+BLOCK = 1 << 15
+"""Rows converted at once: temporaries stay in the processor's cache, whatever the file's size."""
+
+LOGIT_OF_ZERO = -110.0
+"""What stands in a file for the logit of opacity 0 and the log of scale 0: exp(-110) is 0 in
+float32, and unlike -inf it passes every other tool's filters."""
+
+LOGIT_OF_ONE = 20.0
+"""What stands in a file for the logit of opacity 1: its sigmoid is 1 in float32."""
+
+
+class SplatWarning(UserWarning):
+    """A splat file was read or written, but not everything in it could be kept."""
+
+
+def warn(path: Path, sentence: str) -> None:
+    """Warn with the file's path in front, at the line outside this package that led here."""
+    here = str(Path(__file__).parent)
+    level = 1
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_code.co_filename.startswith(here):
+        frame = frame.f_back
+        level += 1
+    warnings.warn(f"{path}: {sentence}", SplatWarning, stacklevel=level)
+
+
+def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
+    """Slices of at most `size` rows that cover `count` rows in order."""
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))
+
+
+def read_file(path: Path) -> bytes:
+    """All bytes of a file that must exist, be a file and not be empty."""
+    check_file(path)
+    return path.read_bytes()
+
+
+def check_file(path: Path) -> int:
+    """Size of a file in bytes.
+
+    Raises:
+        MissingFileError: If it does not exist.
+        FileFormatError: If it is a folder or empty.
+    """
+    if path.is_dir():
+        raise FileFormatError(f"{path}: expected a splat file, got a folder.")
+    if not path.is_file():
+        raise MissingFileError(f"{path}: no such file.")
+    size = path.stat().st_size
+    if size == 0:
+        raise FileFormatError(f"{path}: expected a splat file, got an empty file.")
+    return size
+
+
+@dataclass(slots=True, kw_only=True)
+class Rows:
+    """Arrays that a reader fills, float32, one row a Gaussian."""
+
+    means: Array
+    """(n, 3)"""
+
+    rotations: Array
+    """(n, 4) quaternions (w, x, y, z) of any length but zero."""
+
+    scales: Array
+    """(n, 3): logs while the reader fills them, see `exponentiate`."""
+
+    opacities: Array
+    """(n,): logits while the reader fills them, see `exponentiate`."""
+
+    sh: Array
+    """(n, k, 3)"""
+
+    @staticmethod
+    def empty(count: int, coefficients: int) -> "Rows":
+        """Room for `count` Gaussians with `coefficients` harmonics a channel."""
+        return Rows(
+            means=np.empty((count, 3), np.float32),
+            rotations=np.empty((count, 4), np.float32),
+            scales=np.empty((count, 3), np.float32),
+            opacities=np.empty(count, np.float32),
+            sh=np.empty((count, coefficients, 3), np.float32),
+        )
+
+    def exponentiate(self) -> None:
+        """Turn logs of scales and logits of opacities into values, in place.
+
+        Minus infinity becomes scale or opacity 0 and plus infinity opacity 1, as some tools
+        mean it; NaN and a scale beyond float32 stay for `finish` to refuse.
+        """
+        torch.from_numpy(self.scales).exp_()
+        torch.from_numpy(self.opacities).sigmoid_()
+
+
+def finish(
+    path: Path, rows: Rows, extra: Mapping[str, Tensor] | None = None
+) -> Gaussians:
+    """Check every row, give quaternions unit length and make `Gaussians` without a copy.
+
+    Raises:
+        FileFormatError: If a row is not finite, has a rotation of length zero, a negative
+            scale or an opacity outside [0, 1]; says how many rows and which is the first.
+    """
+    columns = {
+        "position": rows.means,
+        "rotation": rows.rotations,
+        "scale": rows.scales,
+        "opacity": rows.opacities,
+        "colour": rows.sh,
+    }
+    _refuse(
+        path,
+        {name: _not_finite(column) for name, column in columns.items()},
+        "hold values that are NaN or infinite",
+    )
+    _refuse(
+        path, {"rotation": _normalise(rows.rotations)}, "have a rotation of length zero"
+    )
+    _refuse(path, {"scale": np.any(rows.scales < 0, axis=1)}, "have a negative scale")
+    outside = np.logical_or(rows.opacities < 0, rows.opacities > 1)
+    _refuse(path, {"opacity": outside}, "have an opacity outside [0, 1]")
+    return Gaussians(
+        means=torch.from_numpy(rows.means),
+        rotations=torch.from_numpy(rows.rotations),
+        scales=torch.from_numpy(rows.scales),
+        opacities=torch.from_numpy(rows.opacities),
+        sh=torch.from_numpy(rows.sh),
+        extra=dict(extra or {}),
+    )
+
+
+def _refuse(path: Path, faults: Mapping[str, NDArray[np.bool_]], what: str) -> None:
+    """Raise if any row is at fault, naming the first such row and its attributes."""
+    bad = np.any(np.stack(list(faults.values())), axis=0)
+    if not bad.any():
+        return
+    row = int(bad.argmax())
+    names = ", ".join(name for name, fault in faults.items() if fault[row])
+    raise FileFormatError(
+        f"{path}: {int(bad.sum())} of {len(bad)} Gaussians {what}; "
+        f"the first is row {row} ({names})."
+    )
+
+
+def _not_finite(column: Array) -> NDArray[np.bool_]:
+    """Rows with a value that is NaN or infinite."""
+    flat = column.reshape(len(column), -1)
+    bad = np.zeros(len(flat), bool)
+    for rows in blocks(len(flat)):
+        bad[rows] = ~np.isfinite(flat[rows]).all(axis=1)
+    return bad
+
+
+def _normalise(rotations: Array) -> NDArray[np.bool_]:
+    """Give quaternions unit length in place; returns the rows whose length is zero.
+
+    Rows that are of unit length within rounding stay as they are, so that reading and writing
+    again does not move them.
+    """
+    zero = np.zeros(len(rotations), bool)
+    for rows in blocks(len(rotations)):
+        length = np.linalg.norm(rotations[rows].astype(np.float64), axis=1)
+        zero[rows] = length == 0
+        length[(np.abs(length - 1) < 1e-6) | (length == 0)] = 1
+        rotations[rows] /= length[:, None]
+    return zero
+
+
+def to_rows(gaussians: Gaussians) -> Rows:
+    """The arrays of checked Gaussians as float32 on the CPU, linear, quaternions of unit length.
+
+    Raises:
+        RangeError: If a value cannot be rendered, see `Gaussians.check_values`.
+    """
+    gaussians.check_values()
+    rows = Rows(
+        means=_numpy(gaussians.means),
+        rotations=_numpy(gaussians.rotations).copy(),
+        scales=_numpy(gaussians.scales),
+        opacities=_numpy(gaussians.opacities),
+        sh=_numpy(gaussians.sh),
+    )
+    _normalise(rows.rotations)
+    return rows
+
+
+def _numpy(tensor: Tensor) -> Array:
+    return tensor.detach().to(device="cpu", dtype=torch.float32).numpy()
+
+
+def logs(values: Float[np.ndarray, "*shape"]) -> Array:
+    """Logs of scales; zero becomes `LOGIT_OF_ZERO`."""
+    with np.errstate(divide="ignore"):
+        result = np.log(values.astype(np.float64))
+    return np.maximum(result, LOGIT_OF_ZERO).astype(np.float32)
+
+
+def logits(values: Float[np.ndarray, "*shape"]) -> Array:
+    """Logits of opacities; 0 and 1 become `LOGIT_OF_ZERO` and `LOGIT_OF_ONE`."""
+    wide = values.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        result = np.log(wide) - np.log1p(-wide)
+    return np.clip(result, LOGIT_OF_ZERO, LOGIT_OF_ONE).astype(np.float32)
+
+
+def unsigned(
+    values: Float[np.ndarray, "*shape"], top: int
+) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
+    """Round to integers in [0, top]; also says which values lay outside and were clamped.
+
+    A value counts as outside when it is more than half a step beyond the end, because up to
+    there rounding is no worse than anywhere else.
+    """
+    rounded = np.floor(values + 0.5)
+    outside = (rounded < 0) | (rounded > top)
+    return np.clip(rounded, 0, top).astype(np.uint32), outside
+
+
+class Losses:
+    """What a format cannot hold, gathered while writing and told in one warning."""
+
+    def __init__(self, path: Path, label: str) -> None:
+        self._path = path
+        self._label = label
+        self._clamped: dict[str, int] = {}
+        self._dropped: list[str] = []
+
+    def clamp(self, name: str, outside: NDArray[np.bool_]) -> None:
+        """Count values of an attribute that lie outside what the format can say."""
+        count = int(outside.sum())
+        if count:
+            self._clamped[name] = self._clamped.get(name, 0) + count
+
+    def drop(self, what: str) -> None:
+        """Note a part of the Gaussians that the format has no place for."""
+        self._dropped.append(what)
+
+    def drop_extra(self, gaussians: Gaussians) -> None:
+        """Note all extra columns as dropped."""
+        if gaussians.extra:
+            self.drop("the extra columns " + ", ".join(sorted(gaussians.extra)))
+
+    def tell(self) -> None:
+        """Warn once if anything was lost."""
+        parts: list[str] = []
+        if self._dropped:
+            parts.append("no place for " + " and ".join(self._dropped))
+        if self._clamped:
+            counts = ", ".join(
+                f"{count} {name}" for name, count in self._clamped.items()
+            )
+            parts.append(f"values outside its range, which were clamped ({counts})")
+        if parts:
+            warn(self._path, f"{self._label} has " + "; ".join(parts) + ".")

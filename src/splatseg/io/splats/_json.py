@@ -1,0 +1,119 @@
+"""Reading JSON that others wrote: every access says what was expected and what came."""
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from splatseg.errors import FileFormatError
+
+
+class Json:
+    """A JSON value that knows its file and its place, for one-sentence errors."""
+
+    def __init__(self, path: Path, value: Any, place: str = "") -> None:
+        self.path = path
+        self.value = value
+        self.place = place
+
+    @staticmethod
+    def parse(path: Path, text: bytes) -> "Json":
+        """Parse a document whose outermost value is an object.
+
+        Raises:
+            FileFormatError: If it is no JSON or no object.
+        """
+        try:
+            value = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise FileFormatError(f"{path}: expected JSON: {error}.") from error
+        root = Json(path, value)
+        if not isinstance(value, dict):
+            raise root.error("a JSON object")
+        return root
+
+    def error(self, expected: str) -> FileFormatError:
+        """The error to raise where this value is not what was expected."""
+        shown = repr(self.value)
+        shown = shown if len(shown) <= 60 else shown[:57] + "..."
+        return FileFormatError(
+            f"{self.path}: expected {expected} at {self.place or 'the root'}, got {shown}."
+        )
+
+    def __contains__(self, name: str) -> bool:
+        return isinstance(self.value, dict) and name in self.value
+
+    def __getitem__(self, name: str) -> "Json":
+        """A member that must be there."""
+        if not isinstance(self.value, dict):
+            raise self.error("an object")
+        if name not in self.value:
+            place = self.place or "the root"
+            raise FileFormatError(
+                f"{self.path}: expected a member {name!r} at {place}, got none."
+            )
+        return Json(self.path, self.value[name], f"{self.place}.{name}".lstrip("."))
+
+    def names(self) -> list[str]:
+        """The members of an object."""
+        if not isinstance(self.value, dict):
+            raise self.error("an object")
+        return list(self.value)
+
+    def items(self) -> Iterator["Json"]:
+        """The elements of a list."""
+        if not isinstance(self.value, list):
+            raise self.error("a list")
+        for i, value in enumerate(self.value):
+            yield Json(self.path, value, f"{self.place}[{i}]")
+
+    def optional_items(self, name: str) -> list["Json"]:
+        """The elements of a member that is a list; nothing if it is absent."""
+        return list(self[name].items()) if name in self else []
+
+    def element(self, index: int) -> "Json":
+        """One element of a list, by an index that some file gave."""
+        if not isinstance(self.value, list) or not 0 <= index < len(self.value):
+            raise self.error(f"a list with an element {index}")
+        return Json(self.path, self.value[index], f"{self.place}[{index}]")
+
+    def text(self) -> str:
+        """A string."""
+        if not isinstance(self.value, str):
+            raise self.error("a string")
+        return self.value
+
+    def flag(self) -> bool:
+        """True or false."""
+        if not isinstance(self.value, bool):
+            raise self.error("true or false")
+        return self.value
+
+    def integer(self, low: int = 0) -> int:
+        """A whole number that is at least `low`."""
+        value = self.value
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if not isinstance(value, int) or isinstance(value, bool) or value < low:
+            raise self.error(f"a whole number of at least {low}")
+        return value
+
+    def number(self) -> float:
+        """A finite number."""
+        value = self.value
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise self.error("a number")
+        if abs(value) > 1e300 or not math.isfinite(value):
+            raise self.error("a finite number")
+        return float(value)
+
+    def numbers(self, *, least: int, most: int | None = None) -> list[float]:
+        """A list of finite numbers, `least` to `most` of them (exactly `least` by default)."""
+        most = least if most is None else most
+        result = [item.number() for item in self.items()]
+        if not least <= len(result) <= most:
+            raise self.error(
+                f"{least if least == most else f'{least} to {most}'} numbers"
+            )
+        return result

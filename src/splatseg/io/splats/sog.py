@@ -1,0 +1,273 @@
+"""PlayCanvas's SOG, versions 1 and 2: attributes as WebP pictures beside a ``meta.json``.
+
+A Gaussian is the pixel of the same number in row-major order. Positions have 16 bits an axis
+over two pictures (low and high bytes), on a scale ``sign(x) log(1 + |x|)``; quaternions are
+the smallest three in red, green and blue, with 252 plus the index of the largest component
+(w, x, y, z) in alpha. Scales and colours are bytes: between bounds in version 1, into a codebook
+of 256 numbers in version 2. Harmonics are a palette of vectors and 16-bit labels into it.
+Bundled files (``.sog``) are a zip of the same. See docs/formats/splats.md.
+"""
+
+import io
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from splatseg.core import Gaussians
+from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.io.splats._common import Array, Rows, blocks, check_file, finish
+from splatseg.io.splats._json import Json
+from splatseg.io.splats._quaternions import assemble
+
+_PALETTE_WIDTH = 64
+"""Entries of the palette of harmonics in a row of its picture."""
+
+_MAX_META = 1 << 24
+_MAX_COUNT = 1 << 28
+"""More pixels than a WebP picture can have."""
+
+_TAG = 252
+"""Alpha of a quaternion whose largest component is w; x, y and z follow."""
+
+Pixels = NDArray[np.uint8]
+Load = Callable[[str, int], bytes]
+
+
+def read_sog(path: Path) -> Gaussians:
+    """Read a bundled ``.sog`` file, or an unbundled one by its ``meta.json`` or its folder.
+
+    Raises:
+        FileFormatError: If a member of ``meta.json`` or a picture is missing, damaged or too
+            small for the count, a label points beyond its palette, or a row cannot be rendered.
+        MissingFileError: If there is no such file.
+    """
+    if path.is_dir():
+        path = path / "meta.json"
+    check_file(path)
+    with path.open("rb") as file:
+        bundled = file.read(2) == b"PK"
+    if not bundled:
+        return _read(
+            path, lambda name, limit: _load_beside(path, name, limit), path.name
+        )
+    try:
+        with zipfile.ZipFile(path) as archive:
+            metas = [
+                n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"
+            ]
+            if len(metas) != 1:
+                raise FileFormatError(
+                    f"{path}: expected a zip file with one meta.json, got {len(metas)}."
+                )
+            folder = metas[0].removesuffix("meta.json")
+            return _read(
+                path,
+                lambda name, limit: _load_member(path, archive, folder + name, limit),
+                "meta.json",
+            )
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        RuntimeError,
+        NotImplementedError,
+    ) as error:
+        raise FileFormatError(f"{path}: the zip file is damaged: {error}.") from error
+
+
+def _load_beside(path: Path, name: str, limit: int) -> bytes:
+    """A file in the folder of `path`; a name that points elsewhere is refused."""
+    if Path(name).name != name:
+        raise FileFormatError(
+            f"{path}: expected the name of a file beside it, got {name!r}."
+        )
+    member = path.parent / name
+    if not member.is_file():
+        raise MissingFileError(f"{member}: no such file, but {path.name} names it.")
+    if member.stat().st_size > limit:
+        raise FileFormatError(f"{member}: expected at most {limit} bytes.")
+    return member.read_bytes()
+
+
+def _load_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+    """A member of a zip file, unpacked only if it is as small as it should be."""
+    if name not in archive.NameToInfo:
+        raise FileFormatError(f"{path}: expected a file {name!r} in it, got none.")
+    with archive.open(name) as member:
+        data = member.read(limit + 1)
+    if len(data) > limit:
+        raise FileFormatError(
+            f"{path}: expected at most {limit} bytes in {name!r}, got more."
+        )
+    return data
+
+
+def _read(path: Path, load: Load, meta_name: str) -> Gaussians:
+    """Read by a function that loads a file of the bundle by name."""
+    meta = Json.parse(path, load(meta_name, _MAX_META))
+    version = meta["version"].integer() if "version" in meta else 1
+    if version not in (1, 2):
+        raise FileFormatError(f"{path}: expected SOG version 1 or 2, got {version}.")
+    count = (
+        meta["count"] if version == 2 else meta["means"]["shape"].element(0)
+    ).integer()
+    if count > _MAX_COUNT:
+        raise meta.error(f"at most {_MAX_COUNT} Gaussians")
+
+    def pictures(entry: Json, number: int) -> list[Pixels]:
+        names = [item.text() for item in entry["files"].items()]
+        if len(names) != number:
+            raise entry["files"].error(f"{number} names of files")
+        return [_picture(path, load, name, count) for name in names]
+
+    rest = _harmonics(path, load, meta["shN"], version) if "shN" in meta else None
+    rows = Rows.empty(count, 1 + (rest[1].shape[1] if rest else 0))
+    _positions(rows, meta["means"], pictures(meta["means"], 2))
+    (quats,) = pictures(meta["quats"], 1)
+    _rotations(path, rows, quats)
+    for name, target, width in (("scales", rows.scales, 3), ("sh0", rows.sh[:, 0], 4)):
+        (pixels,) = pictures(meta[name], 1)
+        _bytes(rows, meta[name], pixels, target, width=width, version=version)
+    if rest is not None:
+        labels_name, palette = rest
+        _apply_palette(path, rows, _picture(path, load, labels_name, count), palette)
+    with np.errstate(over="ignore"):
+        np.exp(rows.scales, out=rows.scales)
+    return finish(path, rows)
+
+
+def _picture(path: Path, load: Load, name: str, least: int) -> Pixels:
+    """The pixels (n, 4) of a picture that has at least `least` of them."""
+    with _opened(path, name, load(name, 8 * least + (1 << 20))) as image:
+        if image.width * image.height < least:
+            raise FileFormatError(
+                f"{path}: expected at least {least} pixels in {name!r}, got "
+                f"{image.width} x {image.height}."
+            )
+        if image.width * image.height > 2 * least + (1 << 22):
+            raise FileFormatError(
+                f"{path}: expected about {least} pixels in {name!r}, got "
+                f"{image.width} x {image.height}."
+            )
+        return _pixels(path, name, image).reshape(-1, 4)[:least]
+
+
+def _opened(path: Path, name: str, data: bytes) -> Image.Image:
+    """A picture whose size is known but whose pixels are not decoded yet."""
+    try:
+        return Image.open(io.BytesIO(data), formats=["WEBP"])
+    except (OSError, Image.DecompressionBombError) as error:
+        raise FileFormatError(
+            f"{path}: expected a WebP picture in {name!r}: {error}."
+        ) from error
+
+
+def _pixels(path: Path, name: str, image: Image.Image) -> Pixels:
+    """All pixels (height, width, 4); alpha is 255 where the picture has none."""
+    try:
+        return np.asarray(image.convert("RGBA"))
+    except (OSError, EOFError, ValueError) as error:
+        raise FileFormatError(
+            f"{path}: the picture {name!r} is damaged: {error}."
+        ) from error
+
+
+def _positions(rows: Rows, entry: Json, pictures: list[Pixels]) -> None:
+    """Positions: 16 bits between bounds, then the inverse of sign(x) log(1 + |x|)."""
+    low, high = (np.array(entry[name].numbers(least=3)) for name in ("mins", "maxs"))
+    for part in blocks(len(rows.means)):
+        least, most = (picture[part, :3].astype(np.float64) for picture in pictures)
+        logs = low + (high - low) * ((least + 256 * most) / 65535)
+        with np.errstate(over="ignore"):
+            rows.means[part] = np.sign(logs) * np.expm1(np.abs(logs))
+
+
+def _rotations(path: Path, rows: Rows, pixels: Pixels) -> None:
+    """Quaternions: three components as (byte / 255 - 0.5) sqrt 2, the largest by alpha."""
+    wrong = pixels[:, 3] < _TAG
+    if wrong.any():
+        raise FileFormatError(
+            f"{path}: {int(wrong.sum())} of {len(wrong)} Gaussians have a rotation whose alpha "
+            f"is not {_TAG} to 255; the first is row {int(wrong.argmax())}."
+        )
+    for part in blocks(len(pixels)):
+        others = (pixels[part, :3] / 255 - 0.5) * 2**0.5
+        rows.rotations[part] = assemble(pixels[part, 3] - np.uint8(_TAG), others)
+
+
+def _bytes(
+    rows: Rows, entry: Json, pixels: Pixels, target: Array, *, width: int, version: int
+) -> None:
+    """Log scales, or colours with the opacity in alpha, from bytes."""
+    if version == 1:
+        low, high = (
+            np.array(entry[name].numbers(least=width)) for name in ("mins", "maxs")
+        )
+        tables = low[:, None] + (high - low)[:, None] * (np.arange(256) / 255)
+    else:
+        tables = np.full(
+            (width, 256), np.nan
+        )  # a byte beyond a short codebook is refused
+        codebook = entry["codebook"].numbers(least=1, most=256)
+        tables[:, : len(codebook)] = codebook
+    for part in blocks(len(pixels)):
+        for i in range(3):
+            target[part, i] = tables[i, pixels[part, i]]
+    if width < 4:
+        return
+    alpha = pixels[:, 3]
+    if version == 1:  # a logit between bounds
+        with np.errstate(over="ignore"):
+            rows.opacities[:] = (1 / (1 + np.exp(-tables[3])))[alpha]
+    else:
+        rows.opacities[:] = alpha / np.float32(255)
+
+
+def _harmonics(path: Path, load: Load, entry: Json, version: int) -> tuple[str, Array]:
+    """The name of the labels' picture and the palette (entries, coefficients, 3)."""
+    names = [item.text() for item in entry["files"].items()]
+    if len(names) != 2:
+        raise entry["files"].error("2 names of files")
+    with _opened(path, names[0], load(names[0], 1 << 24)) as image:
+        coefficients = image.width // _PALETTE_WIDTH
+        if (
+            image.width % _PALETTE_WIDTH
+            or coefficients not in (3, 8, 15)
+            or image.height > 1024
+        ):
+            raise FileFormatError(
+                f"{path}: expected a palette of 192, 512 or 960 pixels a row and at most 1024 "
+                f"rows in {names[0]!r}, got {image.width} x {image.height}."
+            )
+        pixels = _pixels(path, names[0], image)[..., :3]
+    pixels = pixels.reshape(-1, coefficients, 3)
+    if version == 1:
+        low, high = entry["mins"].number(), entry["maxs"].number()
+        return names[1], (low + (high - low) * (pixels / 255)).astype(np.float32)
+    bands, count = entry["bands"].integer(), entry["count"].integer()
+    if (bands + 1) ** 2 - 1 != coefficients:
+        raise entry["bands"].error(f"the degree of {coefficients} coefficients")
+    if count > len(pixels):
+        raise entry["count"].error(f"at most the {len(pixels)} entries of the palette")
+    codebook = np.full(256, np.nan, np.float32)
+    numbers = entry["codebook"].numbers(least=1, most=256)
+    codebook[: len(numbers)] = numbers
+    return names[1], codebook[pixels[:count]]
+
+
+def _apply_palette(path: Path, rows: Rows, pixels: Pixels, palette: Array) -> None:
+    """Give each Gaussian the harmonics that its label (red + 256 green) points to."""
+    labels = pixels[:, 0].astype(np.int64) + 256 * pixels[:, 1].astype(np.int64)
+    wrong = labels >= len(palette)
+    if wrong.any():
+        raise FileFormatError(
+            f"{path}: {int(wrong.sum())} of {len(labels)} Gaussians have a label beyond the "
+            f"palette of {len(palette)} harmonics; the first is row {int(wrong.argmax())}."
+        )
+    for part in blocks(len(labels)):
+        rows.sh[part, 1:] = palette[labels[part]]

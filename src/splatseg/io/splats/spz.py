@@ -1,0 +1,359 @@
+"""Niantic's SPZ, versions 2, 3 (one gzip stream) and 4 (a zstd stream for each attribute).
+
+All start with the same 16 bytes: magic ``NGSP``, version, number of points (uint32 each),
+degree of the harmonics, fractional bits of positions, flags, and a byte that is reserved
+before version 4 and the number of streams from then on. The attributes follow in the order
+positions, opacities, colours, log scales, rotations, harmonics. SPZ points right, up and back;
+memory and PLY files right, down and forward: y and z change sign here.
+See docs/formats/splats.md.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core import Gaussians
+from splatseg.core.sh import MAX_DEGREE
+from splatseg.errors import FileFormatError, RangeError
+from splatseg.io.splats._common import (
+    Array,
+    Losses,
+    Rows,
+    blocks,
+    finish,
+    logs,
+    read_file,
+    to_rows,
+    unsigned,
+    warn,
+)
+from splatseg.io.splats._quaternions import pack_signed_three, unpack_signed_three
+
+MAGIC = b"NGSP"
+_HEADER = struct.Struct("<4sIIBBBB")
+_HEADER_4 = struct.Struct("<I12x")  # offset of the table of streams, reserved
+_STREAM = struct.Struct("<QQ")  # compressed, uncompressed bytes
+_ANTIALIASED = 1
+_EXTENSIONS = 2
+_COLOUR_SCALE = 0.15
+"""Colours are stored as 0.15 times the coefficient of degree 0, plus one half."""
+
+_MAX_RATIO = 4096
+"""A file that claims to unpack to more than this times its size (and 64 MiB) is refused."""
+_ALWAYS_ALLOWED = 1 << 26
+
+_FLIP = np.array([1, -1, -1], np.float32)
+_FLIP_ROTATION = np.array([1, 1, -1, -1], np.float32)
+_FLIP_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+"""Sign of each basis function of degree 1 to 3 when y and z change sign."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Header:
+    """The first 16 bytes, checked."""
+
+    version: int
+    count: int
+    degree: int
+    fractional_bits: int
+    flags: int
+    streams: int
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes a Gaussian of each attribute, in file order; harmonics only if there are any."""
+        rest = 3 * ((self.degree + 1) ** 2 - 1)
+        rotation = 3 if self.version < 3 else 4
+        return (9, 1, 3, 3, rotation, rest) if rest else (9, 1, 3, 3, rotation)
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read an SPZ file of version 2, 3 or 4, turned to the axes of PLY files.
+
+    Extensions (limits for a viewer's camera, for example) are not kept; a file made for
+    antialiased rendering is read with a warning that says so.
+
+    Raises:
+        FileFormatError: If the file is truncated or longer than it says, of another version
+            or degree, or unpacks to more than its header promises.
+        MissingFileError: If there is no such file.
+    """
+    data = read_file(path)
+    if data[:4] == MAGIC:
+        header, streams = _unpack_zstd(path, data)
+    else:
+        header, streams = _unpack_gzip(path, data)
+    positions, opacities, colours, scales, rotations = (
+        np.frombuffer(stream, np.uint8).reshape(header.count, size)
+        for stream, size in zip(streams[:5], header.sizes[:5], strict=True)
+    )
+    coefficients = (header.degree + 1) ** 2
+    rows = Rows.empty(header.count, coefficients)
+    rest = (
+        np.frombuffer(streams[5], np.uint8).reshape(header.count, coefficients - 1, 3)
+        if header.degree
+        else None
+    )
+    for part in blocks(header.count):
+        rows.means[part] = _positions(positions[part], header.fractional_bits) * _FLIP
+        rows.opacities[part] = opacities[part, 0] / np.float32(255)
+        rows.sh[part, 0] = (colours[part] / 255 - 0.5) / _COLOUR_SCALE
+        rows.scales[part] = np.exp(scales[part] / 16.0 - 10.0)
+        rows.rotations[part] = (
+            _rotations(rotations[part], header.version) * _FLIP_ROTATION
+        )
+        if rest is not None:
+            signs = _FLIP_SH[: coefficients - 1, None]
+            rows.sh[part, 1:] = (rest[part].astype(np.float32) - 128) / 128 * signs
+    if header.flags & _ANTIALIASED:
+        warn(
+            path,
+            "made for antialiased rendering, which Gaussians in memory do not remember.",
+        )
+    return finish(path, rows)
+
+
+def _header(path: Path, data: bytes) -> _Header:
+    """Parse and check the first 16 bytes."""
+    if len(data) < _HEADER.size:
+        raise FileFormatError(
+            f"{path}: expected an SPZ header of {_HEADER.size} bytes, got {len(data)}."
+        )
+    magic, version, count, degree, bits, flags, streams = _HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise FileFormatError(
+            f"{path}: expected the SPZ magic {MAGIC!r}, got {magic!r}."
+        )
+    if version not in (2, 3, 4):
+        raise FileFormatError(f"{path}: expected SPZ version 2, 3 or 4, got {version}.")
+    if degree > MAX_DEGREE:
+        raise FileFormatError(
+            f"{path}: expected harmonics of degree 0 to {MAX_DEGREE}, got {degree}."
+        )
+    if bits > 24:
+        raise FileFormatError(
+            f"{path}: expected at most 24 fractional bits, got {bits}."
+        )
+    return _Header(
+        version=version,
+        count=count,
+        degree=degree,
+        fractional_bits=bits,
+        flags=flags,
+        streams=streams,
+    )
+
+
+def _check_ratio(path: Path, header: _Header, compressed: int) -> None:
+    """Refuse to allocate what a file of this size cannot honestly hold."""
+    total = header.count * sum(header.sizes)
+    if total > max(_ALWAYS_ALLOWED, _MAX_RATIO * compressed):
+        raise FileFormatError(
+            f"{path}: its header promises {header.count} Gaussians in {compressed} bytes, "
+            "which cannot be."
+        )
+
+
+def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
+    """The attributes of versions 2 and 3."""
+    stream = zlib.decompressobj(wbits=31)
+    try:
+        header = _header(path, stream.decompress(data, _HEADER.size))
+        if header.version > 3:
+            raise FileFormatError(
+                f"{path}: expected SPZ version 2 or 3 inside gzip, got {header.version}."
+            )
+        _check_ratio(path, header, len(data))
+        body = sum(header.sizes) * header.count
+        content = stream.decompress(stream.unconsumed_tail, body) if body else b""
+        # Extensions may follow the attributes; anything else after them is a wrong count.
+        more = stream.decompress(stream.unconsumed_tail, 1) if not stream.eof else b""
+    except zlib.error as error:
+        raise FileFormatError(
+            f"{path}: expected gzip data of an SPZ file: {error}."
+        ) from error
+    if len(content) < body:
+        raise FileFormatError(
+            f"{path}: expected {body} bytes for {header.count} Gaussians of degree "
+            f"{header.degree}, got {len(content)}: the file is truncated."
+        )
+    if more and not header.flags & _EXTENSIONS:
+        raise FileFormatError(
+            f"{path}: expected {body} bytes for {header.count} Gaussians of degree "
+            f"{header.degree}, got more."
+        )
+    if not more and not stream.eof:
+        raise FileFormatError(
+            f"{path}: the gzip data end without their check sum: truncated."
+        )
+    view = memoryview(content)
+    parts: list[bytes] = []
+    for size in header.sizes:
+        parts.append(bytes(view[: size * header.count]))
+        view = view[size * header.count :]
+    return header, parts
+
+
+def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
+    """The attributes of version 4."""
+    import zstandard
+
+    header = _header(path, data)
+    if header.version != 4:
+        raise FileFormatError(
+            f"{path}: expected SPZ version 4 outside gzip, got {header.version}."
+        )
+    if header.streams != len(header.sizes):
+        raise FileFormatError(
+            f"{path}: expected {len(header.sizes)} streams for degree {header.degree}, "
+            f"got {header.streams}."
+        )
+    if len(data) < _HEADER.size + _HEADER_4.size:
+        raise FileFormatError(f"{path}: the header is truncated at {len(data)} bytes.")
+    (table,) = _HEADER_4.unpack_from(data, _HEADER.size)
+    at = table + _STREAM.size * header.streams
+    if table < _HEADER.size + _HEADER_4.size or at > len(data):
+        raise FileFormatError(
+            f"{path}: the table of streams at byte {table} lies outside the file of "
+            f"{len(data)} bytes."
+        )
+    _check_ratio(path, header, len(data))
+    entries = [
+        _STREAM.unpack_from(data, table + i * _STREAM.size)
+        for i in range(header.streams)
+    ]
+    end = at + sum(compressed for compressed, _ in entries)
+    if end != len(data):
+        raise FileFormatError(
+            f"{path}: expected {end} bytes as its table of streams says, got {len(data)}: "
+            f"the file is {'truncated' if end > len(data) else 'too long'}."
+        )
+    parts: list[bytes] = []
+    for i, ((compressed, unpacked), size) in enumerate(
+        zip(entries, header.sizes, strict=True)
+    ):
+        if unpacked != size * header.count:
+            raise FileFormatError(
+                f"{path}: expected {size * header.count} bytes in stream {i} for "
+                f"{header.count} Gaussians, got {unpacked}."
+            )
+        frame = data[at : at + compressed]
+        at += compressed
+        try:
+            reader = zstandard.ZstdDecompressor().stream_reader(frame)
+            part = reader.read(unpacked) if unpacked else b""
+            more = reader.read(1)
+        except zstandard.ZstdError as error:
+            raise FileFormatError(
+                f"{path}: stream {i} is no zstd data: {error}."
+            ) from error
+        if len(part) != unpacked or more:
+            raise FileFormatError(
+                f"{path}: expected {unpacked} bytes in stream {i}, "
+                f"got {'more' if more else len(part)}."
+            )
+        parts.append(part)
+    return header, parts
+
+
+def _positions(packed: NDArray[np.uint8], fractional_bits: int) -> Array:
+    """Positions (n, 3) from 24-bit two's complement fixed point."""
+    wide = np.zeros((len(packed), 3, 4), np.uint8)
+    wide[:, :, 1:] = packed.reshape(-1, 3, 3)
+    fixed = wide.view("<i4")[:, :, 0] >> 8  # the shift carries the sign down
+    return (fixed / float(1 << fractional_bits)).astype(np.float32)
+
+
+def _rotations(packed: NDArray[np.uint8], version: int) -> NDArray[np.float64]:
+    """Quaternions wxyz; version 2 has x, y and z in a byte each and w not negative."""
+    if version >= 3:
+        return unpack_signed_three(np.ascontiguousarray(packed).view("<u4")[:, 0])
+    xyz = packed / 127.5 - 1.0
+    w = np.sqrt(np.maximum(0.0, 1.0 - np.square(xyz).sum(axis=1)))
+    return np.concatenate([w[:, None], xyz], axis=1)
+
+
+def write_spz(
+    gaussians: Gaussians, path: Path, *, version: Literal[3, 4], losses: Losses
+) -> None:
+    """Write an SPZ file of version 3 or 4, rows in the order they have.
+
+    Positions get as many fractional bits as the largest coordinate leaves room for, up to
+    20; harmonics get all eight bits that the format has.
+
+    Raises:
+        RangeError: If a coordinate is beyond 2^23 or a row cannot be rendered.
+    """
+    rows = to_rows(gaussians)
+    losses.drop_extra(gaussians)
+    bits = _fractional_bits(rows.means)
+    streams = _pack(rows, bits, losses)
+    header = _HEADER.pack(
+        MAGIC,
+        version,
+        len(gaussians),
+        gaussians.sh_degree,
+        bits,
+        0,
+        len(streams) if version == 4 else 0,
+    )
+    if version == 3:
+        gzip = zlib.compressobj(6, wbits=31)
+        with path.open("wb") as file:
+            for part in (header, *streams):
+                file.write(gzip.compress(part))
+            file.write(gzip.flush())
+        return
+    import zstandard
+
+    frames = [zstandard.ZstdCompressor(level=9).compress(stream) for stream in streams]
+    with path.open("wb") as file:
+        file.write(header + _HEADER_4.pack(_HEADER.size + _HEADER_4.size))
+        for frame, stream in zip(frames, streams, strict=True):
+            file.write(_STREAM.pack(len(frame), len(stream)))
+        for frame in frames:
+            file.write(frame)
+
+
+def _fractional_bits(means: Array) -> int:
+    """How many bits after the point fit beside the largest coordinate in 24 bits."""
+    largest = float(np.abs(means).max(initial=0.0))
+    for bits in range(20, -1, -1):
+        if np.floor(largest * 2.0**bits + 0.5) < 1 << 23:
+            return bits
+    raise RangeError(
+        f"means: expected coordinates below {1 << 23} for an SPZ file, got {largest:g}."
+    )
+
+
+def _pack(rows: Rows, bits: int, losses: Losses) -> list[bytes]:
+    """The uncompressed streams in file order."""
+    count, coefficients = rows.sh.shape[:2]
+    positions = np.empty((count, 3, 3), np.uint8)
+    opacities = np.empty(count, np.uint8)
+    colours = np.empty((count, 3), np.uint8)
+    scales = np.empty((count, 3), np.uint8)
+    rotations = np.empty(count, "<u4")
+    rest = np.empty((count, coefficients - 1, 3), np.uint8)
+    for part in blocks(count):
+        fixed = np.floor(rows.means[part] * _FLIP * 2.0**bits + 0.5).astype("<i4")
+        positions[part] = fixed[:, :, None].view(np.uint8)[:, :, :3]
+        opacities[part] = unsigned(rows.opacities[part] * 255.0, 255)[0]
+        steps, outside = unsigned((rows.sh[part, 0] * _COLOUR_SCALE + 0.5) * 255.0, 255)
+        colours[part] = steps
+        losses.clamp("colours", outside)
+        steps, outside = unsigned((logs(rows.scales[part]) + 10.0) * 16.0, 255)
+        scales[part] = steps
+        losses.clamp("scales", outside)
+        rotations[part] = pack_signed_three(rows.rotations[part] * _FLIP_ROTATION)
+        signs = _FLIP_SH[: coefficients - 1, None]
+        steps, outside = unsigned(rows.sh[part, 1:] * signs * 128.0 + 128.0, 255)
+        rest[part] = steps
+        losses.clamp("harmonics", outside)
+    arrays = [positions, opacities, colours, scales, rotations, rest]
+    return [array.tobytes() for array in (arrays if coefficients > 1 else arrays[:5])]
