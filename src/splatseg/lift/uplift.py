@@ -10,6 +10,7 @@ voting pixels saw. The strongest id is the Gaussian's label and its share the co
 that passes every Gaussian votes alike for the label of what none covers, such as the sky:
 
 .. math:: b_c = \sum_{views} \sum_p \Bigl(1 - \sum_i w_{pi}\Bigr) [\mathrm{id}(p) = c]
+              = \sum_{views} \sum_p [\mathrm{id}(p) = c] - \sum_i v_{ic}
 
 References:
     Marrie et al., LUDVIG: Learning-free Uplifting of 2D Visual features to Gaussian Splatting
@@ -17,7 +18,7 @@ References:
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -28,7 +29,7 @@ from torch import Tensor
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, Camera, ClassTable, Gaussians, LabelMap, Labels, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.render import RenderOptions, back_project, render
+from splatseg.render import RenderOptions, back_project
 
 _CHANNELS = 32
 """Ids that one back-projection carries; bounds the memory of one-hot images."""
@@ -125,30 +126,33 @@ def uplift(
     """
     options = options or UpliftOptions()
     ballots = _read_ballots(views, evidence)
-    ids = sorted({i for ballot in ballots for i in ballot.ids})
+    ids = sorted({i for ballot in ballots for i in ballot.votes})
     if not ids:
         raise InputError(f"evidence: expected a labelled pixel in {len(views)} views, found none.")
     width = min(len(ids), max(1, options.memory // (4 * max(len(gaussians), 1))))
     parts = [ids[start : start + width] for start in range(0, len(ids), width)]
     engine = _Engine(gaussians, render_options or RenderOptions(), backend)
     ranking = _Ranking(len(gaussians), options.candidates)
-    # ids are any int32; the votes of light are counted by their place in the list.
-    light, voting = torch.zeros(len(ids), dtype=torch.float64), 0.0
+    cast_by_id = torch.tensor(
+        [sum(ballot.votes.get(i, 0.0) for ballot in ballots) for i in ids], dtype=torch.float64
+    )
+    caught_by_id: list[Tensor] = []
     done, total = 0, len(parts) * len(ballots)
-    for number, part in enumerate(parts):
+    for part in parts:
         votes = torch.zeros(len(gaussians), len(part))
         for ballot in ballots:
-            mine = [i for i in part if i in ballot.ids]
-            if mine or number == 0:
+            mine = [i for i in part if i in ballot.votes]
+            if mine:
                 paper = evidence.label_map(ballot.view.name)
                 engine.cast(votes, part, mine, ballot.camera, paper)
-                if number == 0:
-                    passed, pixels = engine.light(ids, ballot.camera, paper)
-                    light, voting = light + passed, voting + pixels
             done += 1
             if progress is not None:
                 progress(done, total)
+        caught_by_id.append(votes.sum(dim=0, dtype=torch.float64))
         ranking.add(votes, part)
+    # Rounding may leave a hair less than nothing.
+    light = (cast_by_id - torch.cat(caught_by_id)).clamp_min(0)
+    voting = float(cast_by_id.sum())
     background, share = _background(light, voting, ids, options)
     labels_ids, confidence, shares = ranking.result(options)
     soft = options.candidates > 1
@@ -164,11 +168,11 @@ def uplift(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Ballot:
-    """A view that votes, with the camera of its label map's pixels and the ids in it."""
+    """A view that votes, with the camera of its label map's pixels and the votes for each id."""
 
     view: View
     camera: Camera
-    ids: frozenset[int]
+    votes: Mapping[int, float]
 
 
 def _read_ballots(views: Sequence[View], evidence: LabelSource) -> list[_Ballot]:
@@ -184,15 +188,23 @@ def _read_ballots(views: Sequence[View], evidence: LabelSource) -> list[_Ballot]
     ballots: list[_Ballot] = []
     for view in views:
         paper = evidence.label_map(view.name)
-        present = torch.unique(paper.ids).tolist()
         ballots.append(
             _Ballot(
                 view=view,
                 camera=camera_of_map(view, paper.height, paper.width),
-                ids=frozenset(int(i) for i in present if i != UNLABELLED),
+                votes=_votes_cast(paper),
             )
         )
     return ballots
+
+
+def _votes_cast(paper: LabelMap) -> dict[int, float]:
+    """How many pixels vote for each id, each with its confidence."""
+    ids, place = torch.unique(paper.ids, return_inverse=True)
+    weights = None if paper.confidence is None else paper.confidence.double().reshape(-1)
+    counts = torch.bincount(place.reshape(-1), weights=weights, minlength=len(ids))
+    pairs = zip(ids.tolist(), counts.tolist(), strict=True)
+    return {int(id): float(count) for id, count in pairs if id != UNLABELLED}
 
 
 def camera_of_map(view: View, height: int, width: int) -> Camera:
@@ -215,7 +227,7 @@ def camera_of_map(view: View, height: int, width: int) -> Camera:
 
 
 class _Engine:
-    """The two directions of rendering that voting needs."""
+    """The adjoint of rendering, a few ids at a time."""
 
     def __init__(self, gaussians: Gaussians, options: RenderOptions, backend: str) -> None:
         self._gaussians = gaussians
@@ -247,30 +259,6 @@ class _Engine:
                 ).sums
             columns = torch.tensor([ids.index(i) for i in part])
             votes.index_add_(1, columns, sums.to(votes))
-
-    def light(
-        self, ids: Sequence[int], camera: Camera, paper: LabelMap
-    ) -> tuple[Float[Tensor, "ids"], float]:
-        """The light that passes every Gaussian by the id of its pixel, and the votes there are."""
-        with torch.no_grad():
-            alpha = (
-                render(
-                    self._gaussians,
-                    camera,
-                    self._gaussians.means.new_zeros(len(self._gaussians), 1),
-                    options=self._options,
-                    backend=self._backend,
-                    warp="nearest",
-                )
-                .alpha.float()
-                .cpu()
-            )
-        voters = paper.ids != UNLABELLED
-        weight = torch.ones_like(alpha) if paper.confidence is None else paper.confidence
-        weight = weight.double()[voters]
-        passed = (1 - alpha).clamp(0, 1).double()[voters] * weight
-        place = torch.searchsorted(torch.tensor(ids, dtype=torch.int32), paper.ids[voters])
-        return torch.bincount(place, weights=passed, minlength=len(ids)), float(weight.sum())
 
 
 class _Ranking:
