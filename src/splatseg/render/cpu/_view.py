@@ -175,7 +175,10 @@ class CpuView:
                 wide, signal.shape[1], image, alpha, depth_sum, median, record
             )
             self._wide = wide if record else None
-        self._forward = (image, alpha, depth_sum) if record else None
+        # Detached: autograd hangs its graph, and with it this view, on the tensors it is given,
+        # and a view that held those would be a cycle that keeps tens of megabytes.
+        kept = (image.detach(), alpha.detach(), depth_sum.detach())
+        self._forward = kept if record else None
         return image, alpha, depth_sum, median
 
     def back_project(self, image: Float[Tensor, "height width channels"]) -> tuple[Tensor, Tensor]:
