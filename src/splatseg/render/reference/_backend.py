@@ -154,7 +154,8 @@ def contributors_from_entries(
 ) -> Contributors:
     """Rank the entries of each pixel."""
     device = found.ids.device
-    order, rank = _strongest_first(found)
+    # Ranked by the values that are returned, so that what looks equal is in order of depth.
+    order, rank = _strongest_first(found.pixels, found.weights.to(dtype))
     kept = rank < k
     order, rank = order[kept], rank[kept]
     ids = torch.full((pixel_count, k), -1, dtype=torch.int32, device=device)
@@ -177,16 +178,15 @@ def weights_from_entries(
     """Keep each pixel's k strongest entries (None: all), in the layout asked for."""
     kept = torch.arange(len(found.ids), device=found.ids.device)
     if k is not None:
-        order, rank = _strongest_first(found)
+        order, rank = _strongest_first(found.pixels, found.weights)
         kept = order[rank < k].sort().values
     csr = csr_from_entries(found.pixels[kept], found.ids[kept], found.weights[kept], shape=shape)
     return csr if layout == "csr" else blocks_from_csr(csr, camera.width, camera.height)
 
 
-def _strongest_first(found: Entries) -> tuple[Tensor, Tensor]:
+def _strongest_first(pixels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Entries by pixel, then falling weight, then front to back; and the rank in the pixel."""
-    order = torch.argsort(found.weights, descending=True, stable=True)
-    order = order[torch.argsort(found.pixels[order], stable=True)]
-    pixels = found.pixels[order]
+    order = torch.argsort(weights, descending=True, stable=True)
+    order = order[torch.argsort(pixels[order], stable=True)]
     position = torch.arange(len(pixels), device=pixels.device)
-    return order, position - torch.searchsorted(pixels, pixels)
+    return order, position - torch.searchsorted(pixels, pixels[order])
