@@ -1,0 +1,55 @@
+"""What commands that go through views share: which views, which layer, and a progress bar."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from splatseg.core import Features, Labels, Scene, Selection, View
+from splatseg.errors import InputError
+from splatseg.io.scene import load_scene, load_scene_layer
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on stderr with an estimate; gives a function of (done, total)."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(compact=True),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+
+        def step(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield step
+
+
+def open_scene(root: Path, data: Path | None) -> Scene:
+    """The scene that a command works on."""
+    return load_scene(root, data=data)
+
+
+def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
+    """The views of a split, or all of them.
+
+    Raises:
+        InputError: If the scene has no view of this split.
+    """
+    views = tuple(view for view in scene.views if split in ("all", view.split))
+    if views:
+        return views
+    known = ", ".join(sorted({view.split for view in scene.views})) or "none: it has no views"
+    raise InputError(f"--split: expected all or a split of the scene ({known}), got {split!r}.")
+
+
+def layer_of(scene: Scene, name: str) -> Labels | Selection | Features:
+    """A layer of a scene that was loaded from a folder."""
+    if scene.root is None:
+        raise InputError(f"layer {name!r}: the scene has no folder to read it from.")
+    return load_scene_layer(scene.root, name)

@@ -1,0 +1,236 @@
+"""A scene held against truth: its layers and pictures drawn in views and scored there.
+
+Predictions are drawn in the pixels of the truth, so nothing that is scored was resized. A layer
+that learned from a view it is scored on is said to, in the report's `learned_from`.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, Selection, View
+from splatseg.errors import InputError
+from splatseg.evaluate.metrics import (
+    BinaryScore,
+    Confusion,
+    SemanticScore,
+    binary_score,
+    per_image_miou,
+    psnr,
+    semantic_score,
+    ssim,
+)
+from splatseg.io.images import load_image
+from splatseg.lift import LabelSource, label_map
+from splatseg.lift.uplift import camera_of_map
+from splatseg.render import RenderOptions, render
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SemanticReport:
+    """Scores of a layer's classes."""
+
+    score: SemanticScore
+    """Pooled over all views."""
+
+    per_image_miou: float
+    """Mean over views of each view's own mean IoU."""
+
+    views: tuple[str, ...]
+    """Views that were scored."""
+
+    learned_from: tuple[str, ...]
+    """Those of them that the layer was made from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BinaryReport:
+    """Scores of one object, or of a selection."""
+
+    score: BinaryScore
+    views: tuple[str, ...]
+    """Views that were scored."""
+
+    learned_from: tuple[str, ...]
+    """Those of them that the layer was made from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotographReport:
+    """How like the photographs the pictures are."""
+
+    psnr: float
+    """Mean over views, decibels."""
+
+    psnr_min: float
+    """Of the worst view, decibels."""
+
+    ssim: float
+    """Mean over views."""
+
+    views: tuple[str, ...]
+    """Views that were scored."""
+
+
+def evaluate_semantic(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    labels: Labels,
+    truth: LabelSource,
+    *,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Progress | None = None,
+) -> SemanticReport:
+    """Score the classes of a layer in the views that have a truth.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Where to look; those without a truth are left out.
+        labels: The layer.
+        truth: Label maps by view name; -1 is void.
+        options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and their number.
+
+    Raises:
+        InputError: If no view has a truth.
+        ShapeError: If a truth does not have its photograph's proportions.
+    """
+    scored = _with_truth(views, truth)
+    confusions: list[Confusion] = []
+    for done, view in enumerate(scored, start=1):
+        true = truth.label_map(view.name)
+        drawn = _drawn(gaussians, view, labels, true, options, backend)
+        confusions.append(Confusion.of(drawn.ids, true.ids))
+        if progress is not None:
+            progress(done, len(scored))
+    pooled = sum(confusions[1:], start=confusions[0])
+    return SemanticReport(
+        score=semantic_score(pooled),
+        per_image_miou=per_image_miou(confusions),
+        views=tuple(view.name for view in scored),
+        learned_from=_learned_from(labels, scored),
+    )
+
+
+def evaluate_binary(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    layer: Labels | Selection,
+    truth: LabelSource,
+    *,
+    id: int | None = None,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Progress | None = None,
+) -> BinaryReport:
+    """Score a selection, or one id of a layer, as a mask in the views that have a truth.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Where to look; those without a truth are left out.
+        layer: A selection, or labels.
+        truth: Label maps by view name.
+        id: The id to score, of the truth and of a layer of labels; None takes every labelled
+            pixel.
+        options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and their number.
+
+    Raises:
+        InputError: If no view has a truth.
+        ShapeError: If a truth does not have its photograph's proportions.
+    """
+    scored = _with_truth(views, truth)
+    labels = layer if isinstance(layer, Labels) else labels_of(layer)
+    wanted = id if isinstance(layer, Labels) else None
+    pairs: list[tuple[torch.Tensor, torch.Tensor]] = []
+    for done, view in enumerate(scored, start=1):
+        true = truth.label_map(view.name)
+        drawn = _drawn(gaussians, view, labels, true, options, backend)
+        pairs.append((_mask(drawn, wanted), _mask(true, id)))
+        if progress is not None:
+            progress(done, len(scored))
+    return BinaryReport(
+        score=binary_score(pairs),
+        views=tuple(view.name for view in scored),
+        learned_from=_learned_from(layer, scored),
+    )
+
+
+def evaluate_photographs(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    *,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Progress | None = None,
+) -> PhotographReport:
+    """Score the pictures against the photographs, as 8-bit files of both would score.
+
+    Raises:
+        InputError: If there are no views, or one has no photograph.
+        MissingFileError: If a photograph is not where it was.
+    """
+    if not views:
+        raise InputError("views: expected at least one view with a photograph, got none.")
+    decibels: list[float] = []
+    likeness: list[float] = []
+    for done, view in enumerate(views, start=1):
+        photograph = load_image(view)
+        with torch.no_grad():
+            drawn = render(
+                gaussians, view.camera, options=options or RenderOptions(), backend=backend
+            )
+        picture = (drawn.image.cpu().double().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        decibels.append(psnr(picture, photograph))
+        likeness.append(ssim(picture, photograph))
+        if progress is not None:
+            progress(done, len(views))
+    return PhotographReport(
+        psnr=math.fsum(decibels) / len(decibels),
+        psnr_min=min(decibels),
+        ssim=math.fsum(likeness) / len(likeness),
+        views=tuple(view.name for view in views),
+    )
+
+
+def labels_of(selection: Selection) -> Labels:
+    """A selection as labels, 1 inside and none outside, to be drawn as a mask."""
+    ids = torch.where(selection.mask, 1, UNLABELLED)
+    return Labels(ids=ids, confidence=selection.mask.float(), metadata=selection.metadata)
+
+
+def _drawn(
+    gaussians: Gaussians,
+    view: View,
+    labels: Labels,
+    truth: LabelMap,
+    options: RenderOptions | None,
+    backend: str,
+) -> LabelMap:
+    camera = camera_of_map(view, truth.height, truth.width)
+    return label_map(gaussians, camera, labels, options=options, backend=backend)
+
+
+def _mask(ids: LabelMap, id: int | None) -> torch.Tensor:
+    return ids.ids != UNLABELLED if id is None else ids.ids == id
+
+
+def _with_truth(views: Sequence[View], truth: LabelSource) -> list[View]:
+    known = set(truth.view_names)
+    scored = [view for view in views if view.name in known]
+    if not scored:
+        raise InputError(f"truth: expected the truth of at least one of {len(views)} views.")
+    return scored
+
+
+def _learned_from(layer: Labels | Selection, views: Sequence[View]) -> tuple[str, ...]:
+    voters = layer.metadata.get("views")
+    known = set(map(str, voters)) if isinstance(voters, (list, tuple)) else set[str]()  # pyright: ignore[reportUnknownArgumentType]
+    return tuple(view.name for view in views if view.name in known)
