@@ -4,9 +4,9 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 
+#include <memory>
 #include <optional>
 #include <stdexcept>
-#include <vector>
 
 #include "fit.h"
 
@@ -34,12 +34,13 @@ std::pair<double, double> bound_l1_dssim(Array<const float, 3> image,
   expect(!mask || (mask->shape(0) == height && mask->shape(1) == width),
          "l1_dssim: mask must be (height, width)");
   nb::gil_scoped_release released;
-  std::vector<float> scratch(static_cast<size_t>(l1_dssim_scratch(
-      static_cast<int64_t>(height), static_cast<int64_t>(width), mask.has_value())));
+  // Not a vector: nobody reads what is not written first.
+  const std::unique_ptr<float[]> scratch(new float[static_cast<size_t>(l1_dssim_scratch(
+      static_cast<int64_t>(height), static_cast<int64_t>(width), mask.has_value()))]);
   const LossValue value =
       l1_dssim(image.data(), photograph.data(), mask ? mask->data() : nullptr,
                static_cast<int64_t>(height), static_cast<int64_t>(width), dssim_weight,
-               gradient.data(), scratch.data());
+               gradient.data(), scratch.get());
   return {value.loss, value.squared_error};
 }
 

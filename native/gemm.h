@@ -9,6 +9,7 @@
 #error "SPLATSEG_ISA must name the instruction set this file is compiled for"
 #endif
 
+
 namespace splatseg::SPLATSEG_ISA {
 
 #if defined(__AVX512F__)
@@ -21,38 +22,45 @@ inline constexpr int kWidth = 8, kForwardPixels = 4, kForwardVectors = 2, kAdjoi
 inline constexpr int kWidth = 4, kForwardPixels = 4, kForwardVectors = 2, kAdjointRows = 4,
                      kAdjointVectors = 2;
 #endif
-typedef float Wide __attribute__((vector_size(kWidth * 4)));
-typedef float WideLoose __attribute__((vector_size(kWidth * 4), aligned(4), may_alias));
-
-inline Wide load_wide(const float* p) { return *reinterpret_cast<const WideLoose*>(p); }
-inline void store_wide(float* p, Wide v) { *reinterpret_cast<WideLoose*>(p) = v; }
 
 #if defined(__AVX512F__)
-inline Wide multiply_add(float a, Wide b, Wide c) {
-  return (Wide)_mm512_fmadd_ps(_mm512_set1_ps(a), (__m512)b, (__m512)c);
-}
+using Wide = __m512;
+inline Wide load_wide(const float* p) { return _mm512_loadu_ps(p); }
+inline void store_wide(float* p, Wide v) { _mm512_storeu_ps(p, v); }
+inline Wide multiply_add(float a, Wide b, Wide c) { return _mm512_fmadd_ps(_mm512_set1_ps(a), b, c); }
 #elif defined(__AVX2__)
-inline Wide multiply_add(float a, Wide b, Wide c) {
-  return (Wide)_mm256_fmadd_ps(_mm256_set1_ps(a), (__m256)b, (__m256)c);
-}
+using Wide = __m256;
+inline Wide load_wide(const float* p) { return _mm256_loadu_ps(p); }
+inline void store_wide(float* p, Wide v) { _mm256_storeu_ps(p, v); }
+inline Wide multiply_add(float a, Wide b, Wide c) { return _mm256_fmadd_ps(_mm256_set1_ps(a), b, c); }
 #else
+typedef float Wide __attribute__((vector_size(kWidth * 4)));
+typedef float WideLoose __attribute__((vector_size(kWidth * 4), aligned(4), may_alias));
+inline Wide load_wide(const float* p) { return *reinterpret_cast<const WideLoose*>(p); }
+inline void store_wide(float* p, Wide v) { *reinterpret_cast<WideLoose*>(p) = v; }
 inline Wide multiply_add(float a, Wide b, Wide c) { return c + (a - Wide{}) * b; }
 #endif
 
 // acc[p][channel..] += sum_k weights[k][p] * rows[k][channel..]
+//
+// Not inlined, as its twin below: the constants of the caller would take the registers that the
+// sums need.
 template <int Pixels, int Vectors>
-inline void forward_tile(float* acc, int channels, const float* weights, int count,
+[[gnu::noinline]] void forward_tile(float* acc, int channels, const float* weights, int count,
                          const float* const* rows, int channel) {
   Wide sum[Pixels][Vectors];
   for (int p = 0; p < Pixels; ++p)
     for (int v = 0; v < Vectors; ++v)
       sum[p][v] = load_wide(acc + static_cast<int64_t>(p) * channels + channel + v * kWidth);
   for (int k = 0; k < count; ++k) {
-    Wide row[Vectors];
-    for (int v = 0; v < Vectors; ++v) row[v] = load_wide(rows[k] + channel + v * kWidth);
+    // Named one by one: GCC keeps an array of them on the stack, at 1.5 times the cost.
+    static_assert(Vectors <= 2);
+    const float* row = rows[k] + channel;
+    const Wide row0 = load_wide(row), row1 = Vectors > 1 ? load_wide(row + kWidth) : row0;
     for (int p = 0; p < Pixels; ++p) {
       float w = weights[k * 16 + p];
-      for (int v = 0; v < Vectors; ++v) sum[p][v] = multiply_add(w, row[v], sum[p][v]);
+      sum[p][0] = multiply_add(w, row0, sum[p][0]);
+      if constexpr (Vectors > 1) sum[p][1] = multiply_add(w, row1, sum[p][1]);
     }
   }
   for (int p = 0; p < Pixels; ++p)
@@ -77,7 +85,7 @@ inline void block_forward(float* acc, int channels, const float* weights, int co
 
 // rows[k][channel..] += sum_p weights[k][p] * block[p][channel..] for Rows rows.
 template <int Rows, int Vectors>
-inline void adjoint_tile(float* const* rows, const float* weights, const float* block, int stride,
+[[gnu::noinline]] void adjoint_tile(float* const* rows, const float* weights, const float* block, int stride,
                          int channel) {
   Wide sum[Rows][Vectors];
   for (int r = 0; r < Rows; ++r)

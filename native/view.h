@@ -17,8 +17,17 @@ struct ImageGradients {  // what a backward pass reads; null where there is none
   const float *v_image, *v_alpha, *v_depth_sum;  // gradients towards them
 };
 
+// What building block weights needs on each thread; kept because fresh memory costs page faults.
+struct BlockScratch {
+  Buffer<int32_t> ids, tile_ids;
+  Buffer<uint16_t> weights, tile_weights;
+  Buffer<float> tile;
+};
+
 class View {
  public:
+  std::vector<BlockScratch>& block_scratch() { return block_scratch_; }
+
   void prepare(const Cloud& cloud, const Pinhole& camera, const Blending& blending);
 
   int64_t visible() const { return visible_; }
@@ -74,6 +83,7 @@ class View {
   };
   std::vector<RecordPlace> record_place_;
   std::vector<Buffer<float>> scratch_;  // per thread
+  std::vector<BlockScratch> block_scratch_;
   Buffer<float> batch_;
   Buffer<float> gradients_;  // kGrad a visible splat
 };

@@ -33,26 +33,21 @@ void BlockMatrix::build(View& view, int64_t gaussians) {
   // A tile's entries are not known before it was blended: each thread keeps what it found, and
   // everything moves to its place once all counts are known.
   const size_t parts = static_cast<size_t>(threads());
-  struct Found {
-    Buffer<int32_t> ids;
-    Buffer<uint16_t> weights;
-  };
-  std::vector<Found> found(parts);
-  std::vector<Buffer<int32_t>> tile_ids(parts);
-  std::vector<Buffer<uint16_t>> tile_weights(parts);
-  std::vector<Buffer<float>> scratch(parts);
+  std::vector<BlockScratch>& found = view.block_scratch();
+  if (found.size() < parts) found.resize(parts);
+  for (BlockScratch& each : found) each.ids.set_size(0);
   std::vector<std::pair<int32_t, int64_t>> place(static_cast<size_t>(tiles));
   std::vector<int32_t> counts(static_cast<size_t>(tiles) * 16);
   parallel_for_thread(tiles, 4, [&](int thread, int64_t from, int64_t to) {
     const size_t me = static_cast<size_t>(thread);
     for (int64_t tile = from; tile < to; ++tile) {
       const int64_t room = frame.tile_begin[tile + 1] - frame.tile_begin[tile];
-      int32_t* ids = tile_ids[me].resize(room * 16);
-      uint16_t* weights = tile_weights[me].resize(room * 256 + 16);
+      BlockScratch& mine = found[me];
+      int32_t* ids = mine.tile_ids.resize(room * 16);
+      uint16_t* weights = mine.tile_weights.resize(room * 256 + 16);
       int32_t* count = counts.data() + tile * 16;
       kernels().block_weights(frame, static_cast<int>(tile),
-                              scratch[me].resize(kTileScratchBytes / 4), count, ids, weights, room);
-      Found& mine = found[me];
+                              mine.tile.resize(kTileScratchBytes / 4), count, ids, weights, room);
       place[static_cast<size_t>(tile)] = {thread, mine.ids.size()};
       int64_t sum = 0;
       for (int b = 0; b < 16; ++b) sum += count[b];
@@ -82,7 +77,7 @@ void BlockMatrix::build(View& view, int64_t gaussians) {
   parallel_for(tiles, 16, [&](int64_t from, int64_t to) {
     for (int64_t tile = from; tile < to; ++tile) {
       const auto [thread, offset] = place[static_cast<size_t>(tile)];
-      const Found& source = found[static_cast<size_t>(thread)];
+      const BlockScratch& source = found[static_cast<size_t>(thread)];
       const int64_t at = begin_[static_cast<size_t>(tile) * 16];
       const int64_t n = begin_[static_cast<size_t>(tile) * 16 + 16] - at;
       if (!n) continue;
