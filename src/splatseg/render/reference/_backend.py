@@ -61,9 +61,9 @@ class ReferenceBackend(Backend):
             depth_sum[place] = (weights @ z).reshape(tile.size)
             median[place] = (tile.matrix.median.double() @ z.detach()).reshape(tile.size)
         # Where nothing is visible the gradients are 0, not missing.
-        image = image + 0 * signal.sum()
-        alpha = alpha + 0 * (projected.centres.sum() + projected.covariances.sum())
-        alpha = alpha + 0 * projected.opacities.sum()
+        nothing = 0 * (projected.centres.sum() + projected.covariances.sum())
+        nothing = nothing + 0 * (projected.opacities.sum() + signal.sum())
+        image, alpha = image + nothing, alpha + nothing
         covered = alpha > 0
         depth = torch.where(covered, depth_sum / torch.where(covered, alpha, 1.0), 0.0)
         dtype = gaussians.dtype
