@@ -1,0 +1,55 @@
+# make demo: the whole pipeline on a generated room.   make test: everything CI checks.
+# Both start from nothing but Python (>= 3.11), pip, a C++ compiler and make.
+#
+# Variables: PYTHON (the interpreter to start from), TORCH (the torch to install first).
+
+PYTHON ?= python3
+TORCH  ?= torch==2.13.0
+
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMPS := $(VENV)/stamps
+PIP    := $(BIN)/python -m pip --disable-pip-version-check
+
+NATIVE_SOURCES := CMakeLists.txt $(wildcard native/*)
+
+.PHONY: help install demo test clean
+
+help:
+	@echo 'make demo     run the whole pipeline on a generated room and write a report'
+	@echo 'make test     lint, types, import rules and every test'
+	@echo 'make install  only make .venv and install everything into it'
+	@echo 'make clean    remove .venv and everything that was built'
+
+install: $(STAMPS)/splatseg
+
+demo: install
+	$(BIN)/splatseg demo
+
+test: install
+	scripts/check
+
+# --clear is not given: an environment that is already there is completed, not thrown away.
+$(STAMPS)/venv:
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "splatseg needs Python 3.11 or newer; this is " + sys.version.split()[0])'
+	$(PYTHON) -m venv $(VENV)
+	@mkdir -p $(STAMPS)
+	@touch $@
+
+# torch comes before anything that asks for it, so that this build of it is the one they find.
+$(STAMPS)/torch: $(STAMPS)/venv
+	$(PIP) install '$(TORCH)'
+	@touch $@
+
+# The build requirements are installed, not isolated: cmake then builds in place, and a second
+# run compiles only the kernels that changed.
+$(STAMPS)/build: $(STAMPS)/torch
+	$(PIP) install 'scikit-build-core>=0.10' 'nanobind>=2.4' 'cmake>=3.24' 'ninja>=1.11'
+	@touch $@
+
+$(STAMPS)/splatseg: $(STAMPS)/build pyproject.toml $(NATIVE_SOURCES)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) install --no-build-isolation --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build build-sanitize demo

@@ -1,0 +1,193 @@
+"""The command line: `splatseg COMMAND ...`.
+
+Each command is a module of this package that holds a frozen dataclass `Command` (tyro turns its
+fields into flags and the strings under them into help) and ``run(command)``. The table below is
+all that ``splatseg --help`` reads, so the list of commands appears without importing torch.
+
+Exit status: 0 done, 2 bad input or usage, 1 everything else, Ctrl-C included.
+"""
+
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+from splatseg.errors import InputError, SplatsegError
+
+EXIT_DONE = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandEntry:
+    """One row of the table of commands."""
+
+    module: str
+    """The module that holds `Command` and `run`."""
+
+    summary: str
+    """What the command does, in one line of the top-level help."""
+
+
+COMMANDS: dict[str, CommandEntry] = {
+    "info": CommandEntry(
+        module="splatseg.cli.info",
+        summary="what a capture, a splat file or a scene folder holds",
+    ),
+    "fit": CommandEntry(
+        module="splatseg.cli.fit",
+        summary="posed photographs and start points -> Gaussians",
+    ),
+    "segment": CommandEntry(
+        module="splatseg.cli.segment",
+        summary="evidence (label maps, masks, features) -> a layer of the scene",
+    ),
+    "render": CommandEntry(
+        module="splatseg.cli.render",
+        summary="pictures, depth and label maps of a scene's views",
+    ),
+    "evaluate": CommandEntry(
+        module="splatseg.cli.evaluate",
+        summary="score a layer against label maps of held-out views",
+    ),
+    "export": CommandEntry(
+        module="splatseg.cli.export",
+        summary="a scene and its labels as files that other tools read",
+    ),
+}
+"""Every command, in the order of the work."""
+
+
+class CommandModule(Protocol):
+    """What a module of this package offers."""
+
+    Command: type[Any]
+
+    def run(self, command: Any, /) -> None:
+        """Do what the parsed command says."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line and return its exit status.
+
+    Args:
+        argv: The words after ``splatseg``; the process's own when None.
+
+    Returns:
+        0 when the command was carried out; 2 when the words or the input cannot be used; 1 for
+        everything else. Errors are one line on the standard error stream; ``--debug`` anywhere
+        among the words adds the traceback.
+
+    Example:
+        >>> main(["--version"])
+        splatseg 0.1.0
+        0
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words
+    if debug:
+        words = [word for word in words if word != "--debug"]
+    try:
+        status = _dispatch(words)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output went away (`splatseg info X | head -1`). The interpreter
+        # flushes once more at exit; give it somewhere to write so that it stays silent.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return EXIT_FAILED
+    except InputError as error:
+        return _report(error, str(error), status=EXIT_USAGE, debug=debug)
+    except SplatsegError as error:
+        return _report(error, str(error), status=EXIT_FAILED, debug=debug)
+    except Exception as error:  # noqa: BLE001  (the last resort: one line, not a traceback)
+        sentence = f"{type(error).__name__}: {error} (add --debug for the traceback)"
+        return _report(error, sentence, status=EXIT_FAILED, debug=debug)
+    return status
+
+
+def entry_point() -> int:
+    """What the installed `splatseg` script calls; it exits with the status returned."""
+    return main()
+
+
+def overview() -> str:
+    """The text of ``splatseg --help``: every command with its one line."""
+    width = max(len(name) for name in COMMANDS)
+    rows = "\n".join(f"  {name:<{width}}  {row.summary}" for name, row in COMMANDS.items())
+    return (
+        "usage: splatseg COMMAND ...\n\n"
+        "Segments 3D Gaussian scenes: which Gaussians are what, from posed photographs and what\n"
+        "2D models see in them.\n\n"
+        f"commands:\n{rows}\n\n"
+        "splatseg COMMAND --help   the flags of one command, with their units and defaults\n"
+        "splatseg --version        the version\n"
+        "--debug                   with any command: the traceback of an error\n\n"
+        "exit status: 0 done, 2 bad input or usage, 1 everything else"
+    )
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words:
+        print(overview(), file=sys.stderr)
+        return EXIT_USAGE
+    name, rest = words[0], words[1:]
+    if name in ("--help", "-h", "help"):
+        print(overview())
+        return EXIT_DONE
+    if name == "--version":
+        print(f"splatseg {_version()}")
+        return EXIT_DONE
+    if name not in COMMANDS:
+        raise InputError(_unknown(name))
+    module = cast("CommandModule", importlib.import_module(COMMANDS[name].module))
+    return _run(module, name, rest)
+
+
+def _run(module: CommandModule, name: str, words: list[str]) -> int:
+    """Parse the words of one command and run it; tyro's own exits become our status."""
+    import tyro  # here, because the top-level help needs none of it
+
+    try:
+        command = tyro.cli(
+            module.Command,
+            prog=f"splatseg {name}",
+            args=words,
+            config=(
+                tyro.conf.OmitArgPrefixes,  # --steps, not --options.steps
+                tyro.conf.HelptextFromCommentsOff,  # comments speak to readers of the code
+            ),
+        )
+    except SystemExit as leaving:  # after --help (0) or a usage error (2)
+        return leaving.code if isinstance(leaving.code, int) else EXIT_USAGE
+    module.run(command)
+    return EXIT_DONE
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("splatseg")
+
+
+def _unknown(name: str) -> str:
+    kind = "option" if name.startswith("-") else "command"
+    known = [*COMMANDS, "--help", "--version"]
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(COMMANDS)}."
+    return f"unknown {kind} {name!r}; {hint}"
+
+
+def _report(error: Exception, sentence: str, *, status: int, debug: bool) -> int:
+    if debug:
+        import traceback
+
+        traceback.print_exception(error, file=sys.stderr)
+    print(f"error: {sentence}", file=sys.stderr)
+    return status

@@ -1,0 +1,216 @@
+"""The top of the command line: the table of commands, exit statuses, one-line errors."""
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+import textwrap
+import types
+from collections.abc import Callable
+
+import pytest
+
+from splatseg import cli
+from splatseg.errors import BackendError, InputError, MissingPackageError, RangeError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Count:
+    """Counts."""
+
+    # A comment that must not become help.
+    steps: int = 3
+    """How many steps to take."""
+
+
+@pytest.fixture
+def install_command(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Count], None]], None]:
+    """Put a command `count` whose `run` is the given function into the table."""
+
+    def install(run: Callable[[Count], None]) -> None:
+        module = types.ModuleType("splatseg.cli.count")
+        module.__dict__.update(Command=Count, run=run)
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        entry = cli.CommandEntry(module=module.__name__, summary="counts")
+        monkeypatch.setitem(cli.COMMANDS, "count", entry)
+
+    return install
+
+
+def raising(error: BaseException) -> Callable[[Count], None]:
+    def run(command: Count) -> None:
+        raise error
+
+    return run
+
+
+def test_every_row_of_the_table_is_a_command() -> None:
+    for name, entry in cli.COMMANDS.items():
+        module = importlib.import_module(entry.module)
+        assert dataclasses.is_dataclass(module.Command), name
+        assert module.Command.__dataclass_params__.frozen, name
+        assert callable(module.run), name
+
+
+def test_every_module_of_the_package_is_in_the_table() -> None:
+    from pathlib import Path
+
+    files = {path.stem for path in Path(cli.__file__).parent.glob("[!_]*.py")}
+    assert files == {entry.module.rsplit(".", 1)[1] for entry in cli.COMMANDS.values()}
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_each_command_has_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([name, "--help"]) == 0
+    assert f"splatseg {name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_each_field_of_a_command_is_explained(name: str) -> None:
+    """A sentence stands under every field; tyro shows it as the flag's help."""
+    module = importlib.import_module(cli.COMMANDS[name].module)
+    tree = ast.parse(textwrap.dedent(inspect.getsource(module.Command))).body[0]
+    assert isinstance(tree, ast.ClassDef)
+    body = tree.body
+    for field, below in zip(body, [*body[1:], None], strict=True):
+        if isinstance(field, ast.AnnAssign):
+            explained = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            assert explained, f"{name}: {ast.unparse(field)}"
+
+
+@pytest.mark.parametrize("word", ["--help", "-h", "help"])
+def test_help_lists_every_command(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([word]) == 0
+    text = capsys.readouterr().out
+    for name, entry in cli.COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", text, re.MULTILINE)
+
+
+def test_no_command_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("usage: splatseg COMMAND")
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [
+        ("rendr", "error: unknown command 'rendr'; did you mean 'render'?\n"),
+        ("--versoin", "error: unknown option '--versoin'; did you mean '--version'?\n"),
+    ],
+)
+def test_unknown_words_get_a_suggestion(
+    word: str, sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([word, "--steps", "1"]) == 2
+    assert capsys.readouterr() == ("", sentence)
+
+
+def test_a_word_like_nothing_gets_the_list(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["qqqqq"]) == 2
+    assert f"known are {', '.join(cli.COMMANDS)}." in capsys.readouterr().err
+
+
+def test_words_become_the_dataclass(install_command: Callable[..., None]) -> None:
+    seen: list[Count] = []
+    install_command(seen.append)
+    assert cli.main(["count"]) == 0
+    assert cli.main(["count", "--steps", "7"]) == 0
+    assert seen == [Count(steps=3), Count(steps=7)]
+
+
+def test_help_comes_from_the_string_under_a_field(
+    install_command: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    install_command(raising(RuntimeError("--help must not run the command")))
+    assert cli.main(["count", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "How many steps to take." in text
+    assert "must not become help" not in text
+
+
+@pytest.mark.parametrize("words", [["--steps", "many"], ["--stepz", "1"], ["stray"]])
+def test_words_that_do_not_parse_are_usage_errors(
+    words: list[str], install_command: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    install_command(raising(RuntimeError("must not run")))
+    assert cli.main(["count", *words]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "Traceback" not in captured.err
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "stderr"),
+    [
+        (InputError("DATA is empty."), 2, "error: DATA is empty.\n"),
+        (RangeError("near must be positive."), 2, "error: near must be positive.\n"),
+        (MissingPackageError("pip install gsplat"), 1, "error: pip install gsplat\n"),
+        (BackendError("no GPU."), 1, "error: no GPU.\n"),
+        (KeyboardInterrupt(), 1, "interrupted\n"),
+        (
+            KeyError("x"),
+            1,
+            "error: KeyError: 'x' (add --debug for the traceback)\n",
+        ),
+    ],
+)
+def test_errors_become_one_line_and_a_status(
+    error: BaseException,
+    status: int,
+    stderr: str,
+    install_command: Callable[..., None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    install_command(raising(error))
+    assert cli.main(["count"]) == status
+    assert capsys.readouterr() == ("", stderr)
+
+
+def test_a_command_may_set_its_own_exit_only_through_errors(
+    install_command: Callable[..., None],
+) -> None:
+    """A SystemExit out of `run` is not mistaken for tyro's."""
+    install_command(raising(SystemExit(5)))
+    with pytest.raises(SystemExit):
+        cli.main(["count"])
+
+
+@pytest.mark.parametrize("words", [["--debug", "count"], ["count", "--debug", "--steps", "1"]])
+def test_debug_adds_the_traceback(
+    words: list[str], install_command: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    install_command(raising(InputError("DATA is empty.")))
+    assert cli.main(words) == 2
+    text = capsys.readouterr().err
+    assert text.startswith("Traceback (most recent call last)")
+    assert text.endswith("error: DATA is empty.\n")
+
+
+@pytest.mark.parametrize("module", ["splatseg", "splatseg.cli"])
+def test_python_dash_m(module: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", module, "nothing"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: unknown command 'nothing'")
+
+
+def test_a_reader_that_goes_away_is_no_traceback() -> None:
+    """`splatseg --help | true`: the pipe breaks while we write."""
+    script = (
+        "import sys, splatseg.cli as cli\n"
+        "cli.overview = lambda: 'x' * 10_000_000\n"
+        "sys.exit(cli.main(['--help']))\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1

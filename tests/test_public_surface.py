@@ -1,0 +1,84 @@
+"""The names people import from `splatseg`, and nothing else."""
+
+import ast
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+import splatseg
+
+SURFACE = {
+    "Camera",
+    "Capture",
+    "FeatureMap",
+    "Features",
+    "Gaussians",
+    "InputError",
+    "LabelMap",
+    "Labels",
+    "MaskSet",
+    "RenderOptions",
+    "Scene",
+    "Selection",
+    "Similarity",
+    "SplatsegError",
+    "View",
+    "back_project",
+    "contributors",
+    "get_backend",
+    "load_layer",
+    "load_scene",
+    "open_evidence",
+    "read_capture",
+    "read_splats",
+    "save_layer",
+    "save_scene",
+    "uplift",
+    "weights",
+    "write_splats",
+}
+
+
+def written_imports() -> dict[str, str]:
+    """Name -> module of every ``from M import X as X`` in the package's __init__."""
+    tree = ast.parse(Path(splatseg.__file__).read_text(encoding="utf-8"))
+    found: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("splatseg"):
+            for alias in node.names:
+                assert alias.asname == alias.name, f"{alias.name} is not re-exported as itself"
+                found[alias.name] = node.module
+    return found
+
+
+def test_the_surface_is_the_list_above() -> None:
+    assert set(dir(splatseg)) == SURFACE
+
+
+def test_type_checkers_and_the_interpreter_see_the_same_names() -> None:
+    written = written_imports()
+    assert set(written) == SURFACE
+    lazy = {name: home for name, home in written.items() if home != "splatseg.errors"}
+    assert lazy == splatseg._HOME_OF
+
+
+@pytest.mark.parametrize("name", sorted(SURFACE))
+def test_each_name_is_the_object_of_its_home_and_documented(name: str) -> None:
+    value = getattr(splatseg, name)
+    assert value is getattr(importlib.import_module(written_imports()[name]), name)
+    assert (value.__doc__ or "").strip(), f"{name} has no docstring"
+
+
+def test_a_missing_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="module 'splatseg' has no attribute 'Gausians'"):
+        _ = splatseg.Gausians  # pyright: ignore
+
+
+def test_no_public_name_hides_a_package() -> None:
+    """`splatseg.render` is always the package, whatever was imported before."""
+    for name in SURFACE:
+        assert f"splatseg.{name}" not in sys.modules, name
+    packages = {path.parent.name for path in Path(splatseg.__file__).parent.glob("*/__init__.py")}
+    assert not packages & SURFACE
