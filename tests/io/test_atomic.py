@@ -33,16 +33,21 @@ def test_file_replaces_the_old_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_failed_file_leaves_the_old_one(tmp_path: Path, error: type[BaseException]) -> None:
     (tmp_path / "a").write_bytes(b"old")
-    with pytest.raises(error), atomic_file(tmp_path / "a") as temporary:
-        temporary.write_bytes(b"half")
-        raise error
+
+    def write_half() -> None:
+        with atomic_file(tmp_path / "a") as temporary:
+            temporary.write_bytes(b"half")
+            raise error("stop")
+
+    with pytest.raises(error, match="stop"):
+        write_half()
     assert (tmp_path / "a").read_bytes() == b"old"
     assert names(tmp_path) == ["a"]
 
 
 def test_file_follows_a_link(tmp_path: Path) -> None:
     (tmp_path / "real").write_bytes(b"old")
-    os.symlink(tmp_path / "real", tmp_path / "link")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
     with atomic_file(tmp_path / "link") as temporary:
         temporary.write_bytes(b"new")
     assert (tmp_path / "link").is_symlink()
@@ -72,9 +77,15 @@ def test_missing_parent_is_named(tmp_path: Path, writer: object) -> None:
 def test_folder_for_file_and_file_for_folder(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(InputError, match="got a folder"), atomic_file(tmp_path / "folder"):
+    with (
+        pytest.raises(InputError, match="got a folder"),
+        atomic_file(tmp_path / "folder"),
+    ):
         pass
-    with pytest.raises(InputError, match="got a file"), atomic_folder(tmp_path / "file"):
+    with (
+        pytest.raises(InputError, match="got a file"),
+        atomic_folder(tmp_path / "file"),
+    ):
         pass
 
 
@@ -90,9 +101,14 @@ def test_folder_replaces_the_old_one_whole(tmp_path: Path, name: str) -> None:
 def test_failed_folder_leaves_the_old_one(tmp_path: Path) -> None:
     with atomic_folder(tmp_path / "scene") as temporary:
         (temporary / "old").touch()
-    with pytest.raises(ValueError), atomic_folder(tmp_path / "scene") as temporary:
-        (temporary / "half").touch()
-        raise ValueError
+
+    def write_half() -> None:
+        with atomic_folder(tmp_path / "scene") as temporary:
+            (temporary / "half").touch()
+            raise ValueError("stop")
+
+    with pytest.raises(ValueError, match="stop"):
+        write_half()
     assert names(tmp_path) == ["scene"]
     assert names(tmp_path / "scene") == ["old"]
 
@@ -111,6 +127,9 @@ def test_folder_comes_back_when_the_second_rename_fails(
         replace(source, target)  # type: ignore[arg-type]
 
     monkeypatch.setattr(os, "replace", failing)
-    with pytest.raises(OSError, match="disk"), atomic_folder(tmp_path / "scene") as temporary:
+    with (
+        pytest.raises(OSError, match="disk"),
+        atomic_folder(tmp_path / "scene") as temporary,
+    ):
         (temporary / "new").touch()
     assert names(tmp_path / "scene") == ["old"]

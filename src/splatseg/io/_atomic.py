@@ -48,7 +48,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         if not temporary.is_file():
             raise InputError(f"{target}: expected the file to be written, but nothing was.")
-        os.replace(temporary, target)
+        temporary.replace(target)
     finally:
         shutil.rmtree(holder, ignore_errors=True)
 
@@ -84,15 +84,15 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def _replace_folder(new: Path, target: Path, aside: Path) -> None:
     """Rename `new` to `target`; what was there before goes to `aside`."""
     if not target.exists():
-        os.replace(new, target)
+        new.replace(target)
         return
     if aside == new:  # the target itself is called "previous"
         aside = aside.with_name("previous.old")
-    os.replace(target, aside)
+    target.replace(aside)
     try:
-        os.replace(new, target)
+        new.replace(target)
     except OSError:
-        os.replace(aside, target)
+        aside.replace(target)
         raise
 
 

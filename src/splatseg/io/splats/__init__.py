@@ -123,9 +123,7 @@ def write_splats(
         else:
             from splatseg.io.splats.spz import write_spz
 
-            write_spz(
-                gaussians, temporary, version=4 if chosen == "spz" else 3, losses=losses
-            )
+            write_spz(gaussians, temporary, version=4 if chosen == "spz" else 3, losses=losses)
     losses.tell()
 
 
@@ -136,8 +134,7 @@ def _format_of_name(path: Path) -> WritableFormat:
         if name.endswith(f".{known}") and known != "spz3":
             return known
     raise InputError(
-        f"{path}: expected a name that ends in .ply, .compressed.ply, .splat or .spz, "
-        "or a format."
+        f"{path}: expected a name that ends in .ply, .compressed.ply, .splat or .spz, or a format."
     )
 
 
@@ -182,11 +179,7 @@ def _format_of_content(path: Path, head: bytes) -> SplatFormat | None:
     if head.startswith(b"NGSP"):
         return "spz"
     if head.startswith(b"\x1f\x8b"):
-        return (
-            "spz"
-            if _gzip_start(head) == b"NGSP" or path.suffix.lower() == ".spz"
-            else None
-        )
+        return "spz" if _gzip_start(head) == b"NGSP" or path.suffix.lower() == ".spz" else None
     if head.startswith(b"PK\x03\x04"):
         return "sog"
     if head.startswith(b"glTF"):

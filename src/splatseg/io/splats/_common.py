@@ -120,9 +120,7 @@ class Rows:
         torch.from_numpy(self.opacities).sigmoid_()
 
 
-def finish(
-    path: Path, rows: Rows, extra: Mapping[str, Tensor] | None = None
-) -> Gaussians:
+def finish(path: Path, rows: Rows, extra: Mapping[str, Tensor] | None = None) -> Gaussians:
     """Check every row, give quaternions unit length and make `Gaussians` without a copy.
 
     Raises:
@@ -141,9 +139,7 @@ def finish(
         {name: _not_finite(column) for name, column in columns.items()},
         "hold values that are NaN or infinite",
     )
-    _refuse(
-        path, {"rotation": _normalise(rows.rotations)}, "have a rotation of length zero"
-    )
+    _refuse(path, {"rotation": _normalise(rows.rotations)}, "have a rotation of length zero")
     _refuse(path, {"scale": np.any(rows.scales < 0, axis=1)}, "have a negative scale")
     outside = np.logical_or(rows.opacities < 0, rows.opacities > 1)
     _refuse(path, {"opacity": outside}, "have an opacity outside [0, 1]")
@@ -172,10 +168,9 @@ def _refuse(path: Path, faults: Mapping[str, NDArray[np.bool_]], what: str) -> N
 
 def _not_finite(column: Array) -> NDArray[np.bool_]:
     """Rows with a value that is NaN or infinite."""
-    flat = column.reshape(len(column), -1)
-    bad = np.zeros(len(flat), bool)
-    for rows in blocks(len(flat)):
-        bad[rows] = ~np.isfinite(flat[rows]).all(axis=1)
+    bad = np.zeros(len(column), bool)
+    for rows in blocks(len(column)):
+        bad[rows] = ~np.isfinite(column[rows]).all(axis=tuple(range(1, column.ndim)))
     return bad
 
 
@@ -274,9 +269,7 @@ class Losses:
         if self._dropped:
             parts.append("no place for " + " and ".join(self._dropped))
         if self._clamped:
-            counts = ", ".join(
-                f"{count} {name}" for name, count in self._clamped.items()
-            )
+            counts = ", ".join(f"{count} {name}" for name, count in self._clamped.items())
             parts.append(f"values outside its range, which were clamped ({counts})")
         if parts:
             warn(self._path, f"{self._label} has " + "; ".join(parts) + ".")

@@ -81,19 +81,11 @@ class Gltf:
             )
         values = self._values(entry, _COMPONENTS[kind], _WIDTHS[shape])
         result = values.astype(np.float32)
-        if (
-            "normalized" in entry
-            and entry["normalized"].flag()
-            and values.dtype.kind != "f"
-        ):
-            result = np.maximum(
-                result / _GREATEST[values.dtype.itemsize, values.dtype.kind], -1
-            )
+        if "normalized" in entry and entry["normalized"].flag() and values.dtype.kind != "f":
+            result = np.maximum(result / _GREATEST[values.dtype.itemsize, values.dtype.kind], -1)
         return result, values.dtype
 
-    def _values(
-        self, entry: Json, kind: np.dtype[np.generic], width: int
-    ) -> NDArray[np.generic]:
+    def _values(self, entry: Json, kind: np.dtype[np.generic], width: int) -> NDArray[np.generic]:
         """The stored values of an accessor, as a view into its buffer."""
         count = entry["count"].integer()
         view = self.root["bufferViews"].element(entry["bufferView"].integer())
@@ -109,9 +101,7 @@ class Gltf:
                 f"{self.path}: expected {needed} bytes for {entry.place}, got a view of "
                 f"{length} bytes at byte {start} of {len(data)}, one row each {stride} bytes."
             )
-        return np.ndarray(
-            (count, width), kind, data, start + offset, (stride, kind.itemsize)
-        )
+        return np.ndarray((count, width), kind, data, start + offset, (stride, kind.itemsize))
 
     def _buffer(self, index: int) -> bytes:
         """The bytes of a buffer: the binary part, a data URI or a file beside this one."""
@@ -120,9 +110,7 @@ class Gltf:
         entry = self.root["buffers"].element(index)
         if "uri" not in entry:
             if self._binary is None or index != 0:
-                raise entry.error(
-                    "a uri, or buffer 0 of a .glb file with a binary part"
-                )
+                raise entry.error("a uri, or buffer 0 of a .glb file with a binary part")
             data = self._binary
         else:
             data = self._load(entry["uri"])
@@ -148,18 +136,11 @@ class Gltf:
                 raise uri.error("a data URI in base64") from error
         name = unquote(text)
         relative = Path(name)
-        if (
-            ":" in name
-            or "\\" in name
-            or relative.is_absolute()
-            or ".." in relative.parts
-        ):
+        if ":" in name or "\\" in name or relative.is_absolute() or ".." in relative.parts:
             raise uri.error("a file in the folder of this one")
         target = self.path.parent / relative
         if not target.is_file():
-            raise MissingFileError(
-                f"{target}: no such file, but {self.path.name} names it."
-            )
+            raise MissingFileError(f"{target}: no such file, but {self.path.name} names it.")
         return target.read_bytes()
 
     def meshes(self) -> Iterator[tuple[Json, NDArray[np.float64]]]:
@@ -191,18 +172,14 @@ class Gltf:
             scene = self.root["scenes"].element(which)
             return [node.integer() for node in scene.optional_items("nodes")]
         nodes = self.root.optional_items("nodes")
-        children = {
-            c.integer() for node in nodes for c in node.optional_items("children")
-        }
+        children = {c.integer() for node in nodes for c in node.optional_items("children")}
         return [index for index in range(len(nodes)) if index not in children]
 
 
 def _glb_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """The JSON and the binary part of a ``.glb`` file."""
     if len(data) < 12:
-        raise FileFormatError(
-            f"{path}: expected a .glb header of 12 bytes, got {len(data)}."
-        )
+        raise FileFormatError(f"{path}: expected a .glb header of 12 bytes, got {len(data)}.")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
         raise FileFormatError(f"{path}: expected .glb version 2, got {version}.")
@@ -219,9 +196,7 @@ def _glb_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
         chunks.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
     if _JSON_CHUNK not in chunks:
-        raise FileFormatError(
-            f"{path}: expected a JSON part in the .glb file, got none."
-        )
+        raise FileFormatError(f"{path}: expected a JSON part in the .glb file, got none.")
     return chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK)
 
 

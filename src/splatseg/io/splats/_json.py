@@ -50,9 +50,7 @@ class Json:
             raise self.error("an object")
         if name not in self.value:
             place = self.place or "the root"
-            raise FileFormatError(
-                f"{self.path}: expected a member {name!r} at {place}, got none."
-            )
+            raise FileFormatError(f"{self.path}: expected a member {name!r} at {place}, got none.")
         return Json(self.path, self.value[name], f"{self.place}.{name}".lstrip("."))
 
     def names(self) -> list[str]:
@@ -113,7 +111,5 @@ class Json:
         most = least if most is None else most
         result = [item.number() for item in self.items()]
         if not least <= len(result) <= most:
-            raise self.error(
-                f"{least if least == most else f'{least} to {most}'} numbers"
-            )
+            raise self.error(f"{least if least == most else f'{least} to {most}'} numbers")
         return result

@@ -66,9 +66,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     with path.open("rb") as file:
         head = file.read(MAX_HEADER)
     if not head.startswith((b"ply\n", b"ply\r\n")):
-        raise FileFormatError(
-            f"{path}: expected a PLY file, but it does not start with 'ply'."
-        )
+        raise FileFormatError(f"{path}: expected a PLY file, but it does not start with 'ply'.")
     lines, start = _lines(path, head)
     order = _byte_order(path, lines)
     comments = tuple(line[8:] for line in lines if line.startswith("comment "))
@@ -95,9 +93,7 @@ def _lines(path: Path, head: bytes) -> tuple[list[str], int]:
         if line == "end_header":
             return lines, at
         lines.append(line)
-    raise FileFormatError(
-        f"{path}: expected a PLY header that ends with 'end_header', got none."
-    )
+    raise FileFormatError(f"{path}: expected a PLY header that ends with 'end_header', got none.")
 
 
 def _byte_order(path: Path, lines: list[str]) -> str:
@@ -128,9 +124,7 @@ def _tables(
         match line.split():
             case ["element", name, count] if count.isdecimal() and len(count) < 16:
                 if name in (table[0] for table in tables):
-                    raise FileFormatError(
-                        f"{path}: the PLY element {name!r} stands twice."
-                    )
+                    raise FileFormatError(f"{path}: the PLY element {name!r} stands twice.")
                 tables.append((name, int(count), []))
             case ["property", "list", *_] if tables:
                 raise FileFormatError(
@@ -140,14 +134,10 @@ def _tables(
             case ["property", kind, name] if tables and kind in _TYPES:
                 fields = tables[-1][2]
                 if name in (field[0] for field in fields):
-                    raise FileFormatError(
-                        f"{path}: the PLY property {name!r} stands twice."
-                    )
+                    raise FileFormatError(f"{path}: the PLY property {name!r} stands twice.")
                 fields.append((name, order + _TYPES[kind]))
             case ["element" | "property", *_]:
-                raise FileFormatError(
-                    f"{path}: cannot read the PLY header line {line!r}."
-                )
+                raise FileFormatError(f"{path}: cannot read the PLY header line {line!r}.")
             case _:
                 pass  # comments, obj_info, format
     return tables

@@ -14,9 +14,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """The components kept, by the index of the one left out."""
 
 
-def assemble(
-    largest: NDArray[np.integer], others: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def assemble(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
     """Quaternions from the index of the largest component and the other three, in order.
 
     The largest is positive and makes the length 1; where the others are already longer than
@@ -24,9 +22,7 @@ def assemble(
     """
     result = np.empty((len(others), 4))
     rest = np.maximum(0.0, 1.0 - np.square(others).sum(axis=1))
-    np.put_along_axis(
-        result, largest[:, None].astype(np.intp), np.sqrt(rest)[:, None], axis=1
-    )
+    np.put_along_axis(result, largest[:, None].astype(np.intp), np.sqrt(rest)[:, None], axis=1)
     np.put_along_axis(result, _OTHERS[largest], others, axis=1)
     return result
 
@@ -51,12 +47,8 @@ def pack_smallest_three(rotations: NDArray[np.float32]) -> NDArray[np.uint32]:
     """SuperSplat's words (n,) of unit quaternions."""
     largest, others = split(rotations)
     steps = np.floor((others * _HALF_ROOT + 0.5) * 1023 + 0.5)
-    words = np.clip(steps, 0, 1023).astype(np.uint32) << np.array(
-        [20, 10, 0], np.uint32
-    )
-    return words.sum(axis=1, dtype=np.uint32) | (
-        largest.astype(np.uint32) << np.uint32(30)
-    )
+    words = np.clip(steps, 0, 1023).astype(np.uint32) << np.array([20, 10, 0], np.uint32)
+    return words.sum(axis=1, dtype=np.uint32) | (largest.astype(np.uint32) << np.uint32(30))
 
 
 _XYZW = np.array([1, 2, 3, 0])
@@ -66,20 +58,14 @@ def unpack_signed_three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Quaternions (n, 4) wxyz from SPZ's words: order x, y, z, w; a sign bit and 511 steps."""
     fields = (packed[:, None] >> np.array([20, 10, 0], np.uint32)) & np.uint32(1023)
     size = (fields & np.uint32(511)) * (_HALF_ROOT / 511)
-    xyzw = assemble(
-        packed >> np.uint32(30), np.where(fields >> np.uint32(9), -size, size)
-    )
+    xyzw = assemble(packed >> np.uint32(30), np.where(fields >> np.uint32(9), -size, size))
     return xyzw[:, [3, 0, 1, 2]]
 
 
 def pack_signed_three(rotations: NDArray[np.float32]) -> NDArray[np.uint32]:
     """SPZ's words (n,) of unit quaternions wxyz."""
     largest, others = split(rotations[:, _XYZW])
-    size = np.minimum(np.floor(np.abs(others) * (511 / _HALF_ROOT) + 0.5), 511).astype(
-        np.uint32
-    )
+    size = np.minimum(np.floor(np.abs(others) * (511 / _HALF_ROOT) + 0.5), 511).astype(np.uint32)
     fields = size | (others < 0).astype(np.uint32) << np.uint32(9)
     words = fields << np.array([20, 10, 0], np.uint32)
-    return words.sum(axis=1, dtype=np.uint32) | (
-        largest.astype(np.uint32) << np.uint32(30)
-    )
+    return words.sum(axis=1, dtype=np.uint32) | (largest.astype(np.uint32) << np.uint32(30))

@@ -82,11 +82,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
         rows.sh[part, 0] = (rgb - 0.5) / SH_C0
         rows.opacities[part] = colour[:, 3]
         if sh is not None:
-            table = (
-                _rows_of(packed, sh, part)
-                .view(np.uint8)
-                .reshape(-1, 3, len(names) // 3)
-            )
+            table = _rows_of(packed, sh, part).view(np.uint8).reshape(-1, 3, len(names) // 3)
             rows.sh[part, 1:] = _HARMONIC[table].transpose(0, 2, 1)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
@@ -103,13 +99,9 @@ def _harmonic_of_byte() -> Array:
 _HARMONIC = _harmonic_of_byte()
 
 
-def _elements(
-    path: Path, header: PlyHeader
-) -> tuple[PlyElement, PlyElement, PlyElement | None]:
+def _elements(path: Path, header: PlyHeader) -> tuple[PlyElement, PlyElement, PlyElement | None]:
     """The vertex, chunk and sh elements, checked."""
-    vertex, chunk, sh = (
-        header.elements.get(name) for name in ("vertex", "chunk", "sh")
-    )
+    vertex, chunk, sh = (header.elements.get(name) for name in ("vertex", "chunk", "sh"))
     if vertex is None or chunk is None:
         raise FileFormatError(
             f"{path}: expected the elements chunk and vertex of a compressed PLY file, "
@@ -134,15 +126,11 @@ def _elements(
         expected = tuple(f"f_rest_{i}" for i in range(len(names)))
         _check_columns(path, sh, expected, "u1")
         if names != expected:
-            raise FileFormatError(
-                f"{path}: expected the harmonics f_rest_0, ... in order."
-            )
+            raise FileFormatError(f"{path}: expected the harmonics f_rest_0, ... in order.")
     return vertex, chunk, sh
 
 
-def _check_columns(
-    path: Path, element: PlyElement, names: tuple[str, ...], kind: str
-) -> None:
+def _check_columns(path: Path, element: PlyElement, names: tuple[str, ...], kind: str) -> None:
     """Refuse an element that lacks a column or has it in another type."""
     have = element.row.names or ()
     wrong = [n for n in names if n not in have or element.row[n].str[1:] != kind]
@@ -248,9 +236,7 @@ def _steps(values: Array, top: NDArray[np.int64]) -> tuple[NDArray[np.uint32], A
     of_row = np.arange(len(values)) // CHUNK
     extent = (high.astype(np.float64) - low)[of_row]
     share = (values - low[of_row].astype(np.float64)) / np.where(extent > 0, extent, 1)
-    return np.floor(share * top + 0.5).astype(np.uint32), np.concatenate(
-        [low, high], axis=1
-    )
+    return np.floor(share * top + 0.5).astype(np.uint32), np.concatenate([low, high], axis=1)
 
 
 def _harmonic_bytes(sh: Array, losses: Losses) -> bytes:

@@ -58,21 +58,15 @@ def read_gltf(path: Path) -> Gaussians:
         if (extension := _extension(primitive)) is not None
     ]
     if not found:
-        raise FileFormatError(
-            f"{path}: expected Gaussians ({EXTENSION}), got a glTF without."
-        )
+        raise FileFormatError(f"{path}: expected Gaussians ({EXTENSION}), got a glTF without.")
     logs = _scales_are_logs([attributes for attributes, _, _ in found])
     degree = max(_degree(path, attributes) for attributes, _, _ in found)
-    kernels = sorted(
-        {extension["kernel"].text() for _, extension, _ in found} - {"ellipse"}
-    )
+    kernels = sorted({extension["kernel"].text() for _, extension, _ in found} - {"ellipse"})
     if kernels:
         warn(path, f"the kernel {', '.join(kernels)} is not known; read as ellipses.")
     spaces = [extension["colorSpace"].text() for _, extension, _ in found]
     parts = [
-        _gaussians(
-            path, attributes, degree=degree, logs=logs, space=space, transform=transform
-        )
+        _gaussians(path, attributes, degree=degree, logs=logs, space=space, transform=transform)
         for (attributes, _, transform), space in zip(found, spaces, strict=True)
     ]
     return _marked(path, parts, spaces)
@@ -178,14 +172,10 @@ def _gaussians(
     return gaussians.transformed(_similarity(path, transform))
 
 
-def _column(
-    path: Path, attributes: _Attributes, name: str, width: int, count: int | None
-) -> Array:
+def _column(path: Path, attributes: _Attributes, name: str, width: int, count: int | None) -> Array:
     """One attribute with the right number of columns and rows."""
     if name not in attributes:
-        raise FileFormatError(
-            f"{path}: expected the attribute {name} of Gaussians, got none."
-        )
+        raise FileFormatError(f"{path}: expected the attribute {name} of Gaussians, got none.")
     values = attributes[name]
     expected = (len(values) if count is None else count, width)
     if values.shape != expected:
@@ -217,9 +207,7 @@ def _similarity(path: Path, transform: NDArray[np.float64]) -> Similarity:
     if (
         determinant <= 0
         or not np.allclose(transform[3], [0, 0, 0, 1])
-        or not np.allclose(
-            linear.T @ linear, scale**2 * np.eye(3), atol=1e-4 * scale**2
-        )
+        or not np.allclose(linear.T @ linear, scale**2 * np.eye(3), atol=1e-4 * scale**2)
     ):
         raise FileFormatError(
             f"{path}: expected nodes that move, turn and scale alike in all directions, "

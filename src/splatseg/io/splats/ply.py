@@ -92,10 +92,7 @@ def read_ply(path: Path) -> Gaussians:
     _check_types(path, vertex.row, rest)
     others = [name for name in names if name not in _REQUIRED and name not in rest]
     rows = Rows.empty(vertex.count, 1 + len(rest) // 3)
-    extra = {
-        name: np.empty(vertex.count, vertex.row[name].newbyteorder("="))
-        for name in others
-    }
+    extra = {name: np.empty(vertex.count, vertex.row[name].newbyteorder("=")) for name in others}
     with path.open("rb") as file:
         file.seek(vertex.offset)
         for part in blocks(vertex.count, BLOCK // 4):
@@ -158,11 +155,7 @@ def _restore(header: PlyHeader, columns: Mapping[str, np.ndarray]) -> dict[str, 
         if not comment.startswith(_NOTE) or len(words) != 3 or words[2] not in types:
             continue
         name, components, kind = words
-        parts = (
-            [name]
-            if components == "0"
-            else [f"{name}_{i}" for i in range(int(components))]
-        )
+        parts = [name] if components == "0" else [f"{name}_{i}" for i in range(int(components))]
         if parts and all(part in left for part in parts):  # else an editor dropped some
             values = [left.pop(part).to(types[kind]) for part in parts]
             extra[name] = values[0] if components == "0" else torch.stack(values, dim=1)
@@ -230,9 +223,7 @@ def _flatten(extra: Mapping[str, Tensor]) -> tuple[dict[str, np.ndarray], list[s
         values = tensor.detach().cpu()
         if kind in _CONVERTED:
             values = values.to(_CONVERTED[kind])
-            if kind == torch.int64 and not torch.equal(
-                values.to(kind), tensor.detach().cpu()
-            ):
+            if kind == torch.int64 and not torch.equal(values.to(kind), tensor.detach().cpu()):
                 raise InputError(
                     f"extra[{name!r}]: expected values that fit into 32 bits, as PLY has no "
                     f"longer integers, got {int(tensor.min())} to {int(tensor.max())}."
@@ -242,13 +233,9 @@ def _flatten(extra: Mapping[str, Tensor]) -> tuple[dict[str, np.ndarray], list[s
         array = values.numpy()
         components = 0 if array.ndim == 1 else array.shape[1]
         if array.ndim == 2 and components == 0:
-            raise InputError(
-                f"extra[{name!r}]: expected at least one component, got none."
-            )
+            raise InputError(f"extra[{name!r}]: expected at least one component, got none.")
         if components or kind in _CONVERTED:
-            notes.append(
-                f"{_NOTE} {name} {components} {str(kind).removeprefix('torch.')}"
-            )
+            notes.append(f"{_NOTE} {name} {components} {str(kind).removeprefix('torch.')}")
         parts = (
             {name: array}
             if not components
@@ -271,6 +258,4 @@ def _check_names(extra: Mapping[str, np.ndarray], standard: Sequence[str]) -> No
                 f"extra[{name!r}]: expected a name of printable ASCII without spaces, as PLY needs."
             )
         if (name in standard and name not in allowed) or _REST.fullmatch(name):
-            raise InputError(
-                f"extra[{name!r}]: PLY uses the name {name!r} for something else."
-            )
+            raise InputError(f"extra[{name!r}]: PLY uses the name {name!r} for something else.")

@@ -52,14 +52,10 @@ def read_sog(path: Path) -> Gaussians:
     with path.open("rb") as file:
         bundled = file.read(2) == b"PK"
     if not bundled:
-        return _read(
-            path, lambda name, limit: _load_beside(path, name, limit), path.name
-        )
+        return _read(path, lambda name, limit: _load_beside(path, name, limit), path.name)
     try:
         with zipfile.ZipFile(path) as archive:
-            metas = [
-                n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"
-            ]
+            metas = [n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"]
             if len(metas) != 1:
                 raise FileFormatError(
                     f"{path}: expected a zip file with one meta.json, got {len(metas)}."
@@ -83,9 +79,7 @@ def read_sog(path: Path) -> Gaussians:
 def _load_beside(path: Path, name: str, limit: int) -> bytes:
     """A file in the folder of `path`; a name that points elsewhere is refused."""
     if Path(name).name != name:
-        raise FileFormatError(
-            f"{path}: expected the name of a file beside it, got {name!r}."
-        )
+        raise FileFormatError(f"{path}: expected the name of a file beside it, got {name!r}.")
     member = path.parent / name
     if not member.is_file():
         raise MissingFileError(f"{member}: no such file, but {path.name} names it.")
@@ -101,9 +95,7 @@ def _load_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) ->
     with archive.open(name) as member:
         data = member.read(limit + 1)
     if len(data) > limit:
-        raise FileFormatError(
-            f"{path}: expected at most {limit} bytes in {name!r}, got more."
-        )
+        raise FileFormatError(f"{path}: expected at most {limit} bytes in {name!r}, got more.")
     return data
 
 
@@ -113,9 +105,7 @@ def _read(path: Path, load: Load, meta_name: str) -> Gaussians:
     version = meta["version"].integer() if "version" in meta else 1
     if version not in (1, 2):
         raise FileFormatError(f"{path}: expected SOG version 1 or 2, got {version}.")
-    count = (
-        meta["count"] if version == 2 else meta["means"]["shape"].element(0)
-    ).integer()
+    count = (meta["count"] if version == 2 else meta["means"]["shape"].element(0)).integer()
     if count > _MAX_COUNT:
         raise meta.error(f"at most {_MAX_COUNT} Gaussians")
 
@@ -162,9 +152,7 @@ def _opened(path: Path, name: str, data: bytes) -> Image.Image:
     try:
         return Image.open(io.BytesIO(data), formats=["WEBP"])
     except (OSError, Image.DecompressionBombError) as error:
-        raise FileFormatError(
-            f"{path}: expected a WebP picture in {name!r}: {error}."
-        ) from error
+        raise FileFormatError(f"{path}: expected a WebP picture in {name!r}: {error}.") from error
 
 
 def _pixels(path: Path, name: str, image: Image.Image) -> Pixels:
@@ -172,9 +160,7 @@ def _pixels(path: Path, name: str, image: Image.Image) -> Pixels:
     try:
         return np.asarray(image.convert("RGBA"))
     except (OSError, EOFError, ValueError) as error:
-        raise FileFormatError(
-            f"{path}: the picture {name!r} is damaged: {error}."
-        ) from error
+        raise FileFormatError(f"{path}: the picture {name!r} is damaged: {error}.") from error
 
 
 def _positions(rows: Rows, entry: Json, pictures: list[Pixels]) -> None:
@@ -205,14 +191,10 @@ def _bytes(
 ) -> None:
     """Log scales, or colours with the opacity in alpha, from bytes."""
     if version == 1:
-        low, high = (
-            np.array(entry[name].numbers(least=width)) for name in ("mins", "maxs")
-        )
+        low, high = (np.array(entry[name].numbers(least=width)) for name in ("mins", "maxs"))
         tables = low[:, None] + (high - low)[:, None] * (np.arange(256) / 255)
     else:
-        tables = np.full(
-            (width, 256), np.nan
-        )  # a byte beyond a short codebook is refused
+        tables = np.full((width, 256), np.nan)  # a byte beyond a short codebook is refused
         codebook = entry["codebook"].numbers(least=1, most=256)
         tables[:, : len(codebook)] = codebook
     for part in blocks(len(pixels)):
@@ -235,11 +217,7 @@ def _harmonics(path: Path, load: Load, entry: Json, version: int) -> tuple[str, 
         raise entry["files"].error("2 names of files")
     with _opened(path, names[0], load(names[0], 1 << 24)) as image:
         coefficients = image.width // _PALETTE_WIDTH
-        if (
-            image.width % _PALETTE_WIDTH
-            or coefficients not in (3, 8, 15)
-            or image.height > 1024
-        ):
+        if image.width % _PALETTE_WIDTH or coefficients not in (3, 8, 15) or image.height > 1024:
             raise FileFormatError(
                 f"{path}: expected a palette of 192, 512 or 960 pixels a row and at most 1024 "
                 f"rows in {names[0]!r}, got {image.width} x {image.height}."

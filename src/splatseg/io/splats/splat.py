@@ -66,9 +66,7 @@ def write_splat(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
         RangeError: If a row cannot be rendered.
     """
     if len(gaussians) == 0:
-        raise InputError(
-            "gaussians: a .splat file cannot hold a scene without Gaussians."
-        )
+        raise InputError("gaussians: a .splat file cannot hold a scene without Gaussians.")
     rows = to_rows(gaussians)
     if gaussians.sh_degree:
         losses.drop("harmonics above degree 0")

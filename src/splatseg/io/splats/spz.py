@@ -104,9 +104,7 @@ def read_spz(path: Path) -> Gaussians:
         rows.opacities[part] = opacities[part, 0] / np.float32(255)
         rows.sh[part, 0] = (colours[part] / 255 - 0.5) / _COLOUR_SCALE
         rows.scales[part] = np.exp(scales[part] / 16.0 - 10.0)
-        rows.rotations[part] = (
-            _rotations(rotations[part], header.version) * _FLIP_ROTATION
-        )
+        rows.rotations[part] = _rotations(rotations[part], header.version) * _FLIP_ROTATION
         if rest is not None:
             signs = _FLIP_SH[: coefficients - 1, None]
             rows.sh[part, 1:] = (rest[part].astype(np.float32) - 128) / 128 * signs
@@ -126,9 +124,7 @@ def _header(path: Path, data: bytes) -> _Header:
         )
     magic, version, count, degree, bits, flags, streams = _HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise FileFormatError(
-            f"{path}: expected the SPZ magic {MAGIC!r}, got {magic!r}."
-        )
+        raise FileFormatError(f"{path}: expected the SPZ magic {MAGIC!r}, got {magic!r}.")
     if version not in (2, 3, 4):
         raise FileFormatError(f"{path}: expected SPZ version 2, 3 or 4, got {version}.")
     if degree > MAX_DEGREE:
@@ -136,9 +132,7 @@ def _header(path: Path, data: bytes) -> _Header:
             f"{path}: expected harmonics of degree 0 to {MAX_DEGREE}, got {degree}."
         )
     if bits > 24:
-        raise FileFormatError(
-            f"{path}: expected at most 24 fractional bits, got {bits}."
-        )
+        raise FileFormatError(f"{path}: expected at most 24 fractional bits, got {bits}.")
     return _Header(
         version=version,
         count=count,
@@ -174,9 +168,7 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
         # Extensions may follow the attributes; anything else after them is a wrong count.
         more = stream.decompress(stream.unconsumed_tail, 1) if not stream.eof else b""
     except zlib.error as error:
-        raise FileFormatError(
-            f"{path}: expected gzip data of an SPZ file: {error}."
-        ) from error
+        raise FileFormatError(f"{path}: expected gzip data of an SPZ file: {error}.") from error
     if len(content) < body:
         raise FileFormatError(
             f"{path}: expected {body} bytes for {header.count} Gaussians of degree "
@@ -188,9 +180,7 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
             f"{header.degree}, got more."
         )
     if not more and not stream.eof:
-        raise FileFormatError(
-            f"{path}: the gzip data end without their check sum: truncated."
-        )
+        raise FileFormatError(f"{path}: the gzip data end without their check sum: truncated.")
     view = memoryview(content)
     parts: list[bytes] = []
     for size in header.sizes:
@@ -205,9 +195,7 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
 
     header = _header(path, data)
     if header.version != 4:
-        raise FileFormatError(
-            f"{path}: expected SPZ version 4 outside gzip, got {header.version}."
-        )
+        raise FileFormatError(f"{path}: expected SPZ version 4 outside gzip, got {header.version}.")
     if header.streams != len(header.sizes):
         raise FileFormatError(
             f"{path}: expected {len(header.sizes)} streams for degree {header.degree}, "
@@ -223,10 +211,7 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
             f"{len(data)} bytes."
         )
     _check_ratio(path, header, len(data))
-    entries = [
-        _STREAM.unpack_from(data, table + i * _STREAM.size)
-        for i in range(header.streams)
-    ]
+    entries = [_STREAM.unpack_from(data, table + i * _STREAM.size) for i in range(header.streams)]
     end = at + sum(compressed for compressed, _ in entries)
     if end != len(data):
         raise FileFormatError(
@@ -234,9 +219,7 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
             f"the file is {'truncated' if end > len(data) else 'too long'}."
         )
     parts: list[bytes] = []
-    for i, ((compressed, unpacked), size) in enumerate(
-        zip(entries, header.sizes, strict=True)
-    ):
+    for i, ((compressed, unpacked), size) in enumerate(zip(entries, header.sizes, strict=True)):
         if unpacked != size * header.count:
             raise FileFormatError(
                 f"{path}: expected {size * header.count} bytes in stream {i} for "
@@ -249,9 +232,7 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
             part = reader.read(unpacked) if unpacked else b""
             more = reader.read(1)
         except zstandard.ZstdError as error:
-            raise FileFormatError(
-                f"{path}: stream {i} is no zstd data: {error}."
-            ) from error
+            raise FileFormatError(f"{path}: stream {i} is no zstd data: {error}.") from error
         if len(part) != unpacked or more:
             raise FileFormatError(
                 f"{path}: expected {unpacked} bytes in stream {i}, "
@@ -278,9 +259,7 @@ def _rotations(packed: NDArray[np.uint8], version: int) -> NDArray[np.float64]:
     return np.concatenate([w[:, None], xyz], axis=1)
 
 
-def write_spz(
-    gaussians: Gaussians, path: Path, *, version: Literal[3, 4], losses: Losses
-) -> None:
+def write_spz(gaussians: Gaussians, path: Path, *, version: Literal[3, 4], losses: Losses) -> None:
     """Write an SPZ file of version 3 or 4, rows in the order they have.
 
     Positions get as many fractional bits as the largest coordinate leaves room for, up to
