@@ -1,6 +1,7 @@
 """Reads metadata.json beside a capture: class names, the up axis and the unit of length."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatseg.core import ClassTable
@@ -31,6 +32,9 @@ class Metadata:
     """What metadata.json says; None for what it leaves open."""
 
     classes: ClassTable | None = None
+    tables: Mapping[str, ClassTable] = field(default_factory=dict[str, ClassTable])
+    """Names of further kinds of ids: ``instances`` and ``parts``."""
+
     up: tuple[float, float, float] | None = None
     metres_per_unit: float | None = None
 
@@ -46,6 +50,11 @@ def read_metadata(folder: Path) -> Metadata:
         return Metadata()
     content = read_json(path)
     return Metadata(
+        tables={
+            name: class_table(content[name], where=str(path))
+            for name in ("instances", "parts")
+            if isinstance(content.get(name), list)
+        },
         classes=class_table(content["classes"], where=str(path)) if "classes" in content else None,
         up=_UP_AXES.get(str(content.get("up_axis", ""))),
         metres_per_unit=_METRES.get(str(content.get("units", ""))),

@@ -10,7 +10,7 @@ from splatseg.io.captures._build import RawView, build_capture
 from splatseg.io.captures._colmap_model import ColmapModel, intrinsics_of, poses_of
 from splatseg.io.captures._nerfstudio_split import splits_beside
 
-_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".", "0")
 _IMAGE_FOLDERS = ("images", "input", "rgb", "images_2", "images_4", "images_8", ".")
 # A model may be named itself: capture/colmap/sparse/0 lies three folders below its capture.
 _LEVELS_UP = 3
@@ -31,7 +31,8 @@ def read_colmap(folder: Path) -> Capture:
 
     The model is sought in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, ``colmap/sparse`` and
     the folder itself, binary before text; photographs in ``images``, ``input``, ``rgb``,
-    ``images_2``, ``images_4``, ``images_8`` and the folder itself. Where a ``transforms.json``
+    ``images_2``, ``images_4``, ``images_8`` and the folder itself, then in the same places of
+    up to three folders above. Where a ``transforms.json``
     beside it has a split for the same photographs, that split is the capture's own.
 
     Raises:
@@ -45,9 +46,7 @@ def read_colmap(folder: Path) -> Capture:
             f"{', '.join(_MODEL_FOLDERS)}, got none."
         )
     model = read_colmap_model(model_folder)
-    root, images = _image_folder(
-        folder, model_folder, [image.name for image in model.images.values()]
-    )
+    root, images = _image_folder(folder, [image.name for image in model.images.values()])
     splits = splits_beside(root)
     poses = poses_of(model, where=str(model_folder))
     raw: list[RawView] = []
@@ -75,7 +74,7 @@ def read_colmap(folder: Path) -> Capture:
         raw,
         format="colmap",
         points=model.points,
-        notes=_notes(root, model_folder),
+        notes=_notes(model_folder),
     )
 
 
@@ -98,12 +97,11 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     )
 
 
-def _image_folder(folder: Path, model: Path, names: Iterable[str]) -> tuple[Path, Path]:
+def _image_folder(folder: Path, names: Iterable[str]) -> tuple[Path, Path]:
     """The capture's folder and the one its photographs lie in."""
     first = [name.replace("\\", "/") for name in names][:20]
-    roots = [folder]
-    if model == folder / ".":
-        roots += list(folder.resolve().parents)[:_LEVELS_UP]
+    # The folder may be the model itself, or one between it and the capture.
+    roots = [folder, *list(folder.resolve().parents)[:_LEVELS_UP]]
     for root in roots:
         for name in _IMAGE_FOLDERS:
             if any((root / name / image).is_file() for image in first):
@@ -112,7 +110,7 @@ def _image_folder(folder: Path, model: Path, names: Iterable[str]) -> tuple[Path
     return folder, folder / _IMAGE_FOLDERS[0]
 
 
-def _notes(root: Path, model: Path) -> list[str]:
+def _notes(model: Path) -> list[str]:
     parent = model.parent
     if parent.name != "sparse":
         return []
@@ -121,4 +119,4 @@ def _notes(root: Path, model: Path) -> list[str]:
     )
     if not others:
         return []
-    return [f"{parent.relative_to(root)} holds further models ({', '.join(others)}); 0 was read"]
+    return [f"{parent.name} holds further models ({', '.join(others)}); {model.name} was read"]

@@ -27,6 +27,8 @@ VERSION = 1
 # Folders of a capture that hold what a model saw, as opposed to photographs and truth.
 _PREFIXES = ("labels_", "masks_", "features_")
 _SUFFIX = "_reference"
+# Maps of a capture whose ids are not classes, and the table in metadata.json that names them.
+_TRUTH_TABLES = {"instance": "instances", "part": "parts", "depth": ""}
 
 
 def open_evidence(
@@ -141,4 +143,7 @@ def _kind(folder: Path, *, maps: bool, arrays: bool, objects: bool) -> str | Non
 def _classes(folder: Path, header: dict[str, Any]) -> ClassTable | None:
     if header.get("classes") is not None:
         return class_table(header["classes"], where=str(folder / HEADER_FILE))
-    return read_metadata(folder.absolute().parent).classes
+    metadata = read_metadata(folder.absolute().parent)
+    if folder.name in _TRUTH_TABLES:
+        return metadata.tables.get(_TRUTH_TABLES[folder.name])
+    return metadata.classes

@@ -1,0 +1,352 @@
+"""``splatseg info``: what a capture, a scene, a splat file or a folder of evidence holds."""
+
+import json
+import sys
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from splatseg.core import Capture, Features, Gaussians, Labels, Scene, View
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_capture
+from splatseg.io.evidence import Evidence, evidence_names, open_evidence
+from splatseg.io.images import DEFAULT_LONGEST, image_size
+from splatseg.io.layers import Layer, load_layer
+from splatseg.io.scene import is_scene, load_scene, load_scene_layer, scene_layer_names
+from splatseg.io.splats import SplatWarning, read_splats, splat_format
+
+_LAYOUTS = ("auto", *FORMATS)
+_CAPTURE_FILES = (
+    "transforms.json",
+    "transforms_train.json",
+    "poses_bounds.npy",
+    "cameras_sphere.npz",
+    "cameras.npz",
+)
+_SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".gltf", ".glb")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """Say in one line what is there: a capture, a scene, a splat file or evidence."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """Folder of a capture, of a scene, of evidence or of bare photographs, or a splat file."""
+
+    format: str = "auto"
+    """Which description of a capture to read, where it has several: nerfstudio, blender,
+    colmap, llff or idr. auto takes the first of these that is there."""
+
+    json: bool = False
+    """Print one JSON object."""
+
+    verbose: bool = False
+    """Print all details, one a line, under the line."""
+
+
+def run(command: Command) -> None:
+    """Tell what is there."""
+    if command.format not in _LAYOUTS:
+        raise InputError(
+            f"--format: expected one of {', '.join(_LAYOUTS)}, got {command.format!r}."
+        )
+    facts = describe(command.path, format=command.format)
+    if command.json:
+        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
+        return
+    sys.stdout.write(summary(facts) + "\n")
+    if command.verbose:
+        for key, value in facts.items():
+            sys.stdout.write(f"  {key}: {_shown(value)}\n")
+
+
+def describe(path: Path, *, format: str = "auto") -> dict[str, Any]:
+    """What is at a path, in values that JSON holds.
+
+    Raises:
+        MissingFileError: If there is nothing.
+        InputError: If it is nothing that splatseg reads, or broken.
+    """
+    if not path.exists():
+        raise MissingFileError(f"{path}: there is no such file or folder.")
+    if path.is_dir():
+        return _describe_folder(path, format)
+    if path.name in _CAPTURE_FILES:
+        return _capture_facts(read_capture(path, format=format))
+    if path.suffix == ".npz":
+        layer = load_layer(path)
+        return {"path": str(path), "kind": "layer", "holds": _layer_kind(layer), "rows": len(layer)}
+    return _splat_facts(path)
+
+
+def summary(facts: dict[str, Any]) -> str:
+    """The facts in one line."""
+    notes = "".join(f"; note: {note}" for note in facts.get("notes", []))
+    return f"{facts['path']}: {_SENTENCES[facts['kind']](facts)}{notes}"
+
+
+def _describe_folder(path: Path, format: str) -> dict[str, Any]:
+    if format == "auto" and is_scene(path):
+        return _scene_facts(load_scene(path))
+    if format != "auto" or find_formats(path):
+        return _capture_facts(read_capture(path, format=format))
+    if (path / "meta.json").is_file():
+        return _splat_facts(path)
+    if inside := _captures_inside(path):
+        return {"path": str(path), "kind": "folder", "holds": inside}
+    files = [p for p in sorted(path.iterdir()) if p.suffix.lower() in _SPLAT_SUFFIXES]
+    if (path / "evidence.json").is_file() or not (bare_photographs(path) or files):
+        return _evidence_facts(path)
+    if files:
+        formats = Counter(splat_format(file) for file in files)
+        return {"path": str(path), "kind": "splat folder", "files": dict(sorted(formats.items()))}
+    if evidence := _as_label_maps(path):
+        return evidence
+    photographs = bare_photographs(path)
+    sizes = Counter(image_size(photograph) for photograph in photographs)
+    return {
+        "path": str(path),
+        "kind": "photographs",
+        "photographs": len(photographs),
+        "sizes": [f"{w}x{h}" for w, h in sizes],
+        "notes": [
+            f"larger than {DEFAULT_LONGEST} pixels; worked on at {DEFAULT_LONGEST}"
+            for size in list(sizes)[:1]
+            if max(size) > DEFAULT_LONGEST
+        ],
+    }
+
+
+def _captures_inside(path: Path) -> list[str]:
+    """Names of the captures and scenes directly inside a folder."""
+    folders = [p for p in sorted(path.iterdir()) if p.is_dir() and not p.name.startswith(".")]
+    return [p.name for p in folders if is_scene(p) or find_formats(p)]
+
+
+def _as_label_maps(path: Path) -> dict[str, Any] | None:
+    """Facts of a folder of single-channel PNGs, None if they are photographs."""
+    if {p.suffix.lower() for p in bare_photographs(path)} != {".png"}:
+        return None
+    try:
+        return _evidence_facts(path)
+    except FileFormatError:
+        # Three channels: photographs that were saved as PNG.
+        return None
+
+
+def _capture_facts(capture: Capture) -> dict[str, Any]:
+    folder = capture.path
+    others = [format for format in find_formats(folder) if format != capture.format]
+    facts: dict[str, Any] = {"path": str(folder), "kind": "capture", "format": capture.format}
+    facts |= _view_facts(capture.views)
+    facts |= {
+        "points": None if capture.points is None else len(capture.points),
+        "classes": None if capture.classes is None else len(capture.classes.rows),
+        "up": None if capture.up is None else list(capture.up),
+        "metres_per_unit": capture.metres_per_unit,
+        "masks": sum(view.mask is not None for view in capture.views),
+        "depth_maps": sum(view.depth is not None for view in capture.views),
+        "splats": None if capture.splats is None else str(capture.splats),
+        "evidence": list(evidence_names([folder])),
+        "other_formats": others,
+        "notes": list(capture.notes),
+    }
+    return facts
+
+
+def _scene_facts(scene: Scene) -> dict[str, Any]:
+    root = scene.root if scene.root is not None else Path()
+    places = [place for place in (root, scene.source) if place is not None]
+    lost = [v for v in scene.views if v.image is not None and not v.image.is_file()]
+    facts: dict[str, Any] = {"path": str(root), "kind": "scene"}
+    facts |= _gaussian_facts(scene.gaussians) | _view_facts(scene.views)
+    facts |= {
+        "classes": None if scene.classes is None else len(scene.classes.rows),
+        "up": None if scene.up is None else list(scene.up),
+        "metres_per_unit": scene.metres_per_unit,
+        "source": None if scene.source is None else str(scene.source),
+        "layers": {
+            name: _layer_kind(load_scene_layer(root, name)) for name in scene_layer_names(root)
+        },
+        "evidence": list(evidence_names(places)),
+        "notes": [f"{len(lost)} photographs are not where they were (see --data)"] if lost else [],
+    }
+    return facts
+
+
+def _layer_kind(layer: Layer) -> str:
+    if isinstance(layer, Labels):
+        return f"labels of {len(layer.present)} ids"
+    if isinstance(layer, Features):
+        return f"features of {layer.values.shape[1]} channels"
+    return f"selection of {layer.count}"
+
+
+def _evidence_facts(path: Path) -> dict[str, Any]:
+    evidence = open_evidence(path)
+    names = evidence.view_names
+    if not names:
+        raise InputError(f"{path}: expected evidence of at least one view, got none.")
+    return {
+        "path": str(path),
+        "kind": "evidence",
+        "evidence_kind": evidence.kind,
+        "views": len(names),
+        "first_view": names[0],
+        "in_first_view": _first_view(evidence, names[0]),
+        "classes": None if evidence.classes is None else len(evidence.classes.rows),
+    }
+
+
+def _first_view(evidence: Evidence, name: str) -> str:
+    if evidence.kind == "features":
+        features = evidence.features(name)
+        rows, columns, channels = features.features.shape
+        return f"{rows} x {columns} cells of {features.stride} pixels, {channels} channels"
+    masks = evidence.masks(name)
+    what = "masks" if evidence.kind == "masks" else "ids"
+    return f"{len(masks)} {what} on {masks.width}x{masks.height} pixels"
+
+
+def _splat_facts(path: Path) -> dict[str, Any]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SplatWarning)
+        gaussians = read_splats(path)
+    facts: dict[str, Any] = {"path": str(path), "kind": "splats", "format": splat_format(path)}
+    notes = [str(warning.message) for warning in caught]
+    return facts | _gaussian_facts(gaussians) | {"notes": notes}
+
+
+def _gaussian_facts(gaussians: Gaussians) -> dict[str, Any]:
+    bounds = None
+    if len(gaussians):
+        low, high = gaussians.means.amin(dim=0), gaussians.means.amax(dim=0)
+        bounds = [low.tolist(), high.tolist()]
+    return {
+        "gaussians": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "bounds": bounds,
+        "extra_columns": sorted(gaussians.extra),
+    }
+
+
+def _view_facts(views: Sequence[View]) -> dict[str, Any]:
+    sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in views)
+    return {
+        "photographs": sum(view.image is not None for view in views),
+        "views": len(views),
+        "split": dict(sorted(Counter(view.split for view in views).items(), key=_split_order)),
+        "sizes": list(sizes),
+        "lenses": sorted({view.camera.model for view in views}),
+    }
+
+
+def _split_order(item: tuple[str, int]) -> tuple[int, str]:
+    order = ("train", "val", "test")
+    return (order.index(item[0]) if item[0] in order else len(order), item[0])
+
+
+def _capture_sentence(facts: dict[str, Any]) -> str:
+    parts = [f"{facts['format']} capture, {_views(facts)}"]
+    parts.append(f"{facts['points']} start points" if facts["points"] is not None else "no points")
+    parts += [f"{facts[key]} {word}" for key, word in _COUNTED.items() if facts[key]]
+    if facts["splats"]:
+        parts.append("with a splat file")
+    parts += _world(facts)
+    if facts["evidence"]:
+        parts.append(f"evidence {', '.join(facts['evidence'])}")
+    if facts["other_formats"]:
+        parts.append(f"also as {', '.join(facts['other_formats'])}")
+    return "; ".join(parts)
+
+
+_COUNTED = {"masks": "masks", "depth_maps": "depth maps", "classes": "classes"}
+
+
+def _scene_sentence(facts: dict[str, Any]) -> str:
+    layers = ", ".join(f"{name} ({kind})" for name, kind in facts["layers"].items())
+    parts = [
+        f"scene, {_gaussians(facts)}",
+        _views(facts) if facts["views"] else "no views",
+        *_world(facts),
+        f"layers {layers}" if layers else "no layers",
+    ]
+    if facts["evidence"]:
+        parts.append(f"evidence {', '.join(facts['evidence'])}")
+    return "; ".join(parts)
+
+
+def _evidence_sentence(facts: dict[str, Any]) -> str:
+    classes = f"; {facts['classes']} classes" if facts["classes"] else ""
+    return (
+        f"evidence of the kind {facts['evidence_kind']} of {facts['views']} views; "
+        f"{facts['first_view']} has {facts['in_first_view']}{classes}"
+    )
+
+
+def _photographs_sentence(facts: dict[str, Any]) -> str:
+    return f"{facts['photographs']} photographs, {', '.join(facts['sizes'])}; no poses"
+
+
+def _splat_sentence(facts: dict[str, Any]) -> str:
+    return f"{facts['format']} splats, {_gaussians(facts)}"
+
+
+def _splat_folder_sentence(facts: dict[str, Any]) -> str:
+    files = ", ".join(f"{count} {format}" for format, count in facts["files"].items())
+    return f"splat files ({files}); name one of them"
+
+
+def _layer_sentence(facts: dict[str, Any]) -> str:
+    return f"layer of {facts['holds']}, {facts['rows']} rows"
+
+
+def _folder_sentence(facts: dict[str, Any]) -> str:
+    return f"folder of captures or scenes ({', '.join(facts['holds'])}); name one of them"
+
+
+_SENTENCES = {
+    "capture": _capture_sentence,
+    "scene": _scene_sentence,
+    "evidence": _evidence_sentence,
+    "photographs": _photographs_sentence,
+    "splats": _splat_sentence,
+    "splat folder": _splat_folder_sentence,
+    "layer": _layer_sentence,
+    "folder": _folder_sentence,
+}
+
+
+def _views(facts: dict[str, Any]) -> str:
+    split = ", ".join(f"{count} {name}" for name, count in facts["split"].items())
+    sizes = facts["sizes"]
+    shown = ", ".join(sizes[:2]) + (f" and {len(sizes) - 2} sizes more" if len(sizes) > 2 else "")
+    return f"{facts['views']} views {shown} ({split}), {' and '.join(facts['lenses'])}"
+
+
+def _gaussians(facts: dict[str, Any]) -> str:
+    extra = facts["extra_columns"]
+    columns = f", further columns {', '.join(extra)}" if extra else ""
+    return f"{facts['gaussians']} Gaussians, harmonics of degree {facts['sh_degree']}{columns}"
+
+
+def _world(facts: dict[str, Any]) -> list[str]:
+    parts: list[str] = []
+    if facts["up"] is not None:
+        parts.append(f"up is ({', '.join(f'{v:g}' for v in facts['up'])})")
+    if facts["metres_per_unit"] is not None:
+        parts.append(f"1 unit is {facts['metres_per_unit']:g} m")
+    return parts
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {v}" for k, v in value.items()) or "none"  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, list):
+        return ", ".join(str(v) for v in value) or "none"  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    return "none" if value is None else str(value)
