@@ -41,6 +41,7 @@ inline Vec operator*(Vec a, Vec b) { return {_mm512_mul_ps(a.v, b.v)}; }
 inline Vec operator/(Vec a, Vec b) { return {_mm512_div_ps(a.v, b.v)}; }
 inline Vec fma(Vec a, Vec b, Vec c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
 inline Vec fnma(Vec a, Vec b, Vec c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
+inline Vec sqrt(Vec a) { return {_mm512_sqrt_ps(a.v)}; }
 inline Vec min(Vec a, Vec b) { return {_mm512_min_ps(a.v, b.v)}; }
 inline Vec max(Vec a, Vec b) { return {_mm512_max_ps(a.v, b.v)}; }
 inline Mask ge(Vec a, Vec b) { return _mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ); }
@@ -93,6 +94,7 @@ inline Vec fma(Vec x, Vec y, Vec z) {
 inline Vec fnma(Vec x, Vec y, Vec z) {
   return {_mm256_fnmadd_ps(x.a, y.a, z.a), _mm256_fnmadd_ps(x.b, y.b, z.b)};
 }
+inline Vec sqrt(Vec x) { return {_mm256_sqrt_ps(x.a), _mm256_sqrt_ps(x.b)}; }
 inline Vec min(Vec x, Vec y) { return {_mm256_min_ps(x.a, y.a), _mm256_min_ps(x.b, y.b)}; }
 inline Vec max(Vec x, Vec y) { return {_mm256_max_ps(x.a, y.a), _mm256_max_ps(x.b, y.b)}; }
 inline Mask ge(Vec x, Vec y) {
@@ -168,6 +170,7 @@ inline Vec operator*(Vec a, Vec b) { SPLATSEG_EACH a.v[i] *= b.v[i]; return a; }
 inline Vec operator/(Vec a, Vec b) { SPLATSEG_EACH a.v[i] /= b.v[i]; return a; }
 inline Vec fma(Vec a, Vec b, Vec c) { SPLATSEG_EACH c.v[i] += a.v[i] * b.v[i]; return c; }
 inline Vec fnma(Vec a, Vec b, Vec c) { SPLATSEG_EACH c.v[i] -= a.v[i] * b.v[i]; return c; }
+inline Vec sqrt(Vec a) { SPLATSEG_EACH a.v[i] = __builtin_sqrtf(a.v[i]); return a; }
 inline Vec min(Vec a, Vec b) { SPLATSEG_EACH a.v[i] = a.v[i] < b.v[i] ? a.v[i] : b.v[i]; return a; }
 inline Vec max(Vec a, Vec b) { SPLATSEG_EACH a.v[i] = a.v[i] > b.v[i] ? a.v[i] : b.v[i]; return a; }
 inline Mask ge(Vec a, Vec b) { Mask r; SPLATSEG_EACH r.m[i] = -(a.v[i] >= b.v[i]); return r; }

@@ -14,6 +14,14 @@ constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
 
 int64_t split(int64_t count, int part, int parts) { return count * part / parts; }
 
+// Gaussians are shared out in whole pieces: sums over a piece are then the same for any number
+// of threads.
+constexpr int64_t kPiece = 4096;
+int64_t stretch(int64_t count, int64_t part, int64_t parts) {
+  const int64_t pieces = (count + kPiece - 1) / kPiece;
+  return std::min(count, pieces * part / parts * kPiece);
+}
+
 }  // namespace
 
 void View::prepare(const Cloud& cloud, const Pinhole& camera, const Blending& blending) {
@@ -29,9 +37,11 @@ void View::prepare(const Cloud& cloud, const Pinhole& camera, const Blending& bl
   // of indices, which a stable sort turns into the order of ties.
   const int parts = threads();
   Splat* all = unsorted_.resize(cloud.count);
-  std::vector<int64_t> found(static_cast<size_t>(parts));
+  gaussians_ = cloud.count;
+  std::vector<int64_t>& found = found_;
+  found.assign(static_cast<size_t>(parts), 0);
   run_on_threads(parts, [&](int part) {
-    int64_t begin = split(cloud.count, part, parts), end = split(cloud.count, part + 1, parts);
+    int64_t begin = stretch(cloud.count, part, parts), end = stretch(cloud.count, part + 1, parts);
     found[static_cast<size_t>(part)] =
         kernels().project(cloud, camera, blending, begin, end, all + begin);
   });
@@ -42,7 +52,7 @@ void View::prepare(const Cloud& cloud, const Pinhole& camera, const Blending& bl
   run_on_threads(parts, [&](int part) {
     int64_t to = 0;
     for (int p = 0; p < part; ++p) to += found[static_cast<size_t>(p)];
-    const int64_t begin = split(cloud.count, part, parts);
+    const int64_t begin = stretch(cloud.count, part, parts);
     for (int64_t i = 0; i < found[static_cast<size_t>(part)]; ++i) {
       uint32_t bits;
       std::memcpy(&bits, &all[begin + i].depth, 4);
@@ -83,6 +93,7 @@ void View::sort_by_depth() {
     });
     std::swap(from, to);
   }
+  sorted_keys_ = from;
   Splat* sorted = splats_.resize(visible_);
   const Splat* all = unsorted_.data();
   parallel_for(visible_, 4096, [&](int64_t begin, int64_t end) {
@@ -264,8 +275,7 @@ uint8_t* View::record_of(int tile) {
 }
 
 void View::backward_colour(int channels, const ImageGradients& g) {
-  float* total = gradients_.resize(visible_ * kGrad);
-  std::memset(total, 0, sizeof(float) * static_cast<size_t>(visible_) * kGrad);
+  float* total = cleared_gradients();
   in_batches(
       kGrad, kChunk * 160,
       [&](int tile, float* scratch, float* rows) {
@@ -274,15 +284,14 @@ void View::backward_colour(int channels, const ImageGradients& g) {
                                   scratch + kTileScratchFloats, rows);
       },
       [&](uint32_t splat, const float* row) {
-        float* to = total + static_cast<int64_t>(splat) * kGrad;
+        float* to = total + place(splat) * kGrad;
         for (int j = 0; j < kGrad; ++j) to[j] += row[j];
       });
 }
 
 void View::backward_features(const float* signal, int channels, int64_t stride,
                              int image_channels, const ImageGradients& g, float* v_signal) {
-  float* total = gradients_.resize(visible_ * kGrad);
-  std::memset(total, 0, sizeof(float) * static_cast<size_t>(visible_) * kGrad);
+  float* total = cleared_gradients();
   const int64_t image_floats = 512 * static_cast<int64_t>(channels);
   const int64_t row_floats = v_signal ? channels + 16 : 16;
   in_batches(
@@ -306,7 +315,7 @@ void View::backward_features(const float* signal, int channels, int64_t stride,
         }
       },
       [&](uint32_t splat, const float* row) {
-        float* to = total + static_cast<int64_t>(splat) * kGrad;
+        float* to = total + place(splat) * kGrad;
         for (int j = 0; j < kGrad; ++j) to[j] += row[j];
         if (!v_signal) return;
         float* feature = v_signal + static_cast<int64_t>(splats_[splat].id) * image_channels;
@@ -315,14 +324,24 @@ void View::backward_features(const float* signal, int channels, int64_t stride,
 }
 
 void View::chain(const Cloud& cloud, const CloudGradients& out, double* pose) const {
-  // The pose is one sum over all Gaussians: pieces of fixed size, added in order.
-  constexpr int64_t kPiece = 1024;
-  const int64_t pieces = (visible_ + kPiece - 1) / kPiece;
+  // The pose is one sum over all Gaussians: pieces, added in order.
+  const int64_t pieces = (gaussians_ + kPiece - 1) / kPiece;
+  const int64_t parts = static_cast<int64_t>(found_.size());
+  const Splat* all = unsorted_.data();
   std::vector<double> partial(pose ? static_cast<size_t>(pieces) * 15 : 0, 0.0);
-  parallel_for(visible_, kPiece, [&](int64_t begin, int64_t end) {
-    double* mine = pose ? partial.data() + begin / kPiece * 15 : nullptr;
-    kernels().chain(cloud, camera_, blending_, splats_.data(), gradients_.data(), begin, end, out,
-                    mine);
+  auto by_id = [](const Splat& s, int64_t id) { return s.id < id; };
+  parallel_for(pieces, 1, [&](int64_t piece, int64_t) {
+    double* mine = pose ? partial.data() + piece * 15 : nullptr;
+    const int64_t low = piece * kPiece, high = std::min(low + kPiece, gaussians_);
+    for (int64_t part = 0; part < parts; ++part) {
+      const int64_t first = stretch(gaussians_, part, parts);
+      const int64_t next = stretch(gaussians_, part + 1, parts);
+      if (next <= low || first >= high) continue;
+      const Splat* end = all + first + found_[static_cast<size_t>(part)];
+      const int64_t from = std::lower_bound(all + first, end, low, by_id) - all;
+      const int64_t to = std::lower_bound(all + first, end, high, by_id) - all;
+      kernels().chain(cloud, camera_, blending_, all, gradients_.data(), from, to, out, mine);
+    }
   });
   if (!pose) return;
   std::fill(pose, pose + 15, 0.0);
@@ -330,10 +349,20 @@ void View::chain(const Cloud& cloud, const CloudGradients& out, double* pose) co
     for (int j = 0; j < 15; ++j) pose[j] += partial[static_cast<size_t>(piece * 15 + j)];
 }
 
+float* View::cleared_gradients() {
+  float* total = gradients_.resize(gaussians_ * kGrad);
+  const int parts = static_cast<int>(found_.size());
+  run_on_threads(parts, [&](int part) {
+    std::memset(total + stretch(gaussians_, part, parts) * kGrad, 0,
+                sizeof(float) * static_cast<size_t>(found_[static_cast<size_t>(part)]) * kGrad);
+  });
+  return total;
+}
+
 void View::narrow_signal_gradient(int channels, float* v_signal) const {
   for (int64_t i = 0; i < visible_; ++i)
     for (int c = 0; c < channels; ++c)
-      v_signal[static_cast<int64_t>(splats_[i].id) * channels + c] = gradients_[i * kGrad + 6 + c];
+      v_signal[static_cast<int64_t>(splats_[i].id) * channels + c] = gradients_[place(i) * kGrad + 6 + c];
 }
 
 }  // namespace splatseg

@@ -85,7 +85,14 @@ class View {
   std::vector<Buffer<float>> scratch_;  // per thread
   std::vector<BlockScratch> block_scratch_;
   Buffer<float> batch_;
-  Buffer<float> gradients_;  // kGrad a visible splat
+  // kGrad floats a splat, at its place in unsorted_: there splats are in the order of the scene,
+  // so that the chain rule reads and writes memory in order.
+  Buffer<float> gradients_;
+  const uint64_t* sorted_keys_ = nullptr;  // low half: place in unsorted_
+  std::vector<int64_t> found_;             // visible splats of each stretch of the scene
+  int64_t place(int64_t splat) const { return static_cast<uint32_t>(sorted_keys_[splat]); }
+  float* cleared_gradients();
+  int64_t gaussians_ = 0;
 };
 
 }  // namespace splatseg

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
@@ -52,6 +53,11 @@ def _padded(signal: Tensor) -> Tensor:
     wide = signal.new_zeros(len(signal), padded_channels(channels))
     wide[:, :channels] = signal
     return wide
+
+
+def _zeros(*shape: int) -> Tensor:
+    """Zeros whose pages are only touched when somebody writes: most rows never are."""
+    return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 def _plain(tensor: Tensor) -> Tensor:
@@ -184,8 +190,7 @@ class CpuView:
     def back_project(self, image: Float[Tensor, "height width channels"]) -> tuple[Tensor, Tensor]:
         """``W.T @ image`` (n, c) and ``W.T @ 1`` (n,)."""
         channels = image.shape[2]
-        sums = torch.zeros(self._count, channels)
-        weights = torch.zeros(self._count)
+        sums, weights = _zeros(self._count, channels), _zeros(self._count)
         self._view.adjoint(_plain(image), channels, sums, weights)
         return sums, weights
 
@@ -196,7 +201,7 @@ class CpuView:
         v_alpha: Float[Tensor, "height width"] | None = None,
         v_depth_sum: Float[Tensor, "height width"] | None = None,
         wanted: frozenset[str] = frozenset(
-            ("means", "rotations", "scales", "opacities", "sh", "signal", "screen")
+            ("means", "rotations", "scales", "opacities", "sh", "screen")
         ),
     ) -> SceneGradients:
         """Gradients of ``<v_image, image> + <v_alpha, alpha> + <v_depth_sum, depth_sum>``.
@@ -208,7 +213,7 @@ class CpuView:
         image, alpha, depth_sum = self._forward
         maybe: Callable[[Tensor | None], Tensor | None] = lambda t: None if t is None else _plain(t)
         n, channels = self._count, image.shape[2]
-        v_signal = torch.zeros(n, channels) if "signal" in wanted else None
+        v_signal = _zeros(n, channels) if "signal" in wanted else None
         planes = (image, alpha, depth_sum, _plain(v_image), maybe(v_alpha), maybe(v_depth_sum))
         if self._wide is None:
             self._view.backward_colour(channels, *planes)
@@ -218,12 +223,12 @@ class CpuView:
             self._view.backward_features(self._wide, channels, *planes, v_signal)
 
         def zeros(name: str, *shape: int) -> Tensor | None:
-            return torch.zeros(n, *shape) if name in wanted else None
+            return _zeros(n, *shape) if name in wanted else None
 
         use_sh = "sh" in wanted and self._sh is not None and self._wide is None
         means, rotations, scales = zeros("means", 3), zeros("rotations", 4), zeros("scales", 3)
         opacities, screen = zeros("opacities"), zeros("screen", 2)
-        sh = torch.zeros_like(self._sh) if use_sh and self._sh is not None else None
+        sh = _zeros(*self._sh.shape) if use_sh and self._sh is not None else None
         pose = torch.zeros(15, dtype=torch.float64) if "pose" in wanted else None
         if any(x is not None for x in (means, rotations, scales, opacities, sh, screen, pose)):
             self._view.chain(self._cloud, means, rotations, scales, opacities, sh, screen, pose)
