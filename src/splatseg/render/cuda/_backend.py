@@ -170,8 +170,11 @@ def _take_rows(found: Entries, rows: Tensor) -> Entries:
     )
 
 
-def load_gsplat() -> ModuleType:
+def load_gsplat(device: str = "cuda") -> ModuleType:
     """Import gsplat and see that its kernels run.
+
+    Args:
+        device: Where they are tried.
 
     Raises:
         MissingPackageError: If gsplat, or a GPU that torch can use, is missing.
@@ -192,7 +195,7 @@ def load_gsplat() -> ModuleType:
         )
     try:
         gsplat.quat_scale_to_covar_preci(
-            torch.ones(1, 4, device="cuda"), torch.ones(1, 3, device="cuda")
+            torch.ones(1, 4, device=device), torch.ones(1, 3, device=device)
         )
     except (AttributeError, ImportError, OSError, RuntimeError) as error:
         raise BackendError(
