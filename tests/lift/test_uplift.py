@@ -46,13 +46,14 @@ def test_labels_are_the_strongest_votes(rng, lens) -> None:
     labels = uplift(gaussians, views, maps, backend=BACKEND)
 
     seen = votes.sum(dim=1) > 0
-    assert 5 < int(seen.sum())
+    assert int(seen.sum()) > 5
     shares = votes / votes.sum(dim=1, keepdim=True).clamp_min(1e-30)
     confidence, column = shares.max(dim=1)
     expected = torch.where(seen, torch.tensor(IDS)[column], -1)
     assert labels.ids.tolist() == expected.tolist()
     torch.testing.assert_close(labels.confidence.double(), confidence, rtol=0, atol=1e-5)
-    assert labels.candidates is None and labels.shares is None
+    assert labels.candidates is None
+    assert labels.shares is None
 
 
 @pytest.mark.parametrize("memory", [1, 14 * 4 * 2, 1 << 30])
@@ -73,7 +74,8 @@ def test_passes_over_the_ids_change_nothing(rng, views, memory) -> None:
         progress=lambda done, total: calls.append((done, total)),
     )
 
-    assert labels.shares is not None and labels.candidates is not None
+    assert labels.shares is not None
+    assert labels.candidates is not None
     torch.testing.assert_close(labels.shares.double(), expected[:, :3], rtol=0, atol=1e-5)
     real = expected[:, :3] > 0
     assert torch.equal(labels.candidates[real].long(), torch.tensor(IDS)[order[:, :3]][real])
@@ -93,7 +95,8 @@ def test_voids_cast_no_vote_and_unseen_gaussians_have_no_label(views) -> None:
     assert labels.ids.tolist() == [3, -1]
     assert labels.confidence.tolist() == [1.0, 0.0]
     soft = uplift(gaussians, one, maps, options=UpliftOptions(candidates=2), backend=BACKEND)
-    assert soft.candidates is not None and soft.shares is not None
+    assert soft.candidates is not None
+    assert soft.shares is not None
     assert soft.candidates.tolist() == [[3, -1], [-1, -1]]
     assert soft.shares.tolist() == [[1.0, 0.0], [0.0, 0.0]]
 
@@ -149,7 +152,8 @@ def test_thresholds_take_labels_away() -> None:
     assert label(min_weight=1.01 * weight) == -1
     options = UpliftOptions(min_weight=1.01 * weight, candidates=2)
     unsure = uplift(gaussians, [view], maps, options=options, backend=BACKEND)
-    assert unsure.candidates is not None and unsure.shares is not None
+    assert unsure.candidates is not None
+    assert unsure.shares is not None
     assert unsure.candidates.tolist() == [[-1, -1]]
     assert unsure.shares.tolist() == [[0.0, 0.0]]
 
@@ -215,7 +219,7 @@ def test_bad_input_is_refused(rng, views) -> None:
     with pytest.raises(InputError, match="expected a labelled pixel in 1 views"):
         uplift(gaussians, views[:1], void, backend=BACKEND)
     stretched = Maps({"v0": LabelMap(ids=torch.ones(12, 12, dtype=torch.int32))})
-    with pytest.raises(ShapeError, match="v0: expected a map of 16x12 .* got 12x12"):
+    with pytest.raises(ShapeError, match=r"v0: expected a map of 16x12 .* got 12x12"):
         uplift(gaussians, views[:1], stretched, backend=BACKEND)
     for wrong in (
         {"candidates": 0},

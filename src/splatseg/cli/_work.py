@@ -1,6 +1,6 @@
 """What commands that go through views share: which views, which layer, and a progress bar."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from splatseg.io.scene import load_scene, load_scene_layer
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+def progress(what: str) -> Generator[Callable[[int, int], None]]:
     """A bar on stderr with an estimate; gives a function of (done, total)."""
     columns = (
         TextColumn("{task.description}"),

@@ -63,6 +63,15 @@ class Command:
     """Folder of the capture, where it was moved. Only commands that read photographs need it."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Layer:
+    """A layer to draw; a selection as the label 1."""
+
+    name: str
+    labels: Labels
+    is_selection: bool
+
+
 def run(command: Command) -> None:
     """Render a scene."""
     scene = open_scene(command.scene, command.data)
@@ -71,7 +80,7 @@ def run(command: Command) -> None:
     layers = _layers(scene, wanted)
     folders = [*wanted]
     if command.coloured:
-        folders += [f"{name}_coloured" for name, layer in layers.items() if layer[1]]
+        folders += [f"{layer.name}_coloured" for layer in layers if not layer.is_selection]
     if len(set(folders)) != len(folders):
         raise InputError("--what: a layer has the name of another's coloured pictures.")
     record = _check_output(command.output, folders)
@@ -91,7 +100,7 @@ def _render(
     command: Command,
     scene: Scene,
     views: Sequence[View],
-    layers: Mapping[str, tuple[Labels, bool]],
+    layers: Sequence[_Layer],
     folders: Sequence[str],
 ) -> None:
     """Draw everything; each folder appears whole at the end or not at all."""
@@ -100,14 +109,15 @@ def _render(
         with progress("render") as step:
             for done, view in enumerate(views, start=1):
                 _draw_pictures(scene, view, into, command.backend)
-                for name, (labels, is_labels) in layers.items():
-                    _draw_layer(scene, view, labels, is_labels, name, into, command.backend)
+                for layer in layers:
+                    _draw_layer(scene, view, layer, into, command.backend)
                 step(done, len(views))
         if "depth" in into:
             _finish_depth(into["depth"], views, scene)
-        for name, (labels, is_labels) in layers.items():
-            if is_labels:
-                write_json(into[name] / "legend.json", legend_of(labels, scene.classes))
+        for layer in layers:
+            if not layer.is_selection:
+                legend = legend_of(layer.labels, scene.classes)
+                write_json(into[layer.name] / "legend.json", legend)
 
 
 def _wanted(what: str) -> list[str]:
@@ -117,9 +127,8 @@ def _wanted(what: str) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _layers(scene: Scene, wanted: Sequence[str]) -> dict[str, tuple[Labels, bool]]:
-    """The layers to draw, as labels, and whether they are labels (or a selection)."""
-    layers: dict[str, tuple[Labels, bool]] = {}
+def _layers(scene: Scene, wanted: Sequence[str]) -> list[_Layer]:
+    layers: list[_Layer] = []
     known = () if scene.root is None else scene_layer_names(scene.root)
     for name in wanted:
         if name in _PICTURES:
@@ -131,9 +140,9 @@ def _layers(scene: Scene, wanted: Sequence[str]) -> dict[str, tuple[Labels, bool
             )
         layer = layer_of(scene, name)
         if isinstance(layer, Labels):
-            layers[name] = (layer, True)
+            layers.append(_Layer(name=name, labels=layer, is_selection=False))
         elif isinstance(layer, Selection):
-            layers[name] = (labels_of(layer), False)
+            layers.append(_Layer(name=name, labels=labels_of(layer), is_selection=True))
         else:
             raise InputError(f"--what: {name} holds features, which are no picture.")
     return layers
@@ -216,19 +225,18 @@ def depth_unit(deepest: float) -> float:
 def _draw_layer(
     scene: Scene,
     view: View,
-    labels: Labels,
-    is_labels: bool,
-    name: str,
+    layer: _Layer,
     into: Mapping[str, Path],
     backend: str,
 ) -> None:
-    ids = label_map(scene.gaussians, view.camera, labels, backend=backend).ids
-    if not is_labels:
-        _save(ids != UNLABELLED, into[name], view)
+    ids = label_map(scene.gaussians, view.camera, layer.labels, backend=backend).ids
+    if layer.is_selection:
+        _save(ids != UNLABELLED, into[layer.name], view)
         return
-    _save(torch.where(ids == UNLABELLED, 0, ids), into[name], view)
-    if f"{name}_coloured" in into:
-        _save(coloured(ids, scene.classes), into[f"{name}_coloured"], view)
+    _save(torch.where(ids == UNLABELLED, 0, ids), into[layer.name], view)
+    pictures = into.get(f"{layer.name}_coloured")
+    if pictures is not None:
+        _save(coloured(ids, scene.classes), pictures, view)
 
 
 def _save(image: Tensor, folder: Path, view: View) -> None:

@@ -105,7 +105,7 @@ def evaluate_semantic(
     confusions: list[Confusion] = []
     for done, view in enumerate(scored, start=1):
         true = truth.label_map(view.name)
-        drawn = _drawn(gaussians, view, labels, true, options, backend)
+        drawn = _drawn(gaussians, view, labels, true, options=options, backend=backend)
         confusions.append(Confusion.of(drawn.ids, true.ids))
         if progress is not None:
             progress(done, len(scored))
@@ -152,7 +152,7 @@ def evaluate_binary(
     pairs: list[tuple[torch.Tensor, torch.Tensor]] = []
     for done, view in enumerate(scored, start=1):
         true = truth.label_map(view.name)
-        drawn = _drawn(gaussians, view, labels, true, options, backend)
+        drawn = _drawn(gaussians, view, labels, true, options=options, backend=backend)
         pairs.append((_mask(drawn, wanted), _mask(true, id)))
         if progress is not None:
             progress(done, len(scored))
@@ -211,6 +211,7 @@ def _drawn(
     view: View,
     labels: Labels,
     truth: LabelMap,
+    *,
     options: RenderOptions | None,
     backend: str,
 ) -> LabelMap:
