@@ -110,7 +110,9 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
     spare = tuple(torch.empty(height, width) for _ in range(3))
     image3 = torch.empty(height, width, 3)
     rows["rgb+depth"] = alternate(
-        lambda: view._view.forward_colour(3, image3, *spare, False), lambda: prototype.rgb(scene["colors"]), repeats
+        lambda: view._view.forward_colour(3, image3, *spare, False),
+        lambda: prototype.rgb(scene["colors"]),
+        repeats,
     )
     view.render()
     statistics = view.statistics
@@ -132,9 +134,7 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
     with_sh = CpuView(*cloud, camera=camera, options=options, sh=harmonics)
     with_sh.render(record=True)
     rows["backward 3D (degree 3)"] = alternate(
-        lambda: with_sh.backward(
-            mine, v_alpha=planes[4], v_depth_sum=planes[5], wanted=everything
-        ),
+        lambda: with_sh.backward(mine, v_alpha=planes[4], v_depth_sum=planes[5], wanted=everything),
         None,
         repeats,
     )
@@ -143,9 +143,7 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
         if channels > 64 and n > 500_000:
             continue
         signal = torch.from_numpy(rng.standard_normal((n, channels)).astype(np.float32))
-        image = torch.from_numpy(
-            rng.standard_normal((height, width, channels)).astype(np.float32)
-        )
+        image = torch.from_numpy(rng.standard_normal((height, width, channels)).astype(np.float32))
         result = np.empty((height, width, channels), np.float32)
         few = repeats if channels <= 64 else 5
         rows[f"D={channels}"] = alternate(
@@ -204,9 +202,7 @@ def report(name: str, found: dict[str, Any], sgemm: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--scenes", nargs="+", default=["garden", "room200k_640", "room1M_1296"]
-    )
+    parser.add_argument("--scenes", nargs="+", default=["garden", "room200k_640", "room1M_1296"])
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()

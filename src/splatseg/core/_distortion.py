@@ -99,7 +99,11 @@ def undistort_opencv(
             fraction = torch.where(worse, fraction / 2, fraction)
         guess = guess - fraction * step
         error = residual(guess)
-    _require_converged(error)
+    # Beyond the fold of the polynomial lie solutions that no lens has: there the image is
+    # mirrored, or lies on the other side of the axis.
+    jacobian = _numerical_jacobian(lambda at: distort_opencv(at, parameters), guess)
+    folded = (torch.linalg.det(jacobian) <= 0) | ((guess * target).sum(-1) < 0)
+    _require_converged(torch.where(folded.unsqueeze(-1), torch.inf, error))
     return guess.to(plane)
 
 

@@ -175,9 +175,7 @@ class Camera:
         )
         return torch.stack((u, v), dim=-1)
 
-    def undistort_pixels(
-        self, pixels: Float[Tensor, "*batch 2"]
-    ) -> Float[Tensor, "*batch 2"]:
+    def undistort_pixels(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Where pixels would lie without distortion, same intrinsics."""
         return self._pixels_from_plane(self._plane_from_pixels(pixels), distorted=True)
 

@@ -197,5 +197,3 @@ def _view(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> CpuVi
         camera=camera,
         options=options,
     )
-
-
