@@ -7,7 +7,7 @@ rename is one step) and renamed only when the block ended well.
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,7 +17,7 @@ _TEMPORARY = ".splatseg-"
 
 
 @contextmanager
-def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_file(path: str | os.PathLike[str]) -> Generator[Path]:
     """Give a temporary path to write a file to; it becomes `path` when the block ends well.
 
     The temporary name ends with the target's whole name, so writers that look at the suffix
@@ -54,7 +54,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_folder(path: str | os.PathLike[str]) -> Generator[Path]:
     """Give an empty temporary folder to fill; it becomes `path` when the block ends well.
 
     An existing folder is replaced as a whole: what the block did not write is gone afterwards.
