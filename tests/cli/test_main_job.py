@@ -81,6 +81,33 @@ def test_segment_views(small, splatseg) -> None:
     assert "made from 1 of these views" in out
 
 
+def test_a_source_whose_zero_is_a_class(small, splatseg, tmp_path) -> None:
+    """Ids one lower in the files: sky is 0, and 255 is void."""
+    for folder, other in (("labels_semantic", "labels_zero"), ("semantic", "truth_zero")):
+        (small.capture / other).mkdir()
+        for path in (small.capture / folder).glob("*.png"):
+            ids = pixels(path)
+            lower = np.where(ids == 0, 255, ids - 1).astype(np.uint8)
+            Image.fromarray(lower).save(small.capture / other / path.name)
+    rule = ("--zero-is-class", "--void", 255, "--backend", "reference")
+    status, _, err = splatseg(
+        "segment", small.scene, "--method", "uplift", "--evidence", "labels_zero", *rule
+    )
+    assert status == 0, err
+    layer = load_scene_layer(small.scene, "labels_zero")
+    assert layer.background == 1
+    assert layer.metadata["source_ids"] == {"1": 0, "2": 1, "7": 6}
+    arguments = ("--layer", "labels_zero", "--truth", small.capture / "truth_zero", "--json")
+    status, text, err = splatseg("evaluate", small.scene, *arguments, *rule)
+    assert status == 0, err
+    assert set(json.loads(text)["per_class"]) == {"1", "2", "7"}
+    assert json.loads(text)["mIoU"] > 0.7
+    arguments = ("--what", "labels_zero", "-o", tmp_path / "out", "--backend", "reference")
+    assert splatseg("render", small.scene, *arguments)[0] == 0
+    legend = json.loads((tmp_path / "out" / "labels_zero" / "legend.json").read_text())
+    assert {k: v["source_id"] for k, v in legend["ids"].items()} == {"1": 0, "2": 1, "7": 6}
+
+
 def test_segment_is_repeatable(small, splatseg) -> None:
     path = small.scene / "layers" / "a.npz"
     for _ in range(2):

@@ -1,7 +1,8 @@
 """What the ids of a drawn layer mean, in words and colours: legend.json."""
 
 import colorsys
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, cast
 
 import torch
 from jaxtyping import Int, UInt8
@@ -30,14 +31,14 @@ def colour_of(id: int, classes: ClassTable | None) -> Colour:
 def legend_of(labels: Labels, classes: ClassTable | None) -> dict[str, Any]:
     """The content of legend.json for a layer."""
     names = names_of(labels, classes)
-    return {
-        "none": 0,
-        "background": 0 if labels.background == UNLABELLED else labels.background,
-        "ids": {
-            str(id): {"name": names.get(id, ""), "colour": list(colour_of(id, classes))}
-            for id in labels.present.tolist()
-        },
-    }
+    sources = cast(Mapping[str, int], labels.metadata.get("source_ids") or {})
+    rows: dict[str, dict[str, Any]] = {}
+    for id in labels.present.tolist():
+        rows[str(id)] = {"name": names.get(id, ""), "colour": list(colour_of(id, classes))}
+        if str(id) in sources:
+            rows[str(id)]["source_id"] = sources[str(id)]
+    background = 0 if labels.background == UNLABELLED else labels.background
+    return {"none": 0, "background": background, "ids": rows}
 
 
 def names_of(labels: Labels, classes: ClassTable | None) -> dict[int, str]:

@@ -36,6 +36,12 @@ class Command:
     truth: Path | None = None
     """Folder of the true id maps, one PNG a view; 0 is void."""
 
+    zero_is_class: bool = False
+    """The id 0 of the truth's files is a class and not void: ids grow by 1."""
+
+    void: int | None = None
+    """A further id of the truth's files that means void, such as 255."""
+
     split: str = "test"
     """Which views: test, train, another split of the scene, or all."""
 
@@ -70,7 +76,7 @@ def run(command: Command) -> None:
         layer = layer_of(scene, command.layer)
         if not isinstance(layer, (Labels, Selection)):
             raise InputError(f"--layer: {command.layer} holds features, which have no score.")
-        truth = open_evidence(command.truth)
+        truth = open_evidence(command.truth, zero_is_class=command.zero_is_class, void=command.void)
         figures |= {"layer": command.layer, "metric": command.metric}
         figures |= _layer_figures(command, scene, views, layer, truth)
     if _wants_photographs(command, views):

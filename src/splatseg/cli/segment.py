@@ -39,6 +39,13 @@ class Command:
     layer: str | None = None
     """Name of the layer to write. None names it like the evidence."""
 
+    zero_is_class: bool = False
+    """The id 0 of the evidence's files is a class and not void: ids grow by 1, and the layer
+    records what they were."""
+
+    void: int | None = None
+    """A further id of the evidence's files that means none, such as 255."""
+
     views: str = "train"
     """Which views may be used: train, all, or names with commas between them. What is asked for
     is recorded in the layer."""
@@ -88,6 +95,9 @@ def run(command: Command) -> None:
             "torch": str(torch.__version__),
         },
     }
+    if evidence.source_ids is not None:
+        present = labels.present.tolist()
+        metadata["source_ids"] = {str(id): evidence.source_ids[id] for id in present}
     path = save_scene_layer(command.scene, layer_name, replace(labels, metadata=metadata))
     sys.stdout.write(_summary(labels, len(views), time.monotonic() - started) + f"{path}\n")
 
@@ -114,7 +124,8 @@ def _evidence(command: Command, scene: Scene) -> tuple[str, Evidence]:
             known = ", ".join(names) or "there is none"
             raise InputError(f"--evidence: expected a name ({known}), got none.")
         name = names[0]
-    return name, open_evidence(find_evidence(places, name))
+    folder = find_evidence(places, name)
+    return name, open_evidence(folder, zero_is_class=command.zero_is_class, void=command.void)
 
 
 def _voters(scene: Scene, evidence: Evidence, asked: str) -> tuple[View, ...]:
