@@ -108,9 +108,10 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
     view = prepare()
     # Both sides write into memory that is there: fresh pages would cost as much as blending.
     spare = tuple(torch.empty(height, width) for _ in range(3))
+    quiet = (False,)  # record nothing for a backward pass
     image3 = torch.empty(height, width, 3)
     rows["rgb+depth"] = alternate(
-        lambda: view._view.forward_colour(3, image3, *spare, False),
+        lambda: view._view.forward_colour(3, image3, *spare, *quiet),
         lambda: prototype.rgb(scene["colors"]),
         repeats,
     )
@@ -148,7 +149,7 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
         few = repeats if channels <= 64 else 5
         rows[f"D={channels}"] = alternate(
             lambda s=signal, r=result, c=channels: view._view.forward_features(
-                s, c, torch.from_numpy(r), *spare, False
+                s, c, torch.from_numpy(r), *spare, *quiet
             ),
             (lambda s=signal, r=result: prototype.feat(s.numpy(), r)) if channels <= 64 else None,
             few,

@@ -102,8 +102,10 @@ def test_layers_slice_in_step() -> None:
     )
     part = labels[torch.tensor([2, 0])]
     assert part.ids.tolist() == [5, 3]
-    assert part.candidates is not None and part.candidates.tolist() == [[5, 3], [3, 5]]
-    assert part.background == 7 and part.metadata["method"] == "by hand"
+    assert part.candidates is not None
+    assert part.candidates.tolist() == [[5, 3], [3, 5]]
+    assert part.background == 7
+    assert part.metadata["method"] == "by hand"
     assert labels.present.tolist() == [3, 5, 7]
     with pytest.raises(InputError, match="both or neither"):
         Labels(ids=labels.ids, confidence=labels.confidence, shares=labels.shares)
@@ -159,7 +161,8 @@ def test_class_tables_name_ids() -> None:
     table = ClassTable(
         rows=(ClassInfo(id=1, name="sky", isthing=False), ClassInfo(id=4, name="car"))
     )
-    assert table.name_of(4) == "car" and table.name_of(9) == "id 9"
+    assert table.name_of(4) == "car"
+    assert table.name_of(9) == "id 9"
     assert table.by_name("sky").id == 1
     with pytest.raises(InputError, match="expected one of sky, car, got 'cat'"):
         table.by_name("cat")

@@ -77,7 +77,7 @@ def test_similarity_refuses_what_is_none() -> None:
         Similarity(rotation=torch.diag(torch.tensor([1.0, 1, -1])), translation=zero)
     with pytest.raises(RangeError, match="positive finite"):
         Similarity(rotation=eye, translation=zero, scale=0.0)
-    with pytest.raises(RangeError, match="not zero|non-zero"):
+    with pytest.raises(RangeError, match="non-zero"):
         normalised(torch.zeros(1, 4))
 
 

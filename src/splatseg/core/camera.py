@@ -101,7 +101,7 @@ class Camera:
         return not any(self.distortion)
 
     @property
-    def K(self) -> Float[Tensor, "3 3"]:  # noqa: N802 -- the name the field uses
+    def K(self) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix in pixels, float64."""
         return torch.tensor(
             [[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=torch.float64

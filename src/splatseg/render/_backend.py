@@ -91,8 +91,11 @@ class ViewWeights(ABC):
 
 
 class SparseWeights(ViewWeights):
-    """W as compressed sparse rows: the ids and weights of pixel p are
-    ``ids[indptr[p]:indptr[p + 1]]`` and ``weights[...]``, front to back."""
+    """W as compressed sparse rows.
+
+    The ids and weights of pixel p are ``ids[indptr[p]:indptr[p + 1]]`` and ``weights[...]``,
+    front to back.
+    """
 
     @property
     @abstractmethod

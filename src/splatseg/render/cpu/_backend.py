@@ -26,7 +26,7 @@ class _Render(torch.autograd.Function):
     """Forward and backward of one view. Outputs: image, alpha, depth sum, median depth."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # noqa: PLR0917 -- autograd's own form
         ctx: Any,
         means: Tensor,
         rotations: Tensor,

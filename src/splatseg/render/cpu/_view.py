@@ -4,7 +4,6 @@ This is the layer under the backend that fitting uses directly: it knows nothing
 allocates its scratch memory once.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -211,7 +210,10 @@ class CpuView:
         if self._forward is None:
             raise RuntimeError("backward: render(record=True) comes first.")
         image, alpha, depth_sum = self._forward
-        maybe: Callable[[Tensor | None], Tensor | None] = lambda t: None if t is None else _plain(t)
+
+        def maybe(t: Tensor | None) -> Tensor | None:
+            return None if t is None else _plain(t)
+
         n, channels = self._count, image.shape[2]
         v_signal = _zeros(n, channels) if "signal" in wanted else None
         planes = (image, alpha, depth_sum, _plain(v_image), maybe(v_alpha), maybe(v_depth_sum))
