@@ -1,0 +1,125 @@
+"""Views through a lens: forward, adjoint, picking and W of a distorted photograph."""
+
+import pytest
+import torch
+
+from splatseg.core import Camera, Gaussians
+from splatseg.errors import InputError
+from splatseg.render import back_project, contributors, render, weights
+from splatseg.render.warp import Warp, straightened, warp_into_photograph
+
+BACKEND = "reference"
+LENSES = [("opencv", (-0.2, 0.05, 1e-3, -2e-3)), ("fisheye", (0.02, -0.01))]
+
+
+def camera_of(lens=LENSES[0], width: int = 15, height: int = 11) -> Camera:
+    return Camera(
+        width=width,
+        height=height,
+        fx=13.0,
+        fy=12.0,
+        cx=7.0,
+        cy=6.0,
+        cam_from_world=torch.eye(4, dtype=torch.float64),
+        model=lens[0],
+        distortion=lens[1],
+    )
+
+
+@pytest.fixture
+def gaussians(rng) -> Gaussians:
+    n = 12
+    rotations = torch.from_numpy(rng.normal(size=(n, 4)))
+    return Gaussians(
+        means=torch.from_numpy(rng.uniform((-1, -0.8, 1.5), (1, 0.8, 3), (n, 3))),
+        rotations=rotations / rotations.norm(dim=1, keepdim=True),
+        scales=torch.from_numpy(rng.uniform(0.1, 0.4, (n, 3))),
+        opacities=torch.from_numpy(rng.uniform(0.3, 0.9, n)),
+        sh=torch.from_numpy(rng.normal(size=(n, 1, 3))) * 0.3,
+    )
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("mode", ["bilinear", "nearest"])
+def test_back_project_is_the_adjoint_of_render(rng, gaussians, lens, mode) -> None:
+    camera = camera_of(lens)
+    signal = torch.from_numpy(rng.normal(size=(12, 5)))
+    image = torch.from_numpy(rng.normal(size=(11, 15, 5)))
+    options = {"backend": BACKEND, "warp": mode}
+    drawn = render(gaussians, camera, signal, **options)
+    back = back_project(gaussians, camera, image, **options)
+    left, right = float((drawn.image * image).sum()), float((signal * back.sums).sum())
+    assert left == pytest.approx(right, rel=1e-6)
+    # The weights are the photograph's: together as much light as alpha says.
+    assert float(back.weights.sum()) == pytest.approx(float(drawn.alpha.sum()), rel=1e-6)
+    ones = back_project(gaussians, camera, torch.ones(11, 15, 1).double(), **options)
+    torch.testing.assert_close(ones.sums[:, 0], back.weights)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_view_is_the_straight_view_seen_through_the_lens(gaussians, lens) -> None:
+    camera = camera_of(lens)
+    straight = render(gaussians, straightened(camera), backend=BACKEND)
+    for mode in ("bilinear", "nearest"):
+        warp = Warp.between(camera, straightened(camera), mode)
+        drawn = render(gaussians, camera, backend=BACKEND, warp=mode)
+        torch.testing.assert_close(drawn.image, warp.apply(straight.image))
+        torch.testing.assert_close(drawn.alpha, warp.apply(straight.alpha[..., None])[..., 0])
+        light = warp.apply((straight.alpha * straight.depth)[..., None])[..., 0]
+        covered = drawn.alpha > 0
+        assert int(covered.sum()) > 0
+        torch.testing.assert_close(drawn.depth[covered], (light / drawn.alpha)[covered])
+        assert bool((drawn.depth[~covered] == 0).all())
+        median = warp_into_photograph(camera, "nearest").apply(straight.median_depth[..., None])
+        assert torch.equal(drawn.median_depth, median[..., 0])
+
+
+def test_depth_of_a_plane_stays_its_depth_at_the_silhouette() -> None:
+    """Depths are averaged by weight: beside an empty pixel they do not sink towards 0."""
+    one = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 2.0]]),
+        rotations=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.full((1, 3), 0.2),
+        opacities=torch.tensor([0.9]),
+        sh=torch.zeros(1, 1, 3),
+    )
+    drawn = render(one, camera_of(), backend=BACKEND)
+    covered = drawn.alpha > 0
+    assert bool(covered.any())
+    assert not bool(covered.all())
+    torch.testing.assert_close(
+        drawn.depth[covered], torch.full_like(drawn.depth[covered], 2.0), rtol=1e-5, atol=0
+    )
+
+
+def test_gradients_pass_the_lens(rng, gaussians) -> None:
+    camera = camera_of()
+    signal = torch.from_numpy(rng.normal(size=(12, 2))).requires_grad_()
+    image = torch.from_numpy(rng.normal(size=(11, 15, 2)))
+    (render(gaussians, camera, signal, backend=BACKEND).image * image).sum().backward()
+    expected = back_project(gaussians, camera, image, backend=BACKEND).sums
+    torch.testing.assert_close(signal.grad, expected.to(signal.grad), rtol=1e-5, atol=1e-7)
+
+
+def test_contributors_and_w_read_the_nearest_straight_pixel(gaussians) -> None:
+    camera = camera_of()
+    pixels = torch.tensor([[0, 0], [14, 10], [7, 5], [3, 8]])
+    at, found = warp_into_photograph(camera, "nearest").nearest_sources(pixels)
+    assert bool(found.all())
+    assert not torch.equal(at, pixels)
+    seen = contributors(gaussians, camera, pixels, 3, backend=BACKEND)
+    straight = contributors(gaussians, straightened(camera), at, 3, backend=BACKEND)
+    assert torch.equal(seen.ids, straight.ids)
+    assert torch.equal(seen.weights, straight.weights)
+
+    ones = torch.ones(12, 1, dtype=torch.float32)
+    alpha = render(gaussians, camera, backend=BACKEND, warp="nearest").alpha.float()
+    whole = weights(gaussians, camera, backend=BACKEND)
+    assert whole.shape == (15 * 11, 12)
+    torch.testing.assert_close(whole.render(ones)[:, 0], alpha.reshape(-1), rtol=0, atol=2e-3)
+    some = weights(gaussians, camera, pixels, backend=BACKEND)
+    torch.testing.assert_close(
+        some.render(ones)[:, 0], alpha[pixels[:, 1], pixels[:, 0]], rtol=0, atol=2e-3
+    )
+    with pytest.raises(InputError, match="blocks"):
+        weights(gaussians, camera, layout="blocks", backend=BACKEND)
