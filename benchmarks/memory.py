@@ -1,0 +1,120 @@
+"""Peak memory of big scenes, each in a process of its own.
+
+    python benchmarks/memory.py
+
+`wide`: 1 M Gaussians at 1296 x 840, 64 channels rendered and back-projected; what is counted is
+the peak beyond the inputs (resident memory once scene, signal and image are there).
+`large`: 5 M Gaussians of degree 3 are written to a PLY, loaded, rendered and back-projected with
+3 channels; what is counted is the peak of the whole process that loads it.
+"""
+
+import argparse
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from splatseg.core import Camera, Gaussians
+from splatseg.io.splats import read_splats, write_splats
+from splatseg.render import back_project, render
+from splatseg.render.cpu import threads
+
+
+def room(count: int, degree: int, seed: int = 0) -> Gaussians:
+    """Flat Gaussians on the walls of a 6 x 5 x 2.8 m box, as a trained room has them."""
+    rng = np.random.default_rng(seed)
+    size = np.array([6.0, 5.0, 2.8])
+    points = rng.random((count, 3)) * size
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = size[axis] * rng.integers(0, 2, count)
+    spacing = np.sqrt(2 * (6 * 5 + 6 * 2.8 + 5 * 2.8) / count)
+    scales = spacing * np.exp(rng.normal(-0.3, 0.6, (count, 3)))
+    scales[np.arange(count), axis] *= 0.1
+    rotations = np.zeros((count, 4))
+    rotations[:, 0] = 1
+    return Gaussians(
+        means=torch.from_numpy(points.astype(np.float32)),
+        rotations=torch.from_numpy(rotations.astype(np.float32)),
+        scales=torch.from_numpy(scales.astype(np.float32)),
+        opacities=torch.from_numpy((1 / (1 + np.exp(-rng.normal(0, 2, count)))).astype(np.float32)),
+        sh=torch.from_numpy(rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3)).astype(np.float32)),
+    )
+
+
+def camera() -> Camera:
+    """Eye height in a corner, looking across the room."""
+    eye, target = np.array([0.8, 0.7, 1.5]), np.array([4.5, 3.5, 0.8])
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0, 1])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return Camera(
+        width=1296, height=840, fx=660, fy=660, cx=648, cy=420,
+        cam_from_world=torch.from_numpy(pose),
+    )  # fmt: skip
+
+
+def peak_gb() -> float:
+    """Largest resident memory so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def wide() -> None:
+    """1 M Gaussians, 64 channels."""
+    scene, view = room(1_000_000, 3), camera()
+    signal = torch.randn(len(scene), 64)
+    image = torch.randn(view.height, view.width, 64)
+    before = peak_gb()
+    drawn = render(scene, view, signal)
+    after_render = peak_gb()
+    collected = back_project(scene, view, image)
+    after = peak_gb()
+    total = float(drawn.alpha.mean()), float(collected.weights.sum())
+    print(
+        f"1 M Gaussians, 1296x840, 64 channels, {threads()} threads: inputs {before:.2f} GB, "
+        f"+{after_render - before:.2f} GB after rendering, +{after - before:.2f} GB after "
+        f"back-projecting (limit 3 GB); mean alpha {total[0]:.3f}, weight {total[1]:.0f}"
+    )
+
+
+def large(path: Path) -> None:
+    """5 M Gaussians from a file."""
+    scene, view = read_splats(path), camera()
+    loaded = peak_gb()
+    drawn = render(scene, view)
+    rendered = peak_gb()
+    collected = back_project(scene, view, drawn.image)
+    print(
+        f"5 M Gaussians of degree 3 ({path.stat().st_size / 1e9:.2f} GB PLY): {loaded:.2f} GB "
+        f"loaded, {rendered:.2f} GB rendered, {peak_gb():.2f} GB back-projected (limit 12 GB); "
+        f"weight {float(collected.weights.sum()):.0f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", nargs="?", choices=["wide", "large", "write"])
+    parser.add_argument("path", nargs="?", type=Path)
+    args = parser.parse_args()
+    if args.part == "wide":
+        wide()
+    elif args.part == "large":
+        large(args.path)
+    elif args.part == "write":
+        write_splats(room(5_000_000, 3), args.path)
+    else:
+        subprocess.run([sys.executable, __file__, "wide"], check=True)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "large.ply"
+            subprocess.run([sys.executable, __file__, "write", str(path)], check=True)
+            subprocess.run([sys.executable, __file__, "large", str(path)], check=True)
+
+
+if __name__ == "__main__":
+    main()
