@@ -26,6 +26,12 @@ MODELS: dict[int, tuple[str, int]] = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }
 """Name and number of parameters by the id of the binary files."""
 
@@ -42,6 +48,8 @@ _LENSES: dict[str, tuple[CameraModel, int]] = {
     "OPENCV_FISHEYE": ("fisheye", 2),
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1),
     "RADIAL_FISHEYE": ("fisheye", 1),
+    "SIMPLE_FISHEYE": ("fisheye", 1),
+    "FISHEYE": ("fisheye", 2),
 }
 # Our lens model and the number of focal lengths. The principal point follows them, then the
 # distortion in OpenCV's order, of which the simpler models give the first values.

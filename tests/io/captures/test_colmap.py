@@ -1,0 +1,234 @@
+"""COLMAP models: against files and answers of COLMAP itself, and files that are broken."""
+
+import json
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import Camera
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.captures import read_capture
+from splatseg.io.captures._colmap_model import MODELS, ColmapCamera, intrinsics_of
+from splatseg.io.captures.colmap import read_colmap_model
+
+WIDTH, HEIGHT = 64, 48
+
+
+UNDISTORTABLE = [
+    *["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"],
+    *["OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"],
+]
+REFUSED = ["FOV", "THIN_PRISM_FISHEYE", "DIVISION", "EQUIRECTANGULAR"]
+
+
+@pytest.fixture
+def rig_capture(
+    tmp_path: Path, golden_colmap: Path, write_image: Callable[..., Path]
+) -> Callable[..., Path]:
+    def make(kind: str, folder: str = "sparse/0", *, images: str = "images") -> Path:
+        shutil.copytree(golden_colmap / kind, tmp_path / folder, dirs_exist_ok=True)
+        for side in ("left", "right"):
+            for number in (1, 2):
+                write_image(tmp_path / images / side / f"{number:03d}.png")
+        return tmp_path
+
+    return make
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("layout", [5, 3])
+def test_poses_of_a_rig_are_colmaps(rig_capture, golden_colmap, kind, layout) -> None:
+    folder = rig_capture(kind)
+    if layout == 3:
+        (folder / "sparse/0" / f"rigs.{kind}").unlink()
+        (folder / "sparse/0" / f"frames.{kind}").unlink()
+    expected = json.loads((golden_colmap / "expected.json").read_text())["cam_from_world"]
+    capture = read_capture(folder)
+    assert capture.format == "colmap"
+    assert [view.name for view in capture.views] == [
+        "left/001",
+        "left/002",
+        "right/001",
+        "right/002",
+    ]
+    for view in capture.views:
+        np.testing.assert_allclose(
+            view.camera.cam_from_world[:3], expected[f"{view.name}.png"], atol=1e-12
+        )
+    assert [view.camera.model for view in capture.views] == ["opencv"] * 2 + ["fisheye"] * 2
+    assert capture.points is not None
+    assert capture.points.points.tolist() == [[i, 0.5, -0.25 * i] for i in range(4)]
+    assert capture.points.colours.tolist() == [[10 * i, 255, i] for i in range(4)]
+
+
+def test_frames_come_before_the_poses_of_images(rig_capture) -> None:
+    """As in COLMAP: of a model with frames, the poses in images are not used."""
+    folder = rig_capture("txt")
+    path = folder / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("0.10000000000000001 0.20000", "9.0 0.20000"))
+    left = read_capture(folder).view("left/001").camera
+    assert left.cam_from_world[0, 3] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("model", UNDISTORTABLE)
+def test_lenses_see_what_colmap_sees(golden_colmap, model) -> None:
+    expected = json.loads((golden_colmap / "expected.json").read_text())
+    lens = expected["lenses"][model]
+    raw = ColmapCamera(
+        model=model, width=WIDTH, height=HEIGHT, parameters=tuple(lens["parameters"])
+    )
+    found = intrinsics_of(raw, where="x")
+    camera = Camera(
+        width=WIDTH,
+        height=HEIGHT,
+        fx=found.fx,
+        fy=found.fy,
+        cx=found.cx,
+        cy=found.cy,
+        model=found.model,
+        distortion=found.distortion,
+        cam_from_world=torch.eye(4, dtype=torch.float64),
+    )
+    pixels, _ = camera.project(torch.tensor(expected["rays"], dtype=torch.float64))
+    np.testing.assert_allclose(pixels, lens["pixels"], atol=1e-9)
+
+
+@pytest.mark.parametrize("model", REFUSED)
+def test_other_lenses_are_refused_by_name(golden_colmap, model) -> None:
+    lens = json.loads((golden_colmap / "expected.json").read_text())["lenses"][model]
+    raw = ColmapCamera(model=model, width=8, height=8, parameters=tuple(lens["parameters"]))
+    with pytest.raises(InputError, match=rf"x: .* got {model}; undistort"):
+        intrinsics_of(raw, where="x")
+
+
+def test_every_known_model_is_read_or_refused() -> None:
+    for name, count in MODELS.values():
+        raw = ColmapCamera(model=name, width=8, height=8, parameters=(4.0,) * count)
+        if name in UNDISTORTABLE:
+            assert intrinsics_of(raw, where="x").width == 8
+        else:
+            with pytest.raises(InputError, match=name):
+                intrinsics_of(raw, where="x")
+
+
+@pytest.mark.parametrize("folder", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+@pytest.mark.parametrize("images", ["images", "input", "."])
+def test_places_of_the_model_and_the_photographs(rig_capture, folder, images) -> None:
+    root = rig_capture("bin", folder, images=images)
+    assert len(read_capture(root).views) == 4
+
+
+def test_the_model_folder_itself_can_be_named(rig_capture) -> None:
+    root = rig_capture("bin", "colmap/sparse/0")
+    capture = read_capture(root / "colmap/sparse/0")
+    assert capture.path == root.resolve()
+    assert len(capture.views) == 4
+
+
+@pytest.mark.parametrize(
+    "stem", ["cameras", "images", "points3D", "rigs", "frames"], ids=lambda stem: stem
+)
+def test_a_binary_file_cut_anywhere_is_an_error(golden_colmap, tmp_path, stem) -> None:
+    """Every prefix of every file, and one byte too many: an error that names the file."""
+    shutil.copytree(golden_colmap / "bin", tmp_path / "m")
+    path = tmp_path / "m" / f"{stem}.bin"
+    whole = path.read_bytes()
+    for length in [*range(len(whole)), len(whole) + 1]:
+        path.write_bytes((whole + b"\0")[:length])
+        with pytest.raises(FileFormatError, match=f"^{path}: "):
+            read_colmap_model(tmp_path / "m")
+    path.write_bytes(whole)
+    read_colmap_model(tmp_path / "m")
+
+
+def test_an_absurd_count_is_refused_at_once(golden_colmap, tmp_path) -> None:
+    shutil.copytree(golden_colmap / "bin", tmp_path / "m")
+    path = tmp_path / "m" / "points3D.bin"
+    path.write_bytes(struct.pack("<Q", 2**62) + path.read_bytes()[8:])
+    with pytest.raises(FileFormatError, match="expected 4611686018427387904 records"):
+        read_colmap_model(tmp_path / "m")
+
+
+@pytest.mark.parametrize(
+    ("stem", "line"),
+    [
+        ("cameras", "1 PINHOLE sixty 48 1 1 1 1"),
+        ("images", "1 1 0 0 0 0 0"),
+        ("points3D", "1 0 0 0 300 0 0 1"),
+        ("rigs", "3 2 CAMERA 1 CAMERA"),
+        ("frames", "1 3 1 0 0"),
+    ],
+)
+def test_a_broken_text_line_is_named(golden_colmap, tmp_path, stem, line) -> None:
+    shutil.copytree(golden_colmap / "txt", tmp_path / "m")
+    path = tmp_path / "m" / f"{stem}.txt"
+    path.write_text(f"# comment\n{line}\n")
+    with pytest.raises(FileFormatError, match=r"line 2: expected .*_ID"):
+        read_colmap_model(tmp_path / "m")
+
+
+def test_names_may_hold_spaces_and_2d_points_may_lack(tmp_path, write_image) -> None:
+    write_image(tmp_path / "images" / "a photo (1).png")
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/cameras.txt").write_text(f"7 PINHOLE {WIDTH} {HEIGHT} 50 51 32 24\n")
+    (tmp_path / "sparse/images.txt").write_text("5 1 0 0 0 1 2 3 7 a photo (1).png\n\n")
+    capture = read_capture(tmp_path)
+    assert [view.name for view in capture.views] == ["a photo (1)"]
+    assert capture.points is None
+    assert capture.views[0].split == "train", "a single view is no test view"
+    assert capture.views[0].camera.centre.tolist() == [-1, -2, -3]
+
+
+def test_missing_photographs_are_named(rig_capture) -> None:
+    folder = rig_capture("bin")
+    (folder / "images/left/002.png").unlink()
+    with pytest.raises(MissingFileError, match=r"1 of 4 photographs are missing \(.*left/002.png"):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("0.98006657784124163 0.053096612078198324", "nan 0"), "finite pose"),
+        (("3 0.98006657784124163 0.053", "4 0.98006657784124163 0.053"), "rig 4"),
+    ],
+)
+def test_impossible_frames_are_refused(rig_capture, change, message) -> None:
+    folder = rig_capture("txt")
+    path = folder / "sparse/0/frames.txt"
+    assert change[0] in path.read_text()
+    path.write_text(path.read_text().replace(*change))
+    with pytest.raises(InputError, match=message):
+        read_capture(folder)
+
+
+def test_a_zero_quaternion_is_no_pose(rig_capture) -> None:
+    folder = rig_capture("txt")
+    for name in ("rigs.txt", "frames.txt"):
+        (folder / "sparse/0" / name).unlink()
+    path = folder / "sparse/0/images.txt"
+    path.write_text("11 0 0 0 0 1 2 3 1 left/001.png\n\n")
+    with pytest.raises(InputError, match=r"left/001.png: expected a finite pose"):
+        read_capture(folder)
+
+
+def test_the_split_of_a_transforms_json_beside_it_counts(shared_data) -> None:
+    office = read_capture(shared_data / "office", format="colmap")
+    assert (len(office.train_views), len(office.test_views)) == (100, 25)
+
+
+@pytest.mark.parametrize("name", ["camvid", "replica_office0"])
+def test_real_models_reproject_their_points(shared_data, name) -> None:
+    """Start points project into the photographs at the depth of something seen."""
+    capture = read_capture(shared_data / "real" / name)
+    points = capture.points.points.double()
+    for view in capture.views[::20]:
+        pixels, depth = view.camera.project(points)
+        size = torch.tensor([view.camera.width, view.camera.height])
+        inside = (depth > 0) & (pixels > 0).all(1) & (pixels < size).all(1)
+        assert inside.sum() > 100
