@@ -46,6 +46,9 @@ def image_size(path: Path) -> tuple[int, int]:
         FileFormatError: If it is not an image.
     """
     with open_image(path) as image:
+        if image.format == "TIFF":
+            # Some versions of Pillow turn TIFF files by themselves, others do not.
+            return _upright(image, path).size
         width, height = image.size
         return (height, width) if _orientation(image) in _TURNED else (width, height)
 
@@ -110,10 +113,7 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
         return None
     camera = view.camera
     with open_image(view.mask) as image:
-        try:
-            upright = ImageOps.exif_transpose(image)
-        except (OSError, SyntaxError, ValueError) as error:
-            raise FileFormatError(f"{view.mask}: cannot be decoded ({error}).") from error
+        upright = _upright(image, view.mask)
     grey = np.asarray(upright)
     if upright.mode in ("RGBA", "LA"):
         grey = grey[..., -1]
@@ -203,11 +203,15 @@ def _orientation(image: Image.Image) -> int:
     return int(image.getexif().get(_EXIF_ORIENTATION, 1))
 
 
-def _decode(image: Image.Image, path: Path) -> Image.Image:
+def _upright(image: Image.Image, path: Path) -> Image.Image:
     try:
-        upright = ImageOps.exif_transpose(image)
+        return ImageOps.exif_transpose(image)
     except (OSError, SyntaxError, ValueError) as error:
         raise FileFormatError(f"{path}: cannot be decoded ({error}).") from error
+
+
+def _decode(image: Image.Image, path: Path) -> Image.Image:
+    upright = _upright(image, path)
     if upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info:
         upright = upright.convert("RGBA")
         white = Image.new("RGBA", upright.size, (255, 255, 255, 255))

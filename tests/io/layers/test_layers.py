@@ -1,0 +1,161 @@
+"""Layers: round trips, bytes that stay the same, and files that are refused."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import Features, Labels, Selection
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.layers import load_layer, save_layer
+
+METADATA = {"method": "uplift", "names": {"3": "Stuhl — chair"}, "list": [1, 2.5, None, True]}
+
+
+def labels(n: int = 5, **more) -> Labels:
+    ids = torch.tensor([-1, 3, 70000, 1, 2**31 - 1])[:n]
+    return Labels(ids=ids, confidence=torch.linspace(0, 1, n), metadata=METADATA, **more)
+
+
+def same(a, b) -> None:
+    assert type(a) is type(b)
+    assert dict(a.metadata) == dict(b.metadata)
+    for name in type(a).__dataclass_fields__:
+        one, other = getattr(a, name), getattr(b, name)
+        if isinstance(one, torch.Tensor):
+            assert one.dtype == other.dtype
+            assert torch.equal(one, other), name
+        elif name != "metadata":
+            assert one == other
+
+
+LAYERS = {
+    "labels": labels(),
+    "background": labels(background=4),
+    "soft": labels(
+        candidates=torch.tensor([[-1, -1], [3, 1], [70000, -1], [1, 2], [9, 8]], dtype=torch.int32),
+        shares=torch.rand(5, 2, generator=torch.Generator().manual_seed(1)),
+    ),
+    "features": Features(values=torch.randn(4, 3), weights=torch.rand(4), metadata=METADATA),
+    "half": Features(values=torch.randn(4, 3).half()),
+    "selection": Selection(mask=torch.tensor([True, False, True]), metadata=METADATA),
+    "empty": Labels(ids=torch.zeros(0, dtype=torch.int32), confidence=torch.zeros(0)),
+    "none": Selection(mask=torch.zeros(0, dtype=torch.bool)),
+}
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_round_trip_and_same_bytes(tmp_path, name) -> None:
+    save_layer(tmp_path / "a.npz", LAYERS[name])
+    read = load_layer(tmp_path / "a.npz")
+    same(LAYERS[name], read)
+    save_layer(tmp_path / "b.npz", read)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_none_is_0_in_the_file(tmp_path) -> None:
+    save_layer(tmp_path / "a.npz", LAYERS["soft"])
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+        assert archive["ids"].tolist() == [0, 3, 70000, 1, 2**31 - 1]
+        assert archive["candidates"][0].tolist() == [0, 0]
+        header = json.loads(archive["header"].tobytes())
+    assert header["background"] == 0
+    assert header["metadata"] == METADATA
+
+
+@pytest.mark.parametrize(
+    ("layer", "message"),
+    [
+        (Labels(ids=torch.tensor([0, 1]), confidence=torch.ones(2)), "0, which is void"),
+        (labels(background=0), "0, which is void"),
+        (Selection(mask=torch.ones(1).bool(), metadata={"a": {1: 2}}), "keys that are strings"),
+        (
+            Selection(mask=torch.ones(1).bool(), metadata={"a": [float("nan")]}),
+            r"a\[0\]: expected a finite number",
+        ),
+        (
+            Selection(mask=torch.ones(1).bool(), metadata={"t": torch.ones(1)}),
+            "metadata.*t: expected a value that JSON holds, got one of type Tensor",
+        ),
+    ],
+)
+def test_layers_that_have_no_place_in_a_file(tmp_path, layer, message) -> None:
+    with pytest.raises(InputError, match=message):
+        save_layer(tmp_path / "a.npz", layer)
+    assert not list(tmp_path.iterdir())
+
+
+def changed(tmp_path, change, layer="soft"):
+    """The file of a layer after a change of its entries; header as a dict."""
+    path = tmp_path / "a.npz"
+    save_layer(path, LAYERS[layer])
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = dict(archive)
+    header = json.loads(arrays.pop("header").tobytes())
+    change(header, arrays)
+    text = json.dumps(header).encode()
+    np.savez(path, header=np.frombuffer(text, np.uint8), **arrays)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda h, a: h.update(version=2), "version 1 or less, got version 2; a later splatseg"),
+        (lambda h, a: h.update(version=0), "got version 0"),
+        (lambda h, a: h.update(format="other"), "expected a layer, got 'other'"),
+        (lambda h, a: h.update(kind="voxels"), "got 'voxels'"),
+        (lambda h, a: h.update(count=4), r"'ids' of type i4 and shape \(4\), got int32 of \(5,\)"),
+        (lambda h, a: h.update(count=-1), "a header with a count"),
+        (lambda h, a: h.update(background=-1), "background id of 0 or more"),
+        (lambda h, a: h.pop("metadata"), "metadata"),
+        (lambda h, a: a.pop("ids"), "an array 'ids', which is not there"),
+        (lambda h, a: a.pop("shares"), "an array 'shares', which is not there"),
+        (lambda h, a: a.update(ids=a["ids"].astype(float)), "'ids' of type i4"),
+        (lambda h, a: a.update(confidence=a["confidence"][:, None]), "'confidence' of type f4"),
+    ],
+)
+def test_files_that_contradict_themselves(tmp_path, change, message) -> None:
+    path = changed(tmp_path, change)
+    with pytest.raises(FileFormatError, match=f"^{path}: .*{message}"):
+        load_layer(path)
+
+
+def test_files_that_are_no_layers(tmp_path) -> None:
+    path = tmp_path / "a.npz"
+    with pytest.raises(MissingFileError, match="there is no such layer"):
+        load_layer(path)
+    save_layer(path, LAYERS["labels"])
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 37):
+        path.write_bytes(whole[:length])
+        with pytest.raises(FileFormatError, match=f"^{path}: "):
+            load_layer(path)
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(FileFormatError, match="without a header"):
+        load_layer(path)
+
+
+def test_a_damaged_byte_is_noticed(tmp_path) -> None:
+    path = tmp_path / "a.npz"
+    save_layer(path, LAYERS["features"])
+    data = bytearray(path.read_bytes())
+    data[data.index(b"values.npy") + 200] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        load_layer(path)
+
+
+def test_nothing_is_unpickled(tmp_path) -> None:
+    """A layer that would run code when it is opened is refused."""
+    path = tmp_path / "a.npz"
+    save_layer(path, LAYERS["labels"])
+    entry = io.BytesIO()
+    np.save(entry, np.array([print], dtype=object), allow_pickle=True)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("shares.npy", entry.getvalue())
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        load_layer(path)
