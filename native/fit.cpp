@@ -5,15 +5,15 @@
 #include <cstring>
 #include <vector>
 
-#include "frame.h"
 #include "pool.h"
 
 namespace splatseg {
 namespace {
 
-constexpr int64_t kImageRows = 8;   // rows of an image in one piece of work
+constexpr int64_t kImageRows = 8;  // rows of an image in one piece of work
 constexpr int64_t kMaskPixels = 16384;
-constexpr int64_t kAdamRows = 512;  // rows of a parameter in one piece of work
+constexpr int64_t kCullRows = 8192;   // Gaussians looked at in one piece of work
+constexpr int64_t kUpdateRows = 512;  // Gaussians gathered or updated in one piece of work
 
 const FitKernels& fit_kernels() {
   const char* name = kernels().name;
@@ -96,25 +96,58 @@ LossValue l1_dssim(const float* image, const float* photograph, const uint8_t* m
           sum(row_squared) / values};
 }
 
-void adam_step(float* value, const float* gradient, float* first, float* second,
-               const int64_t* rows, int64_t count, int64_t columns, const float* rates,
-               const AdamSettings& settings) {
+int64_t rows_in_view(const float* means, const float* log_scales, int64_t count,
+                     const Pinhole& camera, float near, int64_t* rows) {
+  const FitKernels& run = fit_kernels();
+  const int64_t pieces = (count + kCullRows - 1) / kCullRows;
+  std::vector<int64_t> found(static_cast<size_t>(pieces));
+  parallel_for(count, kCullRows, [&](int64_t begin, int64_t end) {
+    found[static_cast<size_t>(begin / kCullRows)] =
+        run.find_rows(means, log_scales, begin, end, camera, near, rows + begin);
+  });
+  int64_t total = 0;
+  for (int64_t piece = 0; piece < pieces; piece++) {
+    const int64_t here = found[static_cast<size_t>(piece)];
+    std::memmove(rows + total, rows + piece * kCullRows,
+                 static_cast<size_t>(here) * sizeof(int64_t));
+    total += here;
+  }
+  return total;
+}
+
+void gather_gaussians(const Columns<const float>& raw, const int64_t* rows, int64_t count,
+                      const Columns<float>& out) {
+  const FitKernels& run = fit_kernels();
+  parallel_for(count, kUpdateRows, [&](int64_t begin, int64_t end) {
+    run.gather(raw, rows, begin, end, out);
+  });
+}
+
+void update_rows(const Columns<float>& raw, const Columns<float>& first,
+                 const Columns<float>& second, const Columns<const float>& gradients,
+                 const int64_t* rows, int64_t count, const UpdateSettings& settings) {
   const FitKernels& run = fit_kernels();
   const double step = static_cast<double>(settings.step);
   const double correction1 = 1.0 / (1.0 - std::pow(settings.beta1, step));
   const double correction2 = 1.0 / std::sqrt(1.0 - std::pow(settings.beta2, step));
-  const AdamFactors factors = {static_cast<float>(settings.beta1),
-                               static_cast<float>(1.0 - settings.beta1),
-                               static_cast<float>(settings.beta2),
-                               static_cast<float>(1.0 - settings.beta2),
-                               static_cast<float>(correction2),
-                               static_cast<float>(settings.epsilon)};
-  std::vector<float> corrected(static_cast<size_t>(columns));
-  for (int64_t c = 0; c < columns; c++)
-    corrected[static_cast<size_t>(c)] = static_cast<float>(rates[c] * correction1);
-  parallel_for(count, kAdamRows, [&](int64_t begin, int64_t end) {
-    run.adam_rows(value, gradient, first, second, rows, begin, end, columns, corrected.data(),
-                  factors);
+  AdamFactors factors = {};
+  factors.keep1 = static_cast<float>(settings.beta1);
+  factors.add1 = static_cast<float>(1.0 - settings.beta1);
+  factors.keep2 = static_cast<float>(settings.beta2);
+  factors.add2 = static_cast<float>(1.0 - settings.beta2);
+  factors.correction2 = static_cast<float>(correction2);
+  factors.epsilon = static_cast<float>(settings.epsilon);
+  const auto fill = [&](float* rates, int64_t from, int64_t to, float rate) {
+    for (int64_t c = from; c < to; c++) rates[c] = static_cast<float>(rate * correction1);
+  };
+  fill(factors.means, 0, 3, settings.means);
+  fill(factors.scales, 0, 3, settings.scales);
+  fill(factors.rotations, 0, 4, settings.rotations);
+  fill(factors.opacities, 0, 1, settings.opacities);
+  fill(factors.sh, 0, 3, settings.colour);
+  fill(factors.sh, 3, raw.sh_columns, settings.harmonics);
+  parallel_for(count, kUpdateRows, [&](int64_t begin, int64_t end) {
+    run.update(raw, first, second, gradients, rows, begin, end, settings, factors);
   });
 }
 

@@ -1,9 +1,12 @@
-// What fitting does besides rendering: the loss with its gradient, and Adam.
+// What fitting does besides rendering: the loss with its gradient, the rows a view needs, and
+// the step that the optimiser takes on them.
 //
-// Each function has a readable twin in splatseg.fit, with the same arguments.
+// Each function has a readable twin in splatseg.fit.
 #pragma once
 
 #include <cstdint>
+
+#include "frame.h"
 
 namespace splatseg {
 
@@ -23,23 +26,42 @@ LossValue l1_dssim(const float* image, const float* photograph, const uint8_t* m
                    int64_t height, int64_t width, double dssim_weight, float* gradient,
                    float* scratch);
 
-struct AdamSettings {
-  double beta1, beta2, epsilon;
-  int64_t step;  // 1 for the first: the bias correction is 1 - beta^step
+// One value a Gaussian and column, in rows: raw parameters, moments, gradients.
+// Raw scales are logarithms, raw opacities logits, raw rotations of any length.
+template <class T>
+struct Columns {
+  T *means, *scales, *rotations, *opacities, *sh;
+  int64_t sh_columns;
 };
 
-// value, first, second: (n, columns). gradient: (count, columns), row j belongs to rows[j];
-// without rows, all four have `count` rows. rates: learning rate of each column.
-// Rows must be distinct; those below 0 are left out.
-void adam_step(float* value, const float* gradient, float* first, float* second,
-               const int64_t* rows, int64_t count, int64_t columns, const float* rates,
-               const AdamSettings& settings);
+// Writes the rows that may show in a pinhole view, ascending; returns how many.
+int64_t rows_in_view(const float* means, const float* log_scales, int64_t count,
+                     const Pinhole& camera, float near, int64_t* rows);
+
+// Row j of `out` is the Gaussian that raw row rows[j] stands for.
+void gather_gaussians(const Columns<const float>& raw, const int64_t* rows, int64_t count,
+                      const Columns<float>& out);
+
+struct UpdateSettings {
+  float means, scales, rotations, opacities, colour, harmonics;  // rates
+  double beta1, beta2, epsilon;
+  int64_t step;  // 1 for the first: the bias correction is 1 - beta^step
+  float opacity_penalty, scale_penalty;  // slope of the loss in each opacity and scale
+  float noise;                           // strength of the walk of faint Gaussians
+  uint64_t seed;
+};
+
+// Adam on raw rows[j] from row j of the gradients, which are towards Gaussians, not raw values.
+// Rows with no gradient towards opacity and mean colour are left as they are.
+void update_rows(const Columns<float>& raw, const Columns<float>& first,
+                 const Columns<float>& second, const Columns<const float>& gradients,
+                 const int64_t* rows, int64_t count, const UpdateSettings& settings);
 
 // One loss under way, for the kernels. `n` is 3 * width floats, a row.
 struct LossPass {
   const float *image, *photograph;
   const uint8_t* mask;
-  const float* zeros;                 // a row of zeros
+  const float* zeros;                  // a row of zeros
   float *d_mean, *d_square, *d_cross;  // derivatives of ssim, planes
   float* gradient;
   double *row_ssim, *row_absolute, *row_squared;
@@ -47,8 +69,10 @@ struct LossPass {
   float l1_scale, ssim_scale;
 };
 
+// The constants of one Adam step. `sh` has a rate for each of the sh_columns.
 struct AdamFactors {
   float keep1, add1, keep2, add2, correction2, epsilon;
+  float means[3], scales[3], rotations[4], opacities[1], sh[48];
 };
 
 struct FitKernels {
@@ -58,10 +82,15 @@ struct FitKernels {
   void (*ssim_rows)(const LossPass&, int64_t begin, int64_t end, float* scratch);
   // Second pass: the gradient, and the sums of |x - y| and (x - y)^2.
   void (*gradient_rows)(const LossPass&, int64_t begin, int64_t end, float* scratch);
-  // Rows rows[begin..end) of adam_step; `rates` holds the first bias correction.
-  void (*adam_rows)(float* value, const float* gradient, float* first, float* second,
-                    const int64_t* rows, int64_t begin, int64_t end, int64_t columns,
-                    const float* rates, const AdamFactors&);
+  // The pieces [begin, end) of the functions above.
+  int64_t (*find_rows)(const float* means, const float* log_scales, int64_t begin, int64_t end,
+                       const Pinhole&, float near, int64_t* rows);
+  void (*gather)(const Columns<const float>& raw, const int64_t* rows, int64_t begin, int64_t end,
+                 const Columns<float>& out);
+  void (*update)(const Columns<float>& raw, const Columns<float>& first,
+                 const Columns<float>& second, const Columns<const float>& gradients,
+                 const int64_t* rows, int64_t begin, int64_t end, const UpdateSettings&,
+                 const AdamFactors&);
 };
 
 // Zeroed floats of scratch that one thread needs in either pass over the loss.

@@ -1,6 +1,8 @@
 """CPU kernels, see native/module.cpp. Arrays are C-contiguous, on the CPU, and not checked here
 beyond what memory safety asks for."""
 
+from collections.abc import Sequence
+
 from torch import Tensor
 import numpy as np
 from numpy.typing import NDArray
@@ -151,15 +153,33 @@ def l1_dssim(
     gradient: Tensor,
     dssim_weight: float,
 ) -> tuple[float, float]: ...
-def adam_step(
-    value: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    rows: Tensor | None,
-    rates: Tensor,
+def rows_in_view(
+    means: Tensor,
+    log_scales: Tensor,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    pose: Tensor,
+    near: float,
+    rows: Tensor,
+) -> int: ...
+def gather_gaussians(raw: Sequence[Tensor], rows: Tensor, out: Sequence[Tensor]) -> None: ...
+def update_rows(
+    raw: Sequence[Tensor],
+    first: Sequence[Tensor],
+    second: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    rows: Tensor,
+    rates: Sequence[float],
     beta1: float,
     beta2: float,
     epsilon: float,
     step: int,
+    opacity_penalty: float,
+    scale_penalty: float,
+    noise: float,
+    seed: int,
 ) -> None: ...

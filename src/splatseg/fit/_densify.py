@@ -1,8 +1,8 @@
 """Where Gaussians are needed: dead ones move to living ones, new ones come beside them.
 
 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024): a Gaussian that is joined by others
-at its place shares its opacity and shrinks so that the picture hardly changes, and faint ones
-wander.
+at its place shares its opacity and shrinks so that the picture hardly changes. (That faint ones
+wander is part of the update of each step, see `_update`.)
 """
 
 from functools import cache
@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters
 
@@ -21,11 +20,6 @@ _LEAST_OPACITY = 0.005
 _LEAST_TRANSPARENCY = 1e-6
 # Growth of one round, as a share of what is there: copies need steps to grow apart.
 _MOST_GROWTH = 0.25
-# Kheradmand et al. 2024, section 4.2 and their code: noise fades from opacity 0.005 on.
-_NOISE_STEEPNESS = 100.0
-_NOISE_OPACITY = 0.005
-# Beyond this opacity the factor is below 1e-4 of its largest.
-_FAINT = 0.1
 
 
 def shared_shape(
@@ -125,39 +119,3 @@ def _draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     at = torch.rand(count, generator=generator, dtype=torch.float64).to(weights.device)
     drawn = torch.searchsorted(total, at * total[-1], right=True)
     return drawn.clamp_max(len(weights) - 1)
-
-
-def wander(
-    parameters: Parameters,
-    rows: Int64[Tensor, "m"],
-    *,
-    strength: float,
-    generator: torch.Generator,
-) -> None:
-    r"""Move the centres of faint Gaussians at random, in place.
-
-    .. math:: x \mathrel{+}= \lambda \, \frac{1}{1 + e^{100 (o - 0.005)}} \, \Sigma \eta,
-              \qquad \eta \sim N(0, I)
-
-    (Kheradmand et al. 2024, eq. 8 and 10.)
-
-    Args:
-        parameters: The Gaussians.
-        rows: Distinct rows that may move; those below 0 do not.
-        strength: Lambda: the noise of the options times the position rate.
-        generator: Source of randomness, on the CPU.
-    """
-    rows = rows[rows >= 0]
-    opacities = parameters.logits[rows].sigmoid()
-    faint = opacities.squeeze(1) < _FAINT
-    rows, opacities = rows[faint], opacities[faint]
-    if not len(rows):
-        return
-    noise = torch.randn(len(rows), 3, generator=generator).to(parameters.means)
-    factor = strength * torch.sigmoid(-_NOISE_STEEPNESS * (opacities - _NOISE_OPACITY))
-    axes = rotation_from_quaternion(
-        torch.nn.functional.normalize(parameters.rotations[rows], dim=1)
-    )
-    variances = (2 * parameters.log_scales[rows]).exp()
-    local = variances * torch.einsum("nij,ni->nj", axes, noise * factor)
-    parameters.means[rows] += torch.einsum("nij,nj->ni", axes, local)

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from splatseg.core import Capture, Gaussians
 from splatseg.errors import InputError, SplatsegError
-from splatseg.fit._adam import adam_step
-from splatseg.fit._densify import relocated, wander
+from splatseg.fit._densify import relocated
 from splatseg.fit._initialise import initial_parameters, scene_extent
 from splatseg.fit._loss import Loss, l1_dssim
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters, rates_by_name, rows_in_view
+from splatseg.fit._parameters import Parameters, gathered, rows_in_view
 from splatseg.fit._photographs import Example, Photographs
 from splatseg.fit._schedule import count_at, degree_at, rates_at, reduction_at
+from splatseg.fit._update import UpdateSettings, update_rows
 from splatseg.render import Backend, RenderOptions, get_backend
 
 _RECORD_EVERY = 50  # steps
@@ -128,10 +128,11 @@ def fit(
     run = _Fit(capture, options, renderer, Photographs(views, longest=options.longest))
     interrupted = False
     try:
-        while not run.finished:
-            status = run.step()
-            if progress is not None:
-                progress(status)
+        with _one_torch_thread():
+            while not run.finished:
+                status = run.step()
+                if progress is not None:
+                    progress(status)
     except KeyboardInterrupt:
         interrupted = True
     return FitResult(
@@ -201,9 +202,8 @@ class _Fit:
         render_options = RenderOptions(sh_degree=degree_at(done, options=self._options))
         with self._timed("gather"):
             rows = rows_in_view(parameters, example.camera, near=render_options.near)
-            leaves = parameters.rows(rows).requires_grad()
+            gaussians = gathered(parameters, rows)
         with self._timed("render"):
-            gaussians = leaves.gaussians()
             rendered = self._backend.render(gaussians, example.camera, None, options=render_options)
         with self._timed("loss"):
             loss = l1_dssim(
@@ -220,7 +220,7 @@ class _Fit:
         with self._timed("backward"):
             torch.autograd.backward([rendered.image], [loss.gradient])
         with self._timed("update"), torch.no_grad():
-            self._update(leaves, rows, done)
+            self._update(gaussians, rows, done)
         self.steps += 1
         with self._timed("densify"), torch.no_grad():
             self._densify(done)
@@ -243,39 +243,18 @@ class _Fit:
             mask=None if mask is None else mask.to(self._device),
         )
 
-    def _update(self, leaves: Parameters, rows: Tensor, progress: float) -> None:
-        """Adam on the rows that the view showed; what no pixel depends on stays as it is."""
-        parameters, first, second = self._state
-        gradients = {name: _gradient(tensor) for name, tensor in leaves.tensors()}
-        shown = (gradients["logits"] != 0).squeeze(1) | (gradients["sh"][:, :3] != 0).any(dim=1)
-        rows = torch.where(shown, rows, -1)
-
-        count = len(parameters)
-        opacities = leaves.logits.detach().sigmoid()
-        gradients["logits"] += self._options.opacity_penalty / count * opacities * (1 - opacities)
-        gradients["log_scales"] += (
-            self._options.scale_penalty / (3 * count) * leaves.log_scales.detach().exp()
-        )
+    def _update(self, gaussians: Gaussians, rows: Tensor, progress: float) -> None:
+        count = len(self._state[0])
         rates = rates_at(progress, options=self._options, extent=self._extent)
-        columns = rates_by_name(rates, parameters)
-        moments = dict(first.tensors()), dict(second.tensors())
-        for name, tensor in parameters.tensors():
-            adam_step(
-                tensor,
-                gradients[name],
-                moments[0][name],
-                moments[1][name],
-                rows=rows,
-                rates=columns[name],
-                step=self.steps + 1,
-            )
-        if self._options.noise:
-            wander(
-                parameters,
-                rows,
-                strength=self._options.noise * rates.means,
-                generator=self._generator,
-            )
+        settings = UpdateSettings(
+            rates=rates,
+            step=self.steps + 1,
+            opacity_penalty=self._options.opacity_penalty / count,
+            scale_penalty=self._options.scale_penalty / (3 * count),
+            noise=self._options.noise * rates.means,
+            seed=self._options.seed,
+        )
+        update_rows(*self._state, _gradients(gaussians), rows=rows, settings=settings)
 
     def _densify(self, progress: float) -> None:
         options = self._options
@@ -322,5 +301,27 @@ class _Fit:
             self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin
 
 
-def _gradient(leaf: Tensor) -> Tensor:
-    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Torch's own threads wait by spinning, on the cores that the kernels' threads need."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _gradients(leaves: Gaussians) -> Gaussians:
+    """Slopes of the loss where the values were; 0 where nothing depends on them."""
+
+    def slope(leaf: Tensor) -> Tensor:
+        return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+    return Gaussians(
+        means=slope(leaves.means),
+        rotations=slope(leaves.rotations),
+        scales=slope(leaves.scales),
+        opacities=slope(leaves.opacities),
+        sh=slope(leaves.sh),
+    )

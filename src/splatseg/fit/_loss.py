@@ -106,7 +106,9 @@ def l1_dssim_torch(
         value = (1 - dssim_weight) * difference + dssim_weight * (1 - similarity)
         (gradient,) = torch.autograd.grad(value, leaf)
     squared = (x - y).square().sum() / count
-    return Loss(value=float(value), squared_error=float(squared), gradient=gradient)
+    return Loss(
+        value=float(value.detach()), squared_error=float(squared.detach()), gradient=gradient
+    )
 
 
 def _blur(image: Tensor) -> Tensor:

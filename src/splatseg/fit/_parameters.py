@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from splatseg import _native
 from splatseg.core import Camera, Gaussians
-from splatseg.fit._schedule import Rates
 
 # 2 ln 255: beyond this Mahalanobis distance squared even an opaque Gaussian's alpha is < 1/255.
 _REACH = 3.34
@@ -59,12 +59,6 @@ class Parameters:
         """Zeros of the same shapes: fresh moments."""
         return Parameters(**{name: torch.zeros_like(tensor) for name, tensor in self.tensors()})
 
-    def requires_grad(self) -> "Parameters":
-        """The same tensors, as leaves of a graph."""
-        return Parameters(
-            **{name: tensor.detach().requires_grad_() for name, tensor in self.tensors()}
-        )
-
     def gaussians(self) -> Gaussians:
         """The Gaussians these rows stand for. Differentiable."""
         return Gaussians(
@@ -76,21 +70,6 @@ class Parameters:
         )
 
 
-def rates_by_name(rates: Rates, parameters: Parameters) -> dict[str, Tensor]:
-    """Learning rate of each column of each tensor."""
-    columns = {name: tensor.shape[1] for name, tensor in parameters.tensors()}
-    harmonics = torch.full((columns["sh"],), rates.harmonics)
-    harmonics[:3] = rates.colour
-    device = parameters.means.device
-    return {
-        "means": torch.full((3,), rates.means, device=device),
-        "log_scales": torch.full((3,), rates.log_scales, device=device),
-        "rotations": torch.full((4,), rates.rotations, device=device),
-        "logits": torch.full((1,), rates.logits, device=device),
-        "sh": harmonics.to(device),
-    }
-
-
 def rows_in_view(parameters: Parameters, camera: Camera, *, near: float) -> Int64[Tensor, "m"]:
     """Rows that may show in a pinhole view, ascending; none that does is left out.
 
@@ -98,6 +77,29 @@ def rows_in_view(parameters: Parameters, camera: Camera, *, near: float) -> Int6
     deviation along x is at most ``fx / z * s * sqrt(1 + (x / z)^2)`` with x / z clamped as the
     projection clamps it, plus the low-pass.
     """
+    if parameters.means.device.type != "cpu":
+        return rows_in_view_torch(parameters, camera, near=near)
+    rows = torch.empty(len(parameters), dtype=torch.int64)
+    found = _native.rows_in_view(
+        parameters.means,
+        parameters.log_scales,
+        camera.width,
+        camera.height,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        camera.cam_from_world[:3].to(torch.float32).contiguous(),
+        near,
+        rows,
+    )
+    return rows[:found]
+
+
+def rows_in_view_torch(
+    parameters: Parameters, camera: Camera, *, near: float
+) -> Int64[Tensor, "m"]:
+    """The readable twin of `rows_in_view`."""
     pose = camera.cam_from_world.to(parameters.means)
     x, y, z = (parameters.means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
     inside = z > near
@@ -113,3 +115,33 @@ def rows_in_view(parameters: Parameters, camera: Camera, *, near: float) -> Int6
         at = along * focal + centre
         inside &= (at + reach >= 0) & (at - reach <= size)
     return inside.nonzero().squeeze(1)
+
+
+def gathered(parameters: Parameters, rows: Int64[Tensor, "m"]) -> Gaussians:
+    """The Gaussians that some rows stand for, as leaves of a graph."""
+    if parameters.means.device.type != "cpu":
+        return _as_leaves(parameters.rows(rows).gaussians())
+    count, columns = len(rows), parameters.sh.shape[1]
+    out = tuple(torch.empty(count, width) for width in (3, 3, 4, 1, columns))
+    raw = tuple(tensor for _, tensor in parameters.tensors())
+    _native.gather_gaussians(raw, rows, out)
+    means, scales, rotations, opacities, sh = out
+    return _as_leaves(
+        Gaussians(
+            means=means,
+            rotations=rotations,
+            scales=scales,
+            opacities=opacities.squeeze(1),
+            sh=sh.view(count, -1, 3),
+        )
+    )
+
+
+def _as_leaves(gaussians: Gaussians) -> Gaussians:
+    return gaussians.replace(
+        means=gaussians.means.detach().requires_grad_(),
+        rotations=gaussians.rotations.detach().requires_grad_(),
+        scales=gaussians.scales.detach().requires_grad_(),
+        opacities=gaussians.opacities.detach().requires_grad_(),
+        sh=gaussians.sh.detach().requires_grad_(),
+    )

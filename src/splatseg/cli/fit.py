@@ -1,0 +1,206 @@
+"""``splatseg fit``: photographs with cameras become a scene of Gaussians."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from splatseg.core import Capture, Gaussians, Scene
+from splatseg.errors import InputError
+from splatseg.evaluate import evaluate_photographs
+from splatseg.fit import FitOptions, FitProgress, FitResult, Preset, fit, reduction_note
+from splatseg.io.captures import read_capture
+from splatseg.io.scene import is_scene, save_scene, scene_layer_names
+from splatseg.render import BackendName
+
+# Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
+_SCORING = 20.0
+# Weight of the newest view in the figures of the progress line; views differ much.
+_SMOOTHING = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """Fit Gaussians to the training photographs of a capture, and write a scene folder.
+
+    Ctrl-C ends it early and writes what there is.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SCENE")]
+    """The scene folder to write. A scene that is there is replaced unless it has layers."""
+
+    minutes: float | None = None
+    """Length of the optimisation; the whole command ends within a minute more. None is the
+    preset's."""
+
+    steps: int | None = None
+    """Length in steps instead of minutes: same seed, same result."""
+
+    max_gaussians: int | None = None
+    """Most Gaussians of the scene. None is the preset's."""
+
+    preset: Preset = "default"
+    """quick: 3 minutes, 150 000 Gaussians. default: 10 minutes, 200 000. full: 30 minutes,
+    400 000, colours with harmonics of degree 3."""
+
+    seed: int = 0
+    """Seed of everything that is drawn at random."""
+
+    backend: BackendName = "auto"
+    """Who renders. auto and cpu: the C++ kernels."""
+
+    format: str = "auto"
+    """How DATA is read: auto, nerfstudio, colmap, blender, llff or idr."""
+
+
+def run(command: Command) -> None:
+    """Fit a scene and write it."""
+    options = _options(command)
+    _check_output(command.output)
+    capture = read_capture(command.data, format=command.format)
+    for note in (*capture.notes, reduction_note(capture.train_views, longest=options.longest)):
+        if note is not None:
+            sys.stdout.write(f"{note}\n")
+    sys.stdout.write(_beginning(capture))
+    sys.stdout.flush()
+
+    with _progress_bar() as show:
+        result = fit(capture, options=options, backend=command.backend, progress=show)
+    scene = Scene(
+        gaussians=result.gaussians,
+        views=capture.views,
+        classes=capture.classes,
+        up=capture.up,
+        metres_per_unit=capture.metres_per_unit,
+        source=capture.path,
+        provenance=_provenance(command, options, result),
+    )
+    save_scene(scene, command.output)
+    sys.stdout.write(_summary(result, command.output))
+    sys.stdout.flush()
+    if result.interrupted:
+        raise KeyboardInterrupt
+    sys.stdout.write(_held_out(capture, result.gaussians, command.backend))
+
+
+def _options(command: Command) -> FitOptions:
+    options = replace(FitOptions.preset(command.preset), seed=command.seed)
+    if command.max_gaussians is not None:
+        options = replace(options, max_gaussians=command.max_gaussians)
+    return options.with_length(minutes=command.minutes, steps=command.steps)
+
+
+def _check_output(root: Path) -> None:
+    """Refuse before the work what could not be written after it."""
+    if root.exists() and not root.is_dir():
+        raise InputError(f"{root}: expected a folder to write to, got a file.")
+    if not root.resolve().parent.is_dir():
+        raise InputError(f"{root}: expected a place in a folder that is there, got none.")
+    if is_scene(root):
+        layers = scene_layer_names(root)
+        if layers:
+            raise InputError(
+                f"{root}: expected a new folder, got a scene with layers ({', '.join(layers)}), "
+                "which belong to its Gaussians; remove it or choose another name."
+            )
+    elif root.is_dir() and any(root.iterdir()):
+        raise InputError(f"{root}: expected an empty folder or a new one, got one with files.")
+
+
+def _beginning(capture: Capture) -> str:
+    train, test = len(capture.train_views), len(capture.test_views)
+    points = 0 if capture.points is None else len(capture.points)
+    return (
+        f"{capture.path} ({capture.format}): {train} training views, {test} held out, "
+        f"{points} start points\n"
+    )
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[FitProgress], None]]:
+    """A bar on stderr: share done, smoothed loss and PSNR, count, speed, estimate."""
+    columns = (
+        TextColumn("fit"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0, left="")
+        smooth: list[float] = []
+        shown = 0.0
+
+        def show(now: FitProgress) -> None:
+            nonlocal smooth, shown
+            if not smooth:
+                smooth = [now.loss, now.psnr]
+            smooth = [
+                old + _SMOOTHING * (new - old)
+                for old, new in zip(smooth, (now.loss, now.psnr), strict=True)
+            ]
+            if now.seconds - shown < 0.25:
+                return
+            shown = now.seconds
+            text = (
+                f"step {now.step}  loss {smooth[0]:.4f}  PSNR {smooth[1]:.2f}  "
+                f"{now.count} Gaussians  {now.step / now.seconds:.1f} it/s"
+            )
+            left = f"{now.seconds_left / 60:.1f} min left"
+            bar.update(task, completed=now.progress, description=text, left=left)
+
+        yield show
+
+
+def _provenance(command: Command, options: FitOptions, result: FitResult) -> dict[str, Any]:
+    return {
+        "command": "fit",
+        "steps": result.steps,
+        "seconds": round(result.seconds, 3),
+        "interrupted": result.interrupted,
+        "seed": options.seed,
+        "preset": command.preset,
+        "backend": command.backend,
+        "options": asdict(options),
+        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+    }
+
+
+def _summary(result: FitResult, root: Path) -> str:
+    rate = result.steps / max(result.seconds, 1e-9)
+    ended = "stopped by Ctrl-C after" if result.interrupted else "in"
+    return (
+        f"{root}: {len(result.gaussians)} Gaussians {ended} {result.steps} steps, "
+        f"{result.seconds:.1f} s ({rate:.1f} steps/s)\n"
+    )
+
+
+def _held_out(capture: Capture, gaussians: Gaussians, backend: BackendName) -> str:
+    """PSNR on the test views, as many as the time for it allows."""
+    views = [view for view in capture.test_views if view.image is not None]
+    if not views:
+        return "no held-out views to score\n"
+    begin = time.monotonic()
+    decibels: list[float] = []
+    for view in views:
+        if time.monotonic() - begin > _SCORING:
+            break
+        report = evaluate_photographs(gaussians, [view], backend=backend)
+        decibels.append(report.psnr)
+    mean = sum(decibels) / len(decibels)
+    scored = f"{len(decibels)} held-out views"
+    if len(decibels) < len(views):
+        scored = f"the first {len(decibels)} of {len(views)} held-out views"
+    return f"PSNR {mean:.2f} dB on {scored}\n"
