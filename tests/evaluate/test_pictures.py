@@ -100,6 +100,22 @@ def test_a_longer_subtitle_makes_room_and_long_labels_are_cut():
     assert int(low[:, -20:].amin()) > 200
 
 
+def test_the_legend_shows_every_colour_and_wraps():
+    rows = tuple(ClassInfo(id=i, name=f"class {i}", colour=(0, 250, i)) for i in range(1, 13))
+    table = ClassTable(rows=rows)
+    gallery = Gallery(title="T", columns=("c",), rows=(("v", (plain((9, 9, 9)),)),))
+    bare = contact_sheet(gallery, cell_width=260)
+    sheet = contact_sheet(gallery, cell_width=260, classes=table).int()
+    assert torch.equal(sheet[: bare.shape[0] - 20], bare[:-20].int())
+    lines = set()
+    for row in rows:
+        place = (sheet == torch.tensor(row.colour)).all(dim=-1).nonzero()
+        assert len(place) == 144
+        lines.add(int(place[0, 0]))
+    assert len(lines) >= 2
+    assert int(sheet[:, -20:].amin()) > 200
+
+
 def test_an_empty_sheet_is_refused():
     with pytest.raises(InputError, match="at least one row"):
         contact_sheet(Gallery(title="T", columns=("c",), rows=()))

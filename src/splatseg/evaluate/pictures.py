@@ -15,6 +15,7 @@ from splatseg.core import ClassTable
 from splatseg.errors import InputError
 
 Colour = tuple[int, int, int]
+_Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 _NOTHING: Colour = (24, 24, 28)
 _WRONG: Colour = (226, 48, 48)
@@ -148,13 +149,18 @@ def mark_errors(
 
 
 def contact_sheet(
-    gallery: Gallery, *, subtitle: str = "", cell_width: int = 320
+    gallery: Gallery,
+    *,
+    subtitle: str = "",
+    classes: ClassTable | None = None,
+    cell_width: int = 320,
 ) -> UInt8[Tensor, "height width 3"]:
     """All pictures of a gallery on one sheet, with its title and labels.
 
     Args:
         gallery: What is shown.
         subtitle: A line under the title.
+        classes: Classes whose colours are explained in a line below; None leaves it out.
         cell_width: Width of each picture on the sheet, pixels.
 
     Raises:
@@ -168,6 +174,8 @@ def contact_sheet(
     label_height = 20
     width = 2 * _MARGIN + len(gallery.columns) * (cell_width + _GAP) - _GAP
     height = head + sum(heights) + len(heights) * (label_height + _GAP) + _MARGIN
+    swatches = _swatches(classes, label_font, width)
+    height += max((y for _, y, _, _ in swatches), default=-22) + 22
     sheet = Image.new("RGB", (width, height), _PAPER)
     draw = ImageDraw.Draw(sheet)
     draw.text((_MARGIN, _MARGIN - 4), gallery.title, fill=_INK, font=title_font)
@@ -186,7 +194,25 @@ def contact_sheet(
             words = _fitting(draw, words, label_font, cell_width)
             draw.text((x, y + row_height + 2), words, fill=_QUIET, font=label_font)
         y += row_height + label_height + _GAP
+    for x, down, name, colour in swatches:
+        draw.rectangle((x, y + down + 2, x + 11, y + down + 13), fill=colour)
+        draw.text((x + 17, y + down), name, fill=_QUIET, font=label_font)
     return torch.from_numpy(np.array(sheet))
+
+
+def _swatches(
+    classes: ClassTable | None, font: _Font, width: int
+) -> list[tuple[int, int, str, Colour]]:
+    """Places (x, y from the top of the legend), names and colours, in lines that fit."""
+    x, y = _MARGIN, 0
+    out: list[tuple[int, int, str, Colour]] = []
+    for row in () if classes is None else classes.rows:
+        needed = 17 + int(font.getlength(row.name)) + 18
+        if x + needed > width - _MARGIN and x > _MARGIN:
+            x, y = _MARGIN, y + 20
+        out.append((x, y, row.name, colour_of(row.id, classes)))
+        x += needed
+    return out
 
 
 def _thinned(values: Tensor) -> Tensor:
@@ -208,7 +234,7 @@ def _resized(picture: Picture, width: int) -> Image.Image:
 def _fitting(
     draw: ImageDraw.ImageDraw,
     text: str,
-    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
+    font: _Font,
     width: int,
 ) -> str:
     if draw.textlength(text, font=font) <= width:
