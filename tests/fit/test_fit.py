@@ -1,0 +1,171 @@
+"""The whole fit on a tiny scene: it finds it again, repeats itself, and can be stopped."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatseg import _native
+from splatseg.core import Capture, Gaussians, PointCloud, View
+from splatseg.errors import InputError, MissingFileError
+from splatseg.evaluate import evaluate_photographs
+from splatseg.fit import FitOptions, FitProgress, FitResult, fit
+
+OPTIONS = FitOptions(
+    minutes=None,
+    steps=300,
+    max_gaussians=120,
+    sh_degree=1,
+    densify_from=40,
+    densify_every=20,
+)
+
+
+def _held_out(result: FitResult, capture: Capture) -> float:
+    return evaluate_photographs(result.gaussians, capture.test_views).psnr
+
+
+def _same(one: Gaussians, other: Gaussians) -> bool:
+    return all(
+        torch.equal(getattr(one, name), getattr(other, name))
+        for name in ("means", "rotations", "scales", "opacities", "sh")
+    )
+
+
+def test_a_perturbed_start_becomes_the_scene_again(capture: Capture) -> None:
+    start = fit(capture, options=replace(OPTIONS, steps=1))
+    done = fit(capture, options=OPTIONS)
+    before, after = _held_out(start, capture), _held_out(done, capture)
+    assert before < 18
+    assert after > 27
+    assert done.steps == 300
+    assert not done.interrupted
+    assert len(start.gaussians) == 60
+    assert 60 < len(done.gaussians) <= 120
+    done.gaussians.check_values()
+    assert done.history[-1].psnr > done.history[0].psnr + 5
+    assert [record.step for record in done.history] == [50, 100, 150, 200, 250, 300]
+
+
+def test_photographs_with_a_lens_are_matched_in_their_own_pixels(make_capture) -> None:
+    capture = make_capture(model="opencv", distortion=(-0.25, 0.08, 0.004, -0.003))
+    assert _held_out(fit(capture, options=OPTIONS), capture) > 26
+
+
+def test_the_reference_backend_takes_the_same_steps(capture: Capture) -> None:
+    options = replace(OPTIONS, steps=3, quarter_until=0.0, half_until=0.0)
+    fast, slow = (fit(capture, options=options, backend=name) for name in ("cpu", "reference"))
+    for name in ("means", "scales", "opacities", "sh"):
+        torch.testing.assert_close(
+            getattr(fast.gaussians, name), getattr(slow.gaussians, name), rtol=2e-3, atol=2e-3
+        )
+
+
+def test_same_seed_same_scene_for_any_number_of_threads(capture: Capture) -> None:
+    options = replace(OPTIONS, steps=90)
+    before = _native.threads()
+    found: list[Gaussians] = []
+    try:
+        for count in (1, 2, 5):
+            _native.set_threads(count)
+            found.append(fit(capture, options=options).gaussians)
+    finally:
+        _native.set_threads(before)
+    assert len(found[0]) > 60, "relocation must take part"
+    assert all(_same(found[0], other) for other in found[1:])
+    assert not _same(found[0], fit(capture, options=replace(options, seed=1)).gaussians)
+
+
+def test_held_out_photographs_are_never_opened(capture: Capture) -> None:
+    gone = tuple(
+        replace(view, image=Path("nowhere.png")) if view.split == "test" else view
+        for view in capture.views
+    )
+    options = replace(OPTIONS, steps=30)
+    with_them = fit(capture, options=options)
+    without = fit(replace(capture, views=gone), options=options)
+    assert _same(with_them.gaussians, without.gaussians)
+
+
+def test_an_interrupted_fit_gives_what_it_has(capture: Capture) -> None:
+    seen: list[FitProgress] = []
+
+    def stop(progress: FitProgress) -> None:
+        seen.append(progress)
+        if progress.step == 50:
+            raise KeyboardInterrupt
+
+    result = fit(capture, options=OPTIONS, progress=stop)
+    assert result.interrupted
+    assert result.steps == 50
+    assert [one.step for one in seen] == list(range(1, 51))
+    assert seen[-1].progress == pytest.approx(50 / 300)
+    result.gaussians.check_values()
+    assert _held_out(result, capture) > 18
+
+
+@pytest.mark.parametrize("step", [39, 40, 41])
+def test_a_real_signal_at_any_moment_is_harmless(capture: Capture, step: int) -> None:
+    """Around step 40 Gaussians are added, and their number changes."""
+
+    def stop(progress: FitProgress) -> None:
+        if progress.step == step:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = fit(capture, options=OPTIONS, progress=stop)
+    assert result.interrupted
+    result.gaussians.check_values()
+
+
+def test_minutes_are_kept(capture: Capture) -> None:
+    result = fit(capture, options=replace(OPTIONS, steps=None, minutes=0.02))
+    assert result.seconds == pytest.approx(1.2, abs=0.7)
+    assert result.steps > 5
+
+
+def test_masked_pixels_teach_nothing(capture: Capture, tmp_path: Path) -> None:
+    """Half of each photograph is spoilt and masked: the result is as if it never was."""
+    from splatseg.io.images import load_image, save_png
+
+    def spoilt(view: View, value: int) -> View:
+        pixels = load_image(view)
+        mask = torch.ones(pixels.shape[:2], dtype=torch.uint8) * 255
+        mask[:, :20] = 0
+        pixels[:, :20] = value
+        image = tmp_path / f"{view.name}_{value}.png"
+        save_png(pixels, image)
+        save_png(mask, tmp_path / f"{view.name}_mask.png")
+        return replace(view, image=image, mask=tmp_path / f"{view.name}_mask.png")
+
+    options = replace(OPTIONS, steps=25)
+    found = [
+        fit(replace(capture, views=tuple(spoilt(v, value) for v in capture.views)), options=options)
+        for value in (0, 255)
+    ]
+    assert _same(found[0].gaussians, found[1].gaussians)
+
+
+def test_captures_that_cannot_be_fitted_say_why(capture: Capture) -> None:
+    empty = PointCloud(points=torch.zeros(0, 3))
+    for points in (None, empty):
+        with pytest.raises(InputError, match="expected a capture with start points"):
+            fit(replace(capture, points=points), options=OPTIONS)
+    broken = PointCloud(points=torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]]))
+    with pytest.raises(InputError, match="1 of 2 start points are not finite"):
+        fit(replace(capture, points=broken), options=OPTIONS)
+    with pytest.raises(InputError, match="expected training views with photographs, got none"):
+        fit(replace(capture, views=capture.test_views), options=OPTIONS)
+    lost = tuple(replace(view, image=Path("lost.png")) for view in capture.views)
+    with pytest.raises(MissingFileError, match=r"lost\.png"):
+        fit(replace(capture, views=lost), options=OPTIONS)
+    with pytest.raises(InputError, match="backend"):
+        fit(capture, options=OPTIONS, backend="gpu")
+
+
+def test_torch_gets_its_threads_back(capture: Capture) -> None:
+    before = torch.get_num_threads()
+    fit(capture, options=replace(OPTIONS, steps=1))
+    assert torch.get_num_threads() == before
