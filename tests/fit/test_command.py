@@ -1,0 +1,147 @@
+"""``splatseg fit`` from the command line's side: what it writes, says and refuses."""
+
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatseg.cli import main
+from splatseg.core import Capture, Labels
+from splatseg.io.scene import load_scene, save_scene_layer
+
+
+@pytest.fixture
+def folder(capture: Capture) -> Path:
+    """The tiny capture as a nerfstudio folder."""
+    root = capture.path
+    frames = []
+    for view in capture.views:
+        pose = torch.linalg.inv(view.camera.cam_from_world) @ torch.diag(
+            torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)
+        )
+        frames.append(
+            {
+                "file_path": f"{view.name}.png",
+                "transform_matrix": pose.tolist(),
+                "split": view.split,
+            }
+        )
+    camera = capture.views[0].camera
+    content = {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "frames": frames,
+        "ply_file_path": "points.ply",
+        "train_filenames": [f"{v.name}.png" for v in capture.train_views],
+        "val_filenames": [],
+        "test_filenames": [f"{v.name}.png" for v in capture.test_views],
+    }
+    (root / "transforms.json").write_text(json.dumps(content))
+    assert capture.points is not None
+    rows = "\n".join(
+        " ".join(map(str, point.tolist() + colour.tolist()))
+        for point, colour in zip(capture.points.points, capture.points.colours, strict=True)
+    )
+    names = "".join(f"property float {n}\n" for n in "xyz")
+    names += "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
+    (root / "points.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(capture.points)}\n{names}end_header\n{rows}\n"
+    )
+    return root
+
+
+def test_a_scene_is_written_and_scored(folder: Path, tmp_path: Path, capsys) -> None:
+    scene_path = tmp_path / "scene"
+    words = ["fit", str(folder), "-o", str(scene_path), "--steps", "60", "--seed", "4"]
+    assert main([*words, "--max-gaussians", "80"]) == 0
+    said = capsys.readouterr().out
+    assert str(scene_path) in said
+    assert "11 training views, 3 held out, 60 start points" in said
+    assert "dB on 3 held-out views" in said
+
+    scene = load_scene(scene_path)
+    assert 0 < len(scene.gaussians) <= 80
+    assert len(scene.train_views) == 11
+    assert [view.name for view in scene.test_views] == ["view_02", "view_07", "view_12"]
+    record = scene.provenance
+    assert record["steps"] == 60
+    assert record["seed"] == 4
+    assert record["seconds"] > 0
+    assert record["interrupted"] is False
+    assert record["options"]["max_gaussians"] == 80
+    assert record["options"]["minutes"] is None
+    assert set(record["versions"]) == {"splatseg", "torch"}
+
+
+def test_same_command_same_file(folder: Path, tmp_path: Path) -> None:
+    files = []
+    for name in ("a", "b"):
+        assert main(["fit", str(folder), "-o", str(tmp_path / name), "--steps", "40"]) == 0
+        files.append((tmp_path / name / "gaussians.ply").read_bytes())
+    assert files[0] == files[1]
+
+
+def test_ctrl_c_leaves_a_scene_that_loads(folder: Path, tmp_path: Path, capsys) -> None:
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    status = main(["fit", str(folder), "-o", str(tmp_path / "scene"), "--minutes", "5"])
+    timer.join()
+    assert status == 1
+    assert "stopped by Ctrl-C" in capsys.readouterr().out
+    scene = load_scene(tmp_path / "scene")
+    assert scene.provenance["interrupted"] is True
+    scene.gaussians.check_values()
+
+
+def test_a_scene_without_layers_is_replaced(folder: Path, tmp_path: Path, capsys) -> None:
+    words = ["fit", str(folder), "-o", str(tmp_path / "scene"), "--steps"]
+    assert main([*words, "2"]) == 0
+    assert main([*words, "3"]) == 0
+    scene = load_scene(tmp_path / "scene")
+    assert scene.provenance["steps"] == 3
+    labels = Labels(
+        ids=torch.ones(len(scene.gaussians), dtype=torch.int32),
+        confidence=torch.ones(len(scene.gaussians)),
+    )
+    save_scene_layer(tmp_path / "scene", "semantic", labels)
+    capsys.readouterr()
+    assert main([*words, "4"]) == 2
+    assert "got a scene with layers (semantic)" in capsys.readouterr().err
+
+
+def test_what_cannot_be_done_is_said_before_the_work(folder: Path, tmp_path: Path, capsys) -> None:
+    def refused(*words: str) -> str:
+        assert main(["fit", *words]) == 2
+        return capsys.readouterr().err
+
+    scene = str(tmp_path / "scene")
+    assert "minutes, steps: expected one of the two" in refused(
+        str(folder), "-o", scene, "--steps", "2", "--minutes", "1"
+    )
+    assert "expected an empty folder or a new one" in refused(
+        str(folder), "-o", str(folder), "--steps", "2"
+    )
+    assert "expected a place in a folder that is there" in refused(
+        str(folder), "-o", str(tmp_path / "no" / "scene"), "--steps", "2"
+    )
+    file = tmp_path / "file"
+    file.write_text("x")
+    assert "expected a folder to write to, got a file" in refused(
+        str(folder), "-o", str(file), "--steps", "2"
+    )
+    assert "no_such" in refused(str(tmp_path / "no_such"), "-o", scene)
+    assert "max_gaussians" in refused(str(folder), "-o", scene, "--max-gaussians", "0")
+    (folder / "points.ply").unlink()
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["ply_file_path"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    assert "start points" in refused(str(folder), "-o", scene, "--steps", "2")
+    assert not Path(scene).exists()
