@@ -153,7 +153,7 @@ def _check_ratio(path: Path, header: _Header, compressed: int) -> None:
         )
 
 
-def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
+def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
     """The attributes of versions 2 and 3."""
     stream = zlib.decompressobj(wbits=31)
     try:
@@ -182,14 +182,14 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
     if not more and not stream.eof:
         raise FileFormatError(f"{path}: the gzip data end without their check sum: truncated.")
     view = memoryview(content)
-    parts: list[bytes] = []
+    parts: list[memoryview] = []
     for size in header.sizes:
-        parts.append(bytes(view[: size * header.count]))
+        parts.append(view[: size * header.count])
         view = view[size * header.count :]
     return header, parts
 
 
-def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
+def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
     """The attributes of version 4."""
     import zstandard
 
@@ -218,7 +218,7 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
             f"{path}: expected {end} bytes as its table of streams says, got {len(data)}: "
             f"the file is {'truncated' if end > len(data) else 'too long'}."
         )
-    parts: list[bytes] = []
+    parts: list[memoryview] = []
     for i, ((compressed, unpacked), size) in enumerate(zip(entries, header.sizes, strict=True)):
         if unpacked != size * header.count:
             raise FileFormatError(
@@ -238,7 +238,7 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[bytes]]:
                 f"{path}: expected {unpacked} bytes in stream {i}, "
                 f"got {'more' if more else len(part)}."
             )
-        parts.append(part)
+        parts.append(memoryview(part))
     return header, parts
 
 
