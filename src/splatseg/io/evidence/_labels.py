@@ -97,6 +97,9 @@ class LabelEvidence(Evidence):
 
     rule: IdRule = IdRule()
 
+    recorded: Mapping[int, int] | None = None
+    """The model's own id by id in the files, as evidence.json has it."""
+
     @property
     @override
     def folder(self) -> Path:
@@ -120,7 +123,7 @@ class LabelEvidence(Evidence):
     @property
     @override
     def source_ids(self) -> Mapping[int, int] | None:
-        return self.rule.source_ids
+        return self.rule.source_ids if self.recorded is None else self.recorded
 
     @override
     def label_map(self, name: str) -> LabelMap:

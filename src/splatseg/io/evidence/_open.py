@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from splatseg.core import ClassTable
 from splatseg.errors import FileFormatError, InputError, MissingFileError
@@ -61,7 +61,13 @@ def open_evidence(
         folder, maps=bool(maps), arrays=bool(arrays), objects=bool(objects)
     )
     if kind in ("labels", "panoptic", "tracked"):
-        labels = LabelEvidence(root=folder, files=maps, table=_classes(folder, header), rule=rule)
+        labels = LabelEvidence(
+            root=folder,
+            files=maps,
+            table=_classes(folder, header),
+            rule=rule,
+            recorded=_recorded_ids(folder, header),
+        )
         if kind == "labels":
             return labels
         return open_panoptic(labels) if kind == "panoptic" else open_tracked(labels)
@@ -147,3 +153,16 @@ def _classes(folder: Path, header: dict[str, Any]) -> ClassTable | None:
     if folder.name in _TRUTH_TABLES:
         return metadata.tables.get(_TRUTH_TABLES[folder.name])
     return metadata.classes
+
+
+def _recorded_ids(folder: Path, header: dict[str, Any]) -> dict[int, int] | None:
+    recorded = header.get("source_ids")
+    if recorded is None:
+        return None
+    entries = cast(dict[str, object], recorded) if isinstance(recorded, dict) else {"": None}
+    if not all(key.isdecimal() and isinstance(id, int) for key, id in entries.items()):
+        raise FileFormatError(
+            f"{folder / HEADER_FILE}: expected source_ids of integers by integer, "
+            f"got {recorded!r:.60}."
+        )
+    return {int(key): cast(int, id) for key, id in entries.items()}

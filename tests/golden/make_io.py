@@ -1,0 +1,151 @@
+"""Makes the golden scene folder of the current format version in tests/golden/scene-v1.
+
+Run from the project's root: ``python tests/golden/make_io.py``. A version's files are made
+once and then kept: later versions of splatseg must read them. The scene has one view of each
+lens, evidence of each kind that is written and a layer of each kind.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from splatseg.core import (
+    Camera,
+    ClassInfo,
+    ClassTable,
+    FeatureMap,
+    Features,
+    Gaussians,
+    LabelMap,
+    Labels,
+    MaskSet,
+    Scene,
+    Selection,
+    View,
+)
+from splatseg.io.evidence import create_evidence, save_features, save_label_map, save_masks
+from splatseg.io.scene import CAMERAS_FILE, SCENE_FILE, VERSION, save_scene, save_scene_layer
+
+ROOT = Path(__file__).parent / f"scene-v{VERSION}"
+CLASSES = ClassTable(
+    rows=(
+        ClassInfo(id=1, name="wall", isthing=False, colour=(10, 20, 30)),
+        ClassInfo(id=7, name="Stuhl", isthing=True),
+    )
+)
+
+
+def golden_scene() -> Scene:
+    """Three Gaussians and three views, all numbers in closed form."""
+    n = 3
+    steps = torch.arange(n, dtype=torch.float32)
+    gaussians = Gaussians(
+        means=torch.stack([steps, -steps, steps / 4], dim=1),
+        rotations=torch.tensor([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0, 0, 1, 0]]).float(),
+        scales=torch.full((n, 3), 0.25) * (1 + steps[:, None]),
+        opacities=torch.tensor([0.25, 0.5, 0.75]),
+        sh=torch.linspace(-1, 1, n * 4 * 3).reshape(n, 4, 3),
+        extra={"mark": torch.tensor([5, 6, 7], dtype=torch.int32)},
+    )
+    lenses = {
+        "left/1": ("pinhole", (), "train"),
+        "left/2": ("opencv", (-0.1, 0.02, 0.003, -0.004, 0.005, 0.0, 0.0, 0.0), "train"),
+        "right/1": ("fisheye", (0.1, -0.02, 0.003, -0.0004), "test"),
+    }
+    views = []
+    for i, (name, (model, distortion, split)) in enumerate(lenses.items()):
+        angle = 0.1 + i
+        pose = torch.eye(4, dtype=torch.float64)
+        turn = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pose[:2, :2] = torch.tensor(turn, dtype=torch.float64)
+        pose[:3, 3] = torch.tensor([0.1, -0.2, 1 / 3 + i], dtype=torch.float64)
+        camera = Camera(
+            width=8,
+            height=6,
+            fx=10 + 1 / 3,
+            fy=11,
+            cx=4.25,
+            cy=2.75,
+            cam_from_world=pose,
+            model=model,
+            distortion=distortion,
+        )
+        image = ROOT.parent / "capture-that-moved" / "images" / f"{name}.png"
+        views.append(View(name=name, camera=camera, image=image, split=split))
+    return Scene(
+        gaussians=gaussians,
+        views=tuple(views),
+        classes=CLASSES,
+        up=(0.0, 0.0, 1.0),
+        metres_per_unit=0.5,
+        source=ROOT.parent / "capture-that-moved",
+        provenance={"command": "fit", "steps": 100, "options": {"seed": 0}},
+    )
+
+
+def golden_layers() -> dict[str, Labels | Features | Selection]:
+    """A layer of each kind."""
+    return {
+        "semantic": Labels(
+            ids=torch.tensor([7, -1, 1]),
+            confidence=torch.tensor([0.5, 0.0, 1.0]),
+            background=1,
+            candidates=torch.tensor([[7, 1], [-1, -1], [1, -1]], dtype=torch.int32),
+            shares=torch.tensor([[0.5, 0.25], [0.0, 0.0], [1.0, 0.0]]),
+            metadata={"method": "uplift", "names": {"7": "Stuhl"}},
+        ),
+        "features": Features(
+            values=torch.tensor([[0.5, -1.0], [2.0, 0.0], [0.125, 3.0]]),
+            weights=torch.tensor([1.5, 0.0, 3.0]),
+            metadata={"method": "uplift"},
+        ),
+        "chosen": Selection(mask=torch.tensor([True, False, True]), metadata={"by": "point"}),
+    }
+
+
+def golden_evidence() -> tuple[LabelMap, MaskSet, FeatureMap]:
+    """A label map, masks and features of the view left/1."""
+    ids = torch.full((6, 8), -1, dtype=torch.int32)
+    ids[:2] = 7
+    ids[2:, :3] = 1
+    dense = torch.zeros(2, 6, 8, dtype=torch.bool)
+    dense[0, 1:4, 2:5] = True
+    dense[1, :, 0] = True
+    return (
+        LabelMap(ids=ids, confidence=torch.linspace(0, 1, 48).reshape(6, 8)),
+        MaskSet.from_dense(dense, scores=[0.75, 0.5], levels=[2, 0]),
+        FeatureMap(
+            features=torch.arange(24, dtype=torch.float32).reshape(3, 4, 2) / 8,
+            stride=2,
+            height=6,
+            width=8,
+        ),
+    )
+
+
+def main() -> None:
+    save_scene(golden_scene(), ROOT)
+    # The path of the machine that made it is nobody's business.
+    path = ROOT / SCENE_FILE
+    content = json.loads(path.read_text())
+    content["source"]["absolute"] = "/captures/that-moved"
+    path.write_text(json.dumps(content, indent=1) + "\n")
+    assert str(ROOT.parent) not in (ROOT / CAMERAS_FILE).read_text()
+    for name, layer in golden_layers().items():
+        save_scene_layer(ROOT, name, layer)
+    labels, masks, features = golden_evidence()
+    evidence = ROOT / "evidence"
+    create_evidence(evidence / "labels", kind="labels", classes=CLASSES, metadata={"model": "a"})
+    save_label_map(evidence / "labels", "left/1", labels)
+    create_evidence(evidence / "masks", kind="masks")
+    save_masks(evidence / "masks", "left/1", masks)
+    create_evidence(evidence / "features", kind="features")
+    save_features(evidence / "features", "left/1", features)
+    # Git does not keep empty folders; readers must not need them.
+    (ROOT / "reports").rmdir()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,437 @@
+"""Evidence: recorded folders as they stand, our own round trips, and what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from splatseg.core import ClassInfo, ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
+from splatseg.io.captures import read_capture
+from splatseg.io.evidence import (
+    FeatureEvidence,
+    PanopticEvidence,
+    TrackedEvidence,
+    create_evidence,
+    evidence_names,
+    find_evidence,
+    load_text_embeddings,
+    open_evidence,
+    save_features,
+    save_label_map,
+    save_masks,
+)
+
+SCENES = ["office", "toys", "frontal"]
+
+
+def png(path: Path, values, mode: str | None = None) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(np.asarray(values))
+    (image.convert(mode) if mode else image).save(path)
+
+
+# What others recorded
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("masks_sam", "masks"),
+        ("labels_semantic", "labels"),
+        ("labels_panoptic", "panoptic"),
+        ("labels_tracked", "tracked"),
+        ("features_dino", "features"),
+        ("features_text", "features"),
+    ],
+)
+def test_recorded_evidence_is_of_the_train_views(shared_data, scene, name, kind) -> None:
+    capture = read_capture(shared_data / scene)
+    evidence = open_evidence(find_evidence([capture.path], name))
+    assert evidence.kind == kind
+    assert evidence.view_names == tuple(view.name for view in capture.train_views)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_recorded_masks(shared_data, scene) -> None:
+    """Areas and boxes in the files are those of the masks that were decoded."""
+    evidence = open_evidence(shared_data / scene / "masks_sam")
+    name = evidence.view_names[7]
+    rows = json.loads((shared_data / scene / "masks_sam" / f"{name}.json").read_text())["masks"]
+    masks = evidence.masks(name)
+    assert len(masks) == len(rows) > 10
+    for i, row in enumerate(rows):
+        dense = masks.dense(i)
+        assert dense.shape == (384, 512)
+        assert int(dense.sum()) == row["area"]
+        assert list(masks.masks[i].bbox) == row["bbox"]
+        assert float(masks.scores[i]) == pytest.approx(row["predicted_iou"])
+
+
+def test_recorded_semantic_labels(shared_data) -> None:
+    evidence = open_evidence(shared_data / "office/labels_semantic")
+    name = evidence.view_names[0]
+    with Image.open(shared_data / f"office/labels_semantic/{name}.png") as image:
+        stored = np.asarray(image).astype(int)
+    ids = evidence.label_map(name).ids
+    np.testing.assert_array_equal(ids, np.where(stored == 0, -1, stored))
+    assert ids.dtype == torch.int32
+    assert evidence.classes.name_of(1) == "wall"
+    masks = evidence.masks(name)
+    present = [i for i in np.unique(stored) if i]
+    assert len(masks) == len(present)
+    for i, id in enumerate(present):
+        np.testing.assert_array_equal(masks.dense(i), stored == id)
+
+
+def test_recorded_panoptic_segments(shared_data) -> None:
+    evidence = open_evidence(shared_data / "office/labels_panoptic")
+    assert isinstance(evidence, PanopticEvidence)
+    table = json.loads((shared_data / "office/labels_panoptic/segments.json").read_text())
+    name = evidence.view_names[3]
+    rows = {row["id"]: row for row in table[name]["segments_info"]}
+    ids, categories = evidence.label_map(name), evidence.category_map(name)
+    for segment in evidence.segments(name):
+        row, where = rows[segment.id], ids.ids == segment.id
+        assert int(where.sum()) == row["area"]
+        assert (segment.category, segment.isthing) == (row["category_id"], row["isthing"])
+        assert (categories.ids[where] == row["category_id"]).all()
+        np.testing.assert_allclose(ids.confidence[where], row["score"], rtol=1e-6)
+    assert ((ids.ids == -1) == (categories.ids == -1)).all()
+
+
+def test_recorded_tracks(shared_data) -> None:
+    evidence = open_evidence(shared_data / "office/labels_tracked")
+    assert isinstance(evidence, TrackedEvidence)
+    table = json.loads((shared_data / "office/labels_tracked/tracks.json").read_text())
+    assert evidence.order == tuple(table["order"])
+    assert [track.id for track in evidence.tracks] == sorted(map(int, table["tracks"]))
+    first = evidence.tracks[0]
+    assert dict(first.votes) == {"window": 333366, "picture": 8124, "curtain": 4143}
+    assert first.category == "window"
+    assert evidence.classes.name_of(1) == "window 1"
+    seen = {
+        int(i) for name in evidence.view_names[:5] for i in evidence.label_map(name).ids.unique()
+    }
+    assert seen - {-1} <= {track.id for track in evidence.tracks}
+
+
+def test_recorded_dino_features(shared_data) -> None:
+    folder = shared_data / "office/features_dino"
+    evidence = open_evidence(folder)
+    assert isinstance(evidence, FeatureEvidence)
+    name = evidence.view_names[2]
+    with np.load(folder / f"{name}.npz") as archive, np.load(folder / "quant.npz") as quant:
+        codes, scale, offset = archive["f"], quant["scale"], quant["offset"]
+    assert evidence.blocks == ("block3", "block6", "block9", "block12")
+    for i, block in enumerate(evidence.blocks):
+        features = evidence.block_features(name, block)
+        assert (features.stride, features.height, features.width) == (16, 384, 512)
+        for row, column, channel in ((0, 0, 0), (23, 31, 47), (5, 9, 20)):
+            expected = codes[i, row, column, channel] * scale[i, channel] + offset[i, channel]
+            assert float(features.features[row, column, channel]) == pytest.approx(expected)
+    last = evidence.features(name).features
+    assert torch.equal(last, evidence.block_features(name, "block12").features)
+    with pytest.raises(InputError, match="one of the blocks block3, .* got 'block4'"):
+        evidence.block_features(name, "block4")
+    with pytest.raises(InputError, match=r"expected features with basis.npz"):
+        evidence.expand(last)
+
+
+def test_text_features_expand_to_unit_vectors_near_their_words(shared_data) -> None:
+    """A pixel's full vector is nearer to its class's word than to most others."""
+    evidence = open_evidence(shared_data / "office/features_text")
+    words = load_text_embeddings(shared_data / "office")
+    name = evidence.view_names[0]
+    features = evidence.features(name)
+    assert features.features.shape == (48, 64, 24)
+    full = evidence.expand(features.features)
+    assert full.shape == (48, 64, 512)
+    np.testing.assert_allclose(full.norm(dim=-1), 1, atol=1e-5)
+    labels = open_evidence(shared_data / "office/labels_semantic").label_map(name).ids[4::8, 4::8]
+    classes = [i for i, kind in enumerate(words.kinds) if kind == "class"]
+    scores = full @ words.vectors[classes].T
+    order = scores.argsort(dim=-1, descending=True)
+    ids = torch.tensor([words.target_ids[i] for i in classes])
+    rank = (ids[order] == labels[..., None]).float().argmax(dim=-1)
+    assert float((rank < 5).float().mean()) > 0.6
+    assert words.target_ids[words.labels.index("object")] == -1
+    assert torch.equal(words.vector("wall"), words.vectors[0])
+    with pytest.raises(InputError, match="recorded words .* got 'unicorn'"):
+        words.vector("unicorn")
+
+
+@pytest.mark.parametrize(
+    ("path", "views"),
+    [
+        ("real/camvid/labels_semantic", 101),
+        ("real/camvid/semantic", 101),
+        ("real/replica_office0/sem_reference", 180),
+        ("real/replica_office0/pano_reference", 180),
+        ("real/dtu_scan37/masks", 49),
+        ("office/semantic", 125),
+        ("office/instance", 125),
+        ("office/part", 125),
+    ],
+)
+def test_other_label_maps(shared_data, path, views) -> None:
+    evidence = open_evidence(shared_data / path)
+    assert (evidence.kind, len(evidence.view_names)) == ("labels", views)
+    assert int(evidence.label_map(evidence.view_names[-1]).ids.max()) > 0
+
+
+def test_names_belong_to_the_ids(shared_data) -> None:
+    """Instance ids are named after instances, not after the classes of the same number."""
+    assert open_evidence(shared_data / "office/semantic").classes.name_of(2) == "floor"
+    assert open_evidence(shared_data / "office/instance").classes.name_of(1) == "walls"
+    assert open_evidence(shared_data / "office/part").classes.name_of(1) == "north wall"
+    assert open_evidence(shared_data / "office/depth").classes is None
+
+
+def test_names_of_evidence_leave_truth_out(shared_data) -> None:
+    assert evidence_names([shared_data / "office"]) == (
+        "features_dino",
+        "features_text",
+        "labels_panoptic",
+        "labels_semantic",
+        "labels_tracked",
+        "masks_sam",
+    )
+    assert evidence_names([shared_data / "real/replica_office0"]) == (
+        "pano_reference",
+        "sem_reference",
+    )
+
+
+# Label maps
+
+
+@pytest.mark.parametrize("highest", [255, 256, 65535])
+def test_label_maps_round_trip(tmp_path, rng, highest) -> None:
+    ids = torch.from_numpy(rng.integers(1, highest + 1, (5, 7)))
+    ids[0, 0], ids[0, 1] = -1, highest
+    confidence = torch.from_numpy(rng.random((5, 7)))
+    folder = create_evidence(tmp_path / "e", kind="labels")
+    save_label_map(folder, "sub/a.jpg", LabelMap(ids=ids, confidence=confidence))
+    evidence = open_evidence(folder)
+    assert evidence.view_names == ("sub/a.jpg",)
+    read = evidence.label_map("sub/a.jpg")
+    assert torch.equal(read.ids, ids.int())
+    np.testing.assert_allclose(read.confidence, confidence, atol=0.5 / 65535 + 1e-7)
+    with Image.open(folder / "sub/a.jpg.png") as image:
+        assert image.mode == ("L" if highest == 255 else "I;16")
+    save_label_map(folder, "sub/a.jpg", LabelMap(ids=ids))
+    assert open_evidence(folder).label_map("sub/a.jpg").confidence is None
+
+
+def test_the_score_of_a_label_mask_is_its_mean_confidence(tmp_path) -> None:
+    folder = create_evidence(tmp_path / "e", kind="labels")
+    ids, confidence = torch.tensor([[2, 2, -1]]), torch.tensor([[0.5, 1.0, 0.0]])
+    save_label_map(folder, "a", LabelMap(ids=ids, confidence=confidence))
+    assert open_evidence(folder).masks("a").scores.tolist() == pytest.approx([0.75], abs=1e-4)
+
+
+def test_a_source_whose_0_is_a_class(tmp_path) -> None:
+    """Ids grow by one, 255 is void, and the way back is told."""
+    table = ClassTable(rows=(ClassInfo(id=0, name="road"), ClassInfo(id=18, name="bicycle")))
+    png(tmp_path / "e/a.png", np.array([[0, 18, 255]], np.uint8))
+    (tmp_path / "metadata.json").write_text(
+        json.dumps({"classes": [{"id": 1, "name": "x"}, {"id": 18, "name": "bicycle"}]})
+    )
+    evidence = open_evidence(tmp_path / "e", zero_is_class=True, void=255)
+    assert evidence.label_map("a").ids.tolist() == [[1, 19, -1]]
+    assert evidence.source_ids[1] == 0
+    assert evidence.source_ids[19] == 18
+    assert 256 not in evidence.source_ids
+    assert evidence.classes.name_of(19) == "bicycle"
+    plain = open_evidence(tmp_path / "e")
+    assert plain.label_map("a").ids.tolist() == [[-1, 18, 255]]
+    assert plain.source_ids is None
+    assert open_evidence(tmp_path / "e", void=18).label_map("a").ids.tolist() == [[-1, -1, 255]]
+    with pytest.raises(InputError, match="void: expected another id than 0"):
+        open_evidence(tmp_path / "e", zero_is_class=True, void=0)
+    assert table.name_of(0) == "road"
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA"])
+def test_coloured_label_maps_are_refused_in_a_sentence(tmp_path, mode) -> None:
+    png(tmp_path / "e/a.png", np.full((2, 2), 3, np.uint8), mode)
+    with pytest.raises(FileFormatError, match=rf"a.png: expected one channel of ids, got {mode}"):
+        open_evidence(tmp_path / "e").label_map("a")
+
+
+def test_a_palette_gives_its_indices(tmp_path) -> None:
+    image = Image.fromarray(np.array([[0, 1, 2]], np.uint8))
+    image = image.convert("P")
+    image.putdata([0, 1, 2])
+    image.putpalette([9, 9, 9, 200, 0, 0, 0, 200, 0])
+    (tmp_path / "e").mkdir()
+    image.save(tmp_path / "e/a.png")
+    assert open_evidence(tmp_path / "e").label_map("a").ids.tolist() == [[-1, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("ids", "error", "message"),
+    [
+        (torch.tensor([[0]]), InputError, "ids from 1 on .* got 0"),
+        (torch.tensor([[65536]]), RangeError, "ids up to 65535, got 65536"),
+        (torch.zeros(0, 3), InputError, "at least one pixel"),
+    ],
+)
+def test_label_maps_that_have_no_place_in_a_file(tmp_path, ids, error, message) -> None:
+    with pytest.raises(error, match=message):
+        save_label_map(tmp_path, "a", LabelMap(ids=ids))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["", "../a", "/a", "a//b", ".a", "a/../../b"])
+def test_names_stay_inside_the_folder(tmp_path, name) -> None:
+    with pytest.raises(InputError, match="view: expected a name"):
+        save_label_map(tmp_path, name, LabelMap(ids=torch.ones(1, 1)))
+
+
+# Masks
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(0, 4),
+    height=st.integers(1, 9),
+    width=st.integers(1, 9),
+)
+def test_masks_round_trip(tmp_path_factory, seed, count, height, width) -> None:
+    generator = np.random.default_rng(seed)
+    dense = torch.from_numpy(generator.random((count, height, width)) < generator.random())
+    scores = generator.random(count).astype(np.float32).tolist()
+    levels = generator.integers(0, 3, count).tolist()
+    folder = create_evidence(tmp_path_factory.mktemp("m") / "e", kind="masks")
+    save_masks(folder, "a", MaskSet.from_dense(dense, scores=scores, levels=levels))
+    read = open_evidence(folder).masks("a")
+    assert (read.height, read.width, len(read)) == (height, width, count)
+    assert read.scores.tolist() == scores
+    assert read.levels.tolist() == levels
+    for i in range(count):
+        assert torch.equal(read.dense(i), dense[i])
+
+
+MASKS = {"height": 2, "width": 2, "masks": [{"segmentation": {"size": [2, 2], "counts": [1, 3]}}]}
+
+
+def test_uncompressed_runs_and_defaults(tmp_path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps(MASKS))
+    masks = open_evidence(tmp_path).masks("a")
+    assert masks.dense(0).tolist() == [[False, True], [True, True]]
+    assert (masks.scores.tolist(), masks.levels.tolist()) == ([1.0], [0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.pop("height"), "masks with their height and width"),
+        (lambda m: m["masks"].append(3), r"masks\[1\]: expected a run-length mask"),
+        (lambda m: m["masks"][0]["segmentation"].update(size=[2, 3]), r"mask of 2 x 2, got size"),
+        (lambda m: m["masks"][0]["segmentation"].update(counts=[1, 4]), "add up to 2 x 2"),
+        (lambda m: m["masks"][0]["segmentation"].update(counts=[-1, 5]), r"masks\[0\]: "),
+        (lambda m: m["masks"][0]["segmentation"].update(counts="~~"), "other characters"),
+        (lambda m: m["masks"][0].update(score="high"), "expected a score and a level"),
+    ],
+)
+def test_masks_that_are_broken(tmp_path, change, message) -> None:
+    content = json.loads(json.dumps(MASKS))
+    change(content)
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(FileFormatError, match=rf"a\.json: .*{message}"):
+        open_evidence(tmp_path, void=None).masks("a")
+
+
+# Features
+
+
+def test_features_round_trip_as_float16(tmp_path, rng) -> None:
+    values = torch.from_numpy(rng.normal(size=(3, 4, 5))).float()
+    folder = create_evidence(tmp_path / "e", kind="features", metadata={"model": "dino"})
+    save_features(folder, "a", FeatureMap(features=values, stride=14, height=42, width=50))
+    read = open_evidence(folder).features("a")
+    assert (read.stride, read.height, read.width) == (14, 42, 50)
+    assert read.features.dtype == torch.float32
+    assert torch.equal(read.features, values.half().float())
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e5])
+def test_features_beyond_float16_are_refused(tmp_path, value) -> None:
+    features = FeatureMap(features=torch.full((1, 1, 1), value), stride=1, height=1, width=1)
+    with pytest.raises(RangeError, match="a: features"):
+        save_features(tmp_path, "a", features)
+
+
+def test_features_that_are_broken(tmp_path) -> None:
+    (tmp_path / "a.npz").write_bytes(b"PK")
+    np.savez(tmp_path / "b.npz", f=np.zeros(3))
+    evidence = open_evidence(tmp_path)
+    with pytest.raises(FileFormatError, match=r"a.npz: expected an npz"):
+        evidence.features("a")
+    with pytest.raises(FileFormatError, match=r"b.npz: expected an array 'features', got f"):
+        evidence.features("b")
+
+
+# Folders
+
+
+def test_kinds_that_are_not_there_are_refused(shared_data) -> None:
+    office = shared_data / "office"
+    with pytest.raises(InputError, match="expected evidence of label maps, got masks"):
+        open_evidence(office / "masks_sam").label_map("train_0000")
+    with pytest.raises(InputError, match="expected evidence of masks, got features"):
+        open_evidence(office / "features_dino").masks("train_0000")
+    with pytest.raises(InputError, match="expected evidence of features, got tracked"):
+        open_evidence(office / "labels_tracked").features("train_0000")
+    with pytest.raises(InputError, match=r"nothing of view 'test_0000' among 100 views"):
+        open_evidence(office / "labels_semantic").label_map("test_0000")
+
+
+def test_evidence_of_a_scene_comes_before_that_of_its_capture(tmp_path) -> None:
+    for folder in ("scene/evidence/labels_a", "data/labels_a", "data/labels_b", "data/semantic"):
+        (tmp_path / folder).mkdir(parents=True)
+    places = [tmp_path / "scene", tmp_path / "data"]
+    assert find_evidence(places, "labels_a") == tmp_path / "scene/evidence/labels_a"
+    assert find_evidence(places, "labels_b") == tmp_path / "data/labels_b"
+    assert find_evidence(places, "semantic") == tmp_path / "data/semantic"
+    assert evidence_names(places) == ("labels_a", "labels_b")
+    with pytest.raises(InputError, match=r"at hand \(labels_a, labels_b\), got 'c'"):
+        find_evidence(places, "c")
+
+
+def test_the_header_tells_kind_classes_and_version(tmp_path) -> None:
+    table = ClassTable(rows=(ClassInfo(id=3, name="door", colour=(1, 2, 3)),))
+    folder = create_evidence(tmp_path / "e", kind="labels", classes=table, source_ids={3: 0})
+    evidence = open_evidence(folder)
+    assert (evidence.kind, evidence.view_names, evidence.classes) == ("labels", (), table)
+    header = json.loads((folder / "evidence.json").read_text())
+    assert header["source_ids"] == {"3": 0}
+    assert evidence.source_ids == {3: 0}
+    (folder / "evidence.json").write_text(json.dumps(header | {"source_ids": {"a": 1}}))
+    with pytest.raises(FileFormatError, match="source_ids of integers by integer"):
+        open_evidence(folder)
+    (folder / "evidence.json").write_text(json.dumps(header | {"version": 2}))
+    with pytest.raises(FileFormatError, match="version 1 or less, got version 2"):
+        open_evidence(folder)
+    with pytest.raises(InputError, match="kind: expected one of labels, masks, features"):
+        create_evidence(tmp_path / "f", kind="tracked")
+    with pytest.raises(InputError, match="metadata"):
+        create_evidence(tmp_path / "f", kind="labels", metadata={"a": object()})
+    assert not (tmp_path / "f").exists()
+
+
+def test_what_is_no_evidence(tmp_path, shared_data) -> None:
+    with pytest.raises(MissingFileError, match="no such folder of evidence"):
+        open_evidence(tmp_path / "gone")
+    with pytest.raises(InputError, match="expected evidence"):
+        open_evidence(tmp_path)
+    with pytest.raises(MissingFileError):
+        load_text_embeddings(tmp_path)
