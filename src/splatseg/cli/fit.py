@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
@@ -128,7 +128,7 @@ def _beginning(capture: Capture) -> str:
 
 
 @contextmanager
-def _progress_bar() -> Iterator[Callable[[FitProgress], None]]:
+def _progress_bar() -> Generator[Callable[[FitProgress], None]]:
     """A bar on stderr: share done, smoothed loss and PSNR, count, speed, estimate."""
     columns = (
         TextColumn("fit"),

@@ -93,7 +93,7 @@ def _spacing(points: Tensor) -> Tensor:
 
 def _nearest(points: Tensor, others: Tensor, k: int) -> Float[Tensor, "n k"]:
     """Distances of each point to its k nearest of `others`, nearest first."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    distances, _ = cKDTree(others.numpy()).query(points.numpy(), k=list(range(1, k + 1)))
-    return torch.from_numpy(distances).float()
+    distances, _ = KDTree(others.numpy()).query(points.numpy(), k=k)
+    return torch.from_numpy(distances).float().view(len(points), k)

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -146,8 +146,11 @@ def fit(
 
 
 class _Fit:
-    """State of a fit under way. Every attribute is replaced as a whole or updated by rows, so
-    that an interruption at any moment leaves Gaussians that can be used."""
+    """State of a fit under way.
+
+    Every attribute is replaced as a whole or updated by rows, so that an interruption at any
+    moment leaves Gaussians that can be used.
+    """
 
     def __init__(
         self,
@@ -293,7 +296,7 @@ class _Fit:
         return status
 
     @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
+    def _timed(self, stage: str) -> Generator[None]:
         begin = time.perf_counter()
         try:
             yield
@@ -302,7 +305,7 @@ class _Fit:
 
 
 @contextmanager
-def _one_torch_thread() -> Iterator[None]:
+def _one_torch_thread() -> Generator[None]:
     """Torch's own threads wait by spinning, on the cores that the kernels' threads need."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
