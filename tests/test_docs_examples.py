@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 import splatseg
 from splatseg import cli
@@ -61,6 +62,35 @@ def test_examples_run(example: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip(), "an example shows something"
+
+
+def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    room = splatseg.synthetic.room(seed=0)
+    views = splatseg.synthetic.cameras(room, train=6, test=1, width=48, height=36)
+    splatseg.synthetic.write_capture(room, "CAPTURE", views=views, points=200)
+    start = splatseg.read_capture("CAPTURE").points
+    assert start is not None
+    count = len(start.points)
+    gaussians = splatseg.Gaussians(
+        means=start.points,
+        rotations=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        scales=torch.full((count, 3), 0.1),
+        opacities=torch.full((count,), 0.7),
+        sh=torch.zeros(count, 1, 3),
+    )
+    splatseg.write_splats(gaussians, "labelled.ply")
+    text = (PROJECT_ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert blocks
+    names: dict[str, object] = {}
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), names)
+    view, lifted = names["view"], names["lifted"]
+    assert isinstance(view, splatseg.render.Rendered)
+    assert isinstance(lifted, splatseg.render.BackProjected)
+    assert view.alpha.max() > 0
+    assert lifted.weights.sum() == pytest.approx(view.alpha.sum().item(), rel=1e-4)
 
 
 def readme_code() -> str:

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import subprocess
 import sys
 from pathlib import Path
 
@@ -40,6 +41,8 @@ SURFACE = {
     "write_splats",
 }
 
+PACKAGES = {"core", "evaluate", "fit", "io", "lift", "render", "synthetic"}
+
 
 def written_imports() -> dict[str, str]:
     """Name -> module of every ``from M import X as X`` in the package's __init__."""
@@ -54,13 +57,14 @@ def written_imports() -> dict[str, str]:
 
 
 def test_the_surface_is_the_list_above() -> None:
-    assert set(dir(splatseg)) == SURFACE
+    assert set(dir(splatseg)) == SURFACE | PACKAGES
 
 
 def test_type_checkers_and_the_interpreter_see_the_same_names() -> None:
     written = written_imports()
-    assert set(written) == SURFACE
-    lazy = {name: home for name, home in written.items() if home != "splatseg.errors"}
+    assert set(written) == SURFACE | PACKAGES
+    lazy = {name: home for name, home in written.items() if name in splatseg._HOME_OF}
+    assert SURFACE - set(lazy) == {"InputError", "SplatsegError"}
     assert lazy == splatseg._HOME_OF
 
 
@@ -69,6 +73,13 @@ def test_each_name_is_the_object_of_its_home_and_documented(name: str) -> None:
     value = getattr(splatseg, name)
     assert value is getattr(importlib.import_module(written_imports()[name]), name)
     assert (value.__doc__ or "").strip(), f"{name} has no docstring"
+
+
+@pytest.mark.parametrize("name", sorted(PACKAGES))
+def test_each_package_is_there_without_an_import_of_its_own(name: str) -> None:
+    code = f"import splatseg; print(splatseg.{name}.__name__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == f"splatseg.{name}\n"
 
 
 def test_a_missing_name_is_an_attribute_error() -> None:
@@ -82,3 +93,4 @@ def test_no_public_name_hides_a_package() -> None:
         assert f"splatseg.{name}" not in sys.modules, name
     packages = {path.parent.name for path in Path(splatseg.__file__).parent.glob("*/__init__.py")}
     assert not packages & SURFACE
+    assert packages - {"cli"} == PACKAGES

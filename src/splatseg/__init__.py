@@ -5,9 +5,9 @@ With the geometry frozen, a view is a sparse linear map W from Gaussians to pixe
 is built on those two.
 
 The names below are the public surface. They load at first use, so that ``import splatseg`` costs
-no torch. `render` and `fit` share their names with the packages that hold them and are reached
-there, as ``splatseg.render.render`` and ``splatseg.fit.fit``; a name that is now a package and
-now a function, depending on what was imported first, would be a trap.
+no torch; the packages do too. `render` and `fit` share their names with the packages that hold
+them and are reached there, as ``splatseg.render.render`` and ``splatseg.fit.fit``; a name that is
+now a package and now a function, depending on what was imported first, would be a trap.
 
 Conventions (frames, pixel centres, units, ids): docs/conventions.md.
 """
@@ -19,6 +19,13 @@ from splatseg.errors import InputError as InputError
 from splatseg.errors import SplatsegError as SplatsegError
 
 if TYPE_CHECKING:
+    from splatseg import core as core
+    from splatseg import evaluate as evaluate
+    from splatseg import fit as fit
+    from splatseg import io as io
+    from splatseg import lift as lift
+    from splatseg import render as render
+    from splatseg import synthetic as synthetic
     from splatseg.core import Camera as Camera
     from splatseg.core import Capture as Capture
     from splatseg.core import FeatureMap as FeatureMap
@@ -60,11 +67,14 @@ _HOMES = {
     "splatseg.lift": "uplift",
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
 }
+_PACKAGES = frozenset({"core", "evaluate", "fit", "io", "lift", "render", "synthetic"})
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name at its first use."""
+    """Load a public name or a package at its first use."""
+    if name in _PACKAGES:
+        return importlib.import_module(f"splatseg.{name}")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'splatseg' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOME_OF[name]), name)
@@ -74,4 +84,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """The public names, loaded or not."""
-    return sorted({"InputError", "SplatsegError", *_HOME_OF})
+    return sorted({"InputError", "SplatsegError", *_HOME_OF, *_PACKAGES})
