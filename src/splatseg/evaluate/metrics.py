@@ -264,14 +264,13 @@ def _window_means(images: Tensor) -> Tensor:
     rows = images.shape[-2] - SSIM_WINDOW + 1
     columns = images.shape[-1] - SSIM_WINDOW + 1
     weights = window.tolist()
-    down = sum(
-        (weight * images[..., i : i + rows, :] for i, weight in enumerate(weights)),
-        start=images.new_zeros(()),
-    )
-    return sum(
-        (weight * down[..., i : i + columns] for i, weight in enumerate(weights)),
-        start=images.new_zeros(()),
-    )
+    down = weights[0] * images[..., :rows, :]
+    for i, weight in enumerate(weights[1:], start=1):
+        down.add_(images[..., i : i + rows, :], alpha=weight)
+    means = weights[0] * down[..., :columns]
+    for i, weight in enumerate(weights[1:], start=1):
+        means.add_(down[..., i : i + columns], alpha=weight)
+    return means
 
 
 def _id_pair(predicted: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
