@@ -146,6 +146,12 @@ def test_morton_order_by_hand() -> None:
     codes = corners @ np.array([1, 2, 4])
     np.testing.assert_array_equal(morton_order(corners), np.argsort(codes))
     np.testing.assert_array_equal(morton_order(np.zeros((5, 3), np.float32)), np.arange(5))
+    cells = np.random.default_rng(1).integers(0, 1024, (300, 3))
+    cells[:2] = 0, 1023  # the extent, so that a cell is 1
+    bits = [f"{x:010b}{y:010b}{z:010b}" for x, y, z in cells]
+    mixed = [int("".join(b[20 + i] + b[10 + i] + b[i] for i in range(10)), 2) for b in bits]
+    expected = np.argsort(mixed, kind="stable")
+    np.testing.assert_array_equal(morton_order(cells.astype(np.float32)), expected)
     line = np.zeros((2000, 3), np.float32)
     line[:, 1] = np.arange(2000)[::-1]
     np.testing.assert_array_equal(morton_order(line[::2]), np.arange(1000)[::-1])
