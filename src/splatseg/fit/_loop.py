@@ -125,10 +125,10 @@ def fit(
             f"{capture.path}: expected training views with photographs, got none "
             f"among {len(capture.views)} views."
         )
-    run = _Fit(capture, options, renderer, Photographs(views, longest=options.longest))
+    run = FitRun(capture, options, renderer, Photographs(views, longest=options.longest))
     interrupted = False
     try:
-        with _one_torch_thread():
+        with one_torch_thread():
             while not run.finished:
                 status = run.step()
                 if progress is not None:
@@ -145,7 +145,7 @@ def fit(
     )
 
 
-class _Fit:
+class FitRun:
     """State of a fit under way.
 
     Every attribute is replaced as a whole or updated by rows, so that an interruption at any
@@ -305,7 +305,7 @@ class _Fit:
 
 
 @contextmanager
-def _one_torch_thread() -> Generator[None]:
+def one_torch_thread() -> Generator[None]:
     """Torch's own threads wait by spinning, on the cores that the kernels' threads need."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
