@@ -100,8 +100,10 @@ def _describe_folder(path: Path, format: str) -> dict[str, Any]:
     if inside := _captures_inside(path):
         return {"path": str(path), "kind": "folder", "holds": inside}
     files = [p for p in sorted(path.iterdir()) if p.suffix.lower() in _SPLAT_SUFFIXES]
-    if (path / "evidence.json").is_file() or not (bare_photographs(path) or files):
-        return _evidence_facts(path)
+    if (path / "evidence.json").is_file():
+        return _evidence_facts(open_evidence(path))
+    if not files and not bare_photographs(path):
+        return _evidence_or_nothing(path)
     if files:
         formats = Counter(splat_format(file) for file in files)
         return {"path": str(path), "kind": "splat folder", "files": dict(sorted(formats.items()))}
@@ -128,12 +130,24 @@ def _captures_inside(path: Path) -> list[str]:
     return [p.name for p in folders if is_scene(p) or find_formats(p)]
 
 
+def _evidence_or_nothing(path: Path) -> dict[str, Any]:
+    try:
+        evidence = open_evidence(path)
+    except InputError as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise InputError(
+            f"{path}: expected a capture, photographs, a scene, evidence or splats, got none."
+        ) from error
+    return _evidence_facts(evidence)
+
+
 def _as_label_maps(path: Path) -> dict[str, Any] | None:
     """Facts of a folder of single-channel PNGs, None if they are photographs."""
     if {p.suffix.lower() for p in bare_photographs(path)} != {".png"}:
         return None
     try:
-        return _evidence_facts(path)
+        return _evidence_facts(open_evidence(path))
     except FileFormatError:
         # Three channels: photographs that were saved as PNG.
         return None
@@ -187,13 +201,12 @@ def _layer_kind(layer: Layer) -> str:
     return f"selection of {layer.count}"
 
 
-def _evidence_facts(path: Path) -> dict[str, Any]:
-    evidence = open_evidence(path)
+def _evidence_facts(evidence: Evidence) -> dict[str, Any]:
     names = evidence.view_names
     if not names:
-        raise InputError(f"{path}: expected evidence of at least one view, got none.")
+        raise InputError(f"{evidence.folder}: expected evidence of at least one view, got none.")
     return {
-        "path": str(path),
+        "path": str(evidence.folder),
         "kind": "evidence",
         "evidence_kind": evidence.kind,
         "views": len(names),

@@ -371,8 +371,11 @@ def test_features_beyond_float16_are_refused(tmp_path, value) -> None:
 
 
 def test_features_that_are_broken(tmp_path) -> None:
-    (tmp_path / "a.npz").write_bytes(b"PK")
     np.savez(tmp_path / "b.npz", f=np.zeros(3))
+    with pytest.raises(InputError, match="expected evidence"):
+        open_evidence(tmp_path)
+    create_evidence(tmp_path, kind="features")
+    (tmp_path / "a.npz").write_bytes(b"PK")
     evidence = open_evidence(tmp_path)
     with pytest.raises(FileFormatError, match=r"a.npz: expected an npz"):
         evidence.features("a")

@@ -234,6 +234,15 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
     return FeatureEvidence(root=folder, files=files)
 
 
+def holds_features(path: Path) -> bool:
+    """Whether a file is an npz with features in our own layout."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "features.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
 def _own_features(path: Path) -> FeatureMap:
     arrays = read_npz(path, ["features", "stride", "size"])
     features, size = arrays["features"], arrays["size"]

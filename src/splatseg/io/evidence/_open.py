@@ -1,6 +1,6 @@
 """Finds evidence by name and tells its kind."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,7 +10,12 @@ from splatseg.io._class_rows import class_table
 from splatseg.io._json import read_json
 from splatseg.io.captures import read_metadata
 from splatseg.io.evidence._base import HEADER_FILE, Evidence, view_files
-from splatseg.io.evidence._features import open_features
+from splatseg.io.evidence._features import (
+    BASIS_FILE,
+    QUANTISATION_FILE,
+    holds_features,
+    open_features,
+)
 from splatseg.io.evidence._labels import LabelEvidence, check_rule
 from splatseg.io.evidence._masks import MaskEvidence
 from splatseg.io.evidence._segments import (
@@ -57,9 +62,7 @@ def open_evidence(
     rule = check_rule(zero_is_class, void)
     maps, arrays = view_files(folder, ".png"), view_files(folder, ".npz")
     objects = view_files(folder, ".json")
-    kind = header.get("kind") or _kind(
-        folder, maps=bool(maps), arrays=bool(arrays), objects=bool(objects)
-    )
+    kind = header.get("kind") or _kind(folder, maps, objects, arrays)
     if kind in ("labels", "panoptic", "tracked"):
         labels = LabelEvidence(
             root=folder,
@@ -136,14 +139,24 @@ def _header(folder: Path) -> dict[str, Any]:
     return header
 
 
-def _kind(folder: Path, *, maps: bool, arrays: bool, objects: bool) -> str | None:
+def _kind(
+    folder: Path,
+    maps: Mapping[str, Path],
+    objects: Mapping[str, Path],
+    arrays: Mapping[str, Path],
+) -> str | None:
+    """The kind that files without a header show; the first one must hold what its kind has."""
     if maps:
         if (folder / SEGMENTS_FILE).is_file():
             return "panoptic"
         return "tracked" if (folder / TRACKS_FILE).is_file() else "labels"
-    if objects:
+    if objects and "masks" in read_json(next(iter(objects.values()))):
         return "masks"
-    return "features" if arrays else None
+    if (folder / QUANTISATION_FILE).is_file() or (folder / BASIS_FILE).is_file():
+        return "features" if arrays else None
+    if arrays and holds_features(next(iter(arrays.values()))):
+        return "features"
+    return None
 
 
 def _classes(folder: Path, header: dict[str, Any]) -> ClassTable | None:
