@@ -34,6 +34,10 @@ class CommandEntry:
 
 
 COMMANDS: dict[str, CommandEntry] = {
+    "demo": CommandEntry(
+        module="splatseg.cli.demo",
+        summary="the whole pipeline on a generated room, nothing to download",
+    ),
     "info": CommandEntry(
         module="splatseg.cli.info",
         summary="what a capture, a splat file or a scene folder holds",

@@ -74,8 +74,8 @@ def cameras(
     """Views from inside the scene's bounds, train views first.
 
     They stand on a ring half-way to the walls at changing heights. Two of three look across
-    the room, the third at what is near. Test views stand between train views. The same scene
-    gives the same views.
+    the room, the third at what is near, up to the ceiling. Test views stand between train
+    views. The same scene gives the same views.
 
     Returns:
         Views named ``train_0000`` ... and ``test_0000`` ..., without photographs.
@@ -120,7 +120,8 @@ def _stand(
                     0.0,
                 ]
             )
-        target[2] = low[2] + rng.uniform(0.18, 0.42) * 2 * half[2]
+        rise = rng.uniform(0.25, 0.80) if look_out else rng.uniform(0.18, 0.45)
+        target[2] = low[2] + rise * 2 * half[2]
         place = torch.tensor(eye).unsqueeze(0)
         if not any(bool(p.contains(place, _CLEARANCE)) for p in scene.primitives):
             return eye.tolist(), target.tolist()

@@ -1,0 +1,168 @@
+"""The demo, much smaller than it is by default: what it leaves, and what it does not touch."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+from PIL import Image
+
+from splatseg.cli import demo, evaluate, export, fit, main, render, segment
+from splatseg.io.captures import read_capture
+from splatseg.io.scene import load_scene, scene_layer_names
+from splatseg.io.splats import read_splats
+
+SMALL = ["--steps", "40", "--views", "6", "--width", "64", "--max-gaussians", "3000"]
+MODULES = {m.__name__.rsplit(".", 1)[1]: m for m in (fit, segment, render, evaluate, export)}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    assert main(["demo", "-o", str(folder), *SMALL]) == 0
+    return folder
+
+
+@pytest.fixture
+def earlier(finished: Path, tmp_path: Path) -> Path:
+    """A finished demo that a test may spoil."""
+    return shutil.copytree(finished, tmp_path / "out")
+
+
+def test_everything_is_there_and_opens(finished: Path):
+    names = {path.name for path in finished.iterdir()}
+    assert names == {
+        "capture",
+        "scene",
+        "render",
+        "labelled.ply",
+        "labelled.json",
+        "contact_sheet.png",
+        "report.html",
+        "demo.json",
+    }
+    capture = read_capture(finished / "capture")
+    assert (len(capture.train_views), len(capture.test_views)) == (6, 1)
+    scene = load_scene(finished / "scene")
+    assert scene_layer_names(finished / "scene") == ("semantic",)
+    labelled = read_splats(finished / "labelled.ply")
+    assert len(labelled) == len(scene.gaussians)
+    assert set(labelled.extra["class_id"].unique().tolist()) <= set(range(17))
+    with Image.open(finished / "contact_sheet.png") as sheet:
+        assert sheet.width > 1500
+        assert np.array(sheet).std() > 20
+
+
+def test_the_record_holds_the_figures_that_the_report_shows(finished: Path):
+    record = json.loads((finished / "demo.json").read_text())
+    assert record["finished"] is True
+    page = (finished / "report.html").read_text(encoding="utf-8")
+    assert f"{record['psnr_test']:.1f} dB" in page
+    assert f"{record['miou_lifted_test']:.3f}" in page
+    assert f"{record['miou_labels_as_they_came_train']:.3f}" in page
+    assert 0 < record["miou_lifted_test"] < 1
+    assert 3 < record["psnr_test"] < 50
+    assert sum(record["seconds"].values()) == pytest.approx(record["seconds_total"], abs=1.0)
+    assert page.count("data:image/") >= 10
+    assert not re.search(r"(src|href)=\"(?!data:)", page)
+
+
+def test_what_is_printed_is_what_runs(finished: Path):
+    """Each line, typed into a terminal, is parsed to the very command that the demo ran."""
+    command = tyro.cli(demo.Command, args=["-o", str(finished), *SMALL])
+    jobs = demo.main_job(command)
+    assert [name for name, _, _ in jobs] == [
+        "fit",
+        "segment",
+        "render",
+        "evaluate",
+        "evaluate",
+        "export",
+    ]
+    lines = json.loads((finished / "demo.json").read_text())["commands"]
+    for (name, module, job), line in zip(jobs, lines, strict=True):
+        words = line.split()
+        assert words[:2] == ["splatseg", name]
+        assert module is MODULES[name]
+        parsed = tyro.cli(module.Command, args=words[2:], config=(tyro.conf.OmitArgPrefixes,))
+        assert parsed == job
+
+
+def test_a_second_run_replaces_what_the_first_wrote_and_nothing_else(
+    earlier: Path, capsys: pytest.CaptureFixture[str]
+):
+    (earlier / "notes.txt").write_text("mine")
+    (earlier / "capture" / "images" / "stray.jpg").write_text("from before")
+    (earlier / "report.html").write_text("from before")
+    assert main(["demo", "-o", str(earlier), *SMALL, "--seed", "1"]) == 0
+    assert "Replacing the earlier demo" in capsys.readouterr().out
+    assert (earlier / "notes.txt").read_text() == "mine"
+    assert not (earlier / "capture" / "images" / "stray.jpg").exists()
+    assert "room(seed=1)" in (earlier / "report.html").read_text(encoding="utf-8")
+
+
+def test_after_ctrl_c_a_second_run_works(
+    earlier: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def stop(_) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "run", stop)
+        assert main(["demo", "-o", str(earlier), *SMALL]) == 1
+    assert "interrupted" in capsys.readouterr().err
+    assert json.loads((earlier / "demo.json").read_text())["finished"] is False
+    assert not (earlier / "report.html").exists()
+    assert main(["demo", "-o", str(earlier), *SMALL]) == 0
+    assert json.loads((earlier / "demo.json").read_text())["finished"] is True
+
+
+def test_ctrl_c_while_photographing_leaves_only_the_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def stop(*_) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("splatseg.synthetic._capture.render_truth", stop)
+    assert main(["demo", "-o", str(tmp_path / "out"), *SMALL]) == 1
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["demo.json"]
+
+
+def test_somebody_elses_folder_is_refused_and_left_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "precious.jpg").write_text("mine")
+    assert main(["demo", "-o", str(tmp_path), *SMALL]) == 2
+    assert "an earlier demo made" in capsys.readouterr().err
+    (tmp_path / "demo.json").write_text('{"made_by": "somebody"}')
+    assert main(["demo", "-o", str(tmp_path), *SMALL]) == 2
+    assert (tmp_path / "capture" / "precious.jpg").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["-o", "a/b"], "a/b: expected a place"),
+        (["-o", "file"], "file: expected a folder"),
+        (["--views", "2"], "--views: expected at least 4"),
+        (["--width", "8"], "--width: expected at least 32"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_sentence(
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("")
+    assert main(["demo", *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert "Traceback" not in error
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
