@@ -35,7 +35,15 @@ def tiny_scene(seed: int = 1, count: int = 60) -> Gaussians:
     )
 
 
-def ring_camera(angle: float, *, width: int = 56, height: int = 48, **lens: object) -> Camera:
+def ring_camera(
+    angle: float,
+    *,
+    width: int = 56,
+    height: int = 48,
+    fx: float = 60.0,
+    fy: float = 60.0,
+    **lens: object,
+) -> Camera:
     """A camera 3.2 from the middle, looking at it, a bit up and down as it goes round."""
     centre = np.array([np.cos(angle), np.sin(angle), 0.4 * np.sin(3 * angle)])
     centre = 3.2 * centre / np.linalg.norm(centre)
@@ -49,8 +57,8 @@ def ring_camera(angle: float, *, width: int = 56, height: int = 48, **lens: obje
     return Camera(
         width=width,
         height=height,
-        fx=60.0,
-        fy=60.0,
+        fx=fx,
+        fy=fy,
         cx=width / 2 + 0.7,
         cy=height / 2 - 0.4,
         cam_from_world=torch.from_numpy(pose),

@@ -165,6 +165,39 @@ def test_captures_that_cannot_be_fitted_say_why(capture: Capture) -> None:
         fit(capture, options=OPTIONS, backend="gpu")
 
 
+def test_penalties_make_gaussians_faint_and_small(capture: Capture) -> None:
+    options = replace(OPTIONS, steps=60, opacity_penalty=0.0, scale_penalty=0.0, noise=0.0)
+    free = fit(capture, options=options).gaussians
+    faint = fit(capture, options=replace(options, opacity_penalty=3.0)).gaussians
+    small = fit(capture, options=replace(options, scale_penalty=30.0)).gaussians
+    assert float(faint.opacities.mean()) < 0.8 * float(free.opacities.mean())
+    assert float(small.scales.mean()) < 0.9 * float(free.scales.mean())
+
+
+def test_harmonics_wait_for_their_turn(capture: Capture) -> None:
+    options = replace(OPTIONS, steps=30, sh_degree=2, degree_interval=0.5)
+    sh = fit(capture, options=options).gaussians.sh
+    assert bool(sh[:, 1:4].any())
+    assert not bool(sh[:, 4:].any())
+
+
+def test_coarse_photographs_teach_the_same_scene(make_capture) -> None:
+    """Fitted at a quarter of the size all along, the full-size views look right too."""
+    capture = make_capture(width=260, height=256, fx=260.0, fy=260.0)
+    options = replace(OPTIONS, steps=120, noise=0.0)
+    coarse = fit(capture, options=replace(options, quarter_until=1.0))
+    assert _held_out(coarse, capture) > 21
+    fine = fit(capture, options=replace(options, steps=1, quarter_until=0.0, half_until=0.0))
+    quick = fit(capture, options=replace(options, steps=1, quarter_until=1.0))
+    assert not _same(fine.gaussians, quick.gaussians)
+
+
+def test_noise_is_part_of_the_fit(capture: Capture) -> None:
+    options = replace(OPTIONS, steps=10, start_opacity=0.02)
+    quiet = fit(capture, options=replace(options, noise=0.0)).gaussians
+    assert not torch.equal(quiet.means, fit(capture, options=options).gaussians.means)
+
+
 def test_torch_gets_its_threads_back(capture: Capture) -> None:
     before = torch.get_num_threads()
     fit(capture, options=replace(OPTIONS, steps=1))
