@@ -184,9 +184,7 @@ def evaluate_photographs(
     for done, view in enumerate(views, start=1):
         photograph = load_image(view)
         with torch.no_grad():
-            drawn = render(
-                gaussians, view.camera, options=options or RenderOptions(), backend=backend
-            )
+            drawn = render(gaussians, view.camera, options=options, backend=backend)
         picture = (drawn.image.cpu().double().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
         decibels.append(psnr(picture, photograph))
         likeness.append(ssim(picture, photograph))

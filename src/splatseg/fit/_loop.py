@@ -19,7 +19,7 @@ from splatseg.fit._parameters import Parameters, gathered, rows_in_view
 from splatseg.fit._photographs import Example, Photographs
 from splatseg.fit._schedule import count_at, degree_at, rates_at, reduction_at
 from splatseg.fit._update import UpdateSettings, update_rows
-from splatseg.render import Backend, RenderOptions, get_backend
+from splatseg.render import Backend, default_options, get_backend
 
 _RECORD_EVERY = 50  # steps
 
@@ -202,7 +202,8 @@ class FitRun:
         with self._timed("read"):
             example = self._next_example(done)
         parameters = self._state[0]
-        render_options = RenderOptions(sh_degree=degree_at(done, options=self._options))
+        degree = degree_at(done, options=self._options)
+        render_options = default_options(self._backend.name, sh_degree=degree)
         with self._timed("gather"):
             rows = rows_in_view(parameters, example.camera, near=render_options.near)
             gaussians = gathered(parameters, rows)

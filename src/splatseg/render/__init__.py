@@ -12,4 +12,5 @@ from splatseg.render._public import contributors as contributors
 from splatseg.render._public import render as render
 from splatseg.render._public import weights as weights
 from splatseg.render._registry import BackendName as BackendName
+from splatseg.render._registry import default_options as default_options
 from splatseg.render._registry import get_backend as get_backend

@@ -11,7 +11,7 @@ from splatseg.core import Camera, Gaussians
 from splatseg.errors import InputError, RangeError
 from splatseg.render._backend import BackProjected, Contributors, Layout, Rendered, ViewWeights
 from splatseg.render._options import RenderOptions
-from splatseg.render._registry import get_backend
+from splatseg.render._registry import default_options, get_backend
 from splatseg.render.views import (
     back_project_view,
     contributors_view,
@@ -21,7 +21,6 @@ from splatseg.render.views import (
 from splatseg.render.warp import WarpMode
 
 MAX_CHANNELS = 1024
-_DEFAULT = RenderOptions()
 _checked: "WeakKeyDictionary[Gaussians, tuple[int, ...]]" = WeakKeyDictionary()
 
 
@@ -30,7 +29,7 @@ def render(
     camera: Camera,
     signal: Float[Tensor, "n channels"] | None = None,
     *,
-    options: RenderOptions = _DEFAULT,
+    options: RenderOptions | None = None,
     backend: str = "auto",
     warp: WarpMode = "bilinear",
 ) -> Rendered:
@@ -49,7 +48,7 @@ def render(
         gaussians: What to draw.
         camera: Where from; with distortion, the image is in the photograph's distorted pixels.
         signal: One row a Gaussian, 1 to 1024 channels; None is the colour of the harmonics.
-        options: Switches of the blending model.
+        options: Switches of the blending model; None is `default_options` of the backend.
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         warp: How distorted pixels read the straightened image; ``nearest`` for ids.
 
@@ -74,6 +73,7 @@ def render(
     if signal is not None:
         _check_columns("signal", signal, (len(gaussians), None))
     chosen = get_backend(backend, like=gaussians.means)
+    options = options or default_options(backend, like=gaussians.means)
     return render_view(gaussians, camera, signal, options=options, backend=chosen, warp=warp)
 
 
@@ -82,7 +82,7 @@ def back_project(
     camera: Camera,
     image: Float[Tensor, "height width channels"],
     *,
-    options: RenderOptions = _DEFAULT,
+    options: RenderOptions | None = None,
     backend: str = "auto",
     warp: WarpMode = "bilinear",
 ) -> BackProjected:
@@ -94,7 +94,7 @@ def back_project(
         gaussians: What the view shows.
         camera: Whose pixels the image has, distortion included.
         image: 1 to 1024 channels, float.
-        options: Switches of the blending model.
+        options: Switches of the blending model; None is `default_options` of the backend.
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         warp: As for `render`.
 
@@ -108,9 +108,8 @@ def back_project(
     _check_scene(gaussians)
     _check_columns("image", image, (camera.height, camera.width, None))
     chosen = get_backend(backend, like=gaussians.means)
-    return back_project_view(
-        gaussians, camera, image, options=options, backend=chosen, warp=warp
-    )
+    options = options or default_options(backend, like=gaussians.means)
+    return back_project_view(gaussians, camera, image, options=options, backend=chosen, warp=warp)
 
 
 def contributors(
@@ -119,7 +118,7 @@ def contributors(
     pixels: Int[Tensor, "p 2"],
     k: int,
     *,
-    options: RenderOptions = _DEFAULT,
+    options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> Contributors:
     """The k Gaussians that make most of each pixel, the front-most and the median one.
@@ -129,7 +128,7 @@ def contributors(
         camera: Whose pixels are meant; with distortion, the nearest straightened pixel is read.
         pixels: Column and row of each pixel.
         k: How many, at least 1.
-        options: Switches of the blending model.
+        options: Switches of the blending model; None is `default_options` of the backend.
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:
@@ -140,6 +139,7 @@ def contributors(
     if k < 1:
         raise RangeError(f"k: expected at least 1, got {k}.")
     chosen = get_backend(backend, like=gaussians.means)
+    options = options or default_options(backend, like=gaussians.means)
     return contributors_view(gaussians, camera, pixels, k, options=options, backend=chosen)
 
 
@@ -150,7 +150,7 @@ def weights(
     k: int | None = None,
     *,
     layout: Layout = "csr",
-    options: RenderOptions = _DEFAULT,
+    options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> ViewWeights:
     """W of one view as a matrix, for views that are used again and again.
@@ -162,7 +162,7 @@ def weights(
         k: Keep each pixel's k strongest entries; None keeps all.
         layout: ``csr`` has rows of single pixels; ``blocks`` has 4 x 4 pixel blocks and is
             faster, for whole images and all entries of pinhole cameras.
-        options: Switches of the blending model.
+        options: Switches of the blending model; None is `default_options` of the backend.
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:
@@ -180,6 +180,7 @@ def weights(
             "use csr for pixels, k or a distorted camera."
         )
     chosen = get_backend(backend, like=gaussians.means)
+    options = options or default_options(backend, like=gaussians.means)
     return weights_view(
         gaussians, camera, pixels, k, layout=layout, options=options, backend=chosen
     )

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.render._backend import Backend
+from splatseg.render._options import RenderOptions
 
 BackendName = Literal["auto", "cpu", "cuda", "reference"]
 BACKENDS: tuple[BackendName, ...] = ("auto", "cpu", "cuda", "reference")
@@ -30,6 +31,26 @@ def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
     if name == "auto":
         name = "cuda" if like is not None and like.device.type == "cuda" else "cpu"
     return _backend(cast(BackendName, name))
+
+
+def default_options(
+    name: str = "auto", *, like: Tensor | None = None, sh_degree: int | None = None
+) -> RenderOptions:
+    """What a backend draws with when nobody says otherwise.
+
+    The defaults of `RenderOptions`, but for the opacity cap of ``cuda``, which gsplat has built
+    in (``docs/decisions/0006-cuda-opacity-cap.md``).
+
+    Args:
+        name: As for `get_backend`.
+        like: As for `get_backend`.
+        sh_degree: Highest degree of the harmonics in use; None is all there are.
+    """
+    if get_backend(name, like=like).name == "cuda":
+        from splatseg.render.cuda import GSPLAT_ALPHA_MAX
+
+        return RenderOptions(alpha_max=GSPLAT_ALPHA_MAX, sh_degree=sh_degree)
+    return RenderOptions(sh_degree=sh_degree)
 
 
 @cache
