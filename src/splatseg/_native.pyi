@@ -1,11 +1,13 @@
-"""CPU kernels, see native/module.cpp. Arrays are C-contiguous, on the CPU, and not checked here
-beyond what memory safety asks for."""
+"""CPU kernels, see native/module.cpp.
+
+Arrays are C-contiguous, on the CPU, and not checked here beyond what memory safety asks for.
+"""
 
 from collections.abc import Sequence
 
-from torch import Tensor
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 ALPHA_MIN: float
 TRANSMITTANCE_MIN: float
