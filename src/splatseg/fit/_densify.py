@@ -41,9 +41,9 @@ def shared_shape(
     n = copies.clamp(1, _MOST_COPIES)
     opacity = opacities.double()
     shared = 1 - (1 - opacity) ** (1 / n)
-    k = torch.arange(_MOST_COPIES, dtype=torch.float64)
+    k = torch.arange(_MOST_COPIES, dtype=torch.float64, device=opacity.device)
     powers = shared[:, None] ** (k + 1) * (-1) ** k / (k + 1).sqrt()
-    denominator = (powers * _binomial_sums()[n - 1]).sum(dim=1)
+    denominator = (powers * _binomial_sums().to(opacity.device)[n - 1]).sum(dim=1)
     return shared.to(opacities), (opacity / denominator).to(opacities)
 
 
