@@ -210,3 +210,19 @@ def test_broken_class_tables_are_named(nerfstudio, rows, message) -> None:
     (folder / "metadata.json").write_text(json.dumps({"classes": rows}))
     with pytest.raises(FileFormatError, match=rf"metadata.json: .*{message}"):
         read_capture(folder)
+
+
+@pytest.mark.parametrize(
+    ("names", "values", "expected"),
+    [
+        (("red", "green", "blue"), (0.0, 0.502, 2.0), [0, 128, 255]),
+        # Harmonics: 0.5 + 0.28209479 * 1.2 = 0.8385137.
+        (("f_dc_0", "f_dc_1", "f_dc_2"), (0.0, 1.2, -9.0), [128, 214, 0]),
+    ],
+)
+def test_float_colours_are_rounded(tmp_path, names, values, expected) -> None:
+    columns = "".join(f"property float {name}\n" for name in ("x", "y", "z", *names))
+    row = " ".join(map(str, (1, 2, 3, *values)))
+    path = tmp_path / "p.ply"
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}end_header\n{row}\n")
+    assert read_ply_points(path).colours.tolist() == [expected]
