@@ -10,6 +10,7 @@ import torch
 
 from splatseg import _native
 from splatseg.core import Capture, Gaussians, PointCloud, View
+from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitProgress, FitResult, fit
@@ -196,6 +197,32 @@ def test_noise_is_part_of_the_fit(capture: Capture) -> None:
     options = replace(OPTIONS, steps=10, start_opacity=0.02)
     quiet = fit(capture, options=replace(options, noise=0.0)).gaussians
     assert not torch.equal(quiet.means, fit(capture, options=options).gaussians.means)
+
+
+def test_the_first_step_is_the_rate(capture: Capture) -> None:
+    """Adam's first step is rate * sign(g): mean colours move by the colour's rate or not at all."""
+    assert capture.points is not None
+    colours = (torch.full((60, 3), 128 / 255) - 0.5) / SH_C0
+    grey = PointCloud(
+        points=capture.points.points, colours=torch.full((60, 3), 128, dtype=torch.uint8)
+    )
+    options = replace(OPTIONS, steps=1, colour_rate=0.25)
+    found = fit(replace(capture, points=grey), options=options).gaussians
+    moved = (found.sh[:, 0] - colours).abs()
+    assert float(moved.max()) > 0
+    still = moved < 1e-6
+    torch.testing.assert_close(moved[~still], torch.full_like(moved[~still], 0.25))
+
+
+def test_both_parts_of_the_loss_are_used(capture: Capture) -> None:
+    options = replace(OPTIONS, steps=5)
+    found = [fit(capture, options=replace(options, dssim_weight=w)).gaussians for w in (0, 0.2)]
+    assert not _same(*found)
+
+
+def test_the_number_stays_once_growth_is_over(capture: Capture) -> None:
+    result = fit(capture, options=replace(OPTIONS, steps=100, densify_until=0.0))
+    assert all(record.count == 60 for record in result.history)
 
 
 def test_torch_gets_its_threads_back(capture: Capture) -> None:
