@@ -14,6 +14,7 @@ from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitProgress, FitResult, fit
+from splatseg.render import render
 
 OPTIONS = FitOptions(
     minutes=None,
@@ -22,6 +23,7 @@ OPTIONS = FitOptions(
     sh_degree=1,
     densify_from=40,
     densify_every=20,
+    background="black",  # the tiny scene floats in black, and is photographed so
 )
 
 
@@ -229,3 +231,19 @@ def test_torch_gets_its_threads_back(capture: Capture) -> None:
     before = torch.get_num_threads()
     fit(capture, options=replace(OPTIONS, steps=1))
     assert torch.get_num_threads() == before
+
+
+def test_a_random_background_leaves_no_holes_in_black(capture: Capture) -> None:
+    """Over black a black pixel needs nothing before it; over any colour it must be covered."""
+    covered = {}
+    for background in ("black", "random"):
+        options = replace(OPTIONS, background=background, opacity_penalty=0.0, scale_penalty=0.0)
+        result = fit(capture, options=options)
+        camera = capture.test_views[0].camera
+        covered[background] = float(render(result.gaussians, camera).alpha.mean())
+    assert covered["random"] > covered["black"] + 0.1
+
+
+def test_the_background_is_named() -> None:
+    with pytest.raises(InputError, match="background: expected one of random, black, got 'blue'"):
+        replace(OPTIONS, background="blue")

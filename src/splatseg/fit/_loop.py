@@ -210,8 +210,12 @@ class FitRun:
         with self._timed("render"):
             rendered = self._backend.render(gaussians, example.camera, None, options=render_options)
         with self._timed("loss"):
+            picture = rendered.image
+            if self._options.background == "random":
+                colour = torch.rand(3, generator=self._generator).to(picture)
+                picture = picture + (1 - rendered.alpha).unsqueeze(-1) * colour
             loss = l1_dssim(
-                rendered.image,
+                picture,
                 example.photograph,
                 mask=example.mask,
                 dssim_weight=self._options.dssim_weight,
@@ -222,7 +226,7 @@ class FitRun:
                 "may help."
             )
         with self._timed("backward"):
-            torch.autograd.backward([rendered.image], [loss.gradient])
+            torch.autograd.backward([picture], [loss.gradient])
         with self._timed("update"), torch.no_grad():
             self._update(gaussians, rows, done)
         self.steps += 1

@@ -74,6 +74,10 @@ class FitOptions:
     """Random walk of faint Gaussians, times the position rate and their covariance
     (Kheradmand et al. 2024, eq. 8). 0 is none."""
 
+    background: Literal["random", "black"] = "random"
+    """What is behind the Gaussians while fitting. A random colour each step forbids holes: over
+    black, dark surfaces need no Gaussians, and then have no depth and no label."""
+
     start_opacity: float = 0.1
     """Opacity of a start point, in (0, 1)."""
 
@@ -120,6 +124,7 @@ class FitOptions:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise RangeError(f"{name}: expected at least {least}, got {value}.")
+        check_choice("background", self.background, ("random", "black"))
         if self.sh_degree not in (0, 1, 2, 3):
             raise RangeError(f"sh_degree: expected 0 to 3, got {self.sh_degree}.")
         for name in (
