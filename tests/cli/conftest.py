@@ -1,4 +1,4 @@
-"""A tiny capture and a scene of it, small enough for the readable backend."""
+"""A tiny capture and a scene of it, small enough for every test to have its own."""
 
 import json
 import shutil
@@ -83,7 +83,7 @@ def small_template(tmp_path_factory) -> Small:
         name = f"{'test' if i == 2 else 'train'}_{i}"
         photograph = capture / "images" / f"{name}.png"
         camera = _camera(x)
-        save_png(render(gaussians, camera, backend="reference").image, photograph)
+        save_png(render(gaussians, camera, backend="cpu").image, photograph)
         truth = _true_map(x)
         Image.fromarray(truth).save(capture / "semantic" / f"{name}.png")
         if i != 2:

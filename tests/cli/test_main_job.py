@@ -15,7 +15,7 @@ from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.io.splats import read_splats
 from splatseg.lift import label_map
 
-SEGMENT = ("--method", "uplift", "--evidence", "labels_semantic", "--backend", "reference")
+SEGMENT = ("--method", "uplift", "--evidence", "labels_semantic", "--backend", "cpu")
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_segment_views(small, splatseg) -> None:
     assert views("all") == ["train_0", "train_1", "test_2", "train_3"]
     status, out, _ = splatseg(
         "evaluate", small.scene, "--layer", "labels_semantic", "--truth",
-        small.capture / "semantic", "--backend", "reference",
+        small.capture / "semantic", "--backend", "cpu",
     )  # fmt: skip
     assert status == 0
     assert "made from 1 of these views" in out
@@ -89,7 +89,7 @@ def test_a_source_whose_zero_is_a_class(small, splatseg, tmp_path) -> None:
             ids = pixels(path)
             lower = np.where(ids == 0, 255, ids - 1).astype(np.uint8)
             Image.fromarray(lower).save(small.capture / other / path.name)
-    rule = ("--zero-is-class", "--void", 255, "--backend", "reference")
+    rule = ("--zero-is-class", "--void", 255, "--backend", "cpu")
     status, _, err = splatseg(
         "segment", small.scene, "--method", "uplift", "--evidence", "labels_zero", *rule
     )
@@ -102,7 +102,7 @@ def test_a_source_whose_zero_is_a_class(small, splatseg, tmp_path) -> None:
     assert status == 0, err
     assert set(json.loads(text)["per_class"]) == {"1", "2", "7"}
     assert json.loads(text)["mIoU"] > 0.7
-    arguments = ("--what", "labels_zero", "-o", tmp_path / "out", "--backend", "reference")
+    arguments = ("--what", "labels_zero", "-o", tmp_path / "out", "--backend", "cpu")
     assert splatseg("render", small.scene, *arguments)[0] == 0
     legend = json.loads((tmp_path / "out" / "labels_zero" / "legend.json").read_text())
     assert {k: v["source_id"] for k, v in legend["ids"].items()} == {"1": 0, "2": 1, "7": 6}
@@ -121,7 +121,7 @@ def test_render_writes_what_was_asked(segmented, splatseg, tmp_path) -> None:
     out = tmp_path / "out"
     status, text, err = splatseg(
         "render", segmented.scene, "--split", "all", "--what", "rgb,depth,alpha,semantic",
-        "--coloured", "-o", out, "--backend", "reference",
+        "--coloured", "-o", out, "--backend", "cpu",
     )  # fmt: skip
     assert status == 0, err
     assert "4 views" in text
@@ -136,7 +136,7 @@ def test_render_writes_what_was_asked(segmented, splatseg, tmp_path) -> None:
     scene = load_scene(segmented.scene)
     layer = load_scene_layer(segmented.scene, "semantic")
     shown = label_map(
-        scene.gaussians, scene.view("test_2").camera, layer, backend="reference"
+        scene.gaussians, scene.view("test_2").camera, layer, backend="cpu"
     ).ids.numpy()
     drawn = pixels(out / "semantic" / "test_2.png")
     assert drawn.dtype in (np.uint16, np.int32)
@@ -163,7 +163,7 @@ def test_render_writes_what_was_asked(segmented, splatseg, tmp_path) -> None:
 def test_render_draws_a_selection_as_a_mask(small, splatseg, tmp_path) -> None:
     scene = load_scene(small.scene)
     save_scene_layer(small.scene, "blue", Selection(mask=scene.gaussians.means[:, 0] > 0))
-    arguments = ("--what", "blue", "-o", tmp_path / "out", "--backend", "reference")
+    arguments = ("--what", "blue", "-o", tmp_path / "out", "--backend", "cpu")
     assert splatseg("render", small.scene, *arguments)[0] == 0
     mask = pixels(tmp_path / "out" / "blue" / "test_2.png")
     assert mask.dtype == np.uint8
@@ -177,7 +177,7 @@ def test_render_replaces_its_own_folders_and_no_others(segmented, splatseg, tmp_
     def draw(split: str, output: Path, what: str = "semantic") -> tuple[int, str, str]:
         return splatseg(
             "render", segmented.scene, "--split", split, "--what", what, "-o", output,
-            "--backend", "reference",
+            "--backend", "cpu",
         )  # fmt: skip
 
     out = tmp_path / "out"
@@ -210,18 +210,36 @@ def test_an_interrupted_render_leaves_nothing(small, splatseg, tmp_path, monkeyp
     out = tmp_path / "out"
     status, _, err = splatseg(
         "render", small.scene, "--split", "all", "--what", "rgb,depth", "-o", out,
-        "--backend", "reference",
+        "--backend", "cpu",
     )  # fmt: skip
     assert status == 1
     assert "Traceback" not in err
     assert not out.exists()
 
 
+def test_an_interrupted_segment_leaves_the_layer_as_it_was(
+    segmented, splatseg, monkeypatch
+) -> None:
+    import importlib
+
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    before = {p: p.read_bytes() for p in segmented.scene.rglob("*") if p.is_file()}
+    # The package's function of the same name hides the module from an import statement.
+    monkeypatch.setattr(
+        importlib.import_module("splatseg.lift.uplift"), "back_project", interrupted
+    )
+    assert splatseg("segment", segmented.scene, *SEGMENT, "--layer", "semantic")[0] == 1
+    after = {p: p.read_bytes() for p in segmented.scene.rglob("*") if p.is_file()}
+    assert after == before
+
+
 def test_evaluate_agrees_with_the_scorer(segmented, splatseg, shared_data, tmp_path) -> None:
     truth = segmented.capture / "semantic"
     status, text, err = splatseg(
         "evaluate", segmented.scene, "--layer", "semantic", "--truth", truth, "--split", "test",
-        "--json", "--backend", "reference",
+        "--json", "--backend", "cpu",
     )  # fmt: skip
     assert status == 0, err
     ours = json.loads(text)
@@ -229,7 +247,7 @@ def test_evaluate_agrees_with_the_scorer(segmented, splatseg, shared_data, tmp_p
     assert (
         splatseg(
             "render", segmented.scene, "--what", "rgb,semantic", "-o", out,
-            "--backend", "reference",
+            "--backend", "cpu",
         )[0]
         == 0
     )  # fmt: skip
@@ -253,12 +271,12 @@ def test_evaluate_agrees_with_the_scorer(segmented, splatseg, shared_data, tmp_p
 def test_evaluate_prints_a_table(segmented, splatseg) -> None:
     status, text, _ = splatseg(
         "evaluate", segmented.scene, "--layer", "semantic", "--truth",
-        segmented.capture / "semantic", "--backend", "reference",
+        segmented.capture / "semantic", "--backend", "cpu",
     )  # fmt: skip
     assert status == 0
     for word in ("mIoU", "fwIoU", "mIoU_per_image", "PSNR", "right wall"):
         assert word in text
-    status, text, _ = splatseg("evaluate", segmented.scene, "--json", "--backend", "reference")
+    status, text, _ = splatseg("evaluate", segmented.scene, "--json", "--backend", "cpu")
     assert status == 0
     assert "mIoU" not in json.loads(text)
     assert json.loads(text)["PSNR"] > 50
@@ -266,7 +284,7 @@ def test_evaluate_prints_a_table(segmented, splatseg) -> None:
 
 def test_evaluate_binary(segmented, splatseg) -> None:
     truth = segmented.capture / "semantic"
-    arguments = ("--truth", truth, "--metric", "binary", "--json", "--backend", "reference")
+    arguments = ("--truth", truth, "--metric", "binary", "--json", "--backend", "cpu")
     status, text, err = splatseg(
         "evaluate", segmented.scene, "--layer", "semantic", "--id", 7, *arguments
     )
@@ -283,7 +301,7 @@ def test_evaluate_binary(segmented, splatseg) -> None:
     assert status == 0, err
     assert json.loads(text)["IoU_pooled"] == pytest.approx(one["IoU_pooled"], abs=0.1)
     status, _, err = splatseg(
-        "evaluate", segmented.scene, "--layer", "right", "--truth", truth, "--backend", "reference"
+        "evaluate", segmented.scene, "--layer", "right", "--truth", truth, "--backend", "cpu"
     )
     assert status == 2
     assert "--metric binary" in err
@@ -369,11 +387,11 @@ def test_mistakes_get_one_sentence(segmented, splatseg, tmp_path) -> None:
 
 def test_only_what_needs_photographs_fails_without_them(segmented, splatseg, tmp_path) -> None:
     (segmented.capture / "images").rename(tmp_path / "moved")
-    arguments = ("--what", "rgb", "-o", tmp_path / "out", "--backend", "reference")
+    arguments = ("--what", "rgb", "-o", tmp_path / "out", "--backend", "cpu")
     assert splatseg("render", segmented.scene, *arguments)[0] == 0
     evaluate = (
         "evaluate", segmented.scene, "--layer", "semantic",
-        "--truth", segmented.capture / "semantic", "--json", "--backend", "reference",
+        "--truth", segmented.capture / "semantic", "--json", "--backend", "cpu",
     )  # fmt: skip
     status, text, _ = splatseg(*evaluate)
     assert status == 0

@@ -140,10 +140,11 @@ class Warp:
         Pixels without a counterpart give (0, 0) and False.
         """
         _, columns = self.target_shape
-        rows = pixels[:, 1].long() * columns + pixels[:, 0].long()
+        on_cpu = pixels.cpu().long()
+        rows = on_cpu[:, 1] * columns + on_cpu[:, 0]
         found = self.valid.reshape(-1)[rows]
         if not bool(found.any()):
-            return torch.zeros_like(pixels, dtype=torch.int64), found
+            return torch.zeros_like(pixels, dtype=torch.int64), found.to(pixels.device)
         # Every valid row has the same number of entries.
         starts = self._forward.offsets[rows].long()
         taps = int((self._forward.offsets[1:] - self._forward.offsets[:-1]).max())
@@ -153,7 +154,8 @@ class Warp:
         source = self._forward.columns[entries].long().gather(1, best).squeeze(1)
         source = torch.where(found, source, 0)
         width = self.source_shape[1]
-        return torch.stack((source % width, source // width), dim=-1), found
+        at = torch.stack((source % width, source // width), dim=-1)
+        return at.to(pixels.device), found.to(pixels.device)
 
 
 def straightened(camera: Camera) -> Camera:
