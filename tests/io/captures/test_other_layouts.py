@@ -215,7 +215,7 @@ def test_broken_class_tables_are_named(nerfstudio, rows, message) -> None:
 @pytest.mark.parametrize(
     ("names", "values", "expected"),
     [
-        (("red", "green", "blue"), (0.0, 0.502, 2.0), [0, 128, 255]),
+        (("red", "green", "blue"), (0.0, 0.5, 2.0), [0, 128, 255]),
         # Harmonics: 0.5 + 0.28209479 * 1.2 = 0.8385137.
         (("f_dc_0", "f_dc_1", "f_dc_2"), (0.0, 1.2, -9.0), [128, 214, 0]),
     ],

@@ -154,6 +154,11 @@ def test_text_features_expand_to_unit_vectors_near_their_words(shared_data) -> N
     full = evidence.expand(features.features)
     assert full.shape == (48, 64, 512)
     np.testing.assert_allclose(full.norm(dim=-1), 1, atol=1e-5)
+    with np.load(evidence.folder / f"{name}.npz") as archive:
+        code = archive["f"][9, 13].astype(np.float64)
+    with np.load(evidence.folder / "basis.npz") as basis:
+        exact = (code * basis["scale"] + basis["offset"]) @ basis["basis"] + basis["mean"]
+    np.testing.assert_allclose(full[9, 13], exact / np.linalg.norm(exact), atol=1e-6)
     labels = open_evidence(shared_data / "office/labels_semantic").label_map(name).ids[4::8, 4::8]
     classes = [i for i, kind in enumerate(words.kinds) if kind == "class"]
     scores = full @ words.vectors[classes].T

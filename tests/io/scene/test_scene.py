@@ -183,6 +183,18 @@ def test_data_must_have_the_photographs(scene_of_capture, tmp_path) -> None:
         load_scene(saved.root, data=tmp_path / "gone")
 
 
+def test_photographs_outside_the_capture_keep_their_place(scene_of_capture, tmp_path) -> None:
+    saved, data = scene_of_capture
+    (tmp_path / "far").mkdir()
+    outside = shutil.copy(data / "images/sub/b.png", tmp_path / "far/c.png")
+    views = (saved.views[0], replace(saved.views[1], image=Path(outside)))
+    save_scene(replace(saved, views=views), saved.root)
+    shutil.move(data, tmp_path / "moved")
+    scene = load_scene(saved.root, data=tmp_path / "moved")
+    assert scene.view("a").image == tmp_path / "moved/images/a.png"
+    assert scene.view("b").image == tmp_path / "far/c.png"
+
+
 def test_another_folder_at_the_old_place_is_not_the_capture(scene_of_capture, tmp_path) -> None:
     """Seen from the scene there is a folder of that name, but without its photographs."""
     saved, data = scene_of_capture
