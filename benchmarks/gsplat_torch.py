@@ -46,7 +46,7 @@ def garden() -> dict[str, np.ndarray]:
     return stored
 
 
-def add_up(  # noqa: PLR0917 -- gsplat's own order of arguments
+def add_up(
     centres: Tensor, conics: Tensor, opacities: Tensor, colours: Tensor, ids: Tensor,
     pixels: Tensor, width: int, height: int,
 ) -> Tensor:  # fmt: skip

@@ -20,7 +20,7 @@ def test_cuda_draws_with_the_cap_that_gsplat_has(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(registry, "_backend", lambda _: Cuda())
     assert default_options("cuda") == RenderOptions(alpha_max=GSPLAT_ALPHA_MAX)
-    assert GSPLAT_ALPHA_MAX == pytest.approx(0.999)
+    assert pytest.approx(0.999) == GSPLAT_ALPHA_MAX
 
 
 def test_auto_follows_the_data() -> None:
