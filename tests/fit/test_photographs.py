@@ -72,6 +72,21 @@ def test_a_lens_is_straightened_with_its_corners(tmp_path: Path, rng) -> None:
     assert not bool(example.photograph[~example.mask].any())
 
 
+def test_straightened_pixels_that_mix_masked_ones_do_not_count(tmp_path: Path) -> None:
+    """White behind the mask never bleeds into the grey that is learnt from."""
+    pixels = torch.full((30, 40, 3), 120, dtype=torch.uint8)
+    pixels[:, 25:] = 255
+    mask = torch.full((30, 40), 255, dtype=torch.uint8)
+    mask[:, 25:] = 0
+    view = _view(tmp_path, pixels, model="opencv", distortion=(-0.2,))
+    save_png(mask, tmp_path / "mask.png")
+    masked = replace(view, mask=tmp_path / "mask.png")
+    example = Photographs([masked], longest=1600).example(0)
+    assert example.mask is not None
+    assert 0.3 < float(example.mask.float().mean()) < 0.7
+    assert bool((example.photograph[example.mask] == 120 / 255).all())
+
+
 def test_large_photographs_are_reduced_and_it_is_said(tmp_path: Path, rng) -> None:
     view = _view(tmp_path, _pixels(rng, 60, 80))
     assert reduction_note([view], longest=80) is None
