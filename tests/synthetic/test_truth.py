@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import ClassInfo, ClassTable
+from splatseg.core import Camera, ClassInfo, ClassTable
 from splatseg.errors import InputError
 from splatseg.synthetic import (
     ObjectInfo,
     Primitive,
     SyntheticScene,
     Texture,
+    Truth,
     cast,
     look_at,
     render_truth,
@@ -98,30 +99,42 @@ def test_ids_follow_the_lens():
     assert not torch.equal(truth.instance, render_truth(scene, plain).instance)
 
 
-def test_the_sun_casts_a_hard_shadow_and_no_speckles():
-    """A board under a window in the roof shades the ground below it, evenly."""
+@pytest.fixture
+def sunny() -> SyntheticScene:
+    """A board on nothing, one metre over the ground, under a window as wide as the roof."""
     ground = Primitive(shape="plane", centre=(0, 0, 0), half_size=(3, 3, 1), instance=2)
     board = Primitive(shape="box", centre=(0, 0, 1), half_size=(0.5, 0.5, 0.05), instance=1)
-    window = Primitive(
-        shape="plane",
-        centre=(0, 0, 2.9),
-        half_size=(2.9, 2.9, 1),
-        instance=1,
-        texture=Texture(kind="sky", glow=0.05),
+    pane = Texture(kind="sky", glow=0.05)
+    roof = Primitive(
+        shape="plane", centre=(0, 0, 2.9), half_size=(2.9, 2.9, 1), instance=1, texture=pane
     )
-    scene = scene_of(ground, board, window, sun=(0.0, 0.0, 1.0))
-    # Rays straight down would meet the board, so look from the side, under it.
+    return scene_of(ground, board, roof, sun=(0.0, 0.0, 1.0))
+
+
+def around(truth: Truth, camera: Camera, place: tuple[float, float, float]) -> torch.Tensor:
+    """The 7 x 7 pixels about a place in the world, as floats."""
+    spot, _ = camera.project(torch.tensor(place, dtype=torch.float64))
+    u, v = (int(x) for x in spot)
+    return truth.image[v - 3 : v + 4, u - 3 : u + 4].float()
+
+
+def test_the_sun_casts_a_hard_shadow_where_it_does_not_shine(sunny):
     camera = look_at((0, -2.9, 0.6), (0, 0, 0), width=120, height=90)
-    truth = render_truth(scene, camera)
-    spots, _ = camera.project(torch.tensor([[0.0, 0.3, 0.0], [1.2, 0.3, 0.0]]).double())
-    dark, lit = (truth.image[int(v), int(u)].float().mean() for u, v in spots)
-    assert lit > dark + 40
-    dusk = render_truth(replace(scene, sun=None), camera)
-    u, v = (int(x) for x in spots[0])
-    torch.testing.assert_close(truth.image[v, u], dusk.image[v, u], atol=1, rtol=0)
-    # Speckles would be neighbours that differ by the sun's whole strength.
-    patch = truth.image[int(spots[1, 1]) - 3 : int(spots[1, 1]) + 4, int(spots[1, 0]) - 3 :][:, :7]
-    assert float(patch.float().std(dim=(0, 1)).max()) < 6
+    day, night = (render_truth(s, camera) for s in (sunny, replace(sunny, sun=None)))
+    shaded, lit = (0.0, 0.0, 0.0), (1.2, 0.3, 0.0)
+    assert around(day, camera, lit).mean() > around(day, camera, shaded).mean() + 40
+    # The pixel itself: its neighbours may reach the shadow's rim.
+    assert torch.equal(around(day, camera, shaded)[3, 3], around(night, camera, shaded)[3, 3])
+
+
+@pytest.mark.parametrize("place", [(1.2, 0.3, 0.0), (0.0, 0.0, 1.05)], ids=["ground", "board"])
+def test_a_sunny_surface_does_not_shade_itself(sunny, place):
+    """Neither as a whole nor in speckles, which would differ by the sun's whole strength."""
+    camera = look_at((0.3, -2.5, 2.0), (0.3, 0, 0.7), width=120, height=90)
+    day, night = (render_truth(s, camera) for s in (sunny, replace(sunny, sun=None)))
+    patch = around(day, camera, place)
+    assert float(patch.std(dim=(0, 1)).max()) < 6
+    assert patch.mean() > around(night, camera, place).mean() + 40
 
 
 def test_pictures_are_lit_and_textured(small_truths):
