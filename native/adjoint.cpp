@@ -29,7 +29,7 @@ void adjoint(const Frame& frame, int index, void* scratch, const float* image, i
     std::memset(lane_sums, 0, sizeof(float) * 16 * static_cast<size_t>(count));
     for (int b = 0; b < 16; ++b) {
       if (!tile.count[b]) continue;
-      int taken = collect_weights(frame, tile, b, weights, picked);
+      int taken = collect_weights(frame, tile, b, weights, picked, false);
       for (int k = 0; k < taken; ++k) {
         float* sum = lane_sums[picked[k]];
         store(sum, load(sum) + load(weights + k * 16));
@@ -44,6 +44,11 @@ void adjoint(const Frame& frame, int index, void* scratch, const float* image, i
       if (rows) {
         chunk[k * stride + channels] = total;
         continue;
+      }
+      // Rows of the scene are far apart in memory: ask for the next ones early.
+      if (k + 6 < count) {
+        const float* ahead = sums + sums_stride * tile.splats[k + 6].id;
+        for (int c = 0; c < channels; c += 16) __builtin_prefetch(ahead + c, 1);
       }
       if (!(total > 0)) continue;
       const int64_t id = tile.splats[k].id;

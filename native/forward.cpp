@@ -62,19 +62,22 @@ int64_t forward_colour(const Frame& frame, int index, void* scratch, float* imag
       Vec sum = load(depths.sum[b]), middle = load(depths.median[b]);
       const uint8_t* list = tile.list[b];
       int kept = 0, i = 0;
+      bool open = true;  // a pixel may still have its median to come
       while (i < listed) {
         const uint8_t at = list[i++];
         const Splat& s = tile.splats[at];
         auto step = blender.look(s);
-        const Mask crossing = both(step.used, both(gt(blender.transmittance, half),
-                                                   le(step.next, half)));
+        if (open) {
+          const Mask above = gt(blender.transmittance, half);
+          open = bits(above) != 0;
+          middle = select(both(step.used, both(above, le(step.next, half))), set(s.depth), middle);
+        }
         const bool changed = record && counts(blender, step);
         const Vec weight = blender.take(step), z = set(s.depth);
         red = fma(weight, set(s.red), red);
         green = fma(weight, set(s.green), green);
         blue = fma(weight, set(s.blue), blue);
         sum = fma(weight, z, sum);
-        middle = select(crossing, z, middle);
         if (record) {
           recorder.out[kept] = at;
           kept += changed;
@@ -132,17 +135,21 @@ int64_t forward_features(const Frame& frame, int index, void* scratch, const flo
     for (int b = 0; b < 16; ++b) {
       if (!tile.count[b]) continue;
       Vec before = abs(load(tile.transmittance[b]));
-      int taken = collect_weights(frame, tile, b, weights, picked);
+      int taken = collect_weights(frame, tile, b, weights, picked, record != nullptr);
       steps += taken;
       if (!taken) continue;
       Vec sum = load(depths.sum[b]), middle = load(depths.median[b]), left = before;
+      bool open = true;
       for (int k = 0; k < taken; ++k) {
         const Splat& s = tile.splats[picked[k]];
         rows[k] = signal + stride * s.id;
-        const Vec weight = load(weights + k * 16), z = set(s.depth), next = left - weight;
+        const Vec weight = load(weights + k * 16), z = set(s.depth);
         sum = fma(weight, z, sum);
-        middle = select(both(gt(left, set(kMedian)), le(next, set(kMedian))), z, middle);
-        left = next;
+        if (!open) continue;
+        const Mask above = gt(left, set(kMedian));
+        left = left - weight;
+        middle = select(both(above, le(left, set(kMedian))), z, middle);
+        open = bits(above) != 0;
       }
       store(depths.sum[b], sum);
       store(depths.median[b], middle);

@@ -14,13 +14,13 @@ namespace splatseg::SPLATSEG_ISA {
 
 #if defined(__AVX512F__)
 inline constexpr int kWidth = 16, kForwardPixels = 8, kForwardVectors = 2, kAdjointRows = 6,
-                     kAdjointVectors = 4;
+                     kAdjointVectors = 4, kNarrowRows = 10;
 #elif defined(__AVX2__)
 inline constexpr int kWidth = 8, kForwardPixels = 4, kForwardVectors = 2, kAdjointRows = 6,
-                     kAdjointVectors = 2;
+                     kAdjointVectors = 2, kNarrowRows = 6;
 #else
 inline constexpr int kWidth = 4, kForwardPixels = 4, kForwardVectors = 2, kAdjointRows = 4,
-                     kAdjointVectors = 2;
+                     kAdjointVectors = 2, kNarrowRows = 6;
 #endif
 
 #if defined(__AVX512F__)
@@ -110,6 +110,9 @@ inline void adjoint_rows(float* const* rows, const float* weights, const float* 
   int channel = 0;
   for (; channel + kSpan <= channels; channel += kSpan)
     adjoint_tile<Rows, kAdjointVectors>(rows, weights, block, stride, channel);
+  if constexpr (kAdjointVectors > 2)
+    for (; channel + 2 * kWidth <= channels; channel += 2 * kWidth)
+      adjoint_tile<Rows, 2>(rows, weights, block, stride, channel);
   for (; channel < channels; channel += kWidth)
     adjoint_tile<Rows, 1>(rows, weights, block, stride, channel);
 }
@@ -118,6 +121,9 @@ inline void adjoint_rows(float* const* rows, const float* weights, const float* 
 inline void block_adjoint(float* const* rows, const float* weights, int count, const float* block,
                           int stride, int channels) {
   int k = 0;
+  if (channels <= 2 * kWidth)  // narrow: more rows keep the multipliers busy
+    for (; k + kNarrowRows <= count; k += kNarrowRows)
+      adjoint_rows<kNarrowRows>(rows + k, weights + k * 16, block, stride, channels);
   for (; k + kAdjointRows <= count; k += kAdjointRows)
     adjoint_rows<kAdjointRows>(rows + k, weights + k * 16, block, stride, channels);
   for (; k + 2 <= count; k += 2)

@@ -113,17 +113,17 @@ inline bool counts(const Blender& before, const Blender::Step& step) {
   return bits(step.used) | (bits(step.finished) & ~bits(negative(before.transmittance)));
 }
 
-// Weights of a block's listed Gaussians, 16 floats each; idle ones are left out. One that only
-// finishes pixels is kept with weights of zero: the backward pass must see it too.
+// Weights of a block's listed Gaussians, 16 floats each; idle ones are left out. For a record,
+// one that only finishes pixels is kept with weights of zero: the backward pass must see it too.
 // Returns how many; `picked` has their positions in the chunk.
 inline int collect_weights(const Frame& frame, Tile& tile, int block, float* weights,
-                           uint8_t* picked) {
+                           uint8_t* picked, bool record) {
   Blender blender(frame, tile, block);
   const uint8_t* list = tile.list[block];
   int taken = 0;
   for (int i = 0, n = tile.count[block]; i < n; ++i) {
     auto step = blender.look(tile.splats[list[i]]);
-    const bool kept = counts(blender, step);
+    const bool kept = record ? counts(blender, step) : bits(step.used) != 0;
     store(weights + taken * 16, blender.take(step));
     picked[taken] = list[i];
     taken += kept;
