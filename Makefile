@@ -16,7 +16,7 @@ NATIVE_SOURCES := CMakeLists.txt $(wildcard native/*)
 .PHONY: help install demo test clean
 
 help:
-	@echo 'make demo     run the whole pipeline on a generated room and write a report'
+	@echo 'make demo     the main job on a generated room; the report is splatseg-demo/report.html'
 	@echo 'make test     lint, types, import rules and every test'
 	@echo 'make install  only make .venv and install everything into it'
 	@echo 'make clean    remove .venv and everything that was built'
@@ -52,4 +52,4 @@ $(STAMPS)/splatseg: $(STAMPS)/build pyproject.toml $(NATIVE_SOURCES)
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build build-sanitize demo
+	rm -rf $(VENV) build build-sanitize splatseg-demo
