@@ -139,6 +139,47 @@ void parallel_for_thread(int64_t count, int64_t grain,
   });
 }
 
+void in_order(int64_t count, const std::function<void(int, int64_t, Buffer<float>&)>& make,
+              const std::function<void(int64_t, const Buffer<float>&)>& add) {
+  constexpr int kAhead = 2;  // items a thread may be ahead: few, so that their rows stay in cache
+  const int used = static_cast<int>(std::min<int64_t>(threads(), count));
+  const int64_t room = static_cast<int64_t>(std::max(used, 1)) * kAhead;
+  // Item i lives in slot i % room, which is free once item i - room was added.
+  std::vector<Buffer<float>> slots(static_cast<size_t>(room));
+  std::vector<char> ready(static_cast<size_t>(room), 0);
+  std::mutex mutex;
+  std::condition_variable moved;
+  int64_t next = 0, turn = 0;
+  bool adding = false;
+  run_on_threads(used, [&](int thread) {
+    std::unique_lock<std::mutex> lock(mutex);
+    while (next < count) {
+      const int64_t item = next;
+      if (item >= turn + room) {  // the item whose turn it is is being made or added by another
+        moved.wait(lock, [&] { return next >= count || next < turn + room; });
+        continue;
+      }
+      ++next;
+      lock.unlock();
+      make(thread, item, slots[static_cast<size_t>(item % room)]);
+      lock.lock();
+      ready[static_cast<size_t>(item % room)] = 1;
+      if (adding) continue;
+      adding = true;
+      while (turn < count && ready[static_cast<size_t>(turn % room)]) {
+        const size_t slot = static_cast<size_t>(turn % room);
+        lock.unlock();
+        add(turn, slots[slot]);
+        lock.lock();
+        ready[slot] = 0;
+        ++turn;
+        moved.notify_all();
+      }
+      adding = false;
+    }
+  });
+}
+
 void parallel_for(int64_t count, int64_t grain, const std::function<void(int64_t, int64_t)>& work) {
   parallel_for_thread(count, grain, [&](int, int64_t begin, int64_t end) { work(begin, end); });
 }

@@ -7,6 +7,8 @@
 #include <cstdint>
 #include <functional>
 
+#include "buffer.h"
+
 namespace splatseg {
 
 // Number of threads kernels use; at least 1.
@@ -23,5 +25,11 @@ void parallel_for(int64_t count, int64_t grain, const std::function<void(int64_t
 // The same with the number of the thread, for scratch memory.
 void parallel_for_thread(int64_t count, int64_t grain,
                          const std::function<void(int, int64_t, int64_t)>& work);
+
+// For items 0, 1, ... count - 1: make(thread, item, buffer) in any order on all threads, and
+// add(item, buffer) in the order of items, one at a time, as soon as their turn comes. Who is done
+// with an item whose turn has not come goes on with the next one.
+void in_order(int64_t count, const std::function<void(int, int64_t, Buffer<float>&)>& make,
+              const std::function<void(int64_t, const Buffer<float>&)>& add);
 
 }  // namespace splatseg

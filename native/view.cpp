@@ -8,7 +8,7 @@
 namespace splatseg {
 namespace {
 
-constexpr int64_t kBatchBytes = 1 << 20;  // partial sums of a batch of tiles stay in cache
+constexpr int64_t kBatchBytes = 1 << 22;  // partial sums of a batch of tiles, for each thread
 constexpr int64_t kTileScratchFloats = kTileScratchBytes / 4;
 constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
 
@@ -252,20 +252,34 @@ void View::adjoint(const float* image, int channels, int image_channels, float* 
                      nullptr, 0, sums, stride, weights);
     return;
   }
-  // A row is its sums and its weight, padded so that the next row stays aligned.
+  // A row is its sums and its weight, padded so that the next row stays aligned. Rows are wide:
+  // they are added while they are still in cache, tile after tile, rather than batch by batch.
   const int64_t row_floats = channels + 16;
-  in_batches(
-      row_floats, image_floats,
-      [&](int tile, float* scratch, float* rows) {
-        kernel.adjoint(frame_, tile, scratch, image, channels, image_channels,
-                       scratch + kTileScratchFloats, nullptr, rows, row_floats, nullptr, 0, nullptr);
+  if (scratch_.size() < static_cast<size_t>(threads())) scratch_.resize(static_cast<size_t>(threads()));
+  in_order(
+      tiles(),
+      [&](int thread, int64_t tile, Buffer<float>& rows) {
+        float* scratch = scratch_[static_cast<size_t>(thread)].resize(kTileScratchFloats + image_floats);
+        const int64_t listed = frame_.tile_begin[tile + 1] - frame_.tile_begin[tile];
+        kernel.adjoint(frame_, static_cast<int>(tile), scratch, image, channels, image_channels,
+                       scratch + kTileScratchFloats, nullptr, rows.resize(listed * row_floats),
+                       row_floats, nullptr, 0, nullptr);
       },
-      [&](uint32_t splat, const float* row) {
-        if (!(row[channels] > 0)) return;
-        const int64_t id = splats_[splat].id;
-        weights[id] += row[channels];
-        float* to = sums + stride * id;
-        for (int c = 0; c < image_channels; ++c) to[c] += row[c];
+      [&](int64_t tile, const Buffer<float>& rows) {
+        const uint32_t* list = frame_.tile_list + frame_.tile_begin[tile];
+        const int64_t listed = frame_.tile_begin[tile + 1] - frame_.tile_begin[tile];
+        for (int64_t k = 0; k < listed; ++k) {
+          const float* row = rows.data() + k * row_floats;
+          if (k + 6 < listed) {
+            const float* ahead = sums + stride * splats_[list[k + 6]].id;
+            for (int c = 0; c < channels; c += 16) __builtin_prefetch(ahead + c, 1);
+          }
+          if (!(row[channels] > 0)) continue;
+          const int64_t id = splats_[list[k]].id;
+          weights[id] += row[channels];
+          float* to = sums + stride * id;
+          for (int c = 0; c < image_channels; ++c) to[c] += row[c];
+        }
       });
 }
 
