@@ -74,6 +74,7 @@ def test_unknown_kernel_and_colour_space_fall_back(shared_data: Path) -> None:
     assert "the kernel customShape is not known" in messages
     assert "the colour space custom_space_display is not known" in messages
     assert g.opacities.tolist() == [0.5]
+    assert g.scales.tolist() == [[1, 1, 1]]  # logs: linear zeros could not be seen
     torch.testing.assert_close(g.colours, torch.tensor([[0.282095, 0.56419, 0.846285]]))
 
 
@@ -172,6 +173,19 @@ def test_linear_scales(golden: Path, tmp_path: Path) -> None:
     (tmp_path / "scales.bin").write_bytes(bytes([255, 51, 0, 9] * 3))
     g = read_splats(written(tmp_path, document))
     torch.testing.assert_close(g.scales, torch.tensor([1, 0.2, 0.0]).expand(3, 3))
+
+
+def test_signed_scales_are_logs(golden: Path, tmp_path: Path) -> None:
+    """Also where none is negative: only drafts had signed types."""
+    document = draft(golden)
+    index = attributes(document)["KHR_gaussian_splatting:SCALE"]
+    document["accessors"][index]["componentType"] = 5120
+    document["buffers"].append({"uri": "scales.bin", "byteLength": 9})
+    document["bufferViews"].append({"buffer": 1, "byteLength": 9})
+    document["accessors"][index]["bufferView"] = len(document["bufferViews"]) - 1
+    (tmp_path / "scales.bin").write_bytes(bytes([1, 2, 0] * 3))
+    logs = read_splats(written(tmp_path, document)).scales.log()
+    torch.testing.assert_close(logs, torch.tensor([1.0, 2.0, 0.0]).expand(3, 3))
 
 
 def test_buffers_in_files_beside(golden: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from splatseg.io.splats import read_splats, splat_format
 
@@ -115,6 +116,23 @@ def test_unbundled_sog_is_the_same(golden: Path, tmp_path: Path, version: str) -
         unbundled = read_splats(path)
         assert torch.equal(unbundled.means, bundled.means)
         assert torch.equal(unbundled.sh, bundled.sh)
+
+
+def test_sog_labels_have_two_bytes(golden: Path, tmp_path: Path) -> None:
+    """Entry 256 * 1 + 2 of a palette of five rows, all other entries being another number."""
+    with zipfile.ZipFile(golden / "three.v2.sog") as archive:
+        archive.extractall(tmp_path)
+    book = json.loads((tmp_path / "meta.json").read_bytes())
+    book["shN"] |= {"count": 320, "codebook": [0.5, -0.25]}
+    (tmp_path / "meta.json").write_text(json.dumps(book))
+    centroids = Image.new("RGB", (192, 5), (0, 0, 0))
+    centroids.paste((1, 1, 1), (6, 4, 9, 5))  # row 4, columns 3 * 2 to 3 * 2 + 2
+    centroids.save(tmp_path / "shN_centroids.webp", lossless=True)
+    labels = Image.new("RGB", (3, 1), (2, 1, 0))
+    labels.putpixel((0, 0), (2, 0, 0))
+    labels.save(tmp_path / "shN_labels.webp", lossless=True)
+    rest = read_splats(tmp_path).sh[:, 1:]
+    assert rest.unique(dim=1).squeeze().tolist() == [[0.5] * 3, [-0.25] * 3, [-0.25] * 3]
 
 
 @pytest.mark.parametrize("name", [name for name in BOUNDS if name != "three.splat"])

@@ -219,6 +219,20 @@ def test_splat(make_splats: Make, tmp_path: Path) -> None:
     assert_within(back.opacities, g.opacities, 1 / 510)
 
 
+def test_splat_bytes_by_hand(make_splats: Make, tmp_path: Path) -> None:
+    """The bytes that viewers of the layout decode: 128 is 0, 255 is what is left of 1."""
+    g = make_splats(2, degree=0).replace(
+        rotations=torch.tensor([[1.0, 0, 0, 0], [0.5, -0.5, 0.5, -0.5]]),
+        opacities=torch.tensor([0.0, 1.0]),
+        sh=torch.tensor([[[0.0, 0.5, -0.5]], [[-0.5, 0.5, 0.25]]]) / 0.28209479,
+    )
+    write_splats(g, tmp_path / "a.splat")
+    data = (tmp_path / "a.splat").read_bytes()
+    assert list(data[24:32]) == [128, 255, 0, 0, 255, 128, 128, 128]
+    assert list(data[56:64]) == [0, 255, 191, 255, 192, 64, 192, 64]
+    assert read_splats(tmp_path / "a.splat").rotations.tolist() == g.rotations.tolist()
+
+
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.compressed.ply"])
 def test_no_gaussians_at_all(make_splats: Make, tmp_path: Path, name: str) -> None:
     back = round_trip(make_splats(0, degree=2), tmp_path, name)
