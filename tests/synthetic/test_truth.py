@@ -137,6 +137,17 @@ def test_a_sunny_surface_does_not_shade_itself(sunny, place):
     assert patch.mean() > around(night, camera, place).mean() + 40
 
 
+def test_a_side_that_is_turned_to_the_sun_is_brighter(sunny):
+    """A positive tilt turns a board's upper side towards -y, where this sun stands."""
+    _, board, roof = sunny.primitives
+    camera = look_at((0, -2.5, 2.4), (0, 0, 1), width=120, height=90)
+    bright = {}
+    for tilt in (-0.5, 0.5):
+        scene = scene_of(replace(board, tilt=tilt), roof, sun=(0.0, -1.0, 1.0))
+        bright[tilt] = float(around(render_truth(scene, camera), camera, (0.0, 0.0, 1.05)).mean())
+    assert bright[0.5] > bright[-0.5] + 20
+
+
 def test_pictures_are_lit_and_textured(small_truths):
     """No view is black, burnt out or flat."""
     for name, truth in small_truths.items():
