@@ -18,12 +18,23 @@ from splatseg.errors import BackendError, InputError, MissingPackageError, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """Settings that several commands share."""
+
+    near: float = 0.01
+    """Nearest depth."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Count:
     """Counts."""
 
-    # A comment that must not become help.
     steps: int = 3
     """How many steps to take."""
+
+    # A comment that must not become help.
+    seed: int = 0
+    options: Options = Options()
 
 
 @pytest.fixture
@@ -119,8 +130,8 @@ def test_words_become_the_dataclass(install_command: Callable[..., None]) -> Non
     seen: list[Count] = []
     install_command(seen.append)
     assert cli.main(["count"]) == 0
-    assert cli.main(["count", "--steps", "7"]) == 0
-    assert seen == [Count(steps=3), Count(steps=7)]
+    assert cli.main(["count", "--steps", "7", "--near", "0.5"]) == 0
+    assert seen == [Count(steps=3), Count(steps=7, options=Options(near=0.5))]
 
 
 def test_help_comes_from_the_string_under_a_field(
@@ -200,11 +211,12 @@ def test_python_dash_m(module: str) -> None:
     assert done.stderr.startswith("error: unknown command 'nothing'")
 
 
-def test_a_reader_that_goes_away_is_no_traceback() -> None:
-    """`splatseg --help | true`: the pipe breaks while we write."""
+@pytest.mark.parametrize("length", [10, 10_000_000])
+def test_a_reader_that_goes_away_is_no_traceback(length: int) -> None:
+    """`splatseg --help | true`: the pipe breaks while we write, or when we flush at the end."""
     script = (
         "import sys, splatseg.cli as cli\n"
-        "cli.overview = lambda: 'x' * 10_000_000\n"
+        f"cli.overview = lambda: 'x' * {length}\n"
         "sys.exit(cli.main(['--help']))\n"
     )
     with subprocess.Popen(
