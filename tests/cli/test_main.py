@@ -220,11 +220,17 @@ def test_a_reader_that_goes_away_is_no_traceback(length: int) -> None:
         f"cli.overview = lambda: 'x' * {length}\n"
         "sys.exit(cli.main(['--help']))\n"
     )
+    # Buffered, as a user's is: what is still in the buffer is written at exit.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     read_end, write_end = os.pipe()
     os.close(read_end)
     try:
         done = subprocess.run(
-            [sys.executable, "-c", script], stdout=write_end, stderr=subprocess.PIPE, check=False
+            [sys.executable, "-c", script],
+            stdout=write_end,
+            stderr=subprocess.PIPE,
+            env=environment,
+            check=False,
         )
     finally:
         os.close(write_end)
