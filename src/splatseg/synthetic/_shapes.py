@@ -240,8 +240,7 @@ def _cylinder(origins: Tensor, directions: Tensor, *, taper: float, near: float)
     for sign in (-1.0, 1.0):
         t = _divide(-half_b + sign * sqrt, a)
         z = o[:, 2] + t * d[:, 2]
-        # A cone continues beyond its apex, where its radius is negative.
-        good = real & (z.abs() <= 1) & (t > near) & (_cylinder_radius(z, taper) >= 0)
+        good = real & (z.abs() <= 1) & (t > near)
         nearest = torch.where(good & (t < nearest), t, nearest)
     for z, radius in ((-1.0, 1.0), (1.0, taper)):
         t = _divide(z - o[:, 2], d[:, 2])
