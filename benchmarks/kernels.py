@@ -130,7 +130,7 @@ def measure(name: str, rs: Any, scenes: Any, repeats: int) -> dict[str, Any]:
         lambda: prototype.backward(scene["colors"], scene["opac"], out, left, v_image, v_left),
         repeats,
     )
-    everything = frozenset(("means", "rotations", "scales", "opacities", "sh", "screen"))
+    everything = frozenset(("means", "rotations", "scales", "opacities", "sh"))
     harmonics = torch.zeros(n, 16, 3)
     with_sh = CpuView(*cloud, camera=camera, options=options, sh=harmonics)
     with_sh.render(record=True)
