@@ -19,7 +19,7 @@ from pathlib import Path
 
 from splatseg.core import Capture
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, _loop
+from splatseg.fit import FitOptions, _loop, _run
 from splatseg.fit._photographs import Photographs
 from splatseg.io.captures import read_capture
 from splatseg.render import get_backend
@@ -65,12 +65,12 @@ def main() -> None:
     options = FitOptions(**({"minutes": arguments.minutes} | values))
     clock = Clock(arguments.clock)
     # The fit reads these two clocks and no other.
-    _loop.time = type("Clocks", (), {"monotonic": clock.now, "perf_counter": clock.now})
+    _run.time = type("Clocks", (), {"monotonic": clock.now, "perf_counter": clock.now})
     print(f"{platform.processor() or platform.machine()}, {threads()} threads, {isa()}, {options}")
 
     photographs = Photographs(capture.train_views, longest=options.longest)
     marks = sorted({*arguments.marks, arguments.minutes})
-    run = _loop.FitRun(capture, options, get_backend("cpu"), photographs)
+    run = _run.FitRun(capture, options, get_backend("cpu"), photographs)
     before, steps, last = dict(run.stages), 0, (0, 0.0)
     with _loop.one_torch_thread():
         for mark in marks:

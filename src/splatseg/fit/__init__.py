@@ -3,10 +3,10 @@
 `fit` is the whole of it; `FitOptions` are its switches.
 """
 
-from splatseg.fit._loop import FitProgress as FitProgress
-from splatseg.fit._loop import FitRecord as FitRecord
-from splatseg.fit._loop import FitResult as FitResult
 from splatseg.fit._loop import fit as fit
 from splatseg.fit._options import FitOptions as FitOptions
 from splatseg.fit._options import Preset as Preset
 from splatseg.fit._photographs import reduction_note as reduction_note
+from splatseg.fit._records import FitProgress as FitProgress
+from splatseg.fit._records import FitRecord as FitRecord
+from splatseg.fit._records import FitResult as FitResult

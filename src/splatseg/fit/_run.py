@@ -1,0 +1,203 @@
+"""One fit under way: its state, and one step of it."""
+
+import math
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from splatseg.core import Capture, Gaussians
+from splatseg.errors import SplatsegError
+from splatseg.fit._densify import relocated
+from splatseg.fit._initialise import initial_parameters, scene_extent
+from splatseg.fit._loss import Loss, l1_dssim
+from splatseg.fit._options import FitOptions
+from splatseg.fit._parameters import Parameters, gathered, rows_in_view
+from splatseg.fit._photographs import Example, Photographs
+from splatseg.fit._records import FitProgress, FitRecord
+from splatseg.fit._schedule import count_at, degree_at, rates_at, reduction_at
+from splatseg.fit._update import UpdateSettings, update_rows
+from splatseg.render import Backend, default_options
+
+_RECORD_EVERY = 50  # steps
+
+
+class FitRun:
+    """State of a fit under way.
+
+    Every attribute is replaced as a whole or updated by rows, so that an interruption at any
+    moment leaves Gaussians that can be used.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        options: FitOptions,
+        backend: Backend,
+        photographs: Photographs,
+    ) -> None:
+        self._begin = time.monotonic()
+        self._options = options
+        self._backend = backend
+        self._photographs = photographs
+        self._generator = torch.Generator().manual_seed(options.seed)
+        start = initial_parameters(capture, options=options, generator=self._generator)
+        self._extent = scene_extent(capture.train_views, start.means)
+        self._start_count = len(start)
+        device = torch.device("cuda" if backend.name == "cuda" else "cpu")
+        start = Parameters(**{name: tensor.to(device) for name, tensor in start.tensors()})
+        self._device = device
+        self._state = (start, start.zeros_like(), start.zeros_like())
+        self._order: list[int] = []
+        self._batch: list[FitProgress] = []
+        self.steps = 0
+        self.history: list[FitRecord] = []
+        self.stages: dict[str, float] = {}
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._begin
+
+    @property
+    def progress(self) -> float:
+        if self._options.steps is not None:
+            return min(1.0, self.steps / self._options.steps)
+        minutes = self._options.minutes or math.inf
+        return min(1.0, self.seconds / (60 * minutes))
+
+    @property
+    def finished(self) -> bool:
+        return self.progress >= 1.0
+
+    def gaussians(self) -> Gaussians:
+        parameters = self._state[0]
+        alive = parameters.logits.sigmoid().squeeze(1) > self._options.dead_opacity
+        return parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
+
+    def step(self) -> FitProgress:
+        done = self.progress
+        with self._timed("read"):
+            example = self._next_example(done)
+        parameters = self._state[0]
+        degree = degree_at(done, options=self._options)
+        render_options = default_options(self._backend.name, sh_degree=degree)
+        with self._timed("gather"):
+            rows = rows_in_view(parameters, example.camera, near=render_options.near)
+            gaussians = gathered(parameters, rows)
+        with self._timed("render"):
+            rendered = self._backend.render(gaussians, example.camera, None, options=render_options)
+        with self._timed("loss"):
+            picture = rendered.image
+            if self._options.background == "random":
+                colour = torch.rand(3, generator=self._generator).to(picture)
+                picture = picture + (1 - rendered.alpha).unsqueeze(-1) * colour
+            loss = l1_dssim(
+                picture,
+                example.photograph,
+                mask=example.mask,
+                dssim_weight=self._options.dssim_weight,
+            )
+        if not math.isfinite(loss.value):
+            raise SplatsegError(
+                f"fit: expected a finite loss, got {loss.value} at step {self.steps}; lower rates "
+                "may help."
+            )
+        with self._timed("backward"):
+            torch.autograd.backward([picture], [loss.gradient])
+        with self._timed("update"), torch.no_grad():
+            self._update(gaussians, rows, done)
+        self.steps += 1
+        with self._timed("densify"), torch.no_grad():
+            self._densify(done)
+        return self._report(loss)
+
+    def _next_example(self, progress: float) -> Example:
+        """The next view: all of them in random order, then all again in another."""
+        if not self._order:
+            self._order = torch.randperm(len(self._photographs), generator=self._generator).tolist()
+        index = self._order.pop()
+        camera = self._photographs.camera(index)
+        reduction = reduction_at(
+            progress, options=self._options, width=camera.width, height=camera.height
+        )
+        example = self._photographs.example(index, reduction=reduction)
+        mask = example.mask
+        return Example(
+            camera=example.camera,
+            photograph=example.photograph.to(self._device),
+            mask=None if mask is None else mask.to(self._device),
+        )
+
+    def _update(self, gaussians: Gaussians, rows: Tensor, progress: float) -> None:
+        count = len(self._state[0])
+        rates = rates_at(progress, options=self._options, extent=self._extent)
+        settings = UpdateSettings(
+            rates=rates,
+            step=self.steps + 1,
+            opacity_penalty=self._options.opacity_penalty / count,
+            scale_penalty=self._options.scale_penalty / (3 * count),
+            noise=self._options.noise * rates.means,
+            seed=self._options.seed,
+        )
+        update_rows(*self._state, _gradients(gaussians), rows=rows, settings=settings)
+
+    def _densify(self, progress: float) -> None:
+        options = self._options
+        due = self.steps >= options.densify_from and self.steps % options.densify_every == 0
+        if not due or progress >= options.densify_until:
+            return
+        count = count_at(progress, options=options, start=self._start_count)
+        self._state = relocated(
+            *self._state, count=count, options=options, generator=self._generator
+        )
+
+    def _report(self, loss: Loss) -> FitProgress:
+        seconds, done = self.seconds, self.progress
+        psnr = -10 * math.log10(max(loss.squared_error, 1e-10))
+        status = FitProgress(
+            step=self.steps,
+            progress=done,
+            seconds=seconds,
+            seconds_left=seconds * (1 - done) / max(done, 1e-6),
+            loss=loss.value,
+            psnr=psnr,
+            count=len(self._state[0]),
+        )
+        self._batch.append(status)
+        if self.steps % _RECORD_EVERY == 0:
+            size = len(self._batch)
+            record = FitRecord(
+                step=self.steps,
+                seconds=seconds,
+                loss=sum(one.loss for one in self._batch) / size,
+                psnr=sum(one.psnr for one in self._batch) / size,
+                count=status.count,
+            )
+            self.history.append(record)
+            self._batch = []
+        return status
+
+    @contextmanager
+    def _timed(self, stage: str) -> Generator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin
+
+
+def _gradients(leaves: Gaussians) -> Gaussians:
+    """Slopes of the loss where the values were; 0 where nothing depends on them."""
+
+    def slope(leaf: Tensor) -> Tensor:
+        return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+    return Gaussians(
+        means=slope(leaves.means),
+        rotations=slope(leaves.rotations),
+        scales=slope(leaves.scales),
+        opacities=slope(leaves.opacities),
+        sh=slope(leaves.sh),
+    )
