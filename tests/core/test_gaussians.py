@@ -119,3 +119,16 @@ def test_a_moved_scene_looks_the_same_from_a_moved_camera() -> None:
         )
 
     torch.testing.assert_close(colours(moved, moved_camera), colours(g, camera))
+
+
+def test_what_they_are_meant_for_goes_with_them() -> None:
+    """Every way to make Gaussians of Gaussians keeps `antialiased`; two kinds do not mix."""
+    plain = make(4)
+    g = plain.replace(antialiased=True)
+    assert not plain.antialiased
+    turned = Similarity(rotation=torch.eye(3), translation=torch.ones(3), scale=2.0)
+    made = [g[1:], g[torch.tensor([2])], g.to(dtype=torch.float64), g.transformed(turned)]
+    made += [Gaussians.concatenate([g, g]), g.replace(extra={})]
+    assert all(one.antialiased for one in made)
+    with pytest.raises(InputError, match=r"parts\[1\]: expected antialiased to be True"):
+        Gaussians.concatenate([g, plain])

@@ -53,6 +53,11 @@ class Gaussians:
     extra: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
     """Further columns by name, (n,) or (n, c): they survive slicing, joining and saving."""
 
+    antialiased: bool = False
+    """Whether the opacities are meant for antialiased rendering (`RenderOptions.antialiased`):
+    Gaussians that were fitted one way look wrong the other way. It goes with them into files
+    that can say it."""
+
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
         check_shape("means", self.means, (None, 3))
@@ -82,6 +87,7 @@ class Gaussians:
             opacities=self.opacities[index],
             sh=self.sh[index],
             extra={name: column[index] for name, column in self.extra.items()},
+            antialiased=self.antialiased,
         )
 
     @property
@@ -115,10 +121,10 @@ class Gaussians:
         core = {
             f.name: getattr(self, f.name).to(device=device, dtype=dtype)
             for f in fields(self)
-            if f.name != "extra"
+            if f.name not in ("extra", "antialiased")
         }
         extra = {name: column.to(device=device) for name, column in self.extra.items()}
-        return Gaussians(**core, extra=extra)
+        return Gaussians(**core, extra=extra, antialiased=self.antialiased)
 
     def check_values(self) -> None:
         """Raise `RangeError` unless every row can be rendered.
@@ -154,7 +160,9 @@ class Gaussians:
 
     @staticmethod
     def concatenate(parts: "Sequence[Gaussians]") -> "Gaussians":
-        """Join scenes row by row. All must have the same harmonics and extra columns.
+        """Join scenes row by row.
+
+        All must have the same harmonics and extra columns, and be meant for the same rendering.
 
         Raises:
             InputError: If there is nothing to join or the columns differ.
@@ -173,6 +181,11 @@ class Gaussians:
                     f"parts[{i}]: expected harmonics of degree {parts[0].sh_degree}, "
                     f"got {part.sh_degree}."
                 )
+            if part.antialiased != parts[0].antialiased:
+                raise InputError(
+                    f"parts[{i}]: expected antialiased to be {parts[0].antialiased} as in the "
+                    f"first, got {part.antialiased}."
+                )
         return Gaussians(
             means=torch.cat([p.means for p in parts]),
             rotations=torch.cat([p.rotations for p in parts]),
@@ -180,4 +193,5 @@ class Gaussians:
             opacities=torch.cat([p.opacities for p in parts]),
             sh=torch.cat([p.sh for p in parts]),
             extra={name: torch.cat([p.extra[name] for p in parts]) for name in parts[0].extra},
+            antialiased=parts[0].antialiased,
         )

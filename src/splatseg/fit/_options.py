@@ -78,6 +78,10 @@ class FitOptions:
     """What is behind the Gaussians while fitting. A random colour each step forbids holes: over
     black, dark surfaces need no Gaussians, and then have no depth and no label."""
 
+    antialiased: bool = False
+    """Scale opacities so that the low-pass of 0.3 square pixels adds no light (Mip-Splatting,
+    eq. 9), while fitting and ever after: the result says so (`Gaussians.antialiased`)."""
+
     start_opacity: float = 0.1
     """Opacity of a start point, in (0, 1)."""
 

@@ -74,7 +74,8 @@ class FitRun:
     def gaussians(self) -> Gaussians:
         parameters = self._state[0]
         alive = parameters.logits.sigmoid().squeeze(1) > self._options.dead_opacity
-        return parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
+        found = parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
+        return found.replace(antialiased=self._options.antialiased)
 
     def step(self) -> FitProgress:
         done = self.progress
@@ -82,7 +83,9 @@ class FitRun:
             example = self._next_example(done)
         parameters = self._state[0]
         degree = degree_at(done, options=self._options)
-        render_options = default_options(self._backend.name, sh_degree=degree)
+        render_options = default_options(
+            self._backend.name, sh_degree=degree, antialiased=self._options.antialiased
+        )
         with self._timed("gather"):
             rows = rows_in_view(parameters, example.camera, near=render_options.near)
             gaussians = gathered(parameters, rows)

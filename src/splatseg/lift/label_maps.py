@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, Labels
 from splatseg.errors import RangeError, ShapeError
-from splatseg.render import RenderOptions, back_project, default_options, render
+from splatseg.render import RenderOptions, back_project, options_for, render
 from splatseg.render.warp import straightened, warp_into_photograph
 
 
@@ -60,7 +60,8 @@ def label_map(
         )
     if channels < 1:
         raise RangeError(f"channels: expected at least 1, got {channels}.")
-    draw = _Drawing(gaussians, straightened(camera), options or default_options(backend), backend)
+    options = options or options_for(gaussians, backend)
+    draw = _Drawing(gaussians, straightened(camera), options, backend)
     ids = _ids_to_draw(draw, labels, channels)
     best = torch.full(draw.size, -1.0)
     winner = torch.full(draw.size, UNLABELLED, dtype=torch.int32)

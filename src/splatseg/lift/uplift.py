@@ -29,7 +29,7 @@ from torch import Tensor
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, Camera, ClassTable, Gaussians, LabelMap, Labels, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.render import RenderOptions, back_project, default_options
+from splatseg.render import RenderOptions, back_project, options_for
 
 _CHANNELS = 32
 """Ids that one back-projection carries; bounds the memory of one-hot images."""
@@ -131,7 +131,7 @@ def uplift(
         raise InputError(f"evidence: expected a labelled pixel in {len(views)} views, found none.")
     width = min(len(ids), max(1, options.memory // (4 * max(len(gaussians), 1))))
     parts = [ids[start : start + width] for start in range(0, len(ids), width)]
-    engine = _Engine(gaussians, render_options or default_options(backend), backend)
+    engine = _Engine(gaussians, render_options or options_for(gaussians, backend), backend)
     ranking = _Ranking(len(gaussians), options.candidates)
     cast_by_id = torch.tensor(
         [sum(ballot.votes.get(i, 0.0) for ballot in ballots) for i in ids], dtype=torch.float64

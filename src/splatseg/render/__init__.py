@@ -14,3 +14,4 @@ from splatseg.render._public import weights as weights
 from splatseg.render._registry import BackendName as BackendName
 from splatseg.render._registry import default_options as default_options
 from splatseg.render._registry import get_backend as get_backend
+from splatseg.render._registry import options_for as options_for

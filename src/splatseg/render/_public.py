@@ -11,7 +11,7 @@ from splatseg.core import Camera, Gaussians
 from splatseg.errors import InputError, RangeError
 from splatseg.render._backend import BackProjected, Contributors, Layout, Rendered, ViewWeights
 from splatseg.render._options import RenderOptions
-from splatseg.render._registry import default_options, get_backend
+from splatseg.render._registry import get_backend, options_for
 from splatseg.render.views import (
     back_project_view,
     contributors_view,
@@ -48,7 +48,8 @@ def render(
         gaussians: What to draw.
         camera: Where from; with distortion, the image is in the photograph's distorted pixels.
         signal: One row a Gaussian, 1 to 1024 channels; None is the colour of the harmonics.
-        options: Switches of the blending model; None is `default_options` of the backend.
+        options: Switches of the blending model; None is what the Gaussians are
+            meant for, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         warp: How distorted pixels read the straightened image; ``nearest`` for ids.
 
@@ -73,7 +74,7 @@ def render(
     if signal is not None:
         _check_columns("signal", signal, (len(gaussians), None))
     chosen = get_backend(backend, like=gaussians.means)
-    options = options or default_options(backend, like=gaussians.means)
+    options = options or options_for(gaussians, backend)
     return render_view(gaussians, camera, signal, options=options, backend=chosen, warp=warp)
 
 
@@ -94,7 +95,8 @@ def back_project(
         gaussians: What the view shows.
         camera: Whose pixels the image has, distortion included.
         image: 1 to 1024 channels, float.
-        options: Switches of the blending model; None is `default_options` of the backend.
+        options: Switches of the blending model; None is what the Gaussians are
+            meant for, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         warp: As for `render`.
 
@@ -108,7 +110,7 @@ def back_project(
     _check_scene(gaussians)
     _check_columns("image", image, (camera.height, camera.width, None))
     chosen = get_backend(backend, like=gaussians.means)
-    options = options or default_options(backend, like=gaussians.means)
+    options = options or options_for(gaussians, backend)
     return back_project_view(gaussians, camera, image, options=options, backend=chosen, warp=warp)
 
 
@@ -128,7 +130,8 @@ def contributors(
         camera: Whose pixels are meant; with distortion, the nearest straightened pixel is read.
         pixels: Column and row of each pixel.
         k: How many, at least 1.
-        options: Switches of the blending model; None is `default_options` of the backend.
+        options: Switches of the blending model; None is what the Gaussians are
+            meant for, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:
@@ -139,7 +142,7 @@ def contributors(
     if k < 1:
         raise RangeError(f"k: expected at least 1, got {k}.")
     chosen = get_backend(backend, like=gaussians.means)
-    options = options or default_options(backend, like=gaussians.means)
+    options = options or options_for(gaussians, backend)
     return contributors_view(gaussians, camera, pixels, k, options=options, backend=chosen)
 
 
@@ -162,7 +165,8 @@ def weights(
         k: Keep each pixel's k strongest entries; None keeps all.
         layout: ``csr`` has rows of single pixels; ``blocks`` has 4 x 4 pixel blocks and is
             faster, for whole images and all entries of pinhole cameras.
-        options: Switches of the blending model; None is `default_options` of the backend.
+        options: Switches of the blending model; None is what the Gaussians are
+            meant for, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:
@@ -180,7 +184,7 @@ def weights(
             "use csr for pixels, k or a distorted camera."
         )
     chosen = get_backend(backend, like=gaussians.means)
-    options = options or default_options(backend, like=gaussians.means)
+    options = options or options_for(gaussians, backend)
     return weights_view(
         gaussians, camera, pixels, k, layout=layout, options=options, backend=chosen
     )

@@ -6,6 +6,7 @@ from typing import Literal, cast
 from torch import Tensor
 
 from splatseg._check import check_choice
+from splatseg.core import Gaussians
 from splatseg.render._backend import Backend
 from splatseg.render._options import RenderOptions
 
@@ -33,8 +34,20 @@ def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
     return _backend(cast(BackendName, name))
 
 
+def options_for(gaussians: Gaussians, backend: str = "auto") -> RenderOptions:
+    """What Gaussians are drawn with when nobody says otherwise.
+
+    The `default_options` of the backend, antialiased if that is what they are meant for.
+    """
+    return default_options(backend, like=gaussians.means, antialiased=gaussians.antialiased)
+
+
 def default_options(
-    name: str = "auto", *, like: Tensor | None = None, sh_degree: int | None = None
+    name: str = "auto",
+    *,
+    like: Tensor | None = None,
+    sh_degree: int | None = None,
+    antialiased: bool = False,
 ) -> RenderOptions:
     """What a backend draws with when nobody says otherwise.
 
@@ -45,12 +58,15 @@ def default_options(
         name: As for `get_backend`.
         like: As for `get_backend`.
         sh_degree: Highest degree of the harmonics in use; None is all there are.
+        antialiased: What the Gaussians are meant for, `Gaussians.antialiased`.
     """
     if get_backend(name, like=like).name == "cuda":
         from splatseg.render.cuda import GSPLAT_ALPHA_MAX
 
-        return RenderOptions(alpha_max=GSPLAT_ALPHA_MAX, sh_degree=sh_degree)
-    return RenderOptions(sh_degree=sh_degree)
+        return RenderOptions(
+            alpha_max=GSPLAT_ALPHA_MAX, sh_degree=sh_degree, antialiased=antialiased
+        )
+    return RenderOptions(sh_degree=sh_degree, antialiased=antialiased)
 
 
 @cache

@@ -308,11 +308,11 @@ def test_spz_headers(golden: Path, tmp_path: Path) -> None:
     assert len(read_splats(tmp_path / "a.spz")) == 3
 
 
-def test_spz_made_for_antialiasing_is_said(golden: Path, tmp_path: Path) -> None:
+def test_spz_made_for_antialiasing_is_remembered(golden: Path, tmp_path: Path) -> None:
     body = gzip.decompress((golden / "three.v3.spz").read_bytes())[16:]
-    (tmp_path / "a.spz").write_bytes(gzip.compress(spz_header(flags=1) + body))
-    with pytest.warns(UserWarning, match="made for antialiased rendering"):
-        read_splats(tmp_path / "a.spz")
+    for flags in (0, 1):
+        (tmp_path / "a.spz").write_bytes(gzip.compress(spz_header(flags=flags) + body))
+        assert read_splats(tmp_path / "a.spz").antialiased == bool(flags)
 
 
 def spz_4(streams: list[bytes], *, sizes: list[int] | None = None, **fields: int) -> bytes:
@@ -442,6 +442,14 @@ def test_sog_meta(
 ) -> None:
     files = members(golden, "three.v2.sog")
     refused(tmp_path / "a.sog", edited_meta(files, change), message)
+
+
+def test_sog_made_for_antialiasing_is_remembered(golden: Path, tmp_path: Path) -> None:
+    files = members(golden, "three.v2.sog")
+    for said, antialiased in ((True, True), (False, False), (1, False)):
+        data = edited_meta(files, lambda meta, said=said: meta.update(antialias=said))
+        (tmp_path / "a.sog").write_bytes(data)
+        assert read_splats(tmp_path / "a.sog").antialiased == antialiased
 
 
 def test_sog_names_stay_in_the_folder(golden: Path, tmp_path: Path) -> None:

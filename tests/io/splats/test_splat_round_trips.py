@@ -348,3 +348,20 @@ def test_writing_does_not_change_the_gaussians(make_splats: Make, tmp_path: Path
     back = round_trip(g, tmp_path, "a.ply")
     assert torch.equal(g.rotations, before)
     torch.testing.assert_close(back.rotations, before / 3)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "b.spz"])
+def test_what_they_are_meant_for_is_written(
+    make_splats: Make, tmp_path: Path, name: str, antialiased: bool
+) -> None:
+    g = make_splats(5, degree=1).replace(antialiased=antialiased)
+    options = {"format": "spz3"} if name == "b.spz" else {}
+    assert round_trip(g, tmp_path, name, **options).antialiased == antialiased
+
+
+def test_splat_files_cannot_say_what_they_are_meant_for(make_splats: Make, tmp_path: Path) -> None:
+    g = make_splats(5, degree=0).replace(antialiased=True)
+    with pytest.warns(SplatWarning, match="no place for a note that they are meant for antialias"):
+        write_splats(g, tmp_path / "a.splat")
+    assert not read_splats(tmp_path / "a.splat").antialiased

@@ -120,7 +120,17 @@ class Rows:
         torch.from_numpy(self.opacities).sigmoid_()
 
 
-def finish(path: Path, rows: Rows, extra: Mapping[str, Tensor] | None = None) -> Gaussians:
+ANTIALIASED = "splatseg antialiased"
+"""Comment line of a PLY file whose Gaussians are meant for antialiased rendering."""
+
+
+def finish(
+    path: Path,
+    rows: Rows,
+    extra: Mapping[str, Tensor] | None = None,
+    *,
+    antialiased: bool = False,
+) -> Gaussians:
     """Check every row, give quaternions unit length and make `Gaussians` without a copy.
 
     Raises:
@@ -150,6 +160,7 @@ def finish(path: Path, rows: Rows, extra: Mapping[str, Tensor] | None = None) ->
         opacities=torch.from_numpy(rows.opacities),
         sh=torch.from_numpy(rows.sh),
         extra=dict(extra or {}),
+        antialiased=antialiased,
     )
 
 
@@ -262,6 +273,11 @@ class Losses:
         """Note all extra columns as dropped."""
         if gaussians.extra:
             self.drop("the extra columns " + ", ".join(sorted(gaussians.extra)))
+
+    def drop_antialiased(self, gaussians: Gaussians) -> None:
+        """Note that the format cannot say that Gaussians are meant for antialiased rendering."""
+        if gaussians.antialiased:
+            self.drop("a note that they are meant for antialiased rendering")
 
     def tell(self) -> None:
         """Warn once if anything was lost."""

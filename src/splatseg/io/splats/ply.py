@@ -18,6 +18,7 @@ from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.splats._common import (
+    ANTIALIASED,
     BLOCK,
     Rows,
     blocks,
@@ -101,7 +102,8 @@ def read_ply(path: Path) -> Gaussians:
             for name, column in extra.items():
                 column[part] = block[name]
     rows.exponentiate()
-    return finish(path, rows, _restore(header, extra))
+    antialiased = ANTIALIASED in header.comments
+    return finish(path, rows, _restore(header, extra), antialiased=antialiased)
 
 
 def _rest_columns(path: Path, names: Sequence[str]) -> list[str]:
@@ -171,6 +173,8 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     """
     rows = to_rows(gaussians)
     extra, notes = _flatten(gaussians.extra)
+    if gaussians.antialiased:
+        notes.insert(0, ANTIALIASED)
     coefficients = rows.sh.shape[1] - 1
     rest = [f"f_rest_{i}" for i in range(3 * coefficients)]
     standard = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS)

@@ -128,7 +128,8 @@ def _read(path: Path, load: Load, meta_name: str) -> Gaussians:
         _apply_palette(path, rows, _picture(path, load, labels_name, count), palette)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
-    return finish(path, rows)
+    antialiased = "antialias" in meta and meta["antialias"].value is True
+    return finish(path, rows, antialiased=antialiased)
 
 
 def _picture(path: Path, load: Load, name: str, least: int) -> Pixels:

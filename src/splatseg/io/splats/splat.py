@@ -71,6 +71,7 @@ def write_splat(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
     if gaussians.sh_degree:
         losses.drop("harmonics above degree 0")
     losses.drop_extra(gaussians)
+    losses.drop_antialiased(gaussians)
     with path.open("wb") as file:
         for part in blocks(len(gaussians)):
             block = np.empty(part.stop - part.start, _ROW)

@@ -30,7 +30,6 @@ from splatseg.io.splats._common import (
     read_file,
     to_rows,
     unsigned,
-    warn,
 )
 from splatseg.io.splats._quaternions import pack_signed_three, unpack_signed_three
 
@@ -75,8 +74,8 @@ class _Header:
 def read_spz(path: Path) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, turned to the axes of PLY files.
 
-    Extensions (limits for a viewer's camera, for example) are not kept; a file made for
-    antialiased rendering is read with a warning that says so.
+    Extensions (limits for a viewer's camera, for example) are not kept; the flag of a file made
+    for antialiased rendering becomes `Gaussians.antialiased`.
 
     Raises:
         FileFormatError: If the file is truncated or longer than it says, of another version
@@ -108,12 +107,7 @@ def read_spz(path: Path) -> Gaussians:
         if rest is not None:
             signs = _FLIP_SH[: coefficients - 1, None]
             rows.sh[part, 1:] = (rest[part].astype(np.float32) - 128) / 128 * signs
-    if header.flags & _ANTIALIASED:
-        warn(
-            path,
-            "made for antialiased rendering, which Gaussians in memory do not remember.",
-        )
-    return finish(path, rows)
+    return finish(path, rows, antialiased=bool(header.flags & _ANTIALIASED))
 
 
 def _header(path: Path, data: bytes) -> _Header:
@@ -278,7 +272,7 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: Literal[3, 4], losse
         len(gaussians),
         gaussians.sh_degree,
         bits,
-        0,
+        _ANTIALIASED if gaussians.antialiased else 0,
         len(streams) if version == 4 else 0,
     )
     if version == 3:
