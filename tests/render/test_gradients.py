@@ -7,7 +7,7 @@ import torch
 from render_scenes import axis_camera, bands, float32, random_camera, random_gaussians
 
 from splatseg.core import Camera, Gaussians
-from splatseg.render import RenderOptions
+from splatseg.render import RenderOptions, get_backend
 from splatseg.render import render as splat_render
 
 COLUMNS = ("means", "rotations", "scales", "opacities", "sh")
@@ -217,3 +217,33 @@ def test_only_what_is_asked_for_is_differentiated(backend, rng, wanted):
     drawn.image.sum().backward()
     assert leaf.grad.abs().max() > 0
     assert not drawn.median_depth.requires_grad
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_slope_in_the_projected_centres(rng, antialiased):
+    """The reference moves the centre by the leaf's value; the cpu's leaf only has a gradient."""
+    generator = torch.Generator().manual_seed(5)
+    scene, camera = random_gaussians(rng, 40).to(dtype=torch.float64), random_camera(rng)
+    options = RenderOptions(antialiased=antialiased)
+    slopes = torch.randn(camera.height, camera.width, 3, generator=generator, dtype=torch.float64)
+
+    def loss(scene, camera, name, screen=None):
+        backend = get_backend(name)
+        drawn = backend.render(scene, camera, None, options=options, screen=screen)
+        return (drawn.image * slopes.to(drawn.image)).sum()
+
+    found = {}
+    for name, typed in (("reference", scene), ("cpu", scene.to(dtype=torch.float32))):
+        screen = torch.zeros_like(typed.means[:, :2]).requires_grad_()
+        loss(typed, camera, name, screen).backward()
+        found[name] = screen.grad.double()
+    reference = found["reference"]
+    assert (found["cpu"] - reference).norm() <= 1e-4 * reference.norm()
+
+    step = 1e-5
+    row = int(reference.norm(dim=1).argmax())
+    for axis in range(2):
+        offset = torch.zeros_like(reference)
+        offset[row, axis] = step
+        rise = loss(scene, camera, "reference", offset) - loss(scene, camera, "reference", -offset)
+        assert float(rise) / (2 * step) == pytest.approx(float(reference[row, axis]), rel=1e-4)

@@ -126,8 +126,18 @@ class Backend(ABC):
         signal: Float[Tensor, "n channels"] | None,
         *,
         options: RenderOptions,
+        screen: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+
+        Args:
+            gaussians: The scene.
+            camera: A pinhole camera.
+            signal: One row a Gaussian.
+            options: Switches of the blending model.
+            screen: Zeros, added to the projected centres, pixels: a leaf whose gradient is that
+                towards the centres on the image, which densification looks at.
+        """
 
     @abstractmethod
     def back_project(

@@ -19,7 +19,7 @@ from splatseg.render._options import RenderOptions
 from splatseg.render.cpu._view import NARROW, CpuView
 from splatseg.render.cpu._weights import CpuBlockWeights, CpuSparseWeights
 
-_INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose")
+_INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose", "screen")
 
 
 class _Render(torch.autograd.Function):
@@ -35,6 +35,7 @@ class _Render(torch.autograd.Function):
         sh: Tensor | None,
         signal: Tensor | None,
         pose: Tensor,
+        screen: Tensor | None,
         camera: Camera,
         options: RenderOptions,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -54,7 +55,7 @@ class _Render(torch.autograd.Function):
         ctx.view = view if any(needs) else view.close()
         ctx.dtypes = tuple(
             None if t is None else t.dtype
-            for t in (means, rotations, scales, opacities, sh, signal, pose)
+            for t in (means, rotations, scales, opacities, sh, signal, pose, screen)
         )
         ctx.mark_non_differentiable(median)
         return image, alpha, depth_sum, median
@@ -79,6 +80,7 @@ class _Render(torch.autograd.Function):
             found.sh,
             found.signal,
             found.cam_from_world,
+            found.screen,
         )
         typed = [
             g.to(dtype) if need and g is not None else None
@@ -99,8 +101,12 @@ class CpuBackend(Backend):
         signal: Float[Tensor, "n channels"] | None,
         *,
         options: RenderOptions,
+        screen: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+
+        `screen` is not added, only given its gradient: expected are zeros.
+        """
         image, alpha, depth_sum, median = cast(
             tuple[Tensor, Tensor, Tensor, Tensor],
             _Render.apply(
@@ -111,6 +117,7 @@ class CpuBackend(Backend):
                 gaussians.sh if signal is None else None,
                 signal,
                 camera.cam_from_world,
+                screen,
                 camera,
                 options,
             ),

@@ -1,6 +1,7 @@
 """The CUDA backend: glue between our interface and gsplat (1.5.3 or later)."""
 
 import importlib
+from dataclasses import replace
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -55,10 +56,14 @@ class CudaBackend(Backend):
         signal: Float[Tensor, "n channels"] | None,
         *,
         options: RenderOptions,
+        screen: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
         home, dtype = gaussians.device, gaussians.dtype
         gaussians, view = self._project(gaussians, camera, options)
+        if screen is not None and len(gaussians):
+            offsets = screen.to(device=self._device, dtype=torch.float32)
+            view = replace(view, centres=view.centres + offsets)
         if signal is None:
             signal = colours(view, gaussians, camera, options.sh_degree)
         else:

@@ -1,5 +1,6 @@
 """The readable backend: every product is written out as in DESIGN, in float64."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
@@ -38,9 +39,13 @@ class ReferenceBackend(Backend):
         signal: Float[Tensor, "n channels"] | None,
         *,
         options: RenderOptions,
+        screen: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
         projected = project(gaussians, camera, options=options)
+        if screen is not None:
+            moved = projected.centres + screen[projected.ids].double()
+            projected = replace(projected, centres=moved)
         if signal is None:
             signal = _colours(gaussians, camera, projected, degree=options.sh_degree)
         else:
