@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from splatseg._check import check_choice, check_range
 from splatseg.errors import InputError, RangeError
 from splatseg.io.images import DEFAULT_LONGEST
 
 Preset = Literal["quick", "default", "full"]
+Strategy = Literal["mcmc", "classic"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,17 +95,42 @@ class FitOptions:
     degree_interval: float = 0.1
     """Progress between one degree of the harmonics and the next."""
 
+    strategy: Strategy = "mcmc"
+    """How Gaussians come and go. mcmc: the faint move to where there are others, the number
+    grows to `max_gaussians` on a schedule (Kheradmand et al. 2024). classic: where the picture
+    pulls at the centres they are cloned or split, and the faint are dropped (Kerbl et al.
+    2023)."""
+
     densify_every: int = 100
-    """Steps between two relocations of faint Gaussians."""
+    """Steps between two rounds of relocation, or of cloning and splitting."""
 
     densify_from: int = 200
-    """First step with a relocation."""
+    """First step with a round."""
 
     densify_until: float = 0.6
-    """Progress after which none is moved."""
+    """Progress after which there is no round."""
 
     grow_until: float = 0.5
-    """Progress at which `max_gaussians` is reached."""
+    """mcmc: progress at which `max_gaussians` is reached."""
+
+    densify_gradient: float = 2e-4
+    """classic: least mean slope of the loss in the projected centre, per half image side, from
+    which a Gaussian is cloned or split."""
+
+    clone_scale: float = 0.01
+    """classic: Gaussians up to this largest scale are cloned, others split, scene extents."""
+
+    prune_scale: float = 0.1
+    """classic: Gaussians of a larger scale are dropped after the first reset, scene extents."""
+
+    prune_radius: float = 20.0
+    """classic: Gaussians of a larger radius on an image are dropped then too, pixels."""
+
+    reset_interval: float = 0.1
+    """classic: progress between two resets of the opacities."""
+
+    reset_opacity: float = 0.01
+    """classic: no opacity is higher after a reset, in (0, 1)."""
 
     dead_opacity: float = 0.005
     """Gaussians of this opacity or less are moved to where there are others, and are left out
@@ -128,6 +154,7 @@ class FitOptions:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise RangeError(f"{name}: expected at least {least}, got {value}.")
+        check_choice("strategy", self.strategy, ("mcmc", "classic"))
         check_choice("background", self.background, ("random", "black"))
         if self.sh_degree not in (0, 1, 2, 3):
             raise RangeError(f"sh_degree: expected 0 to 3, got {self.sh_degree}.")
@@ -141,17 +168,21 @@ class FitOptions:
             "final_rate",
             "degree_interval",
             "grow_until",
+            "clone_scale",
+            "prune_scale",
+            "prune_radius",
+            "reset_interval",
         ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise RangeError(f"{name}: expected a positive number, got {value}.")
-        for name in ("opacity_penalty", "scale_penalty", "noise"):
+        for name in ("opacity_penalty", "scale_penalty", "noise", "densify_gradient"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise RangeError(f"{name}: expected 0 or more, got {value}.")
         for name in ("dssim_weight", "quarter_until", "half_until", "densify_until"):
             check_range(name, getattr(self, name), 0.0, 1.0)
-        for name in ("start_opacity", "dead_opacity"):
+        for name in ("start_opacity", "dead_opacity", "reset_opacity"):
             value = getattr(self, name)
             if not 0 < value < 1:
                 raise RangeError(f"{name}: expected a value in (0, 1), got {value}.")
@@ -160,8 +191,10 @@ class FitOptions:
     def preset(cls, name: Preset) -> Self:
         """The options behind ``--preset``.
 
-        ``quick`` takes 3 minutes and shows what is there, ``default`` takes 10, ``full`` takes
-        30 with more Gaussians and harmonics of degree 3.
+        ``quick`` takes 3 minutes and shows what is there, ``default`` takes 10. ``full`` takes
+        the 30 000 steps of the published settings, with up to a million Gaussians and harmonics
+        of degree 3: those of Kheradmand et al. 2024, or with `with_strategy` those of Kerbl et
+        al. 2023.
 
         Raises:
             InputError: If there is no such preset.
@@ -170,8 +203,27 @@ class FitOptions:
         if name == "quick":
             return cls(minutes=3.0, max_gaussians=150_000)
         if name == "full":
-            return cls(minutes=30.0, max_gaussians=400_000, sh_degree=3)
+            return cls(**_PUBLISHED)
         return cls()
+
+    def with_strategy(self, strategy: Strategy) -> Self:
+        """The same options with another strategy and what goes with it.
+
+        ``classic`` has no penalties and no random walk, and stops densifying half-way (Kerbl et
+        al. 2023).
+
+        Raises:
+            InputError: If there is no such strategy.
+        """
+        check_choice("strategy", strategy, ("mcmc", "classic"))
+        if strategy == self.strategy:
+            return self
+        fresh = type(self)()
+        names = ("opacity_penalty", "scale_penalty", "noise", "densify_until")
+        own = dict.fromkeys(names[:3], 0.0) | {"densify_until": 0.5}
+        if strategy == "mcmc":
+            own = {name: getattr(fresh, name) for name in names}
+        return replace(self, strategy=strategy, **own)
 
     def with_length(self, *, minutes: float | None = None, steps: int | None = None) -> Self:
         """The same options with another length: minutes or steps; neither keeps it.
@@ -182,3 +234,23 @@ class FitOptions:
         if minutes is None and steps is None:
             return self
         return replace(self, minutes=minutes, steps=steps)
+
+
+# 30 000 steps of the authors' programs, with their rates. Both grow without bound or to a number
+# that is to be chosen; a million is what 24 GB of memory hold with room.
+_PUBLISHED: dict[str, Any] = {
+    "minutes": None,
+    "steps": 30_000,
+    "max_gaussians": 1_000_000,
+    "sh_degree": 3,
+    "position_rate": 1.6e-4,
+    "position_rate_end": 1.6e-6,
+    "scale_rate": 5e-3,
+    "final_rate": 1.0,
+    "noise": 5e5,
+    "quarter_until": 0.0,
+    "half_until": 0.0,
+    "degree_interval": 1 / 30,
+    "densify_from": 500,
+    "densify_until": 25 / 30,
+}

@@ -55,6 +55,17 @@ class Parameters:
             }
         )
 
+    def joined(self, other: "Parameters") -> "Parameters":
+        """The same with the rows of `other` behind."""
+        mine = dict(self.tensors())
+        return Parameters(
+            **{name: torch.cat((mine[name], tensor)) for name, tensor in other.tensors()}
+        )
+
+    def replaced(self, **columns: Tensor) -> "Parameters":
+        """The same with other tensors in some places."""
+        return Parameters(**(dict(self.tensors()) | columns))
+
     def zeros_like(self) -> "Parameters":
         """Zeros of the same shapes: fresh moments."""
         return Parameters(**{name: torch.zeros_like(tensor) for name, tensor in self.tensors()})

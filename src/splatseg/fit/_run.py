@@ -10,14 +10,14 @@ from torch import Tensor
 
 from splatseg.core import Capture, Gaussians
 from splatseg.errors import SplatsegError
-from splatseg.fit._densify import relocated
+from splatseg.fit._density import density_of
 from splatseg.fit._initialise import initial_parameters, scene_extent
 from splatseg.fit._loss import Loss, l1_dssim
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters, gathered, rows_in_view
 from splatseg.fit._photographs import Example, Photographs
 from splatseg.fit._records import FitProgress, FitRecord
-from splatseg.fit._schedule import count_at, degree_at, rates_at, reduction_at
+from splatseg.fit._schedule import degree_at, rates_at, reduction_at
 from splatseg.fit._update import UpdateSettings, update_rows
 from splatseg.render import Backend, default_options
 
@@ -45,10 +45,10 @@ class FitRun:
         self._generator = torch.Generator().manual_seed(options.seed)
         start = initial_parameters(capture, options=options, generator=self._generator)
         self._extent = scene_extent(capture.train_views, start.means)
-        self._start_count = len(start)
         device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         start = Parameters(**{name: tensor.to(device) for name, tensor in start.tensors()})
         self._device = device
+        self._density = density_of(options, start=len(start), extent=self._extent, device=device)
         self._state = (start, start.zeros_like(), start.zeros_like())
         self._order: list[int] = []
         self._batch: list[FitProgress] = []
@@ -90,7 +90,12 @@ class FitRun:
             rows = rows_in_view(parameters, example.camera, near=render_options.near)
             gaussians = gathered(parameters, rows)
         with self._timed("render"):
-            rendered = self._backend.render(gaussians, example.camera, None, options=render_options)
+            screen = None
+            if self._density.looks_at_screen:
+                screen = torch.zeros_like(gaussians.means[:, :2]).requires_grad_()
+            rendered = self._backend.render(
+                gaussians, example.camera, None, options=render_options, screen=screen
+            )
         with self._timed("loss"):
             picture = rendered.image
             if self._options.background == "random":
@@ -113,7 +118,11 @@ class FitRun:
             self._update(gaussians, rows, done)
         self.steps += 1
         with self._timed("densify"), torch.no_grad():
-            self._densify(done)
+            if screen is not None and screen.grad is not None:
+                self._density.see(rows, screen.grad, camera=example.camera, parameters=parameters)
+            self._state = self._density.after(
+                self._state, steps=self.steps, progress=done, generator=self._generator
+            )
         return self._report(loss)
 
     def _next_example(self, progress: float) -> Example:
@@ -145,16 +154,6 @@ class FitRun:
             seed=self._options.seed,
         )
         update_rows(*self._state, _gradients(gaussians), rows=rows, settings=settings)
-
-    def _densify(self, progress: float) -> None:
-        options = self._options
-        due = self.steps >= options.densify_from and self.steps % options.densify_every == 0
-        if not due or progress >= options.densify_until:
-            return
-        count = count_at(progress, options=options, start=self._start_count)
-        self._state = relocated(
-            *self._state, count=count, options=options, generator=self._generator
-        )
 
     def _report(self, loss: Loss) -> FitProgress:
         seconds, done = self.seconds, self.progress

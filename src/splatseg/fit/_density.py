@@ -1,0 +1,140 @@
+"""Where Gaussians come from and go to while a fit goes on: the two strategies as one interface."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from splatseg.core import Camera
+from splatseg.fit._classic import ScreenStatistics, densified, with_reset_opacities
+from splatseg.fit._densify import relocated
+from splatseg.fit._options import FitOptions
+from splatseg.fit._parameters import Parameters
+from splatseg.fit._schedule import count_at
+
+State = tuple[Parameters, Parameters, Parameters]
+"""Parameters and Adam's first and second moments."""
+
+
+class Density(Protocol):
+    """Decides after each step how many Gaussians there are, and where."""
+
+    looks_at_screen: bool
+    """True if `see` wants the slopes in the projected centres."""
+
+    def see(self, rows: Tensor, slopes: Tensor, *, camera: Camera, parameters: Parameters) -> None:
+        """Take note of one view: its rows, and the slopes (m, 2) in their centres per pixel."""
+        ...
+
+    def after(
+        self, state: State, *, steps: int, progress: float, generator: torch.Generator
+    ) -> State:
+        """The state to go on with after `steps` steps. What is given is not changed."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """All that `restore` needs."""
+        ...
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
+        ...
+
+
+def density_of(options: FitOptions, *, start: int, extent: float, device: torch.device) -> Density:
+    """The strategy that the options name.
+
+    Args:
+        options: Strategy, thresholds and intervals.
+        start: Gaussians at the start.
+        extent: Size of the scene, scene units.
+        device: Where the parameters are.
+    """
+    if options.strategy == "classic":
+        return Classic(options, start=start, extent=extent, device=device)
+    return Relocation(options, start=start)
+
+
+def _round_due(options: FitOptions, *, steps: int, progress: float) -> bool:
+    every = steps >= options.densify_from and steps % options.densify_every == 0
+    return every and progress < options.densify_until
+
+
+class Relocation:
+    """Dead Gaussians move to living ones, and the number grows on a schedule (`_densify`)."""
+
+    looks_at_screen = False
+
+    def __init__(self, options: FitOptions, *, start: int) -> None:
+        self._options = options
+        self._start = start
+
+    def see(self, rows: Tensor, slopes: Tensor, *, camera: Camera, parameters: Parameters) -> None:
+        """Nothing that a view shows matters."""
+
+    def after(
+        self, state: State, *, steps: int, progress: float, generator: torch.Generator
+    ) -> State:
+        """Relocate every `FitOptions.densify_every` steps."""
+        if not _round_due(self._options, steps=steps, progress=progress):
+            return state
+        count = count_at(progress, options=self._options, start=self._start)
+        return relocated(*state, count=count, options=self._options, generator=generator)
+
+    def state(self) -> dict[str, Tensor]:
+        """Nothing is kept from step to step."""
+        return {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Nothing is kept from step to step."""
+
+
+class Classic:
+    """Clone, split, prune, and reset opacities (`_classic`)."""
+
+    looks_at_screen = True
+
+    def __init__(
+        self, options: FitOptions, *, start: int, extent: float, device: torch.device
+    ) -> None:
+        self._options = options
+        self._extent = extent
+        self._statistics = ScreenStatistics.zeros(start, device)
+        self._resets = 0
+
+    def see(self, rows: Tensor, slopes: Tensor, *, camera: Camera, parameters: Parameters) -> None:
+        """Add to the slopes since the last round."""
+        self._statistics.add(rows, slopes, camera=camera, parameters=parameters)
+
+    def after(
+        self, state: State, *, steps: int, progress: float, generator: torch.Generator
+    ) -> State:
+        """A round every `FitOptions.densify_every` steps, a reset every so much progress."""
+        options = self._options
+        if _round_due(options, steps=steps, progress=progress):
+            state = densified(
+                *state,
+                self._statistics,
+                options=options,
+                extent=self._extent,
+                prune_large=self._resets > 0,
+                generator=generator,
+            )
+            self._statistics = ScreenStatistics.zeros(len(state[0]), state[0].means.device)
+        resets = int(progress / options.reset_interval)
+        if resets > self._resets and progress < options.densify_until:
+            self._resets = resets
+            state = with_reset_opacities(*state, most=options.reset_opacity)
+        return state
+
+    def state(self) -> dict[str, Tensor]:
+        """The statistics since the last round, and how many resets there were."""
+        kept = {name: getattr(self._statistics, name) for name in ScreenStatistics.__slots__}
+        return kept | {"resets": torch.tensor([self._resets])}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from what `state` gave."""
+        self._resets = int(tensors["resets"])
+        self._statistics = ScreenStatistics(
+            **{name: tensors[name] for name in ScreenStatistics.__slots__}
+        )
