@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from splatseg.core import Capture, Gaussians, Scene
 from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, FitProgress, FitResult, Preset, fit, reduction_note
+from splatseg.fit import FitOptions, FitProgress, FitResult, Preset, Strategy, fit, reduction_note
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import is_scene, save_scene, scene_layer_names
 from splatseg.render import BackendName
@@ -51,8 +51,12 @@ class Command:
     """Most Gaussians of the scene. None is the preset's."""
 
     preset: Preset = "default"
-    """quick: 3 minutes, 150 000 Gaussians. default: 10 minutes, 200 000. full: 30 minutes,
-    400 000, colours with harmonics of degree 3."""
+    """quick: 3 minutes, 150 000 Gaussians. default: 10 minutes, 200 000. full: the published
+    settings, 30 000 steps, up to a million Gaussians, colours with harmonics of degree 3."""
+
+    strategy: Strategy = "mcmc"
+    """How Gaussians come and go. mcmc: the faint move to where there are others, up to the
+    number asked for. classic: cloned and split where the picture pulls at them."""
 
     seed: int = 0
     """Seed of everything that is drawn at random."""
@@ -98,6 +102,7 @@ def _options(command: Command) -> FitOptions:
     options = replace(FitOptions.preset(command.preset), seed=command.seed)
     if command.max_gaussians is not None:
         options = replace(options, max_gaussians=command.max_gaussians)
+    options = options.with_strategy(command.strategy)
     return options.with_length(minutes=command.minutes, steps=command.steps)
 
 

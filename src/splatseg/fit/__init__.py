@@ -6,6 +6,7 @@
 from splatseg.fit._loop import fit as fit
 from splatseg.fit._options import FitOptions as FitOptions
 from splatseg.fit._options import Preset as Preset
+from splatseg.fit._options import Strategy as Strategy
 from splatseg.fit._photographs import reduction_note as reduction_note
 from splatseg.fit._records import FitProgress as FitProgress
 from splatseg.fit._records import FitRecord as FitRecord
