@@ -4,12 +4,14 @@ import math
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from splatseg.core import Capture, Gaussians
-from splatseg.errors import SplatsegError
+from splatseg.errors import FileFormatError, SplatsegError
 from splatseg.fit._density import density_of
 from splatseg.fit._initialise import initial_parameters, scene_extent
 from splatseg.fit._loss import Loss, l1_dssim
@@ -18,6 +20,7 @@ from splatseg.fit._parameters import Parameters, gathered, rows_in_view
 from splatseg.fit._photographs import Example, Photographs
 from splatseg.fit._records import FitProgress, FitRecord
 from splatseg.fit._schedule import degree_at, rates_at, reduction_at
+from splatseg.fit._state import FitState, Part, named, parameters_of
 from splatseg.fit._update import UpdateSettings, update_rows
 from splatseg.render import Backend, default_options
 
@@ -28,7 +31,8 @@ class FitRun:
     """State of a fit under way.
 
     Every attribute is replaced as a whole or updated by rows, so that an interruption at any
-    moment leaves Gaussians that can be used.
+    moment leaves Gaussians that can be used. What a step changes is in `state`, or in that of
+    one of the parts: a fit that is resumed continues as if nothing had been.
     """
 
     def __init__(
@@ -37,24 +41,36 @@ class FitRun:
         options: FitOptions,
         backend: Backend,
         photographs: Photographs,
+        *,
+        saved: FitState | None = None,
     ) -> None:
         self._begin = time.monotonic()
         self._options = options
         self._backend = backend
         self._photographs = photographs
         self._generator = torch.Generator().manual_seed(options.seed)
-        start = initial_parameters(capture, options=options, generator=self._generator)
-        self._extent = scene_extent(capture.train_views, start.means)
-        device = torch.device("cuda" if backend.name == "cuda" else "cpu")
-        start = Parameters(**{name: tensor.to(device) for name, tensor in start.tensors()})
-        self._device = device
-        self._density = density_of(options, start=len(start), extent=self._extent, device=device)
-        self._state = (start, start.zeros_like(), start.zeros_like())
+        self._device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._order: list[int] = []
         self._batch: list[FitProgress] = []
         self.steps = 0
         self.history: list[FitRecord] = []
         self.stages: dict[str, float] = {}
+        self.between_steps = True
+        if saved is None:
+            start = initial_parameters(capture, options=options, generator=self._generator)
+            self._extent = scene_extent(capture.train_views, start.means)
+            self._start_count = len(start)
+            device = self._device
+            start = Parameters(**{name: tensor.to(device) for name, tensor in start.tensors()})
+            self._state = (start, start.zeros_like(), start.zeros_like())
+        else:
+            self._take_up(saved)
+        self._density = density_of(
+            options, start=self._start_count, extent=self._extent, device=self._device
+        )
+        if saved is not None:
+            for name, part in self._parts().items():
+                part.restore(saved.group(name, part.state(), device=self._device))
 
     @property
     def seconds(self) -> float:
@@ -78,6 +94,66 @@ class FitRun:
         return found.replace(antialiased=self._options.antialiased)
 
     def step(self) -> FitProgress:
+        """Learn from the next view. An exception leaves `between_steps` False."""
+        self.between_steps = False
+        status = self._step()
+        self.between_steps = True
+        return status
+
+    def state(self) -> FitState:
+        """Everything that the steps to come depend on, while `between_steps`; not copied."""
+        parameters, first, second = self._state
+        tensors = named("parameters", dict(parameters.tensors()))
+        tensors |= named("first", dict(first.tensors()))
+        tensors |= named("second", dict(second.tensors()))
+        tensors |= {"generator": self._generator.get_state()}
+        tensors |= {"order": torch.tensor(self._order, dtype=torch.int64)}
+        for name, part in self._parts().items():
+            tensors |= named(name, part.state())
+        content = {
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "progress": self.progress,
+            "gaussians": len(parameters),
+            "extent": self._extent,
+            "start_count": self._start_count,
+            "stages": dict(self.stages),
+            "history": [asdict(record) for record in self.history],
+            "batch": [asdict(status) for status in self._batch],
+        }
+        return FitState(tensors=tensors, content=content)
+
+    def _parts(self) -> dict[str, Part]:
+        """What remembers something of its own, by the name of its group in the state."""
+        return {"density": self._density}
+
+    def _take_up(self, saved: FitState) -> None:
+        """Go on from a state; the parts follow."""
+        device = self._device
+        parameters = parameters_of(saved, "parameters", device)
+        first, second = (parameters_of(saved, name, device) for name in ("first", "second"))
+        self._state = (parameters, first, second)
+        if len({len(one) for one in self._state}) != 1:
+            raise FileFormatError(f"{saved.where}: expected as many moments as Gaussians.")
+        self._order = saved.tensor("order").tolist()
+        if not all(0 <= index < len(self._photographs) for index in self._order):
+            raise FileFormatError(f"{saved.where}: expected an order of the training views.")
+        self._extent = saved.number("extent")
+        self._start_count = int(saved.number("start_count"))
+        self.steps = int(saved.number("steps"))
+        self._begin -= saved.number("seconds")
+        content = cast(dict[str, Any], saved.content)
+        try:
+            self._generator.set_state(saved.tensor("generator"))
+            self.stages = {str(name): float(spent) for name, spent in content["stages"].items()}
+            self.history = [FitRecord(**record) for record in content["history"]]
+            self._batch = [FitProgress(**status) for status in content["batch"]]
+        except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
+            raise FileFormatError(
+                f"{saved.where}: expected the state of a fit, got something else ({error})."
+            ) from error
+
+    def _step(self) -> FitProgress:
         done = self.progress
         with self._timed("read"):
             example = self._next_example(done)
