@@ -3,6 +3,9 @@
 `fit` is the whole of it; `FitOptions` are its switches.
 """
 
+from splatseg.fit._checkpoint import checkpoint_content as checkpoint_content
+from splatseg.fit._checkpoint import discard_checkpoint as discard_checkpoint
+from splatseg.fit._interrupts import deferred_interrupts as deferred_interrupts
 from splatseg.fit._loop import fit as fit
 from splatseg.fit._options import FitOptions as FitOptions
 from splatseg.fit._options import Preset as Preset
@@ -11,3 +14,4 @@ from splatseg.fit._photographs import reduction_note as reduction_note
 from splatseg.fit._records import FitProgress as FitProgress
 from splatseg.fit._records import FitRecord as FitRecord
 from splatseg.fit._records import FitResult as FitResult
+from splatseg.fit._resume import Checkpoints as Checkpoints

@@ -7,9 +7,12 @@ import torch
 
 from splatseg.core import Capture
 from splatseg.errors import InputError
+from splatseg.fit._identity import fit_identity
+from splatseg.fit._interrupts import deferred_interrupts
 from splatseg.fit._options import FitOptions
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._records import FitProgress, FitResult
+from splatseg.fit._resume import CheckpointClock, Checkpoints
 from splatseg.fit._run import FitRun
 from splatseg.render import get_backend
 
@@ -20,6 +23,7 @@ def fit(
     options: FitOptions = FitOptions(),
     backend: str = "auto",
     progress: Callable[[FitProgress], None] | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> FitResult:
     """Optimise Gaussians so that they look like the training photographs of a capture.
 
@@ -32,13 +36,18 @@ def fit(
         capture: Photographs with cameras and start points.
         options: Length, size and rates.
         backend: Which renderer: ``auto``, ``cpu``, ``cuda`` or ``reference``.
-        progress: Called after every step. A `KeyboardInterrupt` out of it, or from the keyboard
-            at any time, ends the fit, which returns what it has.
+        progress: Called after every step. A `KeyboardInterrupt` out of it, Ctrl-C or SIGTERM
+            ends the fit after the step under way; it returns what it has. The third signal
+            does not wait for that.
+        checkpoints: Where the state is kept, to go on from after an interruption or a crash.
+            A fit that is resumed gives what it would have given uninterrupted. None keeps none.
 
     Raises:
-        InputError: If the capture has no training photographs or no start points.
+        InputError: If the capture has no training photographs or no start points, or the
+            checkpoint to resume from is of other data or options.
         MissingFileError: If a photograph is not where it was.
-        SplatsegError: If the loss is no longer a number.
+        FileFormatError: If the checkpoint to resume from is damaged.
+        SplatsegError: If the loss is no longer a number, or a checkpoint cannot be written.
     """
     renderer = get_backend(backend)
     views = tuple(view for view in capture.train_views if view.image is not None)
@@ -47,16 +56,34 @@ def fit(
             f"{capture.path}: expected training views with photographs, got none "
             f"among {len(capture.views)} views."
         )
-    run = FitRun(capture, options, renderer, Photographs(views, longest=options.longest))
-    interrupted = False
-    try:
-        with one_torch_thread():
-            while not run.finished:
+    clock = None
+    if checkpoints is not None:
+        identity = fit_identity(capture, views, options=options, backend=renderer.name)
+        clock = CheckpointClock(checkpoints, identity=identity)
+    photographs = Photographs(views, longest=options.longest)
+    saved = None if clock is None else clock.saved()
+    run = FitRun(capture, options, renderer, photographs, saved=saved)
+
+    def keep() -> None:
+        if clock is not None:
+            spent = clock.write(run.state())
+            run.stages["checkpoint"] = run.stages.get("checkpoint", 0.0) + spent
+
+    with deferred_interrupts() as interrupts, one_torch_thread():
+        interrupted = False
+        try:
+            while not (run.finished or interrupts.requested):
                 status = run.step()
                 if progress is not None:
                     progress(status)
-    except KeyboardInterrupt:
-        interrupted = True
+                if clock is not None and clock.due(run.steps):
+                    keep()
+        except KeyboardInterrupt:
+            interrupted = True
+        interrupted = not run.finished and (interrupted or interrupts.requested)
+        wanted = interrupted or (checkpoints is not None and checkpoints.at_end)
+        if wanted and run.between_steps and not interrupts.impatient:
+            keep()
     return FitResult(
         gaussians=run.gaussians(),
         steps=run.steps,

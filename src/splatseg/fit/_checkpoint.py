@@ -1,0 +1,146 @@
+"""The state of a fit on disk: written now and then, read to go on from.
+
+An npz (a ZIP archive of NumPy arrays, uncompressed, nothing pickled) with a header of JSON. It is
+written beside the one before under a fixed second name and takes its place when it is complete,
+so a process that is killed at any moment leaves a whole one, and a rest that the next one
+overwrites. Each array has a checksum: a damaged file is not taken for a good one.
+"""
+
+import zipfile
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
+
+from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
+from splatseg.fit._state import FitState
+from splatseg.io._json import json_text, parse_object
+
+FORMAT = "splatseg-fit"
+VERSION = 1
+"""Version of the files written. No other is read: a fit is resumed by the program it began in."""
+
+_HEADER = "header"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Checkpoint:
+    """A state, and what it is the state of."""
+
+    state: FitState
+
+    identity: Mapping[str, Any]
+    """Data, options and backend; see `_identity`."""
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint; what is there before stays until the new one is complete.
+
+    Raises:
+        SplatsegError: If it cannot be written; the one before is still there.
+    """
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "identity": dict(checkpoint.identity),
+        "content": dict(checkpoint.state.content),
+    }
+    text = json_text(str(path), header)
+    arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text.encode(), np.uint8)}
+    arrays |= {name: tensor.numpy() for name, tensor in checkpoint.state.tensors.items()}
+    unfinished = _unfinished(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with unfinished.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        unfinished.replace(path)
+    except OSError as error:
+        raise SplatsegError(f"{path}: the checkpoint cannot be written ({error}).") from error
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint. Inverse of `write_checkpoint`.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no checkpoint, damaged, or of another version.
+    """
+    with _opened(path) as archive:
+        header = _header(path, archive)
+        names = [name for name in archive.files if name != _HEADER]
+        tensors = {name: torch.from_numpy(_array(path, archive, name)) for name in names}
+    state = FitState(tensors=tensors, content=header["content"], where=str(path))
+    return Checkpoint(state=state, identity=header["identity"])
+
+
+def checkpoint_content(path: Path) -> Mapping[str, Any]:
+    """What a checkpoint says of itself: steps, seconds, progress, gaussians. Reads no tensors.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no checkpoint, damaged, or of another version.
+    """
+    with _opened(path) as archive:
+        return _header(path, archive)["content"]
+
+
+def discard_checkpoint(path: Path) -> None:
+    """Remove a checkpoint, and its folder if nothing else is in it."""
+    for file in (path, _unfinished(path)):
+        file.unlink(missing_ok=True)
+    if path.parent.is_dir() and not any(path.parent.iterdir()):
+        path.parent.rmdir()
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(f"{path.name}.new")
+
+
+@contextmanager
+def _opened(path: Path) -> Generator[NpzFile]:
+    if not path.is_file():
+        raise MissingFileError(f"{path}: there is no such checkpoint.")
+    try:
+        # NumPy takes a file that is no archive for a single array, or for a pickle.
+        with zipfile.ZipFile(path):
+            pass
+        with np.load(path, allow_pickle=False) as archive:
+            yield archive
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise FileFormatError(
+            f"{path}: expected the checkpoint of a fit, but it is damaged or none ({error})."
+        ) from error
+
+
+def _array(path: Path, archive: NpzFile, name: str) -> NDArray[Any]:
+    array = cast(object, archive[name])
+    # A member that is no .npy comes as bytes.
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+        raise FileFormatError(f"{path}: expected {name!r} to be an array of numbers.")
+    return array
+
+
+def _header(path: Path, archive: NpzFile) -> dict[str, Any]:
+    if _HEADER not in archive.files:
+        raise FileFormatError(f"{path}: expected the checkpoint of a fit, got another archive.")
+    header = parse_object(_array(path, archive, _HEADER).tobytes(), where=str(path))
+    if header.get("format") != FORMAT:
+        raise FileFormatError(
+            f"{path}: expected the checkpoint of a fit, got {header.get('format')!r}."
+        )
+    if header.get("version") != VERSION:
+        raise FileFormatError(
+            f"{path}: expected a checkpoint of version {VERSION}, got version "
+            f"{header.get('version')!r}; another splatseg wrote it."
+        )
+    if not isinstance(header.get("content"), dict) or not isinstance(header.get("identity"), dict):
+        raise FileFormatError(f"{path}: expected a header with content and identity.")
+    return header

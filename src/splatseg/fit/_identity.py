@@ -1,0 +1,122 @@
+"""What a fit is of: its data, options and renderer. A checkpoint goes on only with the same."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Camera, Capture, View
+from splatseg.errors import InputError
+from splatseg.fit._options import FitOptions
+
+# The length may differ: a fit can be made longer or shorter while it goes on.
+_FREE = ("minutes", "steps")
+# Files are told apart by their size and so many of their first bytes.
+_FILE_HEAD = 65_536
+
+
+def fit_identity(
+    capture: Capture, views: Iterable[View], *, options: FitOptions, backend: str
+) -> dict[str, Any]:
+    """Digests of what a fit learns from, its options without the length, and its backend.
+
+    Paths are no part of it: data may move. A photograph that is not there counts as an empty
+    one; reading it says so.
+
+    Args:
+        capture: Its points are taken.
+        views: The training views.
+        options: All but minutes and steps is taken.
+        backend: Name of the renderer in use.
+    """
+    views = tuple(views)
+    names = [view.name for view in views]
+    data = {
+        "training views": _digest(names),
+        "cameras": _digest(_numbers(view.camera) for view in views),
+        "photographs": _digest(_file(view.image) for view in views),
+        "masks": _digest(_file(view.mask) for view in views),
+        "depth maps": _digest([*map(_depth, views)]),
+        "start points": _points(capture),
+    }
+    kept = {name: value for name, value in asdict(options).items() if name not in _FREE}
+    # Tuples come back from JSON as lists: compare what is written, not what was meant.
+    return {"data": data, "options": json.loads(json.dumps(kept)), "backend": backend}
+
+
+def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise unless a checkpoint is of the fit that is to go on.
+
+    Args:
+        path: Of the checkpoint.
+        saved: Its identity.
+        now: The identity of what was asked for.
+
+    Raises:
+        InputError: Naming everything that differs.
+    """
+    before, after = _of(saved, "data"), _of(now, "data")
+    differing = [f"other {name}" for name in _differing(before, after)]
+    before, after = _of(saved, "options"), _of(now, "options")
+    differing += [
+        f"{name} {json.dumps(before.get(name))} instead of {json.dumps(after.get(name))}"
+        for name in _differing(before, after)
+    ]
+    if saved.get("backend") != now.get("backend"):
+        differing.append(f"backend {saved.get('backend')!r} instead of {now.get('backend')!r}")
+    if differing:
+        raise InputError(
+            f"{path}: expected the data and options of the fit to resume, which has "
+            f"{', '.join(differing)}."
+        )
+
+
+def _of(identity: Mapping[str, Any], group: str) -> Mapping[str, Any]:
+    found = identity.get(group)
+    return found if isinstance(found, dict) else {}  # pyright: ignore[reportUnknownVariableType]
+
+
+def _differing(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    names = sorted({*before, *after})
+    return [name for name in names if before.get(name) != after.get(name)]
+
+
+def _digest(values: Iterable[object]) -> str:
+    digest = hashlib.sha256()
+    for value in values:
+        digest.update(repr(value).encode())
+        digest.update(b"\n")
+    return digest.hexdigest()[:16]
+
+
+def _numbers(camera: Camera) -> tuple[object, ...]:
+    pose = camera.cam_from_world.tolist()
+    shape = (camera.width, camera.height, camera.model)
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
+    return (*shape, *(float(number) for number in lens), pose)
+
+
+def _file(path: Path | None) -> tuple[int, str] | None:
+    if path is None:
+        return None
+    if not path.is_file():
+        return (0, "")
+    with path.open("rb") as file:
+        head = file.read(_FILE_HEAD)
+    return (path.stat().st_size, hashlib.sha256(head).hexdigest())
+
+
+def _depth(view: View) -> object:
+    return (_file(view.depth), view.depth_unit)
+
+
+def _points(capture: Capture) -> str:
+    cloud = capture.points
+    if cloud is None:
+        return "none"
+    digest = hashlib.sha256(cloud.points.contiguous().numpy().tobytes())
+    if cloud.colours is not None:
+        digest.update(cloud.colours.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
