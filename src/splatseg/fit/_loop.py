@@ -91,6 +91,8 @@ def fit(
         history=tuple(run.history),
         interrupted=interrupted,
         stages=dict(run.stages),
+        views=run.views.refined(capture),
+        notes=run.views.notes(),
     )
 
 

@@ -83,6 +83,36 @@ class FitOptions:
     """Scale opacities so that the low-pass of 0.3 square pixels adds no light (Mip-Splatting,
     eq. 9), while fitting and ever after: the result says so (`Gaussians.antialiased`)."""
 
+    masks: Literal["ignore", "alpha", "off"] = "ignore"
+    """What masks of the capture mean. ignore: pixels where they are 0 have no loss. alpha: masks,
+    or the alpha channel of photographs that have one, say how opaque a pixel is; beyond is
+    nothing, which with a random background becomes true transparency. off: nothing. Without
+    alpha, transparent pixels of photographs are white."""
+
+    exposure: bool = False
+    """Give each training view a gain and a bias a channel, for photographs that are not equally
+    bright. Their mean is none; held-out views are drawn without."""
+
+    exposure_rate: float = 1e-2
+    """Rate of gains and biases at progress 0; a tenth of it is left at 1."""
+
+    exposure_prior: float = 0.05
+    """Weight of the squares of log gains and biases of a view in the loss."""
+
+    depth: Literal["off", "metric", "relative"] = "off"
+    """What the depth maps of the capture teach. metric: they hold z-depth. relative: inverse
+    depth up to a scale and a shift a view, which the start points settle."""
+
+    depth_weight: float = 0.1
+    """Weight of the depth loss at progress 0; a hundredth of it is left at 1."""
+
+    refine_poses: bool = False
+    """Move the poses of training views so that the photographs agree."""
+
+    pose_rate: float = 1e-3
+    """Rate of the poses at progress 0, radians and typical depths; a hundredth of it is left
+    at 1."""
+
     start_opacity: float = 0.1
     """Opacity of a start point, in (0, 1)."""
 
@@ -156,6 +186,8 @@ class FitOptions:
                 raise RangeError(f"{name}: expected at least {least}, got {value}.")
         check_choice("strategy", self.strategy, ("mcmc", "classic"))
         check_choice("background", self.background, ("random", "black"))
+        check_choice("masks", self.masks, ("ignore", "alpha", "off"))
+        check_choice("depth", self.depth, ("off", "metric", "relative"))
         if self.sh_degree not in (0, 1, 2, 3):
             raise RangeError(f"sh_degree: expected 0 to 3, got {self.sh_degree}.")
         for name in (
@@ -168,6 +200,9 @@ class FitOptions:
             "final_rate",
             "degree_interval",
             "grow_until",
+            "exposure_rate",
+            "pose_rate",
+            "depth_weight",
             "clone_scale",
             "prune_scale",
             "prune_radius",
@@ -176,7 +211,13 @@ class FitOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise RangeError(f"{name}: expected a positive number, got {value}.")
-        for name in ("opacity_penalty", "scale_penalty", "noise", "densify_gradient"):
+        for name in (
+            "exposure_prior",
+            "opacity_penalty",
+            "scale_penalty",
+            "noise",
+            "densify_gradient",
+        ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise RangeError(f"{name}: expected 0 or more, got {value}.")

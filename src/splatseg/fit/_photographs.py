@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg.core import Camera, View
-from splatseg.io.images import image_camera, load_image, load_mask, reduced_size
+from splatseg.io.images import image_camera, load_alpha, load_image, load_mask, reduced_size
 from splatseg.render.warp import photograph_to_pinhole, straightened
 
 _MEMORY = 6 * 2**30
@@ -19,36 +20,55 @@ _MEMORY = 6 * 2**30
 class Example:
     """One view to learn from."""
 
+    index: int
+    """Which of the training views."""
+
     camera: Camera
     """Pinhole."""
 
     photograph: Float[Tensor, "height width 3"]
-    """[0, 1]; 0 where the mask is False."""
+    """[0, 1]; 0 where the mask is False. With an alpha: colour times alpha."""
 
     mask: Bool[Tensor, "height width"] | None
     """Pixels that count; None is all."""
+
+    alpha: Float[Tensor, "height width"] | None = None
+    """How opaque each pixel is, [0, 1]; None is opaque everywhere."""
 
 
 class Photographs:
     """Training views by number. Pixels are read when they are first asked for.
 
     Photographs with distortion are resampled into ``camera.undistorted()``; what lies outside
-    them, or is 0 in the view's own mask, has no loss.
+    them has no loss. What is 0 in the view's own mask has none either, or is transparent, as
+    `FitOptions.masks` says.
 
     Example:
         photographs = Photographs(capture.train_views, longest=1600)
         example = photographs.example(0, reduction=2)
     """
 
-    def __init__(self, views: Sequence[View], *, longest: int) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        *,
+        longest: int,
+        masks: Literal["ignore", "alpha", "off"] = "ignore",
+    ) -> None:
         self._views = tuple(views)
         self._longest = longest
-        self._kept: dict[int, tuple[Tensor, Tensor | None]] = {}
+        self._masks = masks
+        self._kept: dict[int, _Pixels] = {}
         self._bytes = 0
         self._cameras = [straightened(image_camera(view, longest)) for view in self._views]
 
     def __len__(self) -> int:
         return len(self._views)
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The views."""
+        return self._views
 
     def camera(self, index: int) -> Camera:
         """The pinhole camera of a view at full size."""
@@ -60,22 +80,29 @@ class Photographs:
         Rows and columns that do not fill a block are cut off. A block counts if all its pixels
         do.
         """
-        pixels, mask = self._pixels(index)
+        pixels, mask, opaque = self._pixels(index)
         photograph = pixels.float() / 255
+        alpha = None if opaque is None else opaque.float() / 255
         camera = self._cameras[index]
         if reduction == 1:
-            return Example(camera=camera, photograph=photograph, mask=mask)
+            return Example(
+                index=index, camera=camera, photograph=photograph, mask=mask, alpha=alpha
+            )
         photograph = torch.nn.functional.avg_pool2d(photograph.movedim(-1, 0), reduction)
         if mask is not None:
             least = torch.nn.functional.avg_pool2d(mask[None].float(), reduction)[0]
             mask = least == 1
+        if alpha is not None:
+            alpha = torch.nn.functional.avg_pool2d(alpha[None], reduction)[0]
         return Example(
+            index=index,
             camera=reduced_camera(camera, reduction),
             photograph=photograph.movedim(0, -1).contiguous(),
             mask=mask,
+            alpha=alpha,
         )
 
-    def _pixels(self, index: int) -> tuple[Tensor, Tensor | None]:
+    def _pixels(self, index: int) -> "_Pixels":
         kept = self._kept.get(index)
         if kept is None:
             kept = self._read(index)
@@ -85,22 +112,47 @@ class Photographs:
                 self._bytes += size
         return kept
 
-    def _read(self, index: int) -> tuple[Tensor, Tensor | None]:
+    def _read(self, index: int) -> "_Pixels":
         view = self._views[index]
         camera = image_camera(view, self._longest)
         pixels = load_image(view, longest=self._longest)
-        own_mask = load_mask(view, longest=self._longest)
+        if self._masks == "alpha":
+            alpha = load_alpha(view, longest=self._longest)
+            if alpha is not None:
+                return _cut_out(pixels, alpha, view, camera)
+        own_mask = load_mask(view, longest=self._longest) if self._masks == "ignore" else None
         if camera.is_pinhole:
             if own_mask is None:
-                return pixels, None
+                return pixels, None, None
             mask = own_mask.bool()
-            return pixels * mask[..., None], mask
+            return pixels * mask[..., None], mask, None
         straight, mask = photograph_to_pinhole(pixels.float(), camera)
         if own_mask is not None:
             used, _ = photograph_to_pinhole(own_mask.float()[..., None], camera)
             mask = mask & (used[..., 0] > 1 - 1e-3)
         straight = (straight + 0.5).clamp(0, 255).to(torch.uint8)
-        return straight * mask[..., None], mask
+        return straight * mask[..., None], mask, None
+
+
+_Pixels = tuple[Tensor, Tensor | None, Tensor | None]
+"""Photograph (uint8), mask and alpha (uint8)."""
+
+
+def _cut_out(pixels: Tensor, alpha: Tensor, view: View, camera: Camera) -> _Pixels:
+    """A photograph times its alpha, straightened, with the mask of where there is one."""
+    opaque = alpha.float()[..., None]
+    if view.mask is None:
+        # Its own alpha: it was blended over white, and what the white gave is taken off again.
+        colour = (pixels.float() - (255 - opaque)).clamp_min(0)
+    else:
+        colour = pixels.float() * opaque / 255
+    mask = None
+    both = torch.cat((colour, opaque), dim=2)
+    if not camera.is_pinhole:
+        both, mask = photograph_to_pinhole(both, camera)
+        both = both * mask[..., None]
+    both = (both + 0.5).clamp(0, 255).to(torch.uint8)
+    return both[..., :3].contiguous(), mask, both[..., 3].contiguous()
 
 
 def reduced_camera(camera: Camera, reduction: int) -> Camera:

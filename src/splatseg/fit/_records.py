@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from splatseg.core import Gaussians
+from splatseg.core import Gaussians, View
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,3 +72,10 @@ class FitResult:
     stages: Mapping[str, float] = field(default_factory=dict[str, float])
     """Seconds spent in each part of a step: read, gather, render, loss, backward, update,
     densify."""
+
+    views: tuple[View, ...] = ()
+    """The capture's views; with `FitOptions.refine_poses` training views have the refined poses,
+    moved as one to where the given ones are."""
+
+    notes: tuple[str, ...] = ()
+    """Sentences on what was learned besides the Gaussians: exposures, poses."""

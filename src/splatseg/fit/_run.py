@@ -22,7 +22,8 @@ from splatseg.fit._records import FitProgress, FitRecord
 from splatseg.fit._schedule import degree_at, rates_at, reduction_at
 from splatseg.fit._state import FitState, Part, named, parameters_of
 from splatseg.fit._update import UpdateSettings, update_rows
-from splatseg.render import Backend, default_options
+from splatseg.fit._view_parts import ViewParts
+from splatseg.render import Backend, Rendered, default_options
 
 _RECORD_EVERY = 50  # steps
 
@@ -48,6 +49,7 @@ class FitRun:
         self._options = options
         self._backend = backend
         self._photographs = photographs
+        self.views = ViewParts.of(capture, photographs.views, options=options)
         self._generator = torch.Generator().manual_seed(options.seed)
         self._device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self._order: list[int] = []
@@ -91,7 +93,7 @@ class FitRun:
         parameters = self._state[0]
         alive = parameters.logits.sigmoid().squeeze(1) > self._options.dead_opacity
         found = parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
-        return found.replace(antialiased=self._options.antialiased)
+        return self.views.settled(found.replace(antialiased=self._options.antialiased))
 
     def step(self) -> FitProgress:
         """Learn from the next view. An exception leaves `between_steps` False."""
@@ -125,7 +127,7 @@ class FitRun:
 
     def _parts(self) -> dict[str, Part]:
         """What remembers something of its own, by the name of its group in the state."""
-        return {"density": self._density}
+        return {"density": self._density, **self.views.parts()}
 
     def _take_up(self, saved: FitState) -> None:
         """Go on from a state; the parts follow."""
@@ -169,29 +171,37 @@ class FitRun:
             screen = None
             if self._density.looks_at_screen:
                 screen = torch.zeros_like(gaussians.means[:, :2]).requires_grad_()
+            camera = self.views.camera_to_draw(example.index, example.camera)
             rendered = self._backend.render(
-                gaussians, example.camera, None, options=render_options, screen=screen
+                gaussians, camera, None, options=render_options, screen=screen
             )
         with self._timed("loss"):
-            picture = rendered.image
-            if self._options.background == "random":
-                colour = torch.rand(3, generator=self._generator).to(picture)
-                picture = picture + (1 - rendered.alpha).unsqueeze(-1) * colour
+            picture, photograph = self._over_background(rendered, example)
             loss = l1_dssim(
                 picture,
-                example.photograph,
+                photograph,
                 mask=example.mask,
                 dssim_weight=self._options.dssim_weight,
             )
+            depth = None
+            if self.views.depths is not None:
+                depth = self.views.depths.loss(
+                    example.index, rendered.depth, rendered.alpha, progress=done, mask=example.mask
+                )
         if not math.isfinite(loss.value):
             raise SplatsegError(
                 f"fit: expected a finite loss, got {loss.value} at step {self.steps}; lower rates "
                 "may help."
             )
         with self._timed("backward"):
-            torch.autograd.backward([picture], [loss.gradient])
+            roots, slopes = [picture], [loss.gradient]
+            if depth is not None:
+                roots.append(rendered.depth)
+                slopes.append(depth.gradient)
+            torch.autograd.backward(roots, slopes)
         with self._timed("update"), torch.no_grad():
             self._update(gaussians, rows, done)
+            self.views.update(example.index, progress=done)
         self.steps += 1
         with self._timed("densify"), torch.no_grad():
             if screen is not None and screen.grad is not None:
@@ -211,12 +221,26 @@ class FitRun:
             progress, options=self._options, width=camera.width, height=camera.height
         )
         example = self._photographs.example(index, reduction=reduction)
-        mask = example.mask
+        mask, alpha = example.mask, example.alpha
         return Example(
-            camera=example.camera,
+            index=index,
+            camera=self.views.camera(index, example.camera),
             photograph=example.photograph.to(self._device),
             mask=None if mask is None else mask.to(self._device),
+            alpha=None if alpha is None else alpha.to(self._device),
         )
+
+    def _over_background(self, rendered: Rendered, example: Example) -> tuple[Tensor, Tensor]:
+        """Picture and photograph as they are compared: over one colour, in one exposure."""
+        picture, photograph = rendered.image, example.photograph
+        if self.views.exposures is not None:
+            picture = self.views.exposures.applied(example.index, picture, rendered.alpha)
+        if self._options.background == "random":
+            colour = torch.rand(3, generator=self._generator).to(picture)
+            picture = picture + (1 - rendered.alpha).unsqueeze(-1) * colour
+            if example.alpha is not None:
+                photograph = photograph + (1 - example.alpha).unsqueeze(-1) * colour
+        return picture, photograph
 
     def _update(self, gaussians: Gaussians, rows: Tensor, progress: float) -> None:
         count = len(self._state[0])

@@ -130,6 +130,44 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
     return torch.from_numpy((np.asarray(keep) == 255).astype(np.uint8))
 
 
+def load_alpha(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width"] | None:
+    """How opaque each pixel of a view is, 0 to 255; None where the view does not say.
+
+    The view's mask says it if there is one (a mask of zeros and ones counts as 0 and 255), else
+    the alpha channel of its photograph. It is reduced with the photograph (area-weighted).
+
+    Raises:
+        InputError: If the view has no photograph.
+        MissingFileError: If a file is not where it was.
+        FileFormatError: If a file cannot be decoded, or its size is not the camera's.
+    """
+    path = _photograph(view) if view.mask is None else view.mask
+    camera = view.camera
+    with open_image(path) as image:
+        upright = _upright(image, path)
+    if view.mask is None:
+        if not (upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info):
+            return None
+        grey = np.asarray(upright.convert("RGBA"))[..., -1]
+    else:
+        grey = np.asarray(upright)
+        if upright.mode in ("RGBA", "LA"):
+            grey = grey[..., -1]
+        grey = grey.max(axis=2) if grey.ndim == 3 else grey
+        if grey.dtype != np.uint8 or grey.max(initial=0) <= 1:
+            grey = np.where(grey > 0, 255, 0).astype(np.uint8)
+    if grey.shape != (camera.height, camera.width):
+        raise FileFormatError(
+            f"{path}: expected {camera.width}x{camera.height} pixels as the photograph of "
+            f"view {view.name!r} has, got {grey.shape[1]}x{grey.shape[0]}."
+        )
+    opaque = Image.fromarray(grey)
+    target = reduced_size(camera.width, camera.height, longest)
+    if target != opaque.size:
+        opaque = opaque.resize(target, Image.Resampling.BOX)
+    return torch.from_numpy(np.array(opaque, dtype=np.uint8))
+
+
 def image_camera(view: View, longest: int | None = None) -> Camera:
     """The camera of the pixels that `load_image` returns for the same `longest`."""
     camera = view.camera

@@ -1,0 +1,81 @@
+"""Photographs of one scene are not equally bright: a gain and a bias for each of them.
+
+The 3DGS code has an affine map of the colour for each training view as an option (Kerbl et al.
+2023, ``exposure`` in its repository). Here it is diagonal: gain and bias of each channel, which
+is what automatic exposure and white balance change.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.fit._options import FitOptions
+from splatseg.fit._view_adam import ViewAdam
+
+_FINAL_RATE = 0.1
+"""What is left of the rate at progress 1."""
+
+
+class Exposures:
+    r"""Gain and bias of each training view.
+
+    .. math:: I' = e^{g} I + \alpha b
+
+    with g and b a number a channel, both 0 at the start. The means of g and of b over the views
+    stay 0: the scene itself is what a photograph of mean exposure shows, and views that were
+    not trained on are drawn without either. A term :math:`p (|g|^2 + |b|^2)` in the loss keeps
+    them where the photographs do not say otherwise.
+
+    Args:
+        views: Number of training views.
+        options: Rate and weight p.
+    """
+
+    def __init__(self, views: int, *, options: FitOptions) -> None:
+        self._rate = options.exposure_rate
+        self._prior = options.exposure_prior
+        self._values = torch.zeros(views, 6, dtype=torch.float64)
+        self._adam = ViewAdam(views, 6)
+        self._leaf: Tensor | None = None
+
+    @property
+    def gains(self) -> Float[Tensor, "views 3"]:
+        """Factor of each channel in each view; the geometric mean over views is 1."""
+        return self._values[:, :3].exp()
+
+    @property
+    def biases(self) -> Float[Tensor, "views 3"]:
+        """What is added to each channel in each view; the mean over views is 0."""
+        return self._values[:, 3:].clone()
+
+    def applied(
+        self,
+        index: int,
+        image: Float[Tensor, "height width 3"],
+        alpha: Float[Tensor, "height width"],
+    ) -> Float[Tensor, "height width 3"]:
+        """The image as a view's exposure shows it. Differentiable, also towards the exposure."""
+        leaf = self._values[index].to(image).requires_grad_()
+        self._leaf = leaf
+        return image * leaf[:3].exp() + alpha.unsqueeze(-1) * leaf[3:]
+
+    def update(self, index: int, *, progress: float) -> None:
+        """One step of Adam along the gradient of the last image that `applied` gave."""
+        leaf = self._leaf
+        if leaf is None or leaf.grad is None:
+            return
+        slope = leaf.grad.double().cpu() + 2 * self._prior * self._values[index]
+        rate = self._rate * _FINAL_RATE**progress
+        values = self._values.clone()
+        values[index] -= rate * self._adam.direction(index, slope)
+        self._values = values - values.mean(dim=0)
+        self._leaf = None
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything it holds, by name."""
+        return {"values": self._values, **self._adam.state()}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a `state`."""
+        self._values = tensors["values"].cpu().clone()
+        self._adam.restore(tensors)

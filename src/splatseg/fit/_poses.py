@@ -1,0 +1,183 @@
+"""Poses of the training views as unknowns: small moves that make the photographs agree."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import Camera, Similarity, View
+from splatseg.fit._options import FitOptions
+from splatseg.fit._view_adam import ViewAdam
+
+_FINAL_RATE = 0.01
+"""What is left of the rate at progress 1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseShift:
+    """How far refined poses are from those given, after both were aligned."""
+
+    degrees_mean: float
+    degrees_max: float
+    """Turn of a camera."""
+
+    distance_mean: float
+    distance_max: float
+    """Move of a camera's centre, scene units."""
+
+
+class Poses:
+    r"""Poses of the training views, each moved by a twist in its own camera axes.
+
+    .. math:: T \leftarrow \exp \begin{pmatrix} [\omega]_\times & v \\ 0 & 0 \end{pmatrix} T
+
+    with T = ``cam_from_world``. Adam's step is taken in :math:`\omega` and in v over the depth of
+    the scene, so that both move pixels alike.
+
+    Nothing but the start holds the whole scene in place, so it may drift; `aligned` takes the
+    drift out.
+
+    Args:
+        cameras: The training views' cameras as given.
+        depth: A typical depth of the scene, scene units.
+        options: The rate.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], *, depth: float, options: FitOptions) -> None:
+        given = [camera.cam_from_world.detach().double().cpu() for camera in cameras]
+        self._given = torch.stack(given)
+        self._poses = self._given.clone()
+        self._depth = depth
+        self._rate = options.pose_rate
+        self._adam = ViewAdam(len(cameras), 6)
+        self._leaf: Tensor | None = None
+
+    def camera(self, index: int, camera: Camera) -> Camera:
+        """A view's camera at its present pose."""
+        return replace(camera, cam_from_world=self._poses[index])
+
+    def leaf(self, index: int, camera: Camera) -> Camera:
+        """The same, with a pose that gradients are asked for; `update` uses them."""
+        self._leaf = self._poses[index].clone().requires_grad_()
+        return replace(camera, cam_from_world=self._leaf)
+
+    def update(self, index: int, *, progress: float) -> None:
+        """One step of Adam along the gradient of the last camera that `leaf` gave."""
+        leaf = self._leaf
+        if leaf is None or leaf.grad is None:
+            return
+        slope = twist_gradient(leaf.grad, self._poses[index])
+        slope[3:] *= self._depth
+        rate = self._rate * _FINAL_RATE**progress
+        move = -rate * self._adam.direction(index, slope)
+        move[3:] *= self._depth
+        poses = self._poses.clone()
+        poses[index, :3] = (exponential(move) @ poses[index])[:3]
+        self._poses = poses
+        self._leaf = None
+
+    def aligned(self) -> tuple[Similarity, Float[Tensor, "views 4 4"]]:
+        """The similarity that takes the refined frame back to the given one, and the poses there.
+
+        The poses are ``cam_from_world`` of the given world. Gaussians of the fit belong into it
+        by the same similarity.
+        """
+        given_from_refined = aligning_similarity(self._given, self._poses)
+        rotation = given_from_refined.rotation
+        turned = self._poses.clone()
+        turned[:, :3, :3] = self._poses[:, :3, :3] @ rotation.T
+        centres = given_from_refined.apply(centres_of(self._poses))
+        turned[:, :3, 3] = -torch.einsum("nij,nj->ni", turned[:, :3, :3], centres)
+        return given_from_refined, turned
+
+    def refined(self, views: Sequence[View]) -> tuple[View, ...]:
+        """The training views, in the order of the cameras, with their refined poses, aligned."""
+        _, poses = self.aligned()
+        return tuple(
+            replace(view, camera=replace(view.camera, cam_from_world=pose))
+            for view, pose in zip(views, poses, strict=True)
+        )
+
+    def shift(self) -> PoseShift:
+        """How far the refined poses are from those given."""
+        _, poses = self.aligned()
+        turn = poses[:, :3, :3] @ self._given[:, :3, :3].mT
+        # |R - I| = 2 sqrt 2 sin(angle / 2), exact where the arc cosine of the trace is not.
+        chord = torch.linalg.matrix_norm(turn - torch.eye(3, dtype=turn.dtype))
+        degrees = torch.rad2deg(2 * torch.asin((chord / 8**0.5).clamp_max(1)))
+        distance = (centres_of(poses) - centres_of(self._given)).norm(dim=1)
+        return PoseShift(
+            degrees_mean=float(degrees.mean()),
+            degrees_max=float(degrees.max()),
+            distance_mean=float(distance.mean()),
+            distance_max=float(distance.max()),
+        )
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything it holds, by name."""
+        return {"poses": self._poses, **self._adam.state()}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from a `state`."""
+        self._poses = tensors["poses"].cpu().clone()
+        self._adam.restore(tensors)
+
+
+def centres_of(poses: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
+    """Camera centres of ``cam_from_world`` matrices."""
+    return -torch.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def twist_gradient(
+    gradient: Float[Tensor, "4 4"], pose: Float[Tensor, "4 4"]
+) -> Float[Tensor, "6"]:
+    r"""Slope along the twist :math:`(\omega, v)` at 0 of :math:`\exp(\omega, v) T`.
+
+    With :math:`dT = [\omega]_\times T + (0, v)` and G the gradient towards T it is
+    :math:`(A_{32} - A_{23}, A_{13} - A_{31}, A_{21} - A_{12}, G_{14}, G_{24}, G_{34})` where
+    :math:`A = G T^\top` of the upper three rows.
+    """
+    slope = gradient[:3].double().cpu()
+    a = slope @ pose[:3].mT
+    turn = torch.stack((a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]))
+    return torch.cat((turn, slope[:, 3]))
+
+
+def exponential(twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
+    """The rigid motion of a twist (omega, v), by the matrix exponential."""
+    x, y, z = twist[:3].tolist()
+    algebra = torch.zeros(4, 4, dtype=torch.float64)
+    algebra[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    algebra[:3, 3] = twist[3:]
+    return torch.linalg.matrix_exp(algebra)
+
+
+def aligning_similarity(
+    given: Float[Tensor, "n 4 4"], refined: Float[Tensor, "n 4 4"]
+) -> Similarity:
+    """The similarity given_from_refined that best takes refined cameras to the given ones.
+
+    The rotation agrees best with the turns of the cameras and with their centres, in units of
+    the centres' spread; scale and translation then fit the centres in least squares. Where all
+    centres are one, the scale is 1.
+    """
+    goal, start = centres_of(given), centres_of(refined)
+    goal_mean, start_mean = goal.mean(dim=0), start.mean(dim=0)
+    goal, start = goal - goal_mean, start - start_mean
+    spread = float(start.square().sum())
+    # R_given = R_refined rotation^T, so the sum of R_given^T R_refined is nearest to rotation.
+    votes = torch.einsum("nji,njk->ik", given[:, :3, :3], refined[:, :3, :3])
+    degenerate = spread <= 1e-12 * float(start_mean.square().sum() + 1)
+    if not degenerate:
+        votes = votes + len(given) * goal.mT @ start / spread
+    u, _, vt = torch.linalg.svd(votes)
+    sign = torch.ones(3, dtype=votes.dtype)
+    sign[2] = torch.sign(torch.linalg.det(u @ vt))
+    rotation = u @ torch.diag(sign) @ vt
+    turned = start @ rotation.mT
+    scale = 1.0 if degenerate else float((turned * goal).sum()) / spread
+    return Similarity(
+        rotation=rotation, translation=goal_mean - scale * rotation @ start_mean, scale=scale
+    )
