@@ -1,6 +1,6 @@
 """What commands that go through views share: which views, which layer, and a progress bar."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -33,6 +33,12 @@ def progress(what: str) -> Generator[Callable[[int, int], None]]:
 def open_scene(root: Path, data: Path | None) -> Scene:
     """The scene that a command works on."""
     return load_scene(root, data=data)
+
+
+def is_cut_out(scene: Scene) -> bool:
+    """Whether a scene is what masks or alpha channels cut out of its photographs."""
+    options = scene.provenance.get("options")
+    return isinstance(options, Mapping) and options.get("masks") == "alpha"  # pyright: ignore[reportUnknownMemberType]
 
 
 def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:

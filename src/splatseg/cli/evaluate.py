@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._work import layer_of, open_scene, progress, views_of_split
+from splatseg.cli._work import is_cut_out, layer_of, open_scene, progress, views_of_split
 from splatseg.core import Labels, Scene, Selection, View
 from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_binary, evaluate_photographs, evaluate_semantic
@@ -145,7 +145,11 @@ def _wants_photographs(command: Command, views: tuple[View, ...]) -> bool:
 def _photograph_figures(command: Command, scene: Scene, views: tuple[View, ...]) -> dict[str, Any]:
     with progress("photographs") as step:
         report = evaluate_photographs(
-            scene.gaussians, views, backend=command.backend, progress=step
+            scene.gaussians,
+            views,
+            cut_out=is_cut_out(scene),
+            backend=command.backend,
+            progress=step,
         )
     return {
         "PSNR": report.psnr,

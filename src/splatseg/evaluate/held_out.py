@@ -22,7 +22,7 @@ from splatseg.evaluate.metrics import (
     semantic_score,
     ssim,
 )
-from splatseg.io.images import load_image
+from splatseg.io.images import load_alpha, load_image
 from splatseg.lift import LabelSource, label_map
 from splatseg.lift.uplift import camera_of_map
 from splatseg.render import RenderOptions, render
@@ -167,11 +167,22 @@ def evaluate_photographs(
     gaussians: Gaussians,
     views: Sequence[View],
     *,
+    cut_out: bool = False,
     options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Progress | None = None,
 ) -> PhotographReport:
     """Score the pictures against the photographs, as 8-bit files of both would score.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Views with photographs.
+        cut_out: Score what the view's mask, or the alpha channel of its photograph, cuts out:
+            photograph and picture over white, as is the custom for such scenes. A view without
+            either is scored as it is.
+        options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and their number.
 
     Raises:
         InputError: If there are no views, or one has no photograph.
@@ -185,7 +196,12 @@ def evaluate_photographs(
         photograph = load_image(view)
         with torch.no_grad():
             drawn = render(gaussians, view.camera, options=options, backend=backend)
-        picture = (drawn.image.cpu().double().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        image = drawn.image.cpu().double()
+        opaque = load_alpha(view) if cut_out else None
+        if opaque is not None:
+            image = image + (1 - drawn.alpha.cpu().double())[..., None]
+            photograph = _over_white(photograph, opaque, view)
+        picture = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
         decibels.append(psnr(picture, photograph))
         likeness.append(ssim(picture, photograph))
         if progress is not None:
@@ -196,6 +212,14 @@ def evaluate_photographs(
         ssim=math.fsum(likeness) / len(likeness),
         views=tuple(view.name for view in views),
     )
+
+
+def _over_white(photograph: torch.Tensor, opaque: torch.Tensor, view: View) -> torch.Tensor:
+    """A photograph cut out by a mask, over white; its own alpha was blended so when it was read."""
+    if view.mask is None:
+        return photograph
+    share = opaque.double()[..., None] / 255
+    return (photograph * share + 255 * (1 - share) + 0.5).to(torch.uint8)
 
 
 def labels_of(selection: Selection) -> Labels:

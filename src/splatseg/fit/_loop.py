@@ -60,7 +60,7 @@ def fit(
     if checkpoints is not None:
         identity = fit_identity(capture, views, options=options, backend=renderer.name)
         clock = CheckpointClock(checkpoints, identity=identity)
-    photographs = Photographs(views, longest=options.longest)
+    photographs = Photographs(views, longest=options.longest, masks=options.masks)
     saved = None if clock is None else clock.saved()
     run = FitRun(capture, options, renderer, photographs, saved=saved)
 
