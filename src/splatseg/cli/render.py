@@ -1,4 +1,4 @@
-"""``splatseg render``: views of a scene as PNG files."""
+"""``splatseg render``: views of a scene, or a path through it, as PNG files and films."""
 
 import math
 import shutil
@@ -14,6 +14,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from splatseg.cli._film import check_film, path_views, write_film, write_path
 from splatseg.cli._legend import coloured, legend_of
 from splatseg.cli._work import layer_of, open_scene, progress, views_of_split
 from splatseg.core import UNLABELLED, Labels, Scene, Selection, View
@@ -28,6 +29,7 @@ from splatseg.render import BackendName, Rendered, render
 
 _PICTURES = ("rgb", "depth", "alpha")
 _RECORD = "render.json"
+_CAMERAS = "transforms.json"
 _SOLID = 0.5
 _DEEPEST = 65535
 
@@ -39,6 +41,9 @@ class Command:
     rgb and alpha have 8 bit. depth has 16 bit, z-depth with the unit in depth.json and 0 where
     less than half of the light is stopped. A layer of labels becomes a 16-bit id map with 0 for
     none and its meaning in legend.json; a selection becomes 0 and 255.
+
+    --split path draws a smooth path near the captured cameras, and writes its cameras to
+    DIR/transforms.json. --video makes a film of each folder, DIR/<what>.mp4.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -48,13 +53,23 @@ class Command:
     """Folder to write to. DIR/<what> of an earlier render is replaced as a whole."""
 
     split: str = "test"
-    """Which views: test, train, another split of the scene, or all."""
+    """Which views: test, train, another split of the scene, all, or path: a smooth path near the
+    training cameras."""
 
     what: str = "rgb"
     """What to draw, with commas between: rgb, depth, alpha, and names of layers."""
 
     coloured: bool = False
     """Also write DIR/<layer>_coloured with pictures of label layers in the legend's colours."""
+
+    video: bool = False
+    """Also write DIR/<what>.mp4: depth and labels in colours. Needs splatseg[video]."""
+
+    frames: int = 360
+    """Views of --split path."""
+
+    fps: float = 24.0
+    """Frames a second of --video."""
 
     backend: BackendName = "auto"
     """Who renders. auto: cuda for scenes on a GPU, cpu otherwise."""
@@ -75,7 +90,11 @@ class _Layer:
 def run(command: Command) -> None:
     """Render a scene."""
     scene = open_scene(command.scene, command.data)
-    views = views_of_split(scene, command.split)
+    on_path = command.split == "path" and all(view.split != "path" for view in scene.views)
+    if on_path:
+        views = path_views(scene, frames=command.frames, backend=command.backend)
+    else:
+        views = views_of_split(scene, command.split)
     wanted = _wanted(command.what)
     layers = _layers(scene, wanted)
     folders = [*wanted]
@@ -83,17 +102,33 @@ def run(command: Command) -> None:
         folders += [f"{layer.name}_coloured" for layer in layers if not layer.is_selection]
     if len(set(folders)) != len(folders):
         raise InputError("--what: a layer has the name of another's coloured pictures.")
-    record = _check_output(command.output, folders)
+    if command.video:
+        check_film(views, fps=command.fps)
+    films = [name for name in wanted if command.video]
+    files = [f"{name}.mp4" for name in films] + ([_CAMERAS] if on_path else [])
+    record = _check_output(command.output, folders, files)
     command.output.mkdir(parents=True, exist_ok=True)
     try:
         _render(command, scene, views, layers, folders)
+        # Before the films, which take a while: what an interruption leaves can be replaced.
         entry = {"scene": str(command.scene), "split": command.split, "views": len(views)}
-        write_json(command.output / _RECORD, record | dict.fromkeys(folders, entry))
+        write_json(command.output / _RECORD, record | dict.fromkeys([*folders, *files], entry))
+        if on_path:
+            write_path(command.output, views, pictures="rgb" in folders)
+        by_name = {layer.name: layer.labels for layer in layers if not layer.is_selection}
+        for name in films:
+            write_film(
+                command.output / name,
+                views,
+                fps=command.fps,
+                labels=by_name.get(name),
+                classes=scene.classes,
+            )
     finally:
         # Only a folder that nothing was written to is still empty.
         if not any(command.output.iterdir()):
             command.output.rmdir()
-    sys.stdout.write(f"{len(views)} views of {', '.join(folders)} in {command.output}\n")
+    sys.stdout.write(f"{len(views)} views of {', '.join([*folders, *files])} in {command.output}\n")
 
 
 def _render(
@@ -148,8 +183,8 @@ def _layers(scene: Scene, wanted: Sequence[str]) -> list[_Layer]:
     return layers
 
 
-def _check_output(output: Path, folders: Sequence[str]) -> dict[str, Any]:
-    """What earlier renders wrote here; folders that are somebody else's are not replaced."""
+def _check_output(output: Path, folders: Sequence[str], files: Sequence[str]) -> dict[str, Any]:
+    """What earlier renders wrote here; what is somebody else's is not replaced."""
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: expected a folder to write to, got a file.")
     path = output / _RECORD
@@ -160,6 +195,12 @@ def _check_output(output: Path, folders: Sequence[str]) -> dict[str, Any]:
             raise InputError(
                 f"{folder}: expected no folder or one that render wrote, got one with other "
                 "files; choose another output folder."
+            )
+    for name in files:
+        if name not in record and (output / name).exists():
+            raise InputError(
+                f"{output / name}: expected no file or one that render wrote, got another; choose "
+                "another output folder."
             )
     return record
 
