@@ -95,7 +95,9 @@ def test_ctrl_c_leaves_a_scene_that_loads(folder: Path, tmp_path: Path, capsys) 
     status = main(["fit", str(folder), "-o", str(tmp_path / "scene"), "--minutes", "5"])
     timer.join()
     assert status == 1
-    assert "stopped by Ctrl-C" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Gaussians stopped after" in said
+    assert "the same command with --resume goes on" in said
     scene = load_scene(tmp_path / "scene")
     assert scene.provenance["interrupted"] is True
     scene.gaussians.check_values()
@@ -145,3 +147,92 @@ def test_what_cannot_be_done_is_said_before_the_work(folder: Path, tmp_path: Pat
     (folder / "transforms.json").write_text(json.dumps(content))
     assert "start points" in refused(str(folder), "-o", scene, "--steps", "2")
     assert not Path(scene).exists()
+
+
+def _stopped(folder: Path, scene: Path, *words: str) -> None:
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    assert main(["fit", str(folder), "-o", str(scene), "--minutes", "5", *words]) == 1
+    timer.join()
+
+
+def test_a_stopped_fit_is_resumed_or_begun_again(folder: Path, tmp_path: Path, capsys) -> None:
+    scene = tmp_path / "scene"
+    words = ["fit", str(folder), "-o", str(scene)]
+    _stopped(folder, scene)
+    steps = load_scene(scene).provenance["steps"]
+    checkpoint = scene / "fit" / "checkpoint.npz"
+    assert checkpoint.is_file()
+    assert main(["info", str(scene)]) == 0
+    assert f"its fit was stopped at step {steps} (" in capsys.readouterr().out
+
+    assert main([*words, "--minutes", "5"]) == 2
+    said = capsys.readouterr().err
+    assert f"got a fit that was stopped at step {steps} (" in said
+    assert "--resume continues it, --overwrite begins again" in said
+    assert main([*words, "--steps", str(steps + 9), "--resume", "--seed", "8"]) == 2
+    assert "seed 0 instead of 8" in capsys.readouterr().err
+    assert main([*words, "--resume", "--overwrite"]) == 2
+    assert "resume, overwrite: expected one of the two" in capsys.readouterr().err
+
+    assert main([*words, "--steps", str(steps + 9), "--resume"]) == 0
+    assert f"{scene}: going on from step {steps} (" in capsys.readouterr().out
+    assert load_scene(scene).provenance["steps"] == steps + 9
+    assert load_scene(scene).provenance["interrupted"] is False
+    assert not checkpoint.parent.exists()
+    assert main([*words, "--steps", "9", "--resume"]) == 2
+    assert "got a scene without a checkpoint" in capsys.readouterr().err
+    _stopped(folder, scene)
+    assert main([*words, "--steps", "9", "--overwrite"]) == 0
+    assert load_scene(scene).provenance["steps"] == 9
+    assert not checkpoint.parent.exists()
+
+
+def test_a_kept_checkpoint_makes_a_finished_fit_longer(
+    folder: Path, tmp_path: Path, capsys
+) -> None:
+    scene = tmp_path / "scene"
+    words = ["fit", str(folder), "-o", str(scene), "--keep-checkpoint", "--steps"]
+    assert main([*words, "20", "--resume"]) == 0
+    assert "nothing to go on from, beginning" in capsys.readouterr().out
+    assert main([*words, "30", "--resume"]) == 0
+    assert "going on from step 20 (100 %" in capsys.readouterr().out
+    assert load_scene(scene).provenance["steps"] == 30
+    assert main(["info", str(scene)]) == 0
+    assert "stopped" not in capsys.readouterr().out
+    assert main([*words, "5"]) == 0, "a finished scene is replaced, with its checkpoint"
+    assert load_scene(scene).provenance["steps"] == 5
+
+
+def test_a_folder_with_a_checkpoint_alone_is_known(folder: Path, tmp_path: Path, capsys) -> None:
+    """What is left of a process that was killed."""
+    scene = tmp_path / "scene"
+    words = ["fit", str(folder), "-o", str(scene), "--steps", "20"]
+    assert main([*words, "--keep-checkpoint"]) == 0
+    for path in scene.iterdir():
+        if path.name == "scene.json":
+            path.unlink()
+    (scene / ".splatseg-rest").mkdir()
+    capsys.readouterr()
+    assert main(["info", str(scene)]) == 0
+    said = capsys.readouterr().out
+    assert "unfinished fit, 100 % done: " in said
+    assert "Gaussians after 20 steps" in said
+    assert main([*words, "--resume"]) == 0
+    assert load_scene(scene).provenance["steps"] == 20
+    (scene / "scene.json").unlink()
+    (scene / "fit").mkdir()
+    capsys.readouterr()
+    assert main(["info", str(scene)]) == 0
+    assert "stopped before its first checkpoint" in capsys.readouterr().out
+    (scene / "fit" / "checkpoint.npz").write_bytes(b"PK nothing")
+    assert main([*words, "--resume"]) == 2
+    assert "checkpoint.npz: expected the checkpoint of a fit" in capsys.readouterr().err
+    assert main(words) == 2
+    assert "was stopped and has a damaged checkpoint" in capsys.readouterr().err
+    (scene / "holiday.jpg").write_bytes(b"mine")
+    assert main([*words, "--overwrite"]) == 2
+    assert "expected an empty folder or a new one" in capsys.readouterr().err
+    (scene / "holiday.jpg").unlink()
+    assert main([*words, "--overwrite"]) == 0
+    assert not (scene / "fit").exists()

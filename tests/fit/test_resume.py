@@ -17,7 +17,7 @@ from splatseg.fit import (
     Checkpoints,
     FitOptions,
     FitProgress,
-    checkpoint_content,
+    checkpoint_summary,
     discard_checkpoint,
     fit,
 )
@@ -74,7 +74,7 @@ def test_stops_change_no_bit(capture: Capture, path: Path, options: FitOptions) 
         piece = fit(capture, options=options, checkpoints=checkpoints, progress=_stop_after(stop))
         assert piece.interrupted
         assert piece.steps == stop
-        assert checkpoint_content(path)["steps"] == stop
+        assert checkpoint_summary(path).steps == stop
     threads = _native.threads()
     try:
         _native.set_threads(threads + 1)
@@ -118,14 +118,14 @@ def test_checkpoints_are_written_at_their_times(capture: Capture, path: Path) ->
 
     def look(progress: FitProgress) -> None:
         if path.is_file():
-            seen.append(int(checkpoint_content(path)["steps"]))
+            seen.append(checkpoint_summary(path).steps)
 
     options = replace(OPTIONS, steps=20)
     fit(capture, options=options, checkpoints=Checkpoints(path=path, steps=7), progress=look)
     assert seen == [7] * 7 + [14] * 6
-    assert checkpoint_content(path)["steps"] == 14, "a finished fit writes none of its own"
+    assert checkpoint_summary(path).steps == 14, "a finished fit writes none of its own"
     fit(capture, options=options, checkpoints=Checkpoints(path=path, steps=50, at_end=True))
-    assert checkpoint_content(path)["steps"] == 20
+    assert checkpoint_summary(path).steps == 20
 
 
 def test_seconds_between_checkpoints_grow_with_what_they_cost(path: Path, monkeypatch) -> None:
@@ -353,7 +353,7 @@ def test_signals_wait_for_the_step(capture: Capture, path: Path, number: int) ->
     assert signal.getsignal(number) is before
     assert piece.interrupted
     assert piece.steps == 33
-    assert checkpoint_content(path)["steps"] == 33
+    assert checkpoint_summary(path).steps == 33
     rest = fit(capture, options=OPTIONS, checkpoints=checkpoints)
     assert _same(rest.gaussians, straight.gaussians)
 
@@ -375,7 +375,7 @@ def test_the_third_signal_does_not_wait(capture: Capture, path: Path, monkeypatc
     assert result.interrupted
     assert result.steps == 8
     result.gaussians.check_values()
-    assert checkpoint_content(path)["steps"] == 5
+    assert checkpoint_summary(path).steps == 5
 
 
 def test_intervals_are_checked(path: Path) -> None:

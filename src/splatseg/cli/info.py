@@ -5,19 +5,28 @@ import sys
 import warnings
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from splatseg.cli._output import where_it_stopped
 from splatseg.core import Capture, Features, Gaussians, Labels, Scene, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.fit import CheckpointSummary, checkpoint_summary
 from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_capture
 from splatseg.io.evidence import Evidence, evidence_names, open_evidence
 from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import Layer, load_layer
-from splatseg.io.scene import is_scene, load_scene, load_scene_layer, scene_layer_names
+from splatseg.io.scene import (
+    CHECKPOINT_FILE,
+    is_scene,
+    is_unfinished,
+    load_scene,
+    load_scene_layer,
+    scene_layer_names,
+)
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
 
 _LAYOUTS = ("auto", *FORMATS)
@@ -93,6 +102,8 @@ def summary(facts: dict[str, Any]) -> str:
 def _describe_folder(path: Path, format: str) -> dict[str, Any]:
     if format == "auto" and is_scene(path):
         return _scene_facts(load_scene(path))
+    if format == "auto" and is_unfinished(path):
+        return _unfinished_facts(path)
     if format != "auto" or find_formats(path):
         return _capture_facts(read_capture(path, format=format))
     if (path / "meta.json").is_file():
@@ -122,6 +133,16 @@ def _describe_folder(path: Path, format: str) -> dict[str, Any]:
             if max(size) > DEFAULT_LONGEST
         ],
     }
+
+
+def _unfinished_facts(path: Path) -> dict[str, Any]:
+    """Facts of a folder that a fit was to make a scene of."""
+    checkpoint = path / CHECKPOINT_FILE
+    facts: dict[str, Any] = {"path": str(path), "kind": "unfinished fit"}
+    summary = CheckpointSummary(steps=0, progress=0.0, seconds=0.0, gaussians=0)
+    if checkpoint.is_file():
+        summary = checkpoint_summary(checkpoint)
+    return facts | asdict(summary)
 
 
 def _captures_inside(path: Path) -> list[str]:
@@ -179,6 +200,11 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
     lost = [v for v in scene.views if v.image is not None and not v.image.is_file()]
     facts: dict[str, Any] = {"path": str(root), "kind": "scene"}
     facts |= _gaussian_facts(scene.gaussians) | _view_facts(scene.views)
+    notes = [f"{len(lost)} photographs are not where they were (see --data)"] if lost else []
+    if (root / CHECKPOINT_FILE).is_file():
+        stopped = where_it_stopped(root / CHECKPOINT_FILE)
+        if stopped is not None:
+            notes.append(f"its fit {stopped}; fit --resume continues it")
     facts |= {
         "classes": None if scene.classes is None else len(scene.classes.rows),
         "up": None if scene.up is None else list(scene.up),
@@ -188,7 +214,7 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
             name: _layer_kind(load_scene_layer(root, name)) for name in scene_layer_names(root)
         },
         "evidence": list(evidence_names(places)),
-        "notes": [f"{len(lost)} photographs are not where they were (see --data)"] if lost else [],
+        "notes": notes,
     }
     return facts
 
@@ -306,6 +332,16 @@ def _photographs_sentence(facts: dict[str, Any]) -> str:
     return f"{facts['photographs']} photographs, {', '.join(facts['sizes'])}; no poses"
 
 
+def _unfinished_sentence(facts: dict[str, Any]) -> str:
+    if not facts["steps"]:
+        return "fit that was stopped before its first checkpoint"
+    return (
+        f"unfinished fit, {100 * facts['progress']:.0f} % done: {facts['gaussians']} Gaussians "
+        f"after {facts['steps']} steps and {facts['seconds'] / 60:.1f} minutes; "
+        "fit --resume continues it"
+    )
+
+
 def _splat_sentence(facts: dict[str, Any]) -> str:
     return f"{facts['format']} splats, {_gaussians(facts)}"
 
@@ -326,6 +362,7 @@ def _folder_sentence(facts: dict[str, Any]) -> str:
 _SENTENCES = {
     "capture": _capture_sentence,
     "scene": _scene_sentence,
+    "unfinished fit": _unfinished_sentence,
     "evidence": _evidence_sentence,
     "photographs": _photographs_sentence,
     "splats": _splat_sentence,

@@ -3,7 +3,8 @@
 `fit` is the whole of it; `FitOptions` are its switches.
 """
 
-from splatseg.fit._checkpoint import checkpoint_content as checkpoint_content
+from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
+from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
 from splatseg.fit._checkpoint import discard_checkpoint as discard_checkpoint
 from splatseg.fit._interrupts import deferred_interrupts as deferred_interrupts
 from splatseg.fit._loop import fit as fit

@@ -79,15 +79,36 @@ def read_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(state=state, identity=header["identity"])
 
 
-def checkpoint_content(path: Path) -> Mapping[str, Any]:
-    """What a checkpoint says of itself: steps, seconds, progress, gaussians. Reads no tensors.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckpointSummary:
+    """Where a fit was when its checkpoint was written."""
+
+    steps: int
+    progress: float
+    """Share that is done, [0, 1]."""
+
+    seconds: float
+    """Since the fit began, pauses left out."""
+
+    gaussians: int
+
+
+def checkpoint_summary(path: Path) -> CheckpointSummary:
+    """What a checkpoint says of itself. Reads no tensors.
 
     Raises:
         MissingFileError: If there is no such file.
         FileFormatError: If it is no checkpoint, damaged, or of another version.
     """
     with _opened(path) as archive:
-        return _header(path, archive)["content"]
+        content = _header(path, archive)["content"]
+    state = FitState(tensors={}, content=content, where=str(path))
+    return CheckpointSummary(
+        steps=int(state.number("steps")),
+        progress=state.number("progress"),
+        seconds=state.number("seconds"),
+        gaussians=int(state.number("gaussians")),
+    )
 
 
 def discard_checkpoint(path: Path) -> None:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from splatseg.errors import InputError, MissingFileError
 
-_TEMPORARY = ".splatseg-"
+TEMPORARY = ".splatseg-"
+"""How the names of folders begin that hold what is being written."""
 
 
 @contextmanager
@@ -42,7 +43,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Generator[Path]:
     target = _checked_target(path)
     if target.is_dir():
         raise InputError(f"{target}: expected a file to write, got a folder.")
-    holder = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=target.parent))
+    holder = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=target.parent))
     try:
         temporary = holder / target.name
         yield temporary
@@ -71,7 +72,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Generator[Path]:
     target = _checked_target(path)
     if target.exists() and not target.is_dir():
         raise InputError(f"{target}: expected a folder to write, got a file.")
-    holder = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=target.parent))
+    holder = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=target.parent))
     try:
         temporary = holder / target.name
         temporary.mkdir()

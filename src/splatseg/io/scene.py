@@ -7,6 +7,7 @@
       evidence/<name>/          what 2D models saw
       layers/<name>.npz         what is known of each Gaussian
       reports/
+      fit/checkpoint.npz        state of a fit that was stopped
 
 Photographs stay where they are: a scene knows its capture by a path relative to itself and an
 absolute one, and opens without it.
@@ -21,7 +22,7 @@ from typing import Any, cast
 
 from splatseg.core import Scene, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io._atomic import atomic_folder
+from splatseg.io._atomic import TEMPORARY, atomic_folder
 from splatseg.io._cameras import (
     cameras_content,
     relative_path,
@@ -40,6 +41,7 @@ VERSION = 1
 SCENE_FILE = "scene.json"
 GAUSSIANS_FILE = "gaussians.ply"
 CAMERAS_FILE = "cameras/transforms.json"
+CHECKPOINT_FILE = "fit/checkpoint.npz"
 FOLDERS = ("cameras", "evidence", "layers", "reports")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
 
@@ -49,11 +51,25 @@ def is_scene(path: Path) -> bool:
     return (path / SCENE_FILE).is_file()
 
 
+def is_unfinished(path: Path) -> bool:
+    """Whether a folder holds a fit that has not become a scene yet, and nothing else."""
+    checkpoint = path / CHECKPOINT_FILE
+    if is_scene(path) or not checkpoint.parent.is_dir():
+        return False
+    own = {checkpoint.parent.name, GAUSSIANS_FILE, *FOLDERS}
+    others = [entry.name for entry in path.iterdir() if entry.name not in own]
+    # What a process that was killed was about to write lies in hidden folders of this prefix.
+    return all(name.startswith(TEMPORARY) for name in others) and all(
+        entry.name in (checkpoint.name, f"{checkpoint.name}.new")
+        for entry in checkpoint.parent.iterdir()
+    )
+
+
 def save_scene(scene: Scene, root: Path | str) -> Scene:
     """Write a scene folder; layers, evidence and reports that are there stay.
 
-    A new folder appears whole or not at all. In one that is there each file is replaced whole,
-    scene.json last.
+    A new folder appears whole or not at all. In one that is there, be it a scene or the
+    checkpoint of one that was being fitted, each file is replaced whole, scene.json last.
 
     Returns:
         The scene with `root` set.
@@ -63,9 +79,10 @@ def save_scene(scene: Scene, root: Path | str) -> Scene:
         MissingFileError: If the parent of `root` does not exist.
     """
     root = Path(root)
-    if root.is_dir() and not is_scene(root) and any(root.iterdir()):
+    there = is_scene(root) or is_unfinished(root)
+    if root.is_dir() and not there and any(root.iterdir()):
         raise InputError(f"{root}: expected an empty folder or a scene to write to, got neither.")
-    if is_scene(root):
+    if there:
         _write(scene, root, final=root)
     else:
         with atomic_folder(root) as temporary:
