@@ -7,31 +7,44 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from splatseg.cli._output import check_output
 from splatseg.core import Capture, Gaussians, Scene
-from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, FitProgress, FitResult, Preset, Strategy, fit, reduction_note
+from splatseg.fit import (
+    Checkpoints,
+    FitOptions,
+    FitProgress,
+    FitResult,
+    Preset,
+    Strategy,
+    deferred_interrupts,
+    discard_checkpoint,
+    fit,
+    reduction_note,
+)
 from splatseg.io.captures import read_capture
-from splatseg.io.scene import is_scene, save_scene, scene_layer_names
+from splatseg.io.scene import CHECKPOINT_FILE, save_scene
 from splatseg.render import BackendName
 
 # Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
 _SCORING = 20.0
 # Weight of the newest view in the figures of the progress line; views differ much.
 _SMOOTHING = 0.02
+_DEFAULT = FitOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
     """Fit Gaussians to the training photographs of a capture, and write a scene folder.
 
-    Ctrl-C ends it early and writes what there is.
+    Ctrl-C ends it early and writes what there is; --resume goes on from there, and from the
+    last checkpoint of a fit that was killed.
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
@@ -58,6 +71,41 @@ class Command:
     """How Gaussians come and go. mcmc: the faint move to where there are others, up to the
     number asked for. classic: cloned and split where the picture pulls at them."""
 
+    resume: bool = False
+    """Go on with the fit that was stopped in SCENE, with the same data and options; minutes or
+    steps may be others. The result is that of a fit that was never stopped."""
+
+    overwrite: bool = False
+    """Begin again where a fit was stopped in SCENE."""
+
+    checkpoint_every: float = 60.0
+    """Seconds between two checkpoints, from which --resume goes on."""
+
+    checkpoint_steps: int | None = None
+    """Steps between two checkpoints, instead of seconds."""
+
+    keep_checkpoint: bool = False
+    """Keep the checkpoint of the finished fit, so that --resume with more minutes or steps can
+    make it longer."""
+
+    antialiased: bool = _DEFAULT.antialiased
+    """Opacities shrink with Gaussians that are thinner than a pixel, so that they look right from
+    further away too. The scene remembers it."""
+
+    exposure: bool = _DEFAULT.exposure
+    """Give each photograph a brightness and a tint of its own, which the scene is freed of."""
+
+    masks: Literal["ignore", "alpha", "off"] = _DEFAULT.masks
+    """What masks of the capture mean. ignore: nothing is learned where they are 0. alpha: masks,
+    or the alpha channel of photographs, cut out what is wanted; the rest is empty. off: nothing."""
+
+    depth: Literal["off", "metric", "relative"] = _DEFAULT.depth
+    """What to learn from the capture's depth maps. metric: they hold z-depth. relative: inverse
+    depth of unknown scale and shift, as networks guess it from one photograph."""
+
+    refine_poses: bool = _DEFAULT.refine_poses
+    """Correct the poses of training views while fitting."""
+
     seed: int = 0
     """Seed of everything that is drawn at random."""
 
@@ -71,7 +119,8 @@ class Command:
 def run(command: Command) -> None:
     """Fit a scene and write it."""
     options = _options(command)
-    _check_output(command.output)
+    place = check_output(command.output, resume=command.resume, overwrite=command.overwrite)
+    checkpoints = _checkpoints(command)
     capture = read_capture(command.data, format=command.format)
     for note in (*capture.notes, reduction_note(capture.train_views, longest=options.longest)):
         if note is not None:
@@ -79,11 +128,32 @@ def run(command: Command) -> None:
     sys.stdout.write(_beginning(capture))
     sys.stdout.flush()
 
-    with _progress_bar() as show:
-        result = fit(capture, options=options, backend=command.backend, progress=show)
+    if place is not None:
+        sys.stdout.write(f"{place}\n")
+        sys.stdout.flush()
+    with deferred_interrupts() as interrupts:
+        with _progress_bar() as show:
+            result = fit(
+                capture,
+                options=options,
+                backend=command.backend,
+                progress=show,
+                checkpoints=checkpoints,
+            )
+        _save(command, options, capture, result)
+    sys.stdout.write(_summary(result, command.output))
+    sys.stdout.writelines(f"{note}\n" for note in result.notes)
+    sys.stdout.flush()
+    if interrupts.requested or result.interrupted:
+        raise KeyboardInterrupt
+    sys.stdout.write(_held_out(command, capture, result.gaussians))
+
+
+def _save(command: Command, options: FitOptions, capture: Capture, result: FitResult) -> None:
+    """Write the scene; then a finished fit needs its checkpoint no more."""
     scene = Scene(
         gaussians=result.gaussians,
-        views=capture.views,
+        views=result.views,
         classes=capture.classes,
         up=capture.up,
         metres_per_unit=capture.metres_per_unit,
@@ -91,36 +161,34 @@ def run(command: Command) -> None:
         provenance=_provenance(command, options, result),
     )
     save_scene(scene, command.output)
-    sys.stdout.write(_summary(result, command.output))
-    sys.stdout.flush()
-    if result.interrupted:
-        raise KeyboardInterrupt
-    sys.stdout.write(_held_out(capture, result.gaussians, command.backend))
+    if not (result.interrupted or command.keep_checkpoint):
+        discard_checkpoint(command.output / CHECKPOINT_FILE)
+
+
+def _checkpoints(command: Command) -> Checkpoints:
+    return Checkpoints(
+        path=command.output / CHECKPOINT_FILE,
+        seconds=command.checkpoint_every,
+        steps=command.checkpoint_steps,
+        resume=command.resume,
+        at_end=command.keep_checkpoint,
+    )
 
 
 def _options(command: Command) -> FitOptions:
     options = replace(FitOptions.preset(command.preset), seed=command.seed)
     if command.max_gaussians is not None:
         options = replace(options, max_gaussians=command.max_gaussians)
+    options = replace(
+        options,
+        antialiased=command.antialiased,
+        exposure=command.exposure,
+        masks=command.masks,
+        depth=command.depth,
+        refine_poses=command.refine_poses,
+    )
     options = options.with_strategy(command.strategy)
     return options.with_length(minutes=command.minutes, steps=command.steps)
-
-
-def _check_output(root: Path) -> None:
-    """Refuse before the work what could not be written after it."""
-    if root.exists() and not root.is_dir():
-        raise InputError(f"{root}: expected a folder to write to, got a file.")
-    if not root.resolve().parent.is_dir():
-        raise InputError(f"{root}: expected a place in a folder that is there, got none.")
-    if is_scene(root):
-        layers = scene_layer_names(root)
-        if layers:
-            raise InputError(
-                f"{root}: expected a new folder, got a scene with layers ({', '.join(layers)}), "
-                "which belong to its Gaussians; remove it or choose another name."
-            )
-    elif root.is_dir() and any(root.iterdir()):
-        raise InputError(f"{root}: expected an empty folder or a new one, got one with files.")
 
 
 def _beginning(capture: Capture) -> str:
@@ -185,14 +253,15 @@ def _provenance(command: Command, options: FitOptions, result: FitResult) -> dic
 
 def _summary(result: FitResult, root: Path) -> str:
     rate = result.steps / max(result.seconds, 1e-9)
-    ended = "stopped by Ctrl-C after" if result.interrupted else "in"
+    ended = "stopped after" if result.interrupted else "in"
+    onwards = "; the same command with --resume goes on" if result.interrupted else ""
     return (
         f"{root}: {len(result.gaussians)} Gaussians {ended} {result.steps} steps, "
-        f"{result.seconds:.1f} s ({rate:.1f} steps/s)\n"
+        f"{result.seconds:.1f} s ({rate:.1f} steps/s){onwards}\n"
     )
 
 
-def _held_out(capture: Capture, gaussians: Gaussians, backend: BackendName) -> str:
+def _held_out(command: Command, capture: Capture, gaussians: Gaussians) -> str:
     """PSNR on the test views, as many as the time for it allows."""
     views = [view for view in capture.test_views if view.image is not None]
     if not views:
@@ -202,7 +271,9 @@ def _held_out(capture: Capture, gaussians: Gaussians, backend: BackendName) -> s
     for view in views:
         if time.monotonic() - begin > _SCORING:
             break
-        report = evaluate_photographs(gaussians, [view], backend=backend)
+        report = evaluate_photographs(
+            gaussians, [view], cut_out=command.masks == "alpha", backend=command.backend
+        )
         decibels.append(report.psnr)
     mean = sum(decibels) / len(decibels)
     scored = f"{len(decibels)} held-out views"
