@@ -1,6 +1,8 @@
 """A tiny scene, photographed by the renderer itself: what a fit should find again."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -96,3 +98,64 @@ def make_capture(tmp_path: Path) -> CaptureMaker:
 def capture(make_capture: CaptureMaker) -> Capture:
     """The tiny capture with pinhole cameras."""
     return make_capture()
+
+
+def photographed(
+    folder: Path,
+    *,
+    scene: Gaussians | None = None,
+    count: int = 14,
+    gains: Sequence[float] | None = None,
+    noise: float = 0.03,
+    depth_step: int | None = None,
+    **lens: object,
+) -> Capture:
+    """Photographs of a scene round about; every fifth, from the third on, is held out.
+
+    Args:
+        folder: Where to write them.
+        scene: What is photographed; None is `tiny_scene`.
+        count: Number of photographs.
+        gains: Factor of each photograph's colours.
+        noise: Of the start points, scene units.
+        depth_step: Also write depth maps of every so many pixels, in 1/1000 of a unit.
+        lens: For `ring_camera`.
+    """
+    scene = tiny_scene() if scene is None else scene
+    views: list[View] = []
+    for i in range(count):
+        camera = ring_camera(2 * np.pi * i / count, **lens)
+        with torch.no_grad():
+            drawn = render(scene, camera)
+        gain = 1.0 if gains is None else gains[i]
+        # Bright ones keep below the white that would be cut off.
+        save_png(drawn.image.clamp(0, 1) * 0.75 * gain, folder / f"view_{i:02d}.png")
+        view = View(
+            name=f"view_{i:02d}",
+            camera=camera,
+            image=folder / f"view_{i:02d}.png",
+            split="test" if i % 5 == 2 else "train",
+        )
+        if depth_step is not None:
+            depth = torch.where(drawn.alpha > 0.5, drawn.depth, 0.0)
+            steps = (depth[::depth_step, ::depth_step] * 1000 + 0.5).int()
+            save_png(steps, folder / f"depth_{i:02d}.png")
+            view = replace(view, depth=folder / f"depth_{i:02d}.png", depth_unit=1e-3)
+        views.append(view)
+    rng = np.random.default_rng(7)
+    shift = torch.from_numpy(rng.normal(scale=noise, size=(len(scene), 3)).astype(np.float32))
+    colours = (scene.colours.clamp(0, 1) * 0.75 * 255).to(torch.uint8)
+    points = PointCloud(points=scene.means + shift, colours=colours)
+    return Capture(path=folder, format="test", views=tuple(views), points=points)
+
+
+@pytest.fixture
+def photograph(tmp_path: Path) -> CaptureMaker:
+    """`photographed` into a folder of the test's own."""
+    return partial(photographed, tmp_path)
+
+
+@pytest.fixture
+def scene_photographed() -> Gaussians:
+    """What `photograph` shows unless told otherwise."""
+    return tiny_scene()

@@ -15,6 +15,10 @@ from splatseg.fit._view_adam import ViewAdam
 _FINAL_RATE = 0.1
 """What is left of the rate at progress 1."""
 
+_BIAS_SHARE = 0.1
+"""Rate of the biases over that of the gains: cameras change gains, and where a view shows little
+contrast the two cannot be told apart."""
+
 
 class Exposures:
     r"""Gain and bias of each training view.
@@ -67,7 +71,9 @@ class Exposures:
         slope = leaf.grad.double().cpu() + 2 * self._prior * self._values[index]
         rate = self._rate * _FINAL_RATE**progress
         values = self._values.clone()
-        values[index] -= rate * self._adam.direction(index, slope)
+        move = rate * self._adam.direction(index, slope)
+        move[3:] *= _BIAS_SHARE
+        values[index] -= move
         self._values = values - values.mean(dim=0)
         self._leaf = None
 

@@ -93,10 +93,10 @@ class FitOptions:
     """Give each training view a gain and a bias a channel, for photographs that are not equally
     bright. Their mean is none; held-out views are drawn without."""
 
-    exposure_rate: float = 1e-2
-    """Rate of gains and biases at progress 0; a tenth of it is left at 1."""
+    exposure_rate: float = 2e-2
+    """Rate of log gains at progress 0, and ten times that of biases; a tenth is left at 1."""
 
-    exposure_prior: float = 0.05
+    exposure_prior: float = 0.01
     """Weight of the squares of log gains and biases of a view in the loss."""
 
     depth: Literal["off", "metric", "relative"] = "off"
