@@ -1,0 +1,323 @@
+"""Photographs or a video in, a capture with cameras and start points out."""
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Capture
+from splatseg.errors import InputError
+from splatseg.pose._options import PoseOptions
+from splatseg.pose._photographs import (
+    HOW_TO_PHOTOGRAPH,
+    MIN_PHOTOGRAPHS,
+    WorkingLens,
+    find_photographs,
+    read_headers,
+    write_working_copies,
+)
+from splatseg.pose._process import require_pycolmap, run_worker, usable_threads
+from splatseg.pose._report import LeftOut, Lens, MapperTry, PoseReport
+from splatseg.pose._saved import (
+    FILE,
+    MODEL,
+    fingerprint,
+    load_capture,
+    load_report,
+    save_poses,
+)
+from splatseg.pose._video import is_video, take_frames
+
+_FEW_FEATURES = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseProgress:
+    """Where the work stands."""
+
+    stage: str
+    done: int
+    total: int
+    """0 where it is not known."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseResult:
+    """Photographs with poses, and how they came by them."""
+
+    capture: Capture
+    """Views in the photographs' own pixels with the lens distortion found; start points."""
+
+    report: PoseReport
+    reused: bool
+    """Whether all of it was there from an earlier run."""
+
+
+def recover_poses(
+    photographs: Path | str,
+    *,
+    folder: Path | str | None = None,
+    options: PoseOptions = PoseOptions(),  # noqa: B008  (frozen)
+    progress: Callable[[PoseProgress], None] | None = None,
+) -> PoseResult:
+    """Cameras and start points of bare photographs, by structure from motion with pycolmap.
+
+    Features (SIFT) of upright copies of at most `options.longest` pixels are matched, and a
+    global or incremental mapper finds poses, points and lenses with one coefficient of radial
+    distortion. The views of the capture are the photographs themselves: their own pixels after
+    their EXIF orientation, intrinsics scaled up to them. The world has the cameras within about
+    10 units; its scale means nothing. Every 8th photograph by name is a test view.
+
+    pycolmap runs in a process of its own, so Ctrl-C ends it at once.
+
+    Args:
+        photographs: A folder of photographs (or with a folder ``images``), or a video.
+        folder: Where the result is kept, so that a second call with the same photographs and
+            options reads it, and a call after one that was stopped goes on from there. The
+            frames of a video are written there. None keeps nothing.
+        options: How.
+        progress: Told now and then where the work stands.
+
+    Returns:
+        The capture and a report. On one thread the same to the bit in every run on the same
+        machine; on several threads the adjustment adds in another order each time.
+
+    Raises:
+        MissingPackageError: If pycolmap, or for a video imageio-ffmpeg, is not installed.
+        MissingFileError: If there are no such photographs.
+        FileFormatError: If the video cannot be read.
+        InputError: If there are fewer than 3 photographs, HEIC or RAW files, or fewer than 3
+            photographs could be placed; the message says what to do.
+        BackendError: If pycolmap failed.
+    """
+    source = Path(photographs)
+    require_pycolmap()
+    tell = _teller(progress)
+    with ExitStack() as stack:
+        if folder is None:
+            if is_video(source):
+                raise InputError("folder: expected a folder for the frames of the video, got None.")
+            kept = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="splatseg-")))
+        else:
+            kept = Path(folder)
+        if is_video(source):
+            root, files = kept, _frames(source, kept, options, tell)
+        else:
+            root, files = source, find_photographs(source)
+        made_of = fingerprint(files, options)
+        report = load_report(kept, made_of=made_of)
+        reused = report is not None
+        if report is None:
+            report = _recover(
+                source, files, folder=kept, made_of=made_of, options=options, tell=tell
+            )
+        capture = load_capture(kept / MODEL, files, root=root)
+    return PoseResult(
+        capture=replace(capture, notes=(*capture.notes, *report.notes)),
+        report=report,
+        reused=reused,
+    )
+
+
+def _recover(
+    source: Path,
+    files: Sequence[Path],
+    *,
+    folder: Path,
+    made_of: str,
+    options: PoseOptions,
+    tell: Callable[[str, int, int], None],
+) -> PoseReport:
+    work = _work_folder(folder, made_of)
+    (folder / FILE).unlink(missing_ok=True)
+    threads = usable_threads(options.threads)
+    begin = time.monotonic()
+    good, unreadable = read_headers(files)
+    lenses, broken = write_working_copies(
+        good,
+        work / "images",
+        options=options,
+        threads=threads,
+        progress=lambda done, total: tell("copies", done, total),
+    )
+    seconds = {"copies": time.monotonic() - begin}
+    unusable = [*unreadable, *broken]
+    count = sum(len(lens.images) for lens in lenses)
+    if count < MIN_PHOTOGRAPHS:
+        named = "; ".join(f"{left.name}: {left.why}" for left in unusable[:3])
+        raise InputError(
+            f"{source}: expected at least {MIN_PHOTOGRAPHS} photographs that can be read, "
+            f"got {count} ({named})."
+        )
+    result = run_worker(
+        {
+            "database": str(work / "features.db"),
+            "images": str(work / "images"),
+            "folder": str(work),
+            "result": str(work / "result.json"),
+            "lenses": [lens.as_json() for lens in lenses],
+            "options": {
+                "max_features": options.max_features,
+                "matching": options.matching,
+                "exhaustive_up_to": options.exhaustive_up_to,
+                "overlap": options.overlap,
+                "neighbours": options.neighbours,
+                "mapper": options.mapper,
+                "seed": options.seed,
+                "threads": threads,
+            },
+        },
+        work,
+        progress=tell,
+    )
+    best = None if result["best"] is None else result["tries"][result["best"]]
+    if best is None or best["registered"] < MIN_PHOTOGRAPHS:
+        placed = 0 if best is None else best["registered"]
+        # Nothing of this run is worth keeping: other photographs are needed.
+        shutil.rmtree(work)
+        raise InputError(
+            f"{source}: expected photographs of one scene of which at least {MIN_PHOTOGRAPHS} "
+            f"can be placed, got {placed} of {len(files)}; {HOW_TO_PHOTOGRAPH}."
+        )
+    capture = load_capture(work / "model", files, root=_root_of(files))
+    report = _report(
+        result,
+        lenses,
+        capture,
+        photographs=len(files),
+        unusable=unusable,
+        seconds=seconds | result["seconds"],
+        longest=options.longest,
+    )
+    save_poses(folder, model=work / "model", made_of=made_of, report=report)
+    shutil.rmtree(work)
+    return report
+
+
+def _root_of(files: Sequence[Path]) -> Path:
+    return files[0].parent
+
+
+def _work_folder(folder: Path, made_of: str) -> Path:
+    """The folder of what is not finished; emptied when it is of something else."""
+    work = folder / "work"
+    mark = work / "made_of.txt"
+    if work.is_dir() and not (mark.is_file() and mark.read_text(encoding="utf-8") == made_of):
+        shutil.rmtree(work)
+    work.mkdir(parents=True, exist_ok=True)
+    mark.write_text(made_of, encoding="utf-8")
+    return work
+
+
+def _frames(
+    video: Path, folder: Path, options: PoseOptions, tell: Callable[[str, int, int], None]
+) -> tuple[Path, ...]:
+    """Frames of a video, taken unless they are there from an earlier run."""
+    frames, mark = folder / "frames", folder / "frames.txt"
+    if not video.is_file():
+        return take_frames(video, frames, wanted=options.frames, progress=lambda *_: None)
+    made_of = fingerprint([video], PoseOptions(frames=options.frames))
+    if not (mark.is_file() and mark.read_text(encoding="utf-8") == made_of and frames.is_dir()):
+        take_frames(
+            video,
+            frames,
+            wanted=options.frames,
+            progress=lambda done, total: tell("frames", done, total),
+        )
+        mark.write_text(made_of, encoding="utf-8")
+    files = tuple(sorted(frames.iterdir()))
+    if len(files) < MIN_PHOTOGRAPHS:
+        raise InputError(
+            f"{video}: expected a video of at least {MIN_PHOTOGRAPHS} frames, got {len(files)}."
+        )
+    return files
+
+
+def _report(
+    result: Mapping[str, Any],
+    lenses: Sequence[WorkingLens],
+    capture: Capture,
+    *,
+    photographs: int,
+    unusable: Sequence[LeftOut],
+    seconds: Mapping[str, float],
+    longest: int,
+) -> PoseReport:
+    own_name = {copy: own for lens in lenses for copy, own in lens.images.items()}
+    members: list[list[str]] = result["models"]
+    registered = set(members[0])
+    left_out = [
+        LeftOut(name=own_name[copy], why=_why(copy, result["photographs"].get(copy), members))
+        for copy in sorted(own_name)
+        if copy not in registered
+    ]
+    placed = {view.image.name: view.camera for view in capture.views if view.image is not None}
+    straightened = set(result["model"]["straightened"])
+    found: list[Lens] = []
+    for lens in lenses:
+        cameras = [placed[own] for own in lens.images.values() if own in placed]
+        if cameras:
+            first = cameras[0]
+            found.append(
+                Lens(
+                    width=first.width,
+                    height=first.height,
+                    photographs=len(cameras),
+                    focal=first.fx,
+                    k1=first.distortion[0] if first.distortion else 0.0,
+                    start="EXIF" if lens.prior else "guess",
+                )
+            )
+    return PoseReport(
+        photographs=photographs,
+        registered=tuple(sorted(own_name[copy] for copy in registered)),
+        left_out=tuple(sorted([*unusable, *left_out], key=lambda left: left.name)),
+        mapper=result["tries"][result["best"]]["mapper"],
+        tries=tuple(
+            MapperTry(**{**attempt, "models": tuple(attempt["models"])})
+            for attempt in result["tries"]
+        ),
+        error=result["model"]["error"],
+        longest=longest,
+        points=result["model"]["points"],
+        track_length=result["model"]["track_length"],
+        lenses=tuple(found),
+        seconds=seconds,
+        notes=tuple(
+            f"no distortion was found that fits a lens of {lens.full_width}x{lens.full_height} "
+            "pixels; it is taken for one without"
+            for i, lens in enumerate(lenses)
+            if i in straightened
+        ),
+    )
+
+
+def _why(copy: str, facts: Mapping[str, int] | None, members: Sequence[Sequence[str]]) -> str:
+    """Why a photograph has no pose."""
+    if facts is None or facts["features"] < _FEW_FEATURES:
+        count = 0 if facts is None else facts["features"]
+        return f"it has only {count} features: too dark, blurred or plain"
+    for model in members[1:]:
+        if copy in model:
+            return (
+                f"it belongs to another part of {len(model)} photographs that shows nothing of "
+                "the rest"
+            )
+    if not facts["pairs"]:
+        return "it shows nothing that another photograph shows too"
+    return (
+        f"it shows something of {facts['pairs']} other photographs, but too little of what was "
+        "found in 3D to say from where it was taken"
+    )
+
+
+def _teller(progress: Callable[[PoseProgress], None] | None) -> Callable[[str, int, int], None]:
+    def tell(stage: str, done: int, total: int) -> None:
+        if progress is not None:
+            progress(PoseProgress(stage=stage, done=done, total=total))
+
+    return tell

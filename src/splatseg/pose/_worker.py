@@ -1,0 +1,342 @@
+"""The process that works with pycolmap: features, matches, mapping, and what came of it.
+
+Run as ``python -m splatseg.pose._worker JOB.json`` by `splatseg.pose._process`. It is a process
+of its own because calls into pycolmap cannot be interrupted, and because pycolmap and Pillow
+cannot live in one process: each brings its own copy of the image libraries, and a PNG saved
+after ``import pycolmap`` ends in heap corruption (seen with pycolmap 4.2.1 and Pillow 12).
+Nothing here imports torch or Pillow.
+
+Progress goes to the standard output, one JSON object a line; the result to a file. Features and
+matches stay in COLMAP's database, so that a second run goes on where the first was stopped.
+"""
+
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from splatseg.pose._model import Model, finish_model, model_facts
+from splatseg.pose._pairs import (
+    all_pairs,
+    chosen_pairs,
+    connected_groups,
+    likeness,
+    linking_pairs,
+)
+
+_IMAGES_AT_ONCE = 8
+_PAIRS_AT_ONCE = 256
+# COLMAP's own threshold for a verified pair.
+_MIN_INLIERS = 15
+# Without a second try: a model that has all photographs and fits them like this, in pixels.
+_GOOD_ERROR = 1.0
+# With fewer than this share of the photographs, the guess of the focal length is doubted too.
+_POOR_SHARE = 0.8
+
+
+def main() -> int:
+    """Do one job."""
+    _end_with_parent()
+    # Warnings of COLMAP go to the standard error stream, which the parent keeps in a file.
+    pycolmap.logging.minloglevel = 1
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    result = Job(job).run()
+    out = Path(job["result"])
+    temporary = out.with_suffix(".tmp")
+    temporary.write_text(json.dumps(result), encoding="utf-8")
+    temporary.replace(out)
+    return 0
+
+
+class Job:
+    """One set of photographs."""
+
+    def __init__(self, job: dict[str, Any]) -> None:
+        self._database = Path(job["database"])
+        self._images = Path(job["images"])
+        self._folder = Path(job["folder"])
+        self._lenses: list[dict[str, Any]] = job["lenses"]
+        self._options: dict[str, Any] = job["options"]
+        self._names = sorted(name for lens in self._lenses for name in lens["images"])
+        self._seconds: dict[str, float] = {}
+
+    def run(self) -> dict[str, Any]:
+        """All stages; what is to be told of them."""
+        self._timed("features", self._extract)
+        self._timed("matches", self._match)
+        tries, best = self._timed("mapping", self._map)
+        result: dict[str, Any] = {
+            "seconds": self._seconds,
+            "tries": [attempt.facts() for attempt in tries],
+            "photographs": self._photographs(),
+            "best": None,
+        }
+        if best is not None:
+            # Asked before it is finished: finishing gives the photographs their own names.
+            result["models"] = _members(best)
+            result["best"] = tries.index(best)
+            result["model"] = self._timed("finish", lambda: self._finish(best))
+        return result
+
+    def _timed(self, stage: str, work: Any) -> Any:
+        begin = time.monotonic()
+        _tell(stage, 0, 0)
+        result = work()
+        self._seconds[stage] = time.monotonic() - begin
+        return result
+
+    # -- features ---------------------------------------------------------------------------
+
+    def _extract(self) -> None:
+        ids = self._write_lenses()
+        options = pycolmap.FeatureExtractionOptions()
+        options.num_threads = self._options["threads"]
+        options.use_gpu = False
+        options.sift.max_num_features = self._options["max_features"]
+        done = 0
+        for lens, id in zip(self._lenses, ids, strict=True):
+            reader = pycolmap.ImageReaderOptions(
+                camera_model="SIMPLE_RADIAL", existing_camera_id=id
+            )
+            for names in _chunks(sorted(lens["images"]), _IMAGES_AT_ONCE):
+                pycolmap.extract_features(
+                    self._database,
+                    self._images,
+                    image_names=list(names),
+                    camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader,
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                )
+                done += len(names)
+                _tell("features", done, len(self._names))
+
+    def _write_lenses(self) -> list[int]:
+        """Ids of the lenses in the database, which gets them in the first run."""
+        database = pycolmap.Database.open(self._database)
+        try:
+            there = sorted(camera.camera_id for camera in database.read_all_cameras())
+            if len(there) == len(self._lenses):
+                return there
+            # New, or stopped while they were written: no feature was found before they were.
+            database.clear_all_tables()
+            return [database.write_camera(_camera(lens)) for lens in self._lenses]
+        finally:
+            database.close()
+
+    # -- matches ----------------------------------------------------------------------------
+
+    def _match(self) -> None:
+        count = len(self._names)
+        exhaustive = self._options["matching"] == "exhaustive" or (
+            self._options["matching"] == "auto" and count <= self._options["exhaustive_up_to"]
+        )
+        if exhaustive:
+            self._match_pairs(all_pairs(count))
+            return
+        alike = likeness(self._descriptors(), seed=self._options["seed"])
+        near = self._options["neighbours"]
+        self._match_pairs(chosen_pairs(alike, overlap=self._options["overlap"], neighbours=near))
+        groups = connected_groups(count, self._verified())
+        if len(set(groups)) > 1:
+            self._match_pairs(linking_pairs(alike, groups, neighbours=near))
+
+    def _match_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.num_threads = self._options["threads"]
+        matching.use_gpu = False
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = self._options["seed"]
+        listed = self._folder / "pairs.txt"
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = listed
+        done = 0
+        for chunk in _chunks(pairs, _PAIRS_AT_ONCE):
+            lines = (f"{self._names[i]} {self._names[j]}\n" for i, j in chunk)
+            listed.write_text("".join(lines), encoding="utf-8")
+            pycolmap.match_image_pairs(
+                self._database,
+                matching_options=matching,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+            done += len(chunk)
+            _tell("matches", done, len(pairs))
+
+    def _descriptors(self) -> list[np.ndarray[Any, np.dtype[np.uint8]]]:
+        database = pycolmap.Database.open(self._database)
+        try:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            return [np.asarray(database.read_descriptors(ids[n]).data) for n in self._names]
+        finally:
+            database.close()
+
+    def _verified(self, *, database: Path | None = None) -> list[tuple[int, int]]:
+        """Pairs of photographs, by their place in the list of names, that show the same."""
+        opened = pycolmap.Database.open(database or self._database)
+        try:
+            place = {name: i for i, name in enumerate(self._names)}
+            places = {i.image_id: place[i.name] for i in opened.read_all_images()}
+            pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
+        finally:
+            opened.close()
+        ids = [pycolmap.pair_id_to_image_pair(pair) for pair in pair_ids]
+        return [
+            (places[a], places[b])
+            for (a, b), count in zip(ids, inliers, strict=True)
+            if count >= _MIN_INLIERS
+        ]
+
+    # -- mapping ----------------------------------------------------------------------------
+
+    def _map(self) -> tuple[list[Model], Model | None]:
+        """Every try, and the one with the most photographs and then the least error."""
+        plain = self._copied("plain")
+        guessed = any(not lens["prior"] for lens in self._lenses)
+        database = self._calibrated() if guessed else plain
+        mapper = self._options["mapper"]
+        tries: list[Model] = []
+        if mapper in ("auto", "global"):
+            tries.append(self._global(database))
+        if mapper == "incremental" or (mapper == "auto" and not self._good(tries)):
+            tries.append(self._incremental(database, "incremental"))
+            most = max(attempt.registered for attempt in tries)
+            if mapper == "auto" and guessed and most < _POOR_SHARE * len(self._names):
+                tries.append(self._incremental(plain, "incremental, other focal length"))
+        found = [attempt for attempt in tries if attempt.registered]
+        best = min(found, key=lambda a: (-a.registered, a.error), default=None)
+        return tries, best
+
+    def _good(self, tries: Sequence[Model]) -> bool:
+        return any(a.registered == len(self._names) and a.error <= _GOOD_ERROR for a in tries)
+
+    def _copied(self, name: str) -> Path:
+        """A database of its own: calibration changes what it works on."""
+        copy = self._folder / f"{name}.db"
+        shutil.copyfile(self._database, copy)
+        return copy
+
+    def _calibrated(self) -> Path:
+        """A copy whose focal lengths come from the pairs of photographs, where that works."""
+        database = self._copied("calibrated")
+        options = pycolmap.ViewGraphCalibrationOptions()
+        options.random_seed = self._options["seed"]
+        pycolmap.calibrate_view_graph(database, options)
+        return database
+
+    def _global(self, database: Path) -> Model:
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = self._options["threads"]
+        options.random_seed = self._options["seed"]
+        begin = time.monotonic()
+        _tell("global mapper", 0, 0)
+        found = pycolmap.global_mapping(database, self._images, self._empty("global"), options)
+        return Model.of("global", list(found.values()), time.monotonic() - begin)
+
+    def _incremental(self, database: Path, name: str) -> Model:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = self._options["threads"]
+        options.random_seed = self._options["seed"]
+        options.min_model_size = 3
+        begin = time.monotonic()
+        placed = 0
+
+        def next_image() -> None:
+            nonlocal placed
+            placed += 1
+            _tell("incremental mapper", min(placed, len(self._names)), len(self._names))
+
+        found = pycolmap.incremental_mapping(
+            database,
+            self._images,
+            self._empty("incremental"),
+            options,
+            next_image_callback=next_image,
+        )
+        return Model.of(name, list(found.values()), time.monotonic() - begin)
+
+    def _empty(self, name: str) -> Path:
+        folder = self._folder / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return folder
+
+    # -- what came of it --------------------------------------------------------------------
+
+    def _finish(self, best: Model) -> dict[str, Any]:
+        reconstruction = best.reconstructions[0]
+        facts = model_facts(reconstruction)
+        facts["straightened"] = finish_model(
+            reconstruction, self._lenses, threads=self._options["threads"]
+        )
+        out = self._empty("model")
+        reconstruction.write_binary(out)
+        return facts
+
+    def _photographs(self) -> dict[str, dict[str, int]]:
+        """Features and verified pairs of every photograph."""
+        pairs = self._verified()
+        database = pycolmap.Database.open(self._database)
+        try:
+            return {
+                image.name: {
+                    "features": int(database.num_keypoints_for_image(image.image_id)),
+                    "pairs": sum(
+                        self._names[a] == image.name or self._names[b] == image.name
+                        for a, b in pairs
+                    ),
+                }
+                for image in database.read_all_images()
+            }
+        finally:
+            database.close()
+
+
+def _members(best: Model) -> list[list[str]]:
+    """Names of the photographs of each model of a try, the largest first."""
+    return [
+        sorted(model.image(id).name for id in model.reg_image_ids())
+        for model in best.reconstructions
+    ]
+
+
+def _camera(lens: dict[str, Any]) -> pycolmap.Camera:
+    camera = pycolmap.Camera.create_from_model_name(
+        1, "SIMPLE_RADIAL", lens["focal"], lens["width"], lens["height"]
+    )
+    camera.has_prior_focal_length = lens["prior"]
+    return camera
+
+
+def _chunks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
+    return [items[i : i + size] for i in range(0, len(items), size)]
+
+
+def _tell(stage: str, done: int, total: int) -> None:
+    line = json.dumps({"stage": stage, "done": done, "total": total})
+    print(line, flush=True)  # noqa: T201  (the pipe to the parent)
+
+
+def _end_with_parent() -> None:
+    """End this process when the parent is gone: its end of the standard input closes then."""
+
+    def wait() -> None:
+        # A blocked os.read does not hold the interpreter's lock, and neither does pycolmap.
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
