@@ -109,7 +109,7 @@ class Classic:
     def after(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
     ) -> State:
-        """A round every `FitOptions.densify_every` steps, a reset every so much progress."""
+        """A round every `FitOptions.densify_every` steps, a reset every `reset_every`."""
         options = self._options
         if _round_due(options, steps=steps, progress=progress):
             state = densified(
@@ -121,9 +121,8 @@ class Classic:
                 generator=generator,
             )
             self._statistics = ScreenStatistics.zeros(len(state[0]), state[0].means.device)
-        resets = int(progress / options.reset_interval)
-        if resets > self._resets and progress < options.densify_until:
-            self._resets = resets
+        if steps % options.reset_every == 0 and progress < options.densify_until:
+            self._resets += 1
             state = with_reset_opacities(*state, most=options.reset_opacity)
         return state
 

@@ -109,9 +109,12 @@ class FitOptions:
     refine_poses: bool = False
     """Move the poses of training views so that the photographs agree."""
 
-    pose_rate: float = 1e-3
-    """Rate of the poses at progress 0, radians and typical depths; a hundredth of it is left
-    at 1."""
+    pose_rate: float = 0.1
+    """Rate of the poses at progress 0, pixels; a hundredth of it is left at 1."""
+
+    start: Literal["auto", "points", "random"] = "auto"
+    """Where Gaussians start. points: at the capture's points. random: on rays of the photographs,
+    where several of them agree. auto: at the points if there are any."""
 
     start_opacity: float = 0.1
     """Opacity of a start point, in (0, 1)."""
@@ -156,8 +159,9 @@ class FitOptions:
     prune_radius: float = 20.0
     """classic: Gaussians of a larger radius on an image are dropped then too, pixels."""
 
-    reset_interval: float = 0.1
-    """classic: progress between two resets of the opacities."""
+    reset_every: int = 3000
+    """classic: steps between two resets of the opacities. What is needed takes hundreds of
+    steps to grow again, so short fits have none."""
 
     reset_opacity: float = 0.01
     """classic: no opacity is higher after a reset, in (0, 1)."""
@@ -180,10 +184,12 @@ class FitOptions:
             ("longest", 16),
             ("densify_every", 1),
             ("densify_from", 1),
+            ("reset_every", 1),
         ):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise RangeError(f"{name}: expected at least {least}, got {value}.")
+        check_choice("start", self.start, ("auto", "points", "random"))
         check_choice("strategy", self.strategy, ("mcmc", "classic"))
         check_choice("background", self.background, ("random", "black"))
         check_choice("masks", self.masks, ("ignore", "alpha", "off"))
@@ -206,7 +212,6 @@ class FitOptions:
             "clone_scale",
             "prune_scale",
             "prune_radius",
-            "reset_interval",
         ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
