@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from splatseg.cli._output import check_output
+from splatseg.cli._photographs import Poses, capture_of
 from splatseg.core import Capture, Gaussians, Scene
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import (
@@ -26,9 +27,9 @@ from splatseg.fit import (
     deferred_interrupts,
     discard_checkpoint,
     fit,
+    random_start_count,
     reduction_note,
 )
-from splatseg.io.captures import read_capture
 from splatseg.io.scene import CHECKPOINT_FILE, save_scene
 from splatseg.render import BackendName
 
@@ -48,7 +49,8 @@ class Command:
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data."""
+    """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data, a folder of bare
+    photographs, or a video."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SCENE")]
     """The scene folder to write. A scene that is there is replaced unless it has layers."""
@@ -70,6 +72,10 @@ class Command:
     strategy: Strategy = "mcmc"
     """How Gaussians come and go. mcmc: the faint move to where there are others, up to the
     number asked for. classic: cloned and split where the picture pulls at them."""
+
+    start: Literal["auto", "points", "random"] = _DEFAULT.start
+    """Where Gaussians start. points: at the capture's points. random: on rays of the photographs,
+    where several of them agree. auto: at the points if there are any."""
 
     resume: bool = False
     """Go on with the fit that was stopped in SCENE, with the same data and options; minutes or
@@ -115,17 +121,31 @@ class Command:
     format: str = "auto"
     """How DATA is read: auto, nerfstudio, colmap, blender, llff or idr."""
 
+    poses: Poses = "auto"
+    """Where cameras come from. given: DATA. sfm: they are found from the photographs alone, by
+    structure from motion, and kept in SCENE/capture. auto: sfm where DATA has none."""
+
+    frames: int = 120
+    """Frames to take from DATA where it is a video."""
+
 
 def run(command: Command) -> None:
     """Fit a scene and write it."""
     options = _options(command)
     place = check_output(command.output, resume=command.resume, overwrite=command.overwrite)
     checkpoints = _checkpoints(command)
-    capture = read_capture(command.data, format=command.format)
+    capture = capture_of(
+        command.data,
+        scene=command.output,
+        format=command.format,
+        poses=command.poses,
+        frames=command.frames,
+        seed=command.seed,
+    )
     for note in (*capture.notes, reduction_note(capture.train_views, longest=options.longest)):
         if note is not None:
             sys.stdout.write(f"{note}\n")
-    sys.stdout.write(_beginning(capture))
+    sys.stdout.write(_beginning(capture, options))
     sys.stdout.flush()
 
     if place is not None:
@@ -181,6 +201,7 @@ def _options(command: Command) -> FitOptions:
         options = replace(options, max_gaussians=command.max_gaussians)
     options = replace(
         options,
+        start=command.start,
         antialiased=command.antialiased,
         exposure=command.exposure,
         masks=command.masks,
@@ -191,12 +212,15 @@ def _options(command: Command) -> FitOptions:
     return options.with_length(minutes=command.minutes, steps=command.steps)
 
 
-def _beginning(capture: Capture) -> str:
+def _beginning(capture: Capture, options: FitOptions) -> str:
     train, test = len(capture.train_views), len(capture.test_views)
     points = 0 if capture.points is None else len(capture.points)
+    drawn = ""
+    if (number := random_start_count(capture, options)) > 0:
+        drawn = f"; starting at {number} places where photographs agree"
     return (
         f"{capture.path} ({capture.format}): {train} training views, {test} held out, "
-        f"{points} start points\n"
+        f"{points} start points{drawn}\n"
     )
 
 

@@ -8,6 +8,7 @@
       layers/<name>.npz         what is known of each Gaussian
       reports/
       fit/checkpoint.npz        state of a fit that was stopped
+      capture/                  poses that were found for bare photographs
 
 Photographs stay where they are: a scene knows its capture by a path relative to itself and an
 absolute one, and opens without it.
@@ -15,7 +16,7 @@ absolute one, and opens without it.
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -42,6 +43,10 @@ SCENE_FILE = "scene.json"
 GAUSSIANS_FILE = "gaussians.ply"
 CAMERAS_FILE = "cameras/transforms.json"
 CHECKPOINT_FILE = "fit/checkpoint.npz"
+POSES_FOLDER = "capture"
+"""Where `fit` keeps the poses that it found for bare photographs."""
+
+_POSES_ENTRIES = ("poses.json", "sparse", "frames", "frames.txt", "work")
 FOLDERS = ("cameras", "evidence", "layers", "reports")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
 
@@ -53,15 +58,22 @@ def is_scene(path: Path) -> bool:
 
 def is_unfinished(path: Path) -> bool:
     """Whether a folder holds a fit that has not become a scene yet, and nothing else."""
-    checkpoint = path / CHECKPOINT_FILE
-    if is_scene(path) or not checkpoint.parent.is_dir():
+    checkpoint, poses = path / CHECKPOINT_FILE, path / POSES_FOLDER
+    if is_scene(path) or not (checkpoint.parent.is_dir() or poses.is_dir()):
         return False
-    own = {checkpoint.parent.name, GAUSSIANS_FILE, *FOLDERS}
-    others = [entry.name for entry in path.iterdir() if entry.name not in own]
+    own = (checkpoint.parent.name, poses.name, GAUSSIANS_FILE, *FOLDERS)
+    return (
+        _holds_only(path, own)
+        and _holds_only(checkpoint.parent, (checkpoint.name, f"{checkpoint.name}.new"))
+        and _holds_only(poses, _POSES_ENTRIES)
+    )
+
+
+def _holds_only(folder: Path, names: Sequence[str]) -> bool:
+    """Whether a folder, where it is there, holds nothing but these, or what was being written."""
     # What a process that was killed was about to write lies in hidden folders of this prefix.
-    return all(name.startswith(TEMPORARY) for name in others) and all(
-        entry.name in (checkpoint.name, f"{checkpoint.name}.new")
-        for entry in checkpoint.parent.iterdir()
+    return not folder.is_dir() or all(
+        entry.name in names or entry.name.startswith(TEMPORARY) for entry in folder.iterdir()
     )
 
 

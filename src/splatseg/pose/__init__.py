@@ -12,18 +12,21 @@ if TYPE_CHECKING:
     from splatseg.pose._options import Mapper as Mapper
     from splatseg.pose._options import Matching as Matching
     from splatseg.pose._options import PoseOptions as PoseOptions
+    from splatseg.pose._photographs import holds_photographs as holds_photographs
     from splatseg.pose._recover import PoseProgress as PoseProgress
     from splatseg.pose._recover import PoseResult as PoseResult
-    from splatseg.pose._recover import is_video as is_video
     from splatseg.pose._recover import recover_poses as recover_poses
     from splatseg.pose._report import LeftOut as LeftOut
     from splatseg.pose._report import MapperTry as MapperTry
     from splatseg.pose._report import PoseReport as PoseReport
+    from splatseg.pose._video import is_video as is_video
 
 _HOMES = {
     "splatseg.pose._options": "CameraSharing Mapper Matching PoseOptions",
-    "splatseg.pose._recover": "PoseProgress PoseResult is_video recover_poses",
+    "splatseg.pose._photographs": "holds_photographs",
+    "splatseg.pose._recover": "PoseProgress PoseResult recover_poses",
     "splatseg.pose._report": "LeftOut MapperTry PoseReport",
+    "splatseg.pose._video": "is_video",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 

@@ -14,6 +14,7 @@ References:
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ def connected_groups(count: int, pairs: Sequence[tuple[int, int]]) -> list[int]:
     return [find(i) for i in range(count)]
 
 
-def _sample(rows: NDArray, count: int, rng: np.random.Generator) -> NDArray:
+def _sample(rows: NDArray[Any], count: int, rng: np.random.Generator) -> NDArray[Any]:
     if len(rows) <= count:
         return rows
     return rows[np.sort(rng.choice(len(rows), count, replace=False))]

@@ -92,6 +92,16 @@ def find_photographs(folder: Path) -> tuple[Path, ...]:
     return found
 
 
+def holds_photographs(folder: Path) -> bool:
+    """Whether a folder, or its folder ``images``, holds photographs, be they HEIC or RAW."""
+    places = [place for place in (folder, folder / "images") if place.is_dir()]
+    return bool(bare_photographs(folder)) or any(
+        path.suffix.lower() in HEIC_SUFFIXES | RAW_SUFFIXES
+        for place in places
+        for path in place.iterdir()
+    )
+
+
 def read_headers(paths: Sequence[Path]) -> tuple[list[Photograph], list[LeftOut]]:
     """Size and lens of each photograph, and those that cannot be read."""
     good: list[Photograph] = []

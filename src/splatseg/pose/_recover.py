@@ -30,7 +30,7 @@ from splatseg.pose._saved import (
     load_report,
     save_poses,
 )
-from splatseg.pose._video import is_video, take_frames
+from splatseg.pose._video import check_video, is_video, take_frames
 
 _FEW_FEATURES = 100
 
@@ -218,8 +218,7 @@ def _frames(
 ) -> tuple[Path, ...]:
     """Frames of a video, taken unless they are there from an earlier run."""
     frames, mark = folder / "frames", folder / "frames.txt"
-    if not video.is_file():
-        return take_frames(video, frames, wanted=options.frames, progress=lambda *_: None)
+    check_video(video)
     made_of = fingerprint([video], PoseOptions(frames=options.frames))
     if not (mark.is_file() and mark.read_text(encoding="utf-8") == made_of and frames.is_dir()):
         take_frames(
@@ -277,10 +276,7 @@ def _report(
         registered=tuple(sorted(own_name[copy] for copy in registered)),
         left_out=tuple(sorted([*unusable, *left_out], key=lambda left: left.name)),
         mapper=result["tries"][result["best"]]["mapper"],
-        tries=tuple(
-            MapperTry(**{**attempt, "models": tuple(attempt["models"])})
-            for attempt in result["tries"]
-        ),
+        tries=tuple(MapperTry.from_json(attempt) for attempt in result["tries"]),
         error=result["model"]["error"],
         longest=longest,
         points=result["model"]["points"],

@@ -32,6 +32,13 @@ class MapperTry:
 
     seconds: float
 
+    @staticmethod
+    def from_json(row: Mapping[str, Any]) -> "MapperTry":
+        """The try of a JSON object."""
+        values = dict(row)
+        values["models"] = tuple(values["models"])
+        return MapperTry(**values)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lens:
@@ -98,7 +105,5 @@ class PoseReport:
         values["notes"] = tuple(values["notes"])
         values["left_out"] = tuple(LeftOut(**row) for row in values["left_out"])
         values["lenses"] = tuple(Lens(**row) for row in values["lenses"])
-        values["tries"] = tuple(
-            MapperTry(**{**row, "models": tuple(row["models"])}) for row in values["tries"]
-        )
+        values["tries"] = tuple(MapperTry.from_json(row) for row in values["tries"])
         return PoseReport(**values)

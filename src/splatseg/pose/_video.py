@@ -26,6 +26,22 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
+def check_video(path: Path) -> None:
+    """Raise unless there is such a file and the package that reads it.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        MissingPackageError: If imageio-ffmpeg is not installed.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"{path}: there is no such video.")
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise MissingPackageError(
+            "videos need a package that is not installed (imageio-ffmpeg); try: "
+            "pip install 'splatseg[video]'."
+        )
+
+
 def sharpness(picture: NDArray[np.uint8]) -> float:
     """Variance of the Laplacian of a picture's grey values: large where edges are sharp.
 
@@ -70,13 +86,7 @@ def take_frames(
         MissingFileError: If there is no such file.
         FileFormatError: If it is not a video that ffmpeg reads.
     """
-    if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise MissingPackageError(
-            "videos need a package that is not installed (imageio-ffmpeg); try: "
-            "pip install 'splatseg[video]'."
-        )
-    if not video.is_file():
-        raise MissingFileError(f"{video}: there is no such video.")
+    check_video(video)
     count = _count(video)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with atomic_folder(folder) as temporary:
