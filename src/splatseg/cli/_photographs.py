@@ -1,0 +1,119 @@
+"""The capture that `splatseg fit` is given: with poses, or to be found for bare photographs."""
+
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from splatseg.core import Capture
+from splatseg.errors import InputError
+from splatseg.io.captures import find_formats, read_capture
+from splatseg.io.scene import POSES_FOLDER
+from splatseg.pose import (
+    PoseOptions,
+    PoseProgress,
+    PoseReport,
+    PoseResult,
+    holds_photographs,
+    is_video,
+    recover_poses,
+)
+
+Poses = Literal["auto", "given", "sfm"]
+"""Where cameras come from."""
+
+# So many photographs without a pose are named; poses.json names all.
+_NAMED = 10
+
+
+def capture_of(
+    data: Path, *, scene: Path, format: str, poses: Poses, frames: int, seed: int
+) -> Capture:
+    """Read a capture, or find the poses of photographs or a video and say how that went.
+
+    Args:
+        data: What the user gave.
+        scene: The scene folder; poses that are found are kept in it, and read from there by a
+            later run with the same photographs.
+        format: How a capture is read; see `read_capture`.
+        poses: Where cameras come from.
+        frames: Frames taken from a video.
+        seed: Of everything that is drawn at random.
+    """
+    if not _without_poses(data, format, poses):
+        return read_capture(data, format=format)
+    options = PoseOptions(seed=seed, frames=frames)
+    with _progress_bar() as show:
+        result = recover_poses(data, folder=scene / POSES_FOLDER, options=options, progress=show)
+    sys.stdout.write(_told(data, scene / POSES_FOLDER, result))
+    sys.stdout.flush()
+    return result.capture
+
+
+def _without_poses(data: Path, format: str, poses: Poses) -> bool:
+    if poses == "sfm":
+        if format != "auto":
+            raise InputError(f"--format: expected none with --poses sfm, got {format!r}.")
+        return True
+    if poses == "given" or format != "auto":
+        return False
+    if is_video(data):
+        return True
+    return data.is_dir() and not find_formats(data) and holds_photographs(data)
+
+
+@contextmanager
+def _progress_bar() -> Generator[Callable[[PoseProgress], None]]:
+    """A bar on stderr: the stage and how much of it is done."""
+    columns = (
+        TextColumn("poses"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(now: PoseProgress) -> None:
+            text = f"{now.stage} {now.done}/{now.total}" if now.total else now.stage
+            bar.update(task, description=text, completed=now.done, total=now.total or None)
+
+        yield show
+
+
+def _told(data: Path, folder: Path, result: PoseResult) -> str:
+    """What was placed, how well, by whom, and what was left out and why."""
+    report = result.report
+    lines = [_placed(data, report)]
+    if result.reused:
+        lines.append(f"(as found before; remove {folder} to begin again)")
+    else:
+        stages = ", ".join(f"{stage} {seconds:.0f}" for stage, seconds in report.seconds.items())
+        lines.append(f"poses took {sum(report.seconds.values()):.0f} s ({stages})")
+    lines += [
+        f"the {attempt.mapper} mapper placed {attempt.registered} ({attempt.error:.2f} px)"
+        for attempt in report.tries
+        if attempt.mapper != report.mapper
+    ]
+    lines += [
+        f"lens of {lens.photographs} photographs: {lens.width}x{lens.height}, focal length "
+        f"{lens.focal:.1f} px (first from {lens.start}), k1 {lens.k1:.4f}"
+        for lens in report.lenses[:_NAMED]
+    ]
+    lines += [f"left out {left.name}: {left.why}" for left in report.left_out[:_NAMED]]
+    more = len(report.left_out) - _NAMED
+    if more > 0:
+        lines.append(f"left out {more} more; {folder / 'poses.json'} names them")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _placed(data: Path, report: PoseReport) -> str:
+    return (
+        f"{data}: {len(report.registered)} of {report.photographs} photographs placed by the "
+        f"{report.mapper} mapper, {report.points} points seen in {report.track_length:.1f} "
+        f"photographs each, mean reprojection error {report.error:.2f} px at {report.longest} px"
+    )
