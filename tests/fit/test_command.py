@@ -81,6 +81,13 @@ def test_a_scene_is_written_and_scored(folder: Path, tmp_path: Path, capsys) -> 
     assert set(record["versions"]) == {"splatseg", "torch"}
 
 
+def test_without_points_it_says_where_it_starts(folder: Path, tmp_path: Path, capsys) -> None:
+    words = ["fit", str(folder), "-o", str(tmp_path / "scene"), "--steps", "5"]
+    assert main([*words, "--start", "random", "--max-gaussians", "90"]) == 0
+    assert "starting at 90 places where photographs agree" in capsys.readouterr().out
+    assert load_scene(tmp_path / "scene").provenance["options"]["start"] == "random"
+
+
 def test_same_command_same_file(folder: Path, tmp_path: Path) -> None:
     files = []
     for name in ("a", "b"):
@@ -145,7 +152,7 @@ def test_what_cannot_be_done_is_said_before_the_work(folder: Path, tmp_path: Pat
     content = json.loads((folder / "transforms.json").read_text())
     del content["ply_file_path"]
     (folder / "transforms.json").write_text(json.dumps(content))
-    assert "start points" in refused(str(folder), "-o", scene, "--steps", "2")
+    assert "start points" in refused(str(folder), "-o", scene, "--steps", "2", "--start", "points")
     assert not Path(scene).exists()
 
 

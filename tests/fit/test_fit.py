@@ -158,7 +158,7 @@ def test_captures_that_cannot_be_fitted_say_why(capture: Capture) -> None:
     empty = PointCloud(points=torch.zeros(0, 3))
     for points in (None, empty):
         with pytest.raises(InputError, match="expected a capture with start points"):
-            fit(replace(capture, points=points), options=OPTIONS)
+            fit(replace(capture, points=points), options=replace(OPTIONS, start="points"))
     broken = PointCloud(points=torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]]))
     with pytest.raises(InputError, match="1 of 2 start points are not finite"):
         fit(replace(capture, points=broken), options=OPTIONS)

@@ -16,3 +16,4 @@ from splatseg.fit._records import FitProgress as FitProgress
 from splatseg.fit._records import FitRecord as FitRecord
 from splatseg.fit._records import FitResult as FitResult
 from splatseg.fit._resume import Checkpoints as Checkpoints
+from splatseg.fit._start import random_start_count as random_start_count

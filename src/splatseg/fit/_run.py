@@ -20,6 +20,7 @@ from splatseg.fit._parameters import Parameters, gathered, rows_in_view
 from splatseg.fit._photographs import Example, Photographs
 from splatseg.fit._records import FitProgress, FitRecord
 from splatseg.fit._schedule import degree_at, rates_at, reduction_at
+from splatseg.fit._start import with_start_points
 from splatseg.fit._state import FitState, Part, named, parameters_of
 from splatseg.fit._update import UpdateSettings, update_rows
 from splatseg.fit._view_parts import ViewParts
@@ -59,6 +60,9 @@ class FitRun:
         self.stages: dict[str, float] = {}
         self.between_steps = True
         if saved is None:
+            capture = with_start_points(
+                capture, photographs, options=options, generator=self._generator
+            )
             start = initial_parameters(capture, options=options, generator=self._generator)
             self._extent = scene_extent(capture.train_views, start.means)
             self._start_count = len(start)

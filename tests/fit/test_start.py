@@ -1,0 +1,149 @@
+"""Starts without points: where the cameras look, and where photographs agree."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatseg.core import Camera, Capture
+from splatseg.errors import InputError
+from splatseg.evaluate import evaluate_photographs
+from splatseg.fit import FitOptions, fit
+from splatseg.fit._photographs import Photographs
+from splatseg.fit._start import random_points, visible_region, with_start_points
+from splatseg.io.images import save_png
+
+from .conftest import ring_camera, tiny_scene
+
+
+def _looking_along_z(x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
+    """At (x, y, 0), looking along z, turned by an angle to the right."""
+    c, s = torch.cos(torch.tensor(turn)).item(), torch.sin(torch.tensor(turn)).item()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    pose[:3, 3] = -pose[:3, :3] @ torch.tensor([x, y, 0], dtype=torch.float64)
+    return Camera(width=40, height=30, fx=40.0, fy=40.0, cx=20.0, cy=15.0, cam_from_world=pose)
+
+
+def _drawn(photographs: Photographs, count: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return random_points(photographs, count=count, generator=generator).points
+
+
+def test_cameras_around_one_thing_look_at_a_ball() -> None:
+    """They stand 3.2 from it; the shorter side of a picture has a half angle of atan(24 / 60)."""
+    region = visible_region([ring_camera(0.7 * i) for i in range(9)])
+    radius = 3.2 * 24 / 60
+    assert region.core == pytest.approx((3.2 - radius, 3.2 + radius), rel=1e-3)
+    assert region.near == pytest.approx(3.2 / 3, rel=1e-3)
+    assert region.far == pytest.approx(64, rel=1e-3)
+
+
+def test_wide_cameras_have_the_whole_ball_in_front() -> None:
+    wide = [ring_camera(0.7 * i, fx=10.0, fy=10.0) for i in range(9)]
+    region = visible_region(wide)
+    assert region.core == pytest.approx((0.32, 6.08), rel=1e-3)
+    assert region.near == pytest.approx(0.32, rel=1e-3)
+
+
+def test_cameras_that_look_elsewhere_have_no_ball() -> None:
+    """Outwards from a ring of radius 2; side by side and parallel; all in one spot."""
+    outwards = []
+    for i in range(8):
+        inward = ring_camera(0.8 * i)
+        pose = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
+        outwards.append(replace(inward, cam_from_world=pose @ inward.cam_from_world))
+    region = visible_region(outwards)
+    assert region.core is None
+    assert (region.near, region.far) == pytest.approx((0.32, 160), rel=0.05)
+    parallel = visible_region([_looking_along_z(x) for x in (-3.0, -1.0, 1.0, 3.0)])
+    assert parallel.core is None
+    assert parallel.near == pytest.approx(0.1)  # the lower median of 1, 1, 3, 3
+    spot = visible_region([_looking_along_z(0, 0, turn) for turn in (0.0, 0.5, 1.0)])
+    assert (spot.near, spot.far, spot.core) == pytest.approx((0.1, 50.0, None))
+    one = visible_region([_looking_along_z(0)])
+    assert one.core is None
+
+
+def test_points_lie_on_what_is_photographed(capture: Capture) -> None:
+    """Most pixels show blobs within 1.3 of the middle; others show black, which is anywhere."""
+    photographs = Photographs(capture.train_views, longest=1600)
+    generator = torch.Generator().manual_seed(1)
+    cloud = random_points(photographs, count=2000, generator=generator)
+    assert len(cloud) == 2000
+    assert cloud.colours is not None
+    bright = cloud.colours.float().amax(dim=1) > 60
+    assert float(bright.float().mean()) > 0.3
+    points = cloud.points[bright]
+    near_blobs = torch.cdist(points, tiny_scene().means).amin(dim=1)
+    assert float((near_blobs < 0.3).float().mean()) > 0.8
+    assert float(points.norm(dim=1).quantile(0.9)) < 1.3
+    blind = torch.randn(2000, 3)
+    blind *= 1.3 * torch.rand(2000, 1) ** (1 / 3) / blind.norm(dim=1, keepdim=True)
+    blindly = torch.cdist(blind, tiny_scene().means).amin(dim=1)
+    assert float((blindly < 0.3).float().mean()) < 0.6
+
+
+def test_points_have_the_colour_of_their_pixel(capture: Capture) -> None:
+    """Each point is seen by the view it was drawn from in a pixel of its colour."""
+    views = capture.train_views[:1]
+    photographs = Photographs(views, longest=1600)
+    cloud = random_points(photographs, count=300, generator=torch.Generator().manual_seed(1))
+    assert cloud.colours is not None
+    pixels, depth = views[0].camera.project(cloud.points.double())
+    assert bool((depth > 0).all())
+    example = photographs.example(0)
+    found = example.photograph[pixels[:, 1].long(), pixels[:, 0].long()]
+    torch.testing.assert_close(found, cloud.colours / 255.0, atol=0.003, rtol=0)
+
+
+def test_same_seed_same_points(capture: Capture) -> None:
+    photographs = Photographs(capture.train_views, longest=1600)
+    assert torch.equal(_drawn(photographs, 100), _drawn(photographs, 100))
+    assert not torch.equal(_drawn(photographs, 100), _drawn(photographs, 100, seed=1))
+
+
+def test_masked_pixels_start_nothing(capture: Capture, tmp_path: Path) -> None:
+    """Only the middle column of each photograph counts."""
+    mask = torch.zeros(48, 56, dtype=torch.uint8)
+    mask[:, 28] = 255
+    save_png(mask, tmp_path / "mask.png")
+    views = tuple(replace(view, mask=tmp_path / "mask.png") for view in capture.train_views)
+    photographs = Photographs(views, longest=1600)
+    points = _drawn(photographs, 110).reshape(len(views), -1, 3)
+    for view, own in zip(views, points, strict=True):
+        pixels, _ = view.camera.project(own.double())
+        assert bool((pixels[:, 0].floor() == 28).all())
+    save_png(torch.zeros(48, 56, dtype=torch.uint8), tmp_path / "mask.png")
+    assert len(_drawn(Photographs(views, longest=1600), 110)) == 0
+
+
+def test_a_fit_starts_without_points(capture: Capture) -> None:
+    options = FitOptions(
+        minutes=None, steps=250, max_gaussians=400, sh_degree=1, background="black", densify_from=80
+    )
+    bare = replace(capture, points=None)
+    result = fit(bare, options=options)
+    assert evaluate_photographs(result.gaussians, capture.test_views).psnr > 22
+    again = fit(bare, options=replace(options, steps=2)).gaussians
+    forced = fit(capture, options=replace(options, steps=2, start="random")).gaussians
+    assert torch.equal(again.means, forced.means)
+    with pytest.raises(InputError, match="expected a capture with start points"):
+        fit(bare, options=replace(options, start="points"))
+    with pytest.raises(InputError, match="start: expected one of auto, points, random"):
+        replace(options, start="nowhere")
+
+
+def test_the_capture_keeps_its_points(capture: Capture) -> None:
+    photographs = Photographs(capture.train_views, longest=1600)
+    generator = torch.Generator().manual_seed(0)
+
+    def points(start: str, **options: object) -> int:
+        chosen = FitOptions(start=start, **options)
+        found = with_start_points(capture, photographs, options=chosen, generator=generator)
+        assert found.points is not None
+        return len(found.points)
+
+    assert points("auto") == points("points") == 60
+    assert points("random", max_gaussians=77) == 77
