@@ -91,9 +91,8 @@ def test_a_known_scene_is_recovered(strategy: Strategy, tmp_path, rng) -> None:
     start = errors(truth, capture.points.points)
     own = (capture.points.points - truth.means).norm(dim=1).numpy()
     assert np.abs(start - own).max() < 1e-6, "who is nearest says who is who"
-    # Opaque enough from the start that nothing wanders off, and no reset of the opacities: of a
-    # few hundred Gaussians none is one too many, and a reset would lose who is in front of whom.
-    # All else is as it comes: growth, relocation, noise, penalties; cloning, splitting, pruning.
+    # Opaque enough from the start that nothing wanders off. All else is as it comes: growth,
+    # relocation, noise, penalties; cloning, splitting, pruning.
     options = FitOptions(
         minutes=None,
         steps=3200,
@@ -102,7 +101,6 @@ def test_a_known_scene_is_recovered(strategy: Strategy, tmp_path, rng) -> None:
         background="black",
         start_opacity=0.5,
         final_rate=0.5,
-        reset_interval=1.0,
     ).with_strategy(strategy)
 
     result = fit(capture, options=options, backend="cpu")
