@@ -62,7 +62,8 @@ def fit(
         clock = CheckpointClock(checkpoints, identity=identity)
     photographs = Photographs(views, longest=options.longest, masks=options.masks)
     saved = None if clock is None else clock.saved()
-    run = FitRun(capture, options, renderer, photographs, saved=saved)
+    with one_torch_thread():
+        run = FitRun(capture, options, renderer, photographs, saved=saved)
 
     def keep() -> None:
         if clock is not None:
