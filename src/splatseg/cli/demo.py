@@ -176,7 +176,6 @@ def main_job(command: Command) -> list[tuple[str, ModuleType, Any]]:
                     layer=_LAYER,
                     truth=truth,
                     split=split,
-                    photographs=split == "test",
                     json=True,
                     backend=backend,
                 ),

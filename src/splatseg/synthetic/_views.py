@@ -15,6 +15,9 @@ from splatseg.synthetic._raycast import Truth
 from splatseg.synthetic._scene import SyntheticScene
 
 _CLEARANCE = 0.28
+_LOOKS = ("across", "across", "near", "across", "across", "up")
+# Height of what is looked at, as a share of the room's.
+_RISE = {"across": (0.18, 0.45), "near": (0.25, 0.70), "up": (0.80, 1.05)}
 _POINT_SPREAD = 0.012
 _SAME_SURFACE = 0.03
 
@@ -73,8 +76,8 @@ def cameras(
 ) -> tuple[View, ...]:
     """Views from inside the scene's bounds, train views first.
 
-    They stand on a ring half-way to the walls at changing heights. Two of three look across
-    the room, the third at what is near, up to the ceiling. Test views stand between train
+    They stand on a ring half-way to the walls at changing heights. Most look across the
+    room, one of six at what is near and one up to the ceiling. Test views stand between train
     views. The same scene gives the same views.
 
     Returns:
@@ -90,14 +93,14 @@ def cameras(
     for split, count, phase in (("train", train, 0.0), ("test", test, 0.5)):
         for i in range(count):
             turn = 2 * math.pi * (i + phase) / count
-            eye, target = _stand(scene, rng, turn=turn, look_out=i % 3 == 2)
+            eye, target = _stand(scene, rng, turn=turn, look=_LOOKS[i % len(_LOOKS)])
             camera = look_at(eye, target, width=width, height=height, field_of_view=field_of_view)
             views.append(View(name=f"{split}_{i:04d}", camera=camera, split=split))
     return tuple(views)
 
 
 def _stand(
-    scene: SyntheticScene, rng: np.random.Generator, *, turn: float, look_out: bool
+    scene: SyntheticScene, rng: np.random.Generator, *, turn: float, look: str
 ) -> tuple[list[float], list[float]]:
     """A free place on the ring and what it looks at."""
     low, high = np.array(scene.bounds[0]), np.array(scene.bounds[1])
@@ -108,7 +111,7 @@ def _stand(
         eye = np.empty(3)
         eye[:2] = middle[:2] + rng.uniform(0.35, 0.68) * half[:2] * round_
         eye[2] = low[2] + rng.uniform(0.42, 0.72) * 2 * half[2]
-        if look_out:
+        if look == "near":
             aside = angle + rng.choice([-1, 1]) * rng.uniform(0.9, 1.5)
             toward = np.array([math.cos(aside), math.sin(aside)])
             target = np.array([*(eye[:2] + half[:2] * toward), 0.0])
@@ -120,7 +123,7 @@ def _stand(
                     0.0,
                 ]
             )
-        rise = rng.uniform(0.25, 0.80) if look_out else rng.uniform(0.18, 0.45)
+        rise = rng.uniform(*_RISE[look])
         target[2] = low[2] + rise * 2 * half[2]
         place = torch.tensor(eye).unsqueeze(0)
         if not any(bool(p.contains(place, _CLEARANCE)) for p in scene.primitives):
