@@ -46,6 +46,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.fit",
         summary="posed photographs and start points -> Gaussians",
     ),
+    "doctor": CommandEntry(
+        module="splatseg.cli.doctor",
+        summary="what is wrong with a capture's cameras and points, and a corrected copy",
+    ),
     "segment": CommandEntry(
         module="splatseg.cli.segment",
         summary="evidence (label maps, masks, features) -> a layer of the scene",

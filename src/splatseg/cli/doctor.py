@@ -1,0 +1,133 @@
+"""``splatseg doctor``: what is wrong with a capture's cameras and points, and a corrected copy."""
+
+import json
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from splatseg.errors import InputError
+from splatseg.pose.doctor import (
+    Diagnosis,
+    DoctorOptions,
+    diagnose,
+    read_for_doctor,
+    write_corrected,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """Find the usual faults of a capture with poses, and write a corrected one.
+
+    Exit status: 0 when nothing is wrong, or when what is wrong was corrected with --fix;
+    2 when faults are left.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data."""
+
+    fix: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
+    """Folder to write the corrected capture to, as a transforms.json that refers to the same
+    photographs. Nothing of DATA is changed; without faults nothing is written."""
+
+    json: bool = False
+    """Print one JSON object with all figures."""
+
+    views: int = 30
+    """Most photographs to look at; more take longer and decide more finely."""
+
+    format: str = "auto"
+    """How DATA is read: auto, nerfstudio, colmap, blender, llff or idr."""
+
+
+def run(command: Command) -> None:
+    """Examine a capture."""
+    if command.views < 2:
+        raise InputError(f"--views: expected at least 2, got {command.views}.")
+    if command.fix is not None:
+        _check_output(command.fix)
+    read = read_for_doctor(command.data, format=command.format)
+    diagnosis = diagnose(
+        read.capture,
+        options=DoctorOptions(views=command.views),
+        found=read.faults,
+        declared=read.declared,
+    )
+    written = command.fix is not None and diagnosis.corrected is not None
+    if written and command.fix is not None:
+        write_corrected(diagnosis, command.fix)
+    if command.json:
+        content = facts(diagnosis) | {"written": str(command.fix) if written else None}
+        sys.stdout.write(json.dumps(content, allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(report(diagnosis, str(command.data)))
+        if written:
+            sys.stdout.write(f"{command.fix}: the corrected capture\n")
+    sys.stdout.flush()
+    if not diagnosis.healthy and not written:
+        raise InputError(_sentence(diagnosis, command))
+
+
+def facts(diagnosis: Diagnosis) -> dict[str, Any]:
+    """A diagnosis in values that JSON holds."""
+    return {
+        "path": str(diagnosis.capture.path),
+        "format": diagnosis.capture.format,
+        "healthy": diagnosis.healthy,
+        "faults": [asdict(fault) for fault in diagnosis.faults],
+        "doubts": list(diagnosis.doubts),
+        "unchecked": list(diagnosis.unchecked),
+        "correctable": diagnosis.corrected is not None,
+        "figures": dict(diagnosis.figures),
+    }
+
+
+def report(diagnosis: Diagnosis, name: str) -> str:
+    """A diagnosis for people, a line for each thing."""
+    lines = [f"{name}: {_verdict(diagnosis)}"]
+    for fault in diagnosis.faults:
+        lines.append(f"  fault: {fault.sentence}")
+        if fault.remedy:
+            lines.append(f"    remedy: {fault.remedy}")
+    lines += [f"  doubt: {doubt}" for doubt in diagnosis.doubts]
+    lines += [f"  not checked: {sentence}" for sentence in diagnosis.unchecked]
+    lines.append(f"  {_evidence(diagnosis.figures)}")
+    return "\n".join(lines) + "\n"
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
+    if diagnosis.healthy:
+        return "no fault found"
+    count = len(diagnosis.faults)
+    return f"{count} fault{'s' if count > 1 else ''} found"
+
+
+def _evidence(figures: dict[str, Any] | Any) -> str:
+    parts = [f"{figures['matches']} matches in {figures['pairs']} pairs of photographs"]
+    if "agreement" in figures:
+        parts.append(f"{100 * figures['agreement']:.1f} % agree with the cameras as given")
+        after = figures.get("agreement_corrected", figures["agreement"])
+        if after != figures["agreement"]:
+            parts.append(f"{100 * after:.1f} % with the corrected ones")
+    for key, word in (("points", "start points fit"), ("points_corrected", "corrected")):
+        if key in figures:
+            parts.append(f"{word} {100 * figures[key]['value']:.0f} %")
+    return "evidence: " + ", ".join(parts)
+
+
+def _sentence(diagnosis: Diagnosis, command: Command) -> str:
+    names = ", ".join(fault.name for fault in diagnosis.faults)
+    if diagnosis.corrected is None:
+        return f"{command.data}: {names}; no correction that was tried helps."
+    return f"{command.data}: {names}; --fix OUT writes a corrected capture."
+
+
+def _check_output(folder: Path) -> None:
+    """Refuse before the work what could not be written after it."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: expected a new or empty folder to write to.")
+    if not folder.resolve().parent.is_dir():
+        raise InputError(f"{folder}: expected a place in a folder that is there, got none.")

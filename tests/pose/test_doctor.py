@@ -1,0 +1,194 @@
+"""The doctor names deliberate faults of real captures, singly and in pairs, and undoes them."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import Camera, Capture, PointCloud, Similarity
+from splatseg.io.captures import read_capture
+from splatseg.pose.doctor import DoctorOptions, Matches, diagnose, match_views
+
+OPTIONS = DoctorOptions(views=15, longest=512)
+FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+Y_UP = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+OLD_NERFSTUDIO = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+Break = Callable[[Capture], Capture]
+
+
+def with_cameras(capture: Capture, change: Callable[[Camera], Camera]) -> Capture:
+    views = tuple(replace(view, camera=change(view.camera)) for view in capture.views)
+    return replace(capture, views=views)
+
+
+def with_poses(change: Callable[[torch.Tensor], torch.Tensor]) -> Break:
+    def apply(capture: Capture) -> Capture:
+        return with_cameras(capture, lambda c: replace(c, cam_from_world=change(c.cam_from_world)))
+
+    return apply
+
+
+def with_lens(*, focal: float = 1, scale: float = 1, dx: float = 0, dy: float = 0) -> Break:
+    def change(c: Camera) -> Camera:
+        f = focal * scale
+        return replace(c, fx=c.fx * f, fy=c.fy * f, cx=c.cx * scale + dx, cy=c.cy * scale + dy)
+
+    return lambda capture: with_cameras(capture, change)
+
+
+def with_points(matrix: object, scale: float = 1.0) -> Break:
+    def apply(capture: Capture) -> Capture:
+        moved = capture.points.points.double() @ torch.tensor(matrix).double().T * scale
+        return replace(
+            capture, points=PointCloud(points=moved.float(), colours=capture.points.colours)
+        )
+
+    return apply
+
+
+def poses_turned(capture: Capture) -> Capture:
+    turn = Similarity(rotation=torch.tensor(Y_UP).double(), translation=torch.zeros(3).double())
+    return with_cameras(capture, lambda c: c.moved(turn))
+
+
+# As files get them: a transforms.json holds M = world_from_cam with OpenGL axes.
+FAULTS: dict[str, tuple[Break, list[str]]] = {
+    "opencv-poses": (with_poses(lambda c: FLIP @ c), ["camera-axes"]),
+    "inverse": (with_poses(lambda c: FLIP @ torch.linalg.inv(c) @ FLIP), ["inverted-poses"]),
+    "colmap-poses": (
+        with_poses(lambda c: FLIP @ torch.linalg.inv(c)),
+        ["inverted-poses", "camera-axes"],
+    ),
+    "half-size": (with_lens(scale=0.5), ["scaled-intrinsics"]),
+    "double-size": (with_lens(scale=2.0), ["scaled-intrinsics"]),
+    "focal-1.1": (with_lens(focal=1.1), ["focal-length"]),
+    "focal-0.7": (with_lens(focal=0.7), ["focal-length"]),
+    "half-pixel-up": (with_lens(dx=0.5, dy=0.5), ["half-pixel"]),
+    "half-pixel-down": (with_lens(dx=-0.5, dy=-0.5), ["half-pixel"]),
+    "ten-pixels": (with_lens(dx=10, dy=-4), ["principal-point"]),
+    "points-y-up": (with_points(Y_UP), ["point-frame"]),
+    "points-old-nerfstudio": (with_points(OLD_NERFSTUDIO), ["point-frame"]),
+    "points-in-mm": (with_points(np.eye(3), 1000.0), ["point-frame"]),
+    "poses-y-up": (poses_turned, ["pose-frame"]),
+    "up": (lambda capture: replace(capture, up=(0.0, 1.0, 0.0)), ["up-axis"]),
+}
+PAIRS = [
+    ("half-size", "opencv-poses"),
+    ("inverse", "focal-1.1"),
+    ("half-pixel-up", "opencv-poses"),
+    ("double-size", "points-in-mm"),
+    ("up", "inverse"),
+    ("poses-y-up", "focal-0.7"),
+]
+
+
+@pytest.fixture(scope="module")
+def office(shared_data) -> Capture:
+    return read_capture(shared_data / "office")
+
+
+@pytest.fixture(scope="module")
+def office_matches(office) -> Matches:
+    return match_views(office.views, most_views=OPTIONS.views, longest=OPTIONS.longest)
+
+
+def names(diagnosis) -> list[str]:
+    return [fault.name for fault in diagnosis.faults]
+
+
+def reprojection(corrected: Capture, true: Capture) -> float:
+    """Median distance in pixels between where points fall and where they should."""
+    distances = []
+    for ours, theirs in itertools.islice(zip(corrected.views, true.views, strict=True), 0, 99, 9):
+        pixels, _ = ours.camera.project(corrected.points.points[:300].double())
+        expected, depth = theirs.camera.project(true.points.points[:300].double())
+        distances.append((pixels - expected)[depth > 0.1].norm(dim=1))
+    return float(torch.cat(distances).median())
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_fault_is_named_and_undone(name, office, office_matches) -> None:
+    change, expected = FAULTS[name]
+    diagnosis = diagnose(change(office), options=OPTIONS, matches=office_matches)
+    assert names(diagnosis) == expected
+    assert not diagnosis.healthy
+    assert diagnosis.corrected is not None
+    assert reprojection(diagnosis.corrected, office) < 0.15
+    assert diagnosis.corrected.up == (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids="+".join)
+def test_pairs_of_faults_are_told_apart(pair, office, office_matches) -> None:
+    broken = office
+    for name in pair:
+        broken = FAULTS[name][0](broken)
+    diagnosis = diagnose(broken, options=OPTIONS, matches=office_matches)
+    assert sorted(names(diagnosis)) == sorted(n for name in pair for n in FAULTS[name][1])
+    assert diagnosis.corrected is not None
+    assert reprojection(diagnosis.corrected, office) < 0.15
+
+
+def test_a_healthy_capture(office, office_matches) -> None:
+    diagnosis = diagnose(office, options=OPTIONS, matches=office_matches)
+    assert diagnosis.healthy
+    assert (diagnosis.doubts, diagnosis.unchecked, diagnosis.corrected) == ((), (), None)
+    # The margins behind the verdict: wrong readings have less than 0.5 and 0.15.
+    assert diagnosis.figures["agreement"] > 0.9
+    assert diagnosis.figures["points"]["value"] > 0.6
+    add = diagnosis.figures["principal_point"]["add"]
+    assert max(map(abs, add)) < 0.15
+
+
+def test_without_points_cameras_are_still_examined(office, office_matches) -> None:
+    bare = replace(office, points=None)
+    healthy = diagnose(bare, options=OPTIONS, matches=office_matches)
+    assert healthy.healthy
+    assert healthy.unchecked == ("start points against cameras: the capture has no points",)
+    broken = diagnose(FAULTS["inverse"][0](bare), options=OPTIONS, matches=office_matches)
+    assert names(broken) == ["inverted-poses"]
+
+
+def test_nonsense_is_called_unexplained(office, office_matches) -> None:
+    rng = np.random.default_rng(5)
+
+    def anywhere(c: Camera) -> Camera:
+        q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+        q = q * np.sign(np.diag(r))
+        q[:, 0] *= np.linalg.det(q)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = q, rng.normal(size=3)
+        return replace(c, cam_from_world=torch.from_numpy(pose))
+
+    diagnosis = diagnose(
+        replace(with_cameras(office, anywhere), points=None),
+        options=OPTIONS,
+        matches=office_matches,
+    )
+    assert names(diagnosis) == ["unexplained-poses"]
+    assert diagnosis.corrected is None
+
+
+def test_points_of_another_place_are_replaced(office, office_matches, rng) -> None:
+    cloud = torch.from_numpy(rng.normal(size=(4000, 3)) * [4, 0.2, 9]).float()
+    colours = torch.from_numpy(rng.integers(0, 255, (4000, 3), dtype=np.uint8))
+    broken = replace(office, points=PointCloud(points=cloud, colours=colours))
+    diagnosis = diagnose(broken, options=OPTIONS, matches=office_matches)
+    assert names(diagnosis) == ["unexplained-points"]
+    assert diagnosis.corrected is not None
+    # What stands in their place are places in the room, which is 6 m long at most.
+    assert len(diagnosis.corrected.points) > 300
+    low, high = office.points.points.aminmax(dim=0)
+    inside = (diagnosis.corrected.points.points > low - 0.3).all(dim=1)
+    inside &= (diagnosis.corrected.points.points < high + 0.3).all(dim=1)
+    assert inside.float().mean() > 0.97
+
+
+def test_too_few_matches_are_said(office) -> None:
+    two = replace(office, views=office.views[:2])
+    diagnosis = diagnose(two, options=OPTIONS)
+    assert diagnosis.healthy
+    assert diagnosis.unchecked[0].startswith("cameras against each other: only ")
+    assert diagnosis.unchecked[1].startswith("start points against cameras: there are too few")
