@@ -16,6 +16,8 @@ from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitProgress, FitResult, fit
 from splatseg.render import render
 
+from .conftest import tiny_scene
+
 OPTIONS = FitOptions(
     minutes=None,
     steps=300,
@@ -248,5 +250,42 @@ def test_a_random_background_leaves_no_holes_in_black(capture: Capture) -> None:
 
 
 def test_the_background_is_named() -> None:
-    with pytest.raises(InputError, match="background: expected one of random, black, got 'blue'"):
-        replace(OPTIONS, background="blue")
+    for wrong in ("blue", "#12345", "#12345g", "", (0.1, 0.2), (0.0, 0.0, 1.1), [0.0, 0.0, -1.0]):
+        with pytest.raises(InputError, match="background: expected random, black, white, #rrggbb"):
+            replace(OPTIONS, background=wrong)
+    for right in ("white", "#00FF7f", (0.1, 0.2, 1), [0.0, 0.0, 0.0]):
+        replace(OPTIONS, background=right)
+
+
+@pytest.mark.parametrize("background", ["#ff8000", (1.0, 128 / 255, 0.0)])
+def test_photographs_with_alpha_are_blended_over_the_background(
+    capture: Capture, tmp_path: Path, background: object
+) -> None:
+    """A cut-out over a colour teaches what the same picture over that colour teaches."""
+    from PIL import Image
+
+    cut_out, blended = [], []
+    for view in capture.views:
+        with torch.no_grad():
+            drawn = render(tiny_scene(), view.camera)
+        alpha = (drawn.alpha > 0.5).float()[..., None]
+        rgba = (torch.cat((drawn.image.clamp(0, 1), alpha), dim=2) * 255).to(torch.uint8)
+        path = tmp_path / f"{view.name}_rgba.png"
+        Image.fromarray(rgba.numpy()).save(path)
+        cut_out.append(replace(view, image=path))
+        behind = torch.tensor([255, 128, 0], dtype=torch.uint8)
+        path = tmp_path / f"{view.name}_rgb.png"
+        Image.fromarray(torch.where(alpha > 0, rgba[..., :3], behind).numpy()).save(path)
+        blended.append(replace(view, image=path))
+    options = replace(OPTIONS, steps=80, background=background)
+    one, other = (
+        fit(replace(capture, views=tuple(views)), options=options) for views in (cut_out, blended)
+    )
+    assert len(one.gaussians) == len(other.gaussians)
+    torch.testing.assert_close(one.gaussians.means, other.gaussians.means, rtol=0, atol=0.02)
+    camera = capture.train_views[0].camera
+    covered = render(one.gaussians, camera).alpha.mean()
+    over_white = fit(
+        replace(capture, views=tuple(cut_out)), options=replace(options, background="random")
+    )
+    assert float(covered) < 0.9 * float(render(over_white.gaussians, camera).alpha.mean())

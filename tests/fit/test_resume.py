@@ -57,10 +57,11 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "scene" / "fit" / "checkpoint.npz"
 
 
-CLASSIC = replace(OPTIONS.with_strategy("classic"), reset_interval=0.3, densify_gradient=1e-6)
+CLASSIC = replace(OPTIONS.with_strategy("classic"), reset_every=18, densify_gradient=1e-6)
 VARIANTS = {
     "mcmc": OPTIONS,
     "classic": CLASSIC,
+    "views": replace(OPTIONS, exposure=True, refine_poses=True, start="random"),
 }
 
 

@@ -7,6 +7,7 @@ import torch
 
 from splatseg.core import Capture
 from splatseg.errors import InputError
+from splatseg.fit._background import fixed_colour
 from splatseg.fit._identity import fit_identity
 from splatseg.fit._interrupts import deferred_interrupts
 from splatseg.fit._options import FitOptions
@@ -60,7 +61,12 @@ def fit(
     if checkpoints is not None:
         identity = fit_identity(capture, views, options=options, backend=renderer.name)
         clock = CheckpointClock(checkpoints, identity=identity)
-    photographs = Photographs(views, longest=options.longest, masks=options.masks)
+    photographs = Photographs(
+        views,
+        longest=options.longest,
+        masks=options.masks,
+        keep_alpha=fixed_colour(options.background) is not None,
+    )
     saved = None if clock is None else clock.saved()
     with one_torch_thread():
         run = FitRun(capture, options, renderer, photographs, saved=saved)

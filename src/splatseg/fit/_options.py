@@ -6,6 +6,7 @@ from typing import Any, Literal, Self
 
 from splatseg._check import check_choice, check_range
 from splatseg.errors import InputError, RangeError
+from splatseg.fit._background import Background, fixed_colour
 from splatseg.io.images import DEFAULT_LONGEST
 
 Preset = Literal["quick", "default", "full"]
@@ -75,9 +76,11 @@ class FitOptions:
     """Random walk of faint Gaussians, times the position rate and their covariance
     (Kheradmand et al. 2024, eq. 8). 0 is none."""
 
-    background: Literal["random", "black"] = "random"
-    """What is behind the Gaussians while fitting. A random colour each step forbids holes: over
-    black, dark surfaces need no Gaussians, and then have no depth and no label."""
+    background: Background = "random"
+    """What is behind the Gaussians while fitting: random, black, white, #rrggbb or three numbers
+    in [0, 1]. A random colour each step forbids holes: over black, dark surfaces need no
+    Gaussians, and then have no depth and no label. Over a fixed colour photographs are blended
+    too, where they have an alpha channel."""
 
     antialiased: bool = False
     """Scale opacities so that the low-pass of 0.3 square pixels adds no light (Mip-Splatting,
@@ -191,7 +194,7 @@ class FitOptions:
                 raise RangeError(f"{name}: expected at least {least}, got {value}.")
         check_choice("start", self.start, ("auto", "points", "random"))
         check_choice("strategy", self.strategy, ("mcmc", "classic"))
-        check_choice("background", self.background, ("random", "black"))
+        fixed_colour(self.background)
         check_choice("masks", self.masks, ("ignore", "alpha", "off"))
         check_choice("depth", self.depth, ("off", "metric", "relative"))
         if self.sh_degree not in (0, 1, 2, 3):

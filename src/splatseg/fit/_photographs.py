@@ -41,7 +41,8 @@ class Photographs:
 
     Photographs with distortion are resampled into ``camera.undistorted()``; what lies outside
     them has no loss. What is 0 in the view's own mask has none either, or is transparent, as
-    `FitOptions.masks` says.
+    `FitOptions.masks` says. With `keep_alpha` an alpha channel of a photograph is kept, to be
+    blended over another colour than white.
 
     Example:
         photographs = Photographs(capture.train_views, longest=1600)
@@ -54,10 +55,12 @@ class Photographs:
         *,
         longest: int,
         masks: Literal["ignore", "alpha", "off"] = "ignore",
+        keep_alpha: bool = False,
     ) -> None:
         self._views = tuple(views)
         self._longest = longest
         self._masks = masks
+        self._keep_alpha = keep_alpha
         self._kept: dict[int, _Pixels] = {}
         self._bytes = 0
         self._cameras = [straightened(image_camera(view, longest)) for view in self._views]
@@ -116,7 +119,7 @@ class Photographs:
         view = self._views[index]
         camera = image_camera(view, self._longest)
         pixels = load_image(view, longest=self._longest)
-        if self._masks == "alpha":
+        if self._masks == "alpha" or (self._keep_alpha and view.mask is None):
             alpha = load_alpha(view, longest=self._longest)
             if alpha is not None:
                 return _cut_out(pixels, alpha, view, camera)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from splatseg.core import Capture, Gaussians
 from splatseg.errors import FileFormatError, SplatsegError
+from splatseg.fit._background import background_colour
 from splatseg.fit._density import density_of
 from splatseg.fit._initialise import initial_parameters, scene_extent
 from splatseg.fit._loss import Loss, l1_dssim
@@ -239,8 +240,9 @@ class FitRun:
         picture, photograph = rendered.image, example.photograph
         if self.views.exposures is not None:
             picture = self.views.exposures.applied(example.index, picture, rendered.alpha)
-        if self._options.background == "random":
-            colour = torch.rand(3, generator=self._generator).to(picture)
+        colour = background_colour(self._options.background, generator=self._generator)
+        if colour is not None:
+            colour = colour.to(picture)
             picture = picture + (1 - rendered.alpha).unsqueeze(-1) * colour
             if example.alpha is not None:
                 photograph = photograph + (1 - example.alpha).unsqueeze(-1) * colour
