@@ -95,7 +95,7 @@ def test_a_known_scene_is_recovered(strategy: Strategy, tmp_path, rng) -> None:
     # relocation, noise, penalties; cloning, splitting, pruning.
     options = FitOptions(
         minutes=None,
-        steps=3200,
+        steps=4600,
         max_gaussians=COUNT + 20,
         sh_degree=0,
         background="black",

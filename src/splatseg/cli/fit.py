@@ -1,7 +1,6 @@
 """``splatseg fit``: photographs with cameras become a scene of Gaussians."""
 
 import sys
-import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -13,10 +12,10 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from splatseg.cli._fit_report import score_and_report
 from splatseg.cli._output import check_output
 from splatseg.cli._photographs import Poses, capture_of
-from splatseg.core import Capture, Gaussians, Scene
-from splatseg.evaluate import evaluate_photographs
+from splatseg.core import Capture, Scene
 from splatseg.fit import (
     Checkpoints,
     FitOptions,
@@ -33,8 +32,6 @@ from splatseg.fit import (
 from splatseg.io.scene import CHECKPOINT_FILE, save_scene
 from splatseg.render import BackendName
 
-# Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
-_SCORING = 20.0
 # Weight of the newest view in the figures of the progress line; views differ much.
 _SMOOTHING = 0.02
 _DEFAULT = FitOptions()
@@ -164,9 +161,19 @@ def run(command: Command) -> None:
     sys.stdout.write(_summary(result, command.output))
     sys.stdout.writelines(f"{note}\n" for note in result.notes)
     sys.stdout.flush()
-    if interrupts.requested or result.interrupted:
+    stopped = interrupts.requested or result.interrupted
+    sys.stdout.write(
+        score_and_report(
+            command.output,
+            capture,
+            result,
+            options=options,
+            backend=command.backend,
+            scoring=not stopped,
+        )
+    )
+    if stopped:
         raise KeyboardInterrupt
-    sys.stdout.write(_held_out(command, capture, result.gaussians))
 
 
 def _save(command: Command, options: FitOptions, capture: Capture, result: FitResult) -> None:
@@ -283,24 +290,3 @@ def _summary(result: FitResult, root: Path) -> str:
         f"{root}: {len(result.gaussians)} Gaussians {ended} {result.steps} steps, "
         f"{result.seconds:.1f} s ({rate:.1f} steps/s){onwards}\n"
     )
-
-
-def _held_out(command: Command, capture: Capture, gaussians: Gaussians) -> str:
-    """PSNR on the test views, as many as the time for it allows."""
-    views = [view for view in capture.test_views if view.image is not None]
-    if not views:
-        return "no held-out views to score\n"
-    begin = time.monotonic()
-    decibels: list[float] = []
-    for view in views:
-        if time.monotonic() - begin > _SCORING:
-            break
-        report = evaluate_photographs(
-            gaussians, [view], cut_out=command.masks == "alpha", backend=command.backend
-        )
-        decibels.append(report.psnr)
-    mean = sum(decibels) / len(decibels)
-    scored = f"{len(decibels)} held-out views"
-    if len(decibels) < len(views):
-        scored = f"the first {len(decibels)} of {len(views)} held-out views"
-    return f"PSNR {mean:.2f} dB on {scored}\n"

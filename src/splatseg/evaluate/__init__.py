@@ -3,9 +3,11 @@
 from splatseg.evaluate.held_out import BinaryReport as BinaryReport
 from splatseg.evaluate.held_out import PhotographReport as PhotographReport
 from splatseg.evaluate.held_out import SemanticReport as SemanticReport
+from splatseg.evaluate.held_out import ViewScore as ViewScore
 from splatseg.evaluate.held_out import evaluate_binary as evaluate_binary
 from splatseg.evaluate.held_out import evaluate_photographs as evaluate_photographs
 from splatseg.evaluate.held_out import evaluate_semantic as evaluate_semantic
+from splatseg.evaluate.held_out import picture_and_photograph as picture_and_photograph
 from splatseg.evaluate.metrics import BinaryScore as BinaryScore
 from splatseg.evaluate.metrics import Confusion as Confusion
 from splatseg.evaluate.metrics import SemanticScore as SemanticScore

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, Selection, View
 from splatseg.errors import InputError
@@ -60,6 +62,21 @@ class BinaryReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ViewScore:
+    """How like its photograph one picture is."""
+
+    name: str
+    """Of the view."""
+
+    psnr: float
+    """Decibels."""
+
+    ssim: float
+    lpips: float | None = None
+    """None where no network was given."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PhotographReport:
     """How like the photographs the pictures are."""
 
@@ -74,6 +91,12 @@ class PhotographReport:
 
     views: tuple[str, ...]
     """Views that were scored."""
+
+    per_view: tuple[ViewScore, ...] = ()
+    """The scores of each of them."""
+
+    lpips: float | None = None
+    """Mean over views; None where no network was given."""
 
 
 def evaluate_semantic(
@@ -168,6 +191,7 @@ def evaluate_photographs(
     views: Sequence[View],
     *,
     cut_out: bool = False,
+    lpips: Callable[[torch.Tensor, torch.Tensor], float] | None = None,
     options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Progress | None = None,
@@ -180,6 +204,8 @@ def evaluate_photographs(
         cut_out: Score what the view's mask, or the alpha channel of its photograph, cuts out:
             photograph and picture over white, as is the custom for such scenes. A view without
             either is scored as it is.
+        lpips: A network with weights (`splatseg.evaluate.lpips.load_lpips`); None leaves that
+            score out.
         options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and their number.
@@ -190,28 +216,53 @@ def evaluate_photographs(
     """
     if not views:
         raise InputError("views: expected at least one view with a photograph, got none.")
-    decibels: list[float] = []
-    likeness: list[float] = []
+    scores: list[ViewScore] = []
     for done, view in enumerate(views, start=1):
-        photograph = load_image(view)
-        with torch.no_grad():
-            drawn = render(gaussians, view.camera, options=options, backend=backend)
-        image = drawn.image.cpu().double()
-        opaque = load_alpha(view) if cut_out else None
-        if opaque is not None:
-            image = image + (1 - drawn.alpha.cpu().double())[..., None]
-            photograph = _over_white(photograph, opaque, view)
-        picture = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
-        decibels.append(psnr(picture, photograph))
-        likeness.append(ssim(picture, photograph))
+        picture, photograph = picture_and_photograph(
+            gaussians, view, cut_out=cut_out, options=options, backend=backend
+        )
+        scores.append(
+            ViewScore(
+                name=view.name,
+                psnr=psnr(picture, photograph),
+                ssim=ssim(picture, photograph),
+                lpips=None if lpips is None else lpips(picture, photograph),
+            )
+        )
         if progress is not None:
             progress(done, len(views))
+    distances = [score.lpips for score in scores if score.lpips is not None]
     return PhotographReport(
-        psnr=math.fsum(decibels) / len(decibels),
-        psnr_min=min(decibels),
-        ssim=math.fsum(likeness) / len(likeness),
+        psnr=math.fsum(score.psnr for score in scores) / len(scores),
+        psnr_min=min(score.psnr for score in scores),
+        ssim=math.fsum(score.ssim for score in scores) / len(scores),
         views=tuple(view.name for view in views),
+        per_view=tuple(scores),
+        lpips=math.fsum(distances) / len(distances) if distances else None,
     )
+
+
+def picture_and_photograph(
+    gaussians: Gaussians,
+    view: View,
+    *,
+    cut_out: bool = False,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+) -> tuple[UInt8[Tensor, "height width 3"], UInt8[Tensor, "height width 3"]]:
+    """What the Gaussians show in a view, and what the camera saw, both as 8-bit files hold them.
+
+    Arguments and errors are those of `evaluate_photographs`.
+    """
+    photograph = load_image(view)
+    with torch.no_grad():
+        drawn = render(gaussians, view.camera, options=options, backend=backend)
+    image = drawn.image.cpu().double()
+    opaque = load_alpha(view) if cut_out else None
+    if opaque is not None:
+        image = image + (1 - drawn.alpha.cpu().double())[..., None]
+        photograph = _over_white(photograph, opaque, view)
+    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8), photograph
 
 
 def _over_white(photograph: torch.Tensor, opaque: torch.Tensor, view: View) -> torch.Tensor:

@@ -126,6 +126,14 @@ def colour_depth(
     ).to(torch.uint8)
 
 
+def colour_difference(
+    one: UInt8[Tensor, "height width 3"], other: UInt8[Tensor, "height width 3"]
+) -> UInt8[Tensor, "height width 3"]:
+    """How far two images differ in each channel, times four: black where they agree."""
+    check_shape("other", other, one.shape)
+    return (4 * (one.int() - other.int()).abs()).clamp(max=255).to(torch.uint8)
+
+
 def mark_errors(
     image: UInt8[Tensor, "height width 3"],
     ids: Int[Tensor, "height width"],

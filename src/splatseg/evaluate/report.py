@@ -14,6 +14,7 @@ from PIL import Image
 
 from splatseg.core import ClassTable
 from splatseg.errors import InputError
+from splatseg.evaluate._chart import Chart, chart_svg
 from splatseg.evaluate.pictures import Gallery, Picture, colour_of
 
 Cell = str | int | float | None
@@ -90,7 +91,16 @@ class Commands:
     note: str = ""
 
 
-Block = Table | Bars | Gallery | Legend | Commands
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curves:
+    """Charts beside each other."""
+
+    title: str
+    charts: tuple[Chart, ...]
+    note: str = ""
+
+
+Block = Table | Bars | Curves | Gallery | Legend | Commands
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,6 +186,8 @@ def _block(block: Block) -> str:
         inner = _table(block)
     elif isinstance(block, Bars):
         inner = _bars(block)
+    elif isinstance(block, Curves):
+        inner = _curves(block)
     elif isinstance(block, Gallery):
         inner = _gallery(block)
     elif isinstance(block, Legend):
@@ -222,6 +234,21 @@ def _bars(bars: Bars) -> str:
         )
         rows.append(f'<div class="name">{_text(name)}</div><div class="group">{lines}</div>')
     return f'<div class="keys">{keys}</div><div class="bars">{"".join(rows)}</div>'
+
+
+def _curves(curves: Curves) -> str:
+    figures: list[str] = []
+    for chart in curves.charts:
+        names = [line.name for line in chart.lines]
+        keys = "".join(
+            f'<span><i class="series{i + 1}"></i>{_text(name)}</span>'
+            for i, name in enumerate(names)
+        )
+        told = f'<div class="keys">{keys}</div>' if len(names) > 1 else ""
+        figures.append(
+            f"<figure><figcaption>{_text(chart.title)}</figcaption>{told}{chart_svg(chart)}</figure>"
+        )
+    return f'<div class="charts">{"".join(figures)}</div>'
 
 
 def _gallery(gallery: Gallery) -> str:
@@ -306,6 +333,14 @@ img { display: block; width: 100%; min-width: 11rem; max-width: 24rem; height: a
   font-variant-numeric: tabular-nums; }
 .series0 { background: var(--first); } .series1 { background: var(--second); }
 .series2 { background: var(--third); }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(18rem, 1fr)); gap: 1rem; }
+.charts figcaption { font-size: .92rem; color: var(--ink); }
+svg { display: block; width: 100%; height: auto; }
+svg text { fill: var(--quiet); font-size: 11px; font-variant-numeric: tabular-nums; }
+svg .grid { stroke: var(--line); stroke-width: 1; }
+svg polyline { fill: none; stroke-width: 1.8; stroke-linejoin: round; }
+.line0 { stroke: var(--second); } .line1 { stroke: var(--third); }
+.dot0 { fill: var(--second); } .dot1 { fill: var(--third); }
 pre { margin: 0; padding: .9rem 1rem; overflow-x: auto; background: var(--card);
   border: 1px solid var(--line); border-radius: .6rem;
   font: .85rem/1.6 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }

@@ -1,0 +1,148 @@
+"""The end of ``splatseg fit``: held-out views are scored and reports/fit.html is written."""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Capture, View
+from splatseg.evaluate import PhotographReport, evaluate_photographs, picture_and_photograph
+from splatseg.evaluate.fit_report import FitStory, fit_record, fit_report
+from splatseg.evaluate.pictures import Gallery, Picture, colour_difference
+from splatseg.evaluate.report import report_html
+from splatseg.fit import FitOptions, FitResult
+from splatseg.io._atomic import atomic_file
+from splatseg.io._json import read_json, write_json
+from splatseg.io.scene import GAUSSIANS_FILE, POSES_FOLDER
+from splatseg.render import BackendName
+
+# Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
+_SCORING = 20.0
+
+
+def score_and_report(
+    root: Path,
+    capture: Capture,
+    result: FitResult,
+    *,
+    options: FitOptions,
+    backend: BackendName,
+    scoring: bool,
+) -> str:
+    """Score the held-out views, write SCENE/reports/fit.html and fit.json; gives what to print.
+
+    As many views are scored as the time for it allows; with `scoring` False none is, for who
+    stopped a fit does not want to wait.
+    """
+    views = [view for view in capture.test_views if view.image is not None]
+    scores = None
+    if views and scoring:
+        scores = _scored(result, views, options=options, backend=backend)
+    story = FitStory(
+        capture=replace(capture, views=result.views or capture.views),
+        options=options,
+        result=result,
+        scores=scores,
+        held_out=len(views),
+        file_bytes=(root / GAUSSIANS_FILE).stat().st_size,
+        command=_typed(sys.argv),
+        poses=_poses(root),
+        facts={"backend": backend},
+    )
+    pairs = None
+    if scores is not None:
+        pairs = _pairs(result, views, scores, cut_out=options.masks == "alpha", backend=backend)
+    folder = root / "reports"
+    folder.mkdir(exist_ok=True)
+    with atomic_file(folder / "fit.html") as path:
+        page = report_html(fit_report(story, pairs=pairs))
+        path.write_text(page, encoding="utf-8", newline="\n")
+    write_json(folder / "fit.json", fit_record(story))
+    return _told(scores, len(views)) + f"report: {folder / 'fit.html'}\n"
+
+
+def _scored(
+    result: FitResult, views: Sequence[View], *, options: FitOptions, backend: BackendName
+) -> PhotographReport:
+    """The scores of the first views, until the time is over; at least one."""
+    begin = time.monotonic()
+    cut_out = options.masks == "alpha"
+    reports: list[PhotographReport] = []
+    for view in views:
+        if reports and time.monotonic() - begin > _SCORING:
+            break
+        reports.append(
+            evaluate_photographs(result.gaussians, [view], cut_out=cut_out, backend=backend)
+        )
+    count = len(reports)
+    return PhotographReport(
+        psnr=sum(report.psnr for report in reports) / count,
+        psnr_min=min(report.psnr for report in reports),
+        ssim=sum(report.ssim for report in reports) / count,
+        views=tuple(name for report in reports for name in report.views),
+        per_view=tuple(score for report in reports for score in report.per_view),
+    )
+
+
+def _pairs(
+    result: FitResult,
+    views: Sequence[View],
+    scores: PhotographReport,
+    *,
+    cut_out: bool,
+    backend: BackendName,
+) -> Gallery:
+    """Photograph, picture and difference of the worst, the middle and the best view."""
+    ordered = sorted(scores.per_view, key=lambda score: score.psnr)
+    middle, last = len(ordered) // 2, len(ordered) - 1
+    # Of few views some are two of the three; each is shown once.
+    ranks = {0: "worst", middle: "median", last: "best"} if last else {0: "the only one"}
+    names = {view.name: view for view in views}
+    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    for rank, label in ranks.items():
+        score = ordered[rank]
+        picture, photograph = picture_and_photograph(
+            result.gaussians, names[score.name], cut_out=cut_out, backend=backend
+        )
+        rows.append(
+            (
+                f"{label}: {score.name}",
+                (
+                    Picture(image=photograph),
+                    Picture(image=picture, caption=f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"),
+                    Picture(image=colour_difference(picture, photograph)),
+                ),
+            )
+        )
+    return Gallery(
+        title="Held-out views",
+        columns=("photograph", "rendered", "difference"),
+        rows=tuple(rows),
+        note="The difference is four times as bright as it is.",
+    )
+
+
+def _poses(root: Path) -> dict[str, Any] | None:
+    path = root / POSES_FOLDER / "poses.json"
+    return read_json(path).get("report") if path.is_file() else None
+
+
+def _typed(words: Sequence[str]) -> str:
+    """The command line; nothing where the command was called from Python."""
+    name = Path(words[0]).name if words else ""
+    if name not in ("splatseg", "__main__.py"):
+        return ""
+    return " ".join(["splatseg", *words[1:]])
+
+
+def _told(scores: PhotographReport | None, count: int) -> str:
+    if not count:
+        return "no held-out views to score\n"
+    if scores is None:
+        return ""
+    scored = f"{count} held-out views"
+    if len(scores.views) < count:
+        scored = f"the first {len(scores.views)} of {count} held-out views"
+    return f"PSNR {scores.psnr:.2f} dB on {scored}, SSIM {scores.ssim:.3f}\n"
