@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from splatseg import fit as fit
     from splatseg import io as io
     from splatseg import lift as lift
+    from splatseg import pose as pose
     from splatseg import render as render
     from splatseg import synthetic as synthetic
     from splatseg.core import Camera as Camera
@@ -67,7 +68,7 @@ _HOMES = {
     "splatseg.lift": "uplift",
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
 }
-_PACKAGES = frozenset({"core", "evaluate", "fit", "io", "lift", "render", "synthetic"})
+_PACKAGES = frozenset({"core", "evaluate", "fit", "io", "lift", "pose", "render", "synthetic"})
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 

@@ -42,6 +42,9 @@ class LensFacts:
 
 def lens_facts(image: Image.Image) -> LensFacts:
     """What the EXIF data of an opened image say of its lens."""
+    if image.format == "PNG" and "exif" not in image.info:
+        # Pillow would decode the whole picture to look for them behind the pixels.
+        return LensFacts(identity=("",) * 5, focal=None)
     exif = image.getexif()
     detail: Mapping[int, Any] = exif.get_ifd(_EXIF_IFD)
     identity = tuple(

@@ -1,9 +1,12 @@
 """Photographs from a video: the sharpest frame of each of equal intervals."""
 
 import importlib.util
-from collections.abc import Callable, Iterator
+import subprocess
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from tempfile import TemporaryFile
+from typing import IO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,33 +120,56 @@ def _save(best: tuple[float, int, NDArray[np.uint8]], folder: Path) -> None:
 
 
 def _count(video: Path) -> int:
-    import imageio_ffmpeg
-
-    try:
-        count, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
-    except (RuntimeError, OSError) as error:
-        raise FileFormatError(f"{video}: cannot be read as a video ({_first(error)}).") from error
+    """Frames of a video, from its packets alone."""
+    words = ["-map", "0:v:0", "-c", "copy", "-f", "null", "-progress", "pipe:1", "-"]
+    with _ffmpeg(video, words) as said:
+        counts = [line for line in said.read().split() if line.startswith(b"frame=")]
+    count = int(counts[-1].removeprefix(b"frame=")) if counts else 0
     if not count:
         raise FileFormatError(f"{video}: expected a video, got a file without frames.")
-    return int(count)
+    return count
 
 
 def _frames(video: Path) -> Iterator[NDArray[np.uint8]]:
-    """Frames as (height, width, 3), in order."""
+    """Frames as (height, width, 3), in order, turned as the file asks."""
+    words = ["-map", "0:v:0", "-fps_mode", "passthrough", "-f", "image2pipe", "-c:v", "ppm", "-"]
+    with _ffmpeg(video, words) as stream:
+        # Each is a PPM file: P6, width and height, 255, the pixels.
+        while stream.readline() == b"P6\n":
+            width, height = (int(word) for word in stream.readline().split())
+            stream.readline()
+            data = stream.read(width * height * 3)
+            if len(data) < width * height * 3:
+                return
+            yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
+
+
+@contextmanager
+def _ffmpeg(video: Path, words: Sequence[str]) -> Generator[IO[bytes]]:
+    """What ffmpeg writes when it reads a video; it is ended when the block ends.
+
+    Raises:
+        FileFormatError: If ffmpeg fails; the message has its last words.
+    """
     import imageio_ffmpeg
 
-    reader = cast("Any", imageio_ffmpeg.read_frames(str(video)))
-    try:
-        about = next(reader)
-        width, height = about["size"]
-        for data in reader:
-            yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-    except (RuntimeError, OSError, ValueError, StopIteration) as error:
-        raise FileFormatError(f"{video}: cannot be read as a video ({_first(error)}).") from error
-    finally:
-        reader.close()
-
-
-def _first(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
+    program = imageio_ffmpeg.get_ffmpeg_exe()
+    command = [program, "-v", "error", "-nostdin", "-i", str(video), *words]
+    with TemporaryFile() as complaints:
+        # The words are ours, the program is that of the package, and there is no shell.
+        process = subprocess.Popen(  # noqa: S603
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints
+        )
+        try:
+            yield cast("IO[bytes]", process.stdout)
+            status = process.wait()
+        finally:
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+        if status:
+            complaints.seek(0)
+            said = complaints.read().decode(errors="replace").strip().splitlines()
+            reason = said[-1].removeprefix(f"{video}: ") if said else f"status {status}"
+            raise FileFormatError(f"{video}: cannot be read as a video ({reason}).")
