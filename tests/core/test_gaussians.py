@@ -132,3 +132,15 @@ def test_what_they_are_meant_for_goes_with_them() -> None:
     assert all(one.antialiased for one in made)
     with pytest.raises(InputError, match=r"parts\[1\]: expected antialiased to be True"):
         Gaussians.concatenate([g, plain])
+
+
+def test_their_low_pass_goes_with_them() -> None:
+    plain = make(4)
+    g = plain.replace(low_pass=0.1)
+    assert plain.low_pass == 0.3
+    turned = Similarity(rotation=torch.eye(3), translation=torch.ones(3), scale=2.0)
+    made = [g[1:], g[torch.tensor([2])], g.to(dtype=torch.float64), g.transformed(turned)]
+    made += [Gaussians.concatenate([g, g]), g.replace(extra={})]
+    assert all(one.low_pass == 0.1 for one in made)
+    with pytest.raises(InputError, match=r"parts\[1\]: expected low_pass to be 0.1 as.* got 0.3"):
+        Gaussians.concatenate([g, plain])

@@ -96,8 +96,23 @@ def test_values_out_of_range_are_named(field: str, value: float) -> None:
 
 def test_presets_differ_in_length_and_size() -> None:
     quick, default, full = (FitOptions.preset(n) for n in ("quick", "default", "full"))
-    assert quick.minutes < default.minutes < full.minutes
+    assert quick.minutes < default.minutes
+    assert (full.minutes, full.steps, full.sh_degree) == (None, 30_000, 3)
     assert quick.max_gaussians < default.max_gaussians < full.max_gaussians
     assert default == FitOptions()
+    assert (default.antialiased, default.low_pass_drawn) == (True, 0.1)
+    assert (full.antialiased, full.low_pass_drawn) == (False, 0.3)
     with pytest.raises(InputError, match="preset: expected one of quick, default, full"):
         FitOptions.preset("slow")
+
+
+def test_classic_has_its_own_penalties_and_its_own_end() -> None:
+    options = FitOptions(noise=7.0, seed=3).with_strategy("classic")
+    changed = (options.noise, options.opacity_penalty, options.scale_penalty)
+    assert (*changed, options.densify_until) == (0, 0, 0, 0.5)
+    assert options.seed == 3
+    back = options.with_strategy("mcmc")
+    assert back == FitOptions(seed=3)
+    assert back.with_strategy("mcmc") is back
+    with pytest.raises(InputError, match="strategy: expected one of mcmc, classic"):
+        back.with_strategy("new")

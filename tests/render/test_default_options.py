@@ -57,6 +57,7 @@ def test_gaussians_are_drawn_as_they_are_meant() -> None:
     meant = gaussians.replace(antialiased=True)
     assert options_for(gaussians) == RenderOptions()
     assert options_for(meant) == RenderOptions(antialiased=True)
+    assert options_for(meant.replace(low_pass=0.1)) == RenderOptions(antialiased=True, low_pass=0.1)
     expected = 0.9 * 0.01 / 0.31
     pixel = torch.tensor([[1, 1]])
     assert float(render(gaussians, camera).alpha[1, 1]) == pytest.approx(0.9, rel=1e-5)

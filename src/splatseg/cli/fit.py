@@ -91,9 +91,10 @@ class Command:
     """Keep the checkpoint of the finished fit, so that --resume with more minutes or steps can
     make it longer."""
 
-    antialiased: bool = _DEFAULT.antialiased
+    antialiased: bool | None = None
     """Opacities shrink with Gaussians that are thinner than a pixel, so that they look right from
-    further away too. The scene remembers it."""
+    nearer and further away too. The scene remembers it; programs that cannot draw so show thin
+    things somewhat thicker. None is the preset's: yes, but for full."""
 
     exposure: bool = _DEFAULT.exposure
     """Give each photograph a brightness and a tint of its own, which the scene is freed of."""
@@ -209,7 +210,7 @@ def _options(command: Command) -> FitOptions:
     options = replace(
         options,
         start=command.start,
-        antialiased=command.antialiased,
+        antialiased=options.antialiased if command.antialiased is None else command.antialiased,
         exposure=command.exposure,
         masks=command.masks,
         depth=command.depth,

@@ -15,6 +15,9 @@ from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion
 from splatseg.core.sh import SH_C0, degree_of, rotate_sh
 from splatseg.errors import InputError, RangeError, ShapeError
 
+LOW_PASS = 0.3
+"""Variance of 3DGS's low-pass, square pixels."""
+
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
 class Gaussians:
@@ -58,6 +61,10 @@ class Gaussians:
     Gaussians that were fitted one way look wrong the other way. It goes with them into files
     that can say it."""
 
+    low_pass: float = LOW_PASS
+    """Variance of the filter that they are drawn with, square pixels
+    (`RenderOptions.low_pass`). Other than 3DGS's, it goes with them into PLY files."""
+
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
         check_shape("means", self.means, (None, 3))
@@ -88,6 +95,7 @@ class Gaussians:
             sh=self.sh[index],
             extra={name: column[index] for name, column in self.extra.items()},
             antialiased=self.antialiased,
+            low_pass=self.low_pass,
         )
 
     @property
@@ -121,10 +129,10 @@ class Gaussians:
         core = {
             f.name: getattr(self, f.name).to(device=device, dtype=dtype)
             for f in fields(self)
-            if f.name not in ("extra", "antialiased")
+            if f.name not in ("extra", "antialiased", "low_pass")
         }
         extra = {name: column.to(device=device) for name, column in self.extra.items()}
-        return Gaussians(**core, extra=extra, antialiased=self.antialiased)
+        return Gaussians(**core, extra=extra, antialiased=self.antialiased, low_pass=self.low_pass)
 
     def check_values(self) -> None:
         """Raise `RangeError` unless every row can be rendered.
@@ -181,11 +189,12 @@ class Gaussians:
                     f"parts[{i}]: expected harmonics of degree {parts[0].sh_degree}, "
                     f"got {part.sh_degree}."
                 )
-            if part.antialiased != parts[0].antialiased:
-                raise InputError(
-                    f"parts[{i}]: expected antialiased to be {parts[0].antialiased} as in the "
-                    f"first, got {part.antialiased}."
-                )
+            for name in ("antialiased", "low_pass"):
+                expected, got = getattr(parts[0], name), getattr(part, name)
+                if got != expected:
+                    raise InputError(
+                        f"parts[{i}]: expected {name} to be {expected} as in the first, got {got}."
+                    )
         return Gaussians(
             means=torch.cat([p.means for p in parts]),
             rotations=torch.cat([p.rotations for p in parts]),
@@ -194,4 +203,5 @@ class Gaussians:
             sh=torch.cat([p.sh for p in parts]),
             extra={name: torch.cat([p.extra[name] for p in parts]) for name in parts[0].extra},
             antialiased=parts[0].antialiased,
+            low_pass=parts[0].low_pass,
         )

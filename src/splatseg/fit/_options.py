@@ -5,12 +5,16 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 from splatseg._check import check_choice, check_range
+from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import InputError, RangeError
 from splatseg.fit._background import Background, fixed_colour
 from splatseg.io.images import DEFAULT_LONGEST
 
 Preset = Literal["quick", "default", "full"]
 Strategy = Literal["mcmc", "classic"]
+
+# Yu et al. 2024, section 5.2: about the variance of a pixel's box, 1/12.
+_MIP_LOW_PASS = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,9 +86,13 @@ class FitOptions:
     Gaussians, and then have no depth and no label. Over a fixed colour photographs are blended
     too, where they have an alpha channel."""
 
-    antialiased: bool = False
-    """Scale opacities so that the low-pass of 0.3 square pixels adds no light (Mip-Splatting,
-    eq. 9), while fitting and ever after: the result says so (`Gaussians.antialiased`)."""
+    antialiased: bool = True
+    """Scale opacities so that the low-pass adds no light (Mip-Splatting, eq. 9), while fitting
+    and ever after: the result says so (`Gaussians.antialiased`)."""
+
+    low_pass: float | None = None
+    """Variance of the low-pass, square pixels, while fitting and ever after
+    (`Gaussians.low_pass`). None is Mip-Splatting's 0.1 where antialiased, else 3DGS's 0.3."""
 
     masks: Literal["ignore", "alpha", "off"] = "ignore"
     """What masks of the capture mean. ignore: pixels where they are 0 have no loss. alpha: masks,
@@ -106,7 +114,7 @@ class FitOptions:
     """What the depth maps of the capture teach. metric: they hold z-depth. relative: inverse
     depth up to a scale and a shift a view, which the start points settle."""
 
-    depth_weight: float = 0.1
+    depth_weight: float = 0.2
     """Weight of the depth loss at progress 0; a hundredth of it is left at 1."""
 
     refine_poses: bool = False
@@ -219,6 +227,8 @@ class FitOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise RangeError(f"{name}: expected a positive number, got {value}.")
+        if self.low_pass is not None and not (math.isfinite(self.low_pass) and self.low_pass >= 0):
+            raise RangeError(f"low_pass: expected 0 or more, got {self.low_pass}.")
         for name in (
             "exposure_prior",
             "opacity_penalty",
@@ -254,6 +264,13 @@ class FitOptions:
         if name == "full":
             return cls(**_PUBLISHED)
         return cls()
+
+    @property
+    def low_pass_drawn(self) -> float:
+        """Variance of the low-pass that the options ask for, square pixels."""
+        if self.low_pass is not None:
+            return self.low_pass
+        return _MIP_LOW_PASS if self.antialiased else LOW_PASS
 
     def with_strategy(self, strategy: Strategy) -> Self:
         """The same options with another strategy and what goes with it.
@@ -297,6 +314,7 @@ _PUBLISHED: dict[str, Any] = {
     "scale_rate": 5e-3,
     "final_rate": 1.0,
     "noise": 5e5,
+    "antialiased": False,
     "quarter_until": 0.0,
     "half_until": 0.0,
     "degree_interval": 1 / 30,

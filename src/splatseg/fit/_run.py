@@ -98,7 +98,11 @@ class FitRun:
         parameters = self._state[0]
         alive = parameters.logits.sigmoid().squeeze(1) > self._options.dead_opacity
         found = parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
-        return self.views.settled(found.replace(antialiased=self._options.antialiased))
+        return self.views.settled(
+            found.replace(
+                antialiased=self._options.antialiased, low_pass=self._options.low_pass_drawn
+            )
+        )
 
     def step(self) -> FitProgress:
         """Learn from the next view. An exception leaves `between_steps` False."""
@@ -167,7 +171,10 @@ class FitRun:
         parameters = self._state[0]
         degree = degree_at(done, options=self._options)
         render_options = default_options(
-            self._backend.name, sh_degree=degree, antialiased=self._options.antialiased
+            self._backend.name,
+            sh_degree=degree,
+            antialiased=self._options.antialiased,
+            low_pass=self._options.low_pass_drawn,
         )
         with self._timed("gather"):
             rows = rows_in_view(parameters, example.camera, near=render_options.near)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import RangeError
 
 
@@ -16,7 +17,7 @@ class RenderOptions:
     alpha_max: float = 0.99
     """Largest alpha of one Gaussian at one pixel. gsplat's CUDA kernels have 0.999."""
 
-    low_pass: float = 0.3
+    low_pass: float = LOW_PASS
     """Added to both variances of the projected Gaussian, square pixels."""
 
     antialiased: bool = False

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.core import Gaussians
+from splatseg.core.gaussians import LOW_PASS
 from splatseg.render._backend import Backend
 from splatseg.render._options import RenderOptions
 
@@ -37,9 +38,14 @@ def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
 def options_for(gaussians: Gaussians, backend: str = "auto") -> RenderOptions:
     """What Gaussians are drawn with when nobody says otherwise.
 
-    The `default_options` of the backend, antialiased if that is what they are meant for.
+    The `default_options` of the backend, with the filter that they are meant for.
     """
-    return default_options(backend, like=gaussians.means, antialiased=gaussians.antialiased)
+    return default_options(
+        backend,
+        like=gaussians.means,
+        antialiased=gaussians.antialiased,
+        low_pass=gaussians.low_pass,
+    )
 
 
 def default_options(
@@ -48,6 +54,7 @@ def default_options(
     like: Tensor | None = None,
     sh_degree: int | None = None,
     antialiased: bool = False,
+    low_pass: float = LOW_PASS,
 ) -> RenderOptions:
     """What a backend draws with when nobody says otherwise.
 
@@ -59,14 +66,18 @@ def default_options(
         like: As for `get_backend`.
         sh_degree: Highest degree of the harmonics in use; None is all there are.
         antialiased: What the Gaussians are meant for, `Gaussians.antialiased`.
+        low_pass: Likewise, `Gaussians.low_pass`.
     """
     if get_backend(name, like=like).name == "cuda":
         from splatseg.render.cuda import GSPLAT_ALPHA_MAX
 
         return RenderOptions(
-            alpha_max=GSPLAT_ALPHA_MAX, sh_degree=sh_degree, antialiased=antialiased
+            alpha_max=GSPLAT_ALPHA_MAX,
+            sh_degree=sh_degree,
+            antialiased=antialiased,
+            low_pass=low_pass,
         )
-    return RenderOptions(sh_degree=sh_degree, antialiased=antialiased)
+    return RenderOptions(sh_degree=sh_degree, antialiased=antialiased, low_pass=low_pass)
 
 
 @cache

@@ -10,7 +10,7 @@ import torch
 
 from splatseg.core import Gaussians
 from splatseg.core.sh import evaluate_sh
-from splatseg.errors import InputError, MissingFileError, RangeError
+from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
 from splatseg.io.splats import SplatWarning, read_splats, write_splats
 from splatseg.io.splats.compressed_ply import CHUNK, morton_order
 from splatseg.io.splats.spz import _FLIP_SH
@@ -365,3 +365,34 @@ def test_splat_files_cannot_say_what_they_are_meant_for(make_splats: Make, tmp_p
     with pytest.warns(SplatWarning, match="no place for a note that they are meant for antialias"):
         write_splats(g, tmp_path / "a.splat")
     assert not read_splats(tmp_path / "a.splat").antialiased
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply"])
+def test_the_low_pass_is_written_where_it_is_not_the_usual(
+    make_splats: Make, tmp_path: Path, name: str
+) -> None:
+    g = make_splats(5, degree=1)
+    back = round_trip(g.replace(low_pass=0.1, antialiased=True), tmp_path, name)
+    assert (back.low_pass, back.antialiased) == (0.1, True)
+    assert b"low_pass 0.1\n" in (tmp_path / name).read_bytes()
+    assert round_trip(g, tmp_path, name).low_pass == 0.3
+    assert b"low_pass" not in (tmp_path / name).read_bytes()
+
+
+@pytest.mark.parametrize("text", ["nan", "-0.1", "inf", "wide"])
+def test_a_low_pass_that_is_none_is_refused(make_splats: Make, tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.ply"
+    write_splats(make_splats(5, degree=0).replace(low_pass=0.1), path)
+    path.write_bytes(path.read_bytes().replace(b"low_pass 0.1", f"low_pass {text}".encode()))
+    with pytest.raises(FileFormatError, match=f"a.ply: expected 'low_pass' .* got '{text}'"):
+        read_splats(path)
+
+
+@pytest.mark.parametrize("name", ["a.splat", "a.spz"])
+def test_formats_that_cannot_say_the_low_pass_warn(
+    make_splats: Make, tmp_path: Path, name: str
+) -> None:
+    g = make_splats(5, degree=0).replace(low_pass=0.1)
+    with pytest.warns(SplatWarning, match="meant for a low-pass of 0.1"):
+        write_splats(g, tmp_path / name)
+    assert read_splats(tmp_path / name).low_pass == 0.3

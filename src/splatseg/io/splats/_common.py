@@ -6,8 +6,9 @@ the same fault.
 """
 
 import inspect
+import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians
+from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import FileFormatError, MissingFileError
 
 StrPath: TypeAlias = str | PathLike[str]
@@ -123,13 +125,54 @@ class Rows:
 ANTIALIASED = "splatseg antialiased"
 """Comment line of a PLY file whose Gaussians are meant for antialiased rendering."""
 
+_VARIANCE_LINE = "splatseg low_pass "
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Filter:
+    """How Gaussians want to be drawn, as comments of a PLY file say it."""
+
+    antialiased: bool = False
+    low_pass: float = LOW_PASS
+
+    @classmethod
+    def of(cls, gaussians: Gaussians) -> "Filter":
+        """What Gaussians are meant for."""
+        return cls(antialiased=gaussians.antialiased, low_pass=gaussians.low_pass)
+
+    @classmethod
+    def from_comments(cls, path: Path, comments: Sequence[str]) -> "Filter":
+        """Read the lines that `comments` writes; without one, what 3DGS draws with."""
+        low_pass = LOW_PASS
+        for line in comments:
+            if line.startswith(_VARIANCE_LINE):
+                low_pass = _variance(path, line.removeprefix(_VARIANCE_LINE))
+        return cls(antialiased=ANTIALIASED in comments, low_pass=low_pass)
+
+    def comments(self) -> list[str]:
+        """Lines for the header; none for what 3DGS draws with."""
+        lines = [ANTIALIASED] if self.antialiased else []
+        if self.low_pass != LOW_PASS:
+            lines.append(f"{_VARIANCE_LINE}{self.low_pass!r}")
+        return lines
+
+
+def _variance(path: Path, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0):
+        raise FileFormatError(f"{path}: expected 'low_pass' to be 0 or more, got {text!r}.")
+    return value
+
 
 def finish(
     path: Path,
     rows: Rows,
     extra: Mapping[str, Tensor] | None = None,
     *,
-    antialiased: bool = False,
+    drawn: Filter = Filter(),
 ) -> Gaussians:
     """Check every row, give quaternions unit length and make `Gaussians` without a copy.
 
@@ -160,7 +203,8 @@ def finish(
         opacities=torch.from_numpy(rows.opacities),
         sh=torch.from_numpy(rows.sh),
         extra=dict(extra or {}),
-        antialiased=antialiased,
+        antialiased=drawn.antialiased,
+        low_pass=drawn.low_pass,
     )
 
 
@@ -278,6 +322,11 @@ class Losses:
         """Note that the format cannot say that Gaussians are meant for antialiased rendering."""
         if gaussians.antialiased:
             self.drop("a note that they are meant for antialiased rendering")
+
+    def drop_low_pass(self, gaussians: Gaussians) -> None:
+        """Note that the format cannot say what low-pass Gaussians are meant for."""
+        if gaussians.low_pass != LOW_PASS:
+            self.drop(f"a note that they are meant for a low-pass of {gaussians.low_pass:g}")
 
     def tell(self) -> None:
         """Warn once if anything was lost."""

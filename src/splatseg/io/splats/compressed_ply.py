@@ -17,8 +17,8 @@ from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError
 from splatseg.io.splats._common import (
-    ANTIALIASED,
     Array,
+    Filter,
     Losses,
     Rows,
     blocks,
@@ -87,7 +87,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
             rows.sh[part, 1:] = _HARMONIC[table].transpose(0, 2, 1)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
-    return finish(path, rows, antialiased=ANTIALIASED in header.comments)
+    return finish(path, rows, drawn=Filter.from_comments(path, header.comments))
 
 
 def _harmonic_of_byte() -> Array:
@@ -197,7 +197,7 @@ def write_compressed_ply(gaussians: Gaussians, path: Path, *, losses: Losses) ->
         packed[part, 3] = rgba.sum(axis=1, dtype=np.uint32)
     with path.open("wb") as file:
         rest = 3 * (rows.sh.shape[1] - 1)
-        file.write(_header(count, chunks, rest, antialiased=gaussians.antialiased))
+        file.write(_header(count, chunks, rest, comments=Filter.of(gaussians).comments()))
         file.write(bounds.tobytes())
         file.write(packed.tobytes())
         if rows.sh.shape[1] > 1:
@@ -248,11 +248,10 @@ def _harmonic_bytes(sh: Array, losses: Losses) -> bytes:
     return np.clip(steps, 0, 255).astype(np.uint8).transpose(0, 2, 1).tobytes()
 
 
-def _header(count: int, chunks: int, rest: int, *, antialiased: bool) -> bytes:
+def _header(count: int, chunks: int, rest: int, *, comments: list[str]) -> bytes:
     """The header of a file with `rest` harmonics a Gaussian."""
     lines = ["ply", "format binary_little_endian 1.0"]
-    if antialiased:
-        lines.append(f"comment {ANTIALIASED}")
+    lines += [f"comment {line}" for line in comments]
     lines.append(f"element chunk {chunks}")
     lines += [f"property float {name}" for name in _MIN_MAX]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]

@@ -18,8 +18,8 @@ from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.splats._common import (
-    ANTIALIASED,
     BLOCK,
+    Filter,
     Rows,
     blocks,
     finish,
@@ -102,8 +102,8 @@ def read_ply(path: Path) -> Gaussians:
             for name, column in extra.items():
                 column[part] = block[name]
     rows.exponentiate()
-    antialiased = ANTIALIASED in header.comments
-    return finish(path, rows, _restore(header, extra), antialiased=antialiased)
+    drawn = Filter.from_comments(path, header.comments)
+    return finish(path, rows, _restore(header, extra), drawn=drawn)
 
 
 def _rest_columns(path: Path, names: Sequence[str]) -> list[str]:
@@ -173,8 +173,7 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     """
     rows = to_rows(gaussians)
     extra, notes = _flatten(gaussians.extra)
-    if gaussians.antialiased:
-        notes.insert(0, ANTIALIASED)
+    notes = [*Filter.of(gaussians).comments(), *notes]
     coefficients = rows.sh.shape[1] - 1
     rest = [f"f_rest_{i}" for i in range(3 * coefficients)]
     standard = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS)

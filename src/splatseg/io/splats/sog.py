@@ -20,7 +20,7 @@ from PIL import Image
 
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.splats._common import Array, Rows, blocks, check_file, finish
+from splatseg.io.splats._common import Array, Filter, Rows, blocks, check_file, finish
 from splatseg.io.splats._json import Json
 from splatseg.io.splats._quaternions import assemble
 
@@ -129,7 +129,7 @@ def _read(path: Path, load: Load, meta_name: str) -> Gaussians:
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
     antialiased = "antialias" in meta and meta["antialias"].value is True
-    return finish(path, rows, antialiased=antialiased)
+    return finish(path, rows, drawn=Filter(antialiased=antialiased))
 
 
 def _picture(path: Path, load: Load, name: str, least: int) -> Pixels:

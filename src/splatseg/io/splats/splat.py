@@ -72,6 +72,7 @@ def write_splat(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
         losses.drop("harmonics above degree 0")
     losses.drop_extra(gaussians)
     losses.drop_antialiased(gaussians)
+    losses.drop_low_pass(gaussians)
     with path.open("wb") as file:
         for part in blocks(len(gaussians)):
             block = np.empty(part.stop - part.start, _ROW)

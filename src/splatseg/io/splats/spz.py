@@ -22,6 +22,7 @@ from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, RangeError
 from splatseg.io.splats._common import (
     Array,
+    Filter,
     Losses,
     Rows,
     blocks,
@@ -107,7 +108,7 @@ def read_spz(path: Path) -> Gaussians:
         if rest is not None:
             signs = _FLIP_SH[: coefficients - 1, None]
             rows.sh[part, 1:] = (rest[part].astype(np.float32) - 128) / 128 * signs
-    return finish(path, rows, antialiased=bool(header.flags & _ANTIALIASED))
+    return finish(path, rows, drawn=Filter(antialiased=bool(header.flags & _ANTIALIASED)))
 
 
 def _header(path: Path, data: bytes) -> _Header:
@@ -264,6 +265,7 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: Literal[3, 4], losse
     """
     rows = to_rows(gaussians)
     losses.drop_extra(gaussians)
+    losses.drop_low_pass(gaussians)
     bits = _fractional_bits(rows.means)
     streams = _pack(rows, bits, losses)
     header = _HEADER.pack(
