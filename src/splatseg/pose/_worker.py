@@ -34,6 +34,9 @@ from splatseg.pose._pairs import (
 
 _IMAGES_AT_ONCE = 8
 _PAIRS_AT_ONCE = 256
+# Photographs with fewer verified matches in all are looked at again, at seconds a pair.
+_WEAK = 150
+_MOST_LOOKED_AT_AGAIN = 12
 # COLMAP's own threshold for a verified pair.
 _MIN_INLIERS = 15
 # Without a second try: a model that has all photographs and fits them like this, in pixels.
@@ -141,16 +144,47 @@ class Job:
         )
         if exhaustive:
             self._match_pairs(all_pairs(count))
-            return
+        else:
+            self._match_likely(count)
+        self._look_again()
+
+    def _match_likely(self, count: int) -> None:
+        """Pairs by name and by looks, and then what may join parts that do not hang together."""
         alike = likeness(self._descriptors(), seed=self._options["seed"])
         near = self._options["neighbours"]
         self._match_pairs(chosen_pairs(alike, overlap=self._options["overlap"], neighbours=near))
-        groups = connected_groups(count, self._verified())
+        groups = connected_groups(count, list(self._verified()))
         if len(set(groups)) > 1:
             self._match_pairs(linking_pairs(alike, groups, neighbours=near))
 
-    def _match_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+    def _look_again(self) -> None:
+        """Search along epipolar lines where a photograph hardly hangs on the rest.
+
+        Knowing how two photographs lie to each other, a feature has few candidates left, and
+        many more matches are sure; but on the CPU that costs seconds a pair.
+        """
+        verified = self._verified()
+        strength = [0] * len(self._names)
+        for pair, inliers in verified.items():
+            for i in pair:
+                strength[i] += inliers
+        weak = [pair for pair in verified if min(strength[i] for i in pair) < _WEAK]
+        weak = sorted(sorted(weak, key=lambda pair: -verified[pair])[:_MOST_LOOKED_AT_AGAIN])
+        database = pycolmap.Database.open(self._database)
+        try:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            for pair in weak:
+                a, b = (ids[self._names[i]] for i in pair)
+                database.delete_matches(a, b)
+                database.delete_two_view_geometry(a, b)
+        finally:
+            database.close()
+        # Should this be stopped now, the next run finds them missing and matches them anew.
+        self._match_pairs(weak, guided=True)
+
+    def _match_pairs(self, pairs: Sequence[tuple[int, int]], *, guided: bool = False) -> None:
         matching = pycolmap.FeatureMatchingOptions()
+        matching.guided_matching = guided
         matching.num_threads = self._options["threads"]
         matching.use_gpu = False
         verification = pycolmap.TwoViewGeometryOptions()
@@ -159,7 +193,7 @@ class Job:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = listed
         done = 0
-        for chunk in _chunks(pairs, _PAIRS_AT_ONCE):
+        for chunk in _chunks(pairs, _IMAGES_AT_ONCE if guided else _PAIRS_AT_ONCE):
             lines = (f"{self._names[i]} {self._names[j]}\n" for i, j in chunk)
             listed.write_text("".join(lines), encoding="utf-8")
             pycolmap.match_image_pairs(
@@ -180,21 +214,21 @@ class Job:
         finally:
             database.close()
 
-    def _verified(self, *, database: Path | None = None) -> list[tuple[int, int]]:
-        """Pairs of photographs, by their place in the list of names, that show the same."""
-        opened = pycolmap.Database.open(database or self._database)
+    def _verified(self) -> dict[tuple[int, int], int]:
+        """How many matches say that two photographs show the same, by their places."""
+        database = pycolmap.Database.open(self._database)
         try:
             place = {name: i for i, name in enumerate(self._names)}
-            places = {i.image_id: place[i.name] for i in opened.read_all_images()}
-            pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
+            places = {i.image_id: place[i.name] for i in database.read_all_images()}
+            pair_ids, inliers = database.read_two_view_geometry_num_inliers()
         finally:
-            opened.close()
-        ids = [pycolmap.pair_id_to_image_pair(pair) for pair in pair_ids]
-        return [
-            (places[a], places[b])
-            for (a, b), count in zip(ids, inliers, strict=True)
-            if count >= _MIN_INLIERS
-        ]
+            database.close()
+        verified: dict[tuple[int, int], int] = {}
+        for pair_id, count in zip(pair_ids, inliers, strict=True):
+            a, b = (places[id] for id in pycolmap.pair_id_to_image_pair(pair_id))
+            if count >= _MIN_INLIERS:
+                verified[min(a, b), max(a, b)] = int(count)
+        return verified
 
     # -- mapping ----------------------------------------------------------------------------
 
