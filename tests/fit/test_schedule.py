@@ -116,3 +116,15 @@ def test_classic_has_its_own_penalties_and_its_own_end() -> None:
     assert back.with_strategy("mcmc") is back
     with pytest.raises(InputError, match="strategy: expected one of mcmc, classic"):
         back.with_strategy("new")
+
+
+def test_the_number_of_gaussians_goes_with_the_root_of_the_length() -> None:
+    options = FitOptions()
+    assert (options.minutes, options.max_gaussians) == (10.0, 500_000)
+    assert options.with_length(minutes=2.5).max_gaussians == 250_000
+    assert options.with_length(minutes=40.0).max_gaussians == 1_000_000
+    assert options.with_length(steps=15_000).max_gaussians == 500_000
+    assert options.with_length(steps=600).max_gaussians == 100_000
+    assert options.with_length(steps=1).max_gaussians == 20_000
+    assert options.with_length() is options
+    assert FitOptions.preset("quick").max_gaussians == 274_000

@@ -11,8 +11,9 @@ from splatseg.core import Camera, Capture, View
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 
-# The length may differ: a fit can be made longer or shorter while it goes on.
-_FREE = ("minutes", "steps")
+# The length may differ, and the number of Gaussians, which goes with it: a fit can be made longer
+# or shorter while it goes on.
+_FREE = ("minutes", "steps", "max_gaussians")
 # Files are told apart by their size and so many of their first bytes.
 _FILE_HEAD = 65_536
 
@@ -28,7 +29,7 @@ def fit_identity(
     Args:
         capture: Its points are taken.
         views: The training views.
-        options: All but minutes and steps is taken.
+        options: All but the length and the number of Gaussians is taken.
         backend: Name of the renderer in use.
     """
     views = tuple(views)

@@ -13,6 +13,10 @@ from splatseg.io.images import DEFAULT_LONGEST
 Preset = Literal["quick", "default", "full"]
 Strategy = Literal["mcmc", "classic"]
 
+# Of a fit with half a million Gaussians at 512 x 384 pixels.
+_STEPS_A_MINUTE = 1500
+_LEAST_GAUSSIANS = 20_000
+
 # Yu et al. 2024, section 5.2: about the variance of a pixel's box, 1/12.
 _MIP_LOW_PASS = 0.1
 
@@ -34,7 +38,7 @@ class FitOptions:
     """Number of steps, one view each. Same seed and steps, same result. None where `minutes`
     says how long."""
 
-    max_gaussians: int = 200_000
+    max_gaussians: int = 500_000
     """The number of Gaussians grows to this and stays."""
 
     seed: int = 0
@@ -181,6 +185,11 @@ class FitOptions:
     """Gaussians of this opacity or less are moved to where there are others, and are left out
     of the result."""
 
+    prune_floaters: bool = True
+    """Leave out of the finished result what no training view needs: Gaussians that hide in or
+    behind things, and lone ones that float before a camera or two. An interrupted fit keeps
+    them."""
+
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.steps is None):
             raise InputError(
@@ -260,7 +269,7 @@ class FitOptions:
         """
         check_choice("preset", name, ("quick", "default", "full"))
         if name == "quick":
-            return cls(minutes=3.0, max_gaussians=150_000)
+            return cls().with_length(minutes=3.0)
         if name == "full":
             return cls(**_PUBLISHED)
         return cls()
@@ -294,12 +303,24 @@ class FitOptions:
     def with_length(self, *, minutes: float | None = None, steps: int | None = None) -> Self:
         """The same options with another length: minutes or steps; neither keeps it.
 
+        The number of Gaussians goes with the square root of the length: more need more steps.
+
         Raises:
             InputError: If both are given.
         """
         if minutes is None and steps is None:
             return self
-        return replace(self, minutes=minutes, steps=steps)
+        changed = replace(self, minutes=minutes, steps=steps)
+        share = math.sqrt(changed._length / self._length)
+        most = 1000 * round(self.max_gaussians * share / 1000)
+        return replace(changed, max_gaussians=max(_LEAST_GAUSSIANS, most))
+
+    @property
+    def _length(self) -> float:
+        """Minutes, or what the steps take on two cores."""
+        if self.minutes is not None:
+            return self.minutes
+        return (self.steps or 1) / _STEPS_A_MINUTE
 
 
 # 30 000 steps of the authors' programs, with their rates. Both grow without bound or to a number
