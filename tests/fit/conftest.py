@@ -107,6 +107,7 @@ def photographed(
     count: int = 14,
     gains: Sequence[float] | None = None,
     noise: float = 0.03,
+    arc: float = 2 * np.pi,
     depth_step: int | None = None,
     **lens: object,
 ) -> Capture:
@@ -118,13 +119,14 @@ def photographed(
         count: Number of photographs.
         gains: Factor of each photograph's colours.
         noise: Of the start points, scene units.
+        arc: Part of the circle that the cameras stand on, radians.
         depth_step: Also write depth maps of every so many pixels, in 1/1000 of a unit.
         lens: For `ring_camera`.
     """
     scene = tiny_scene() if scene is None else scene
     views: list[View] = []
     for i in range(count):
-        camera = ring_camera(2 * np.pi * i / count, **lens)
+        camera = ring_camera(arc * i / count, **lens)
         with torch.no_grad():
             drawn = render(scene, camera)
         gain = 1.0 if gains is None else gains[i]

@@ -30,6 +30,7 @@ _NEAREST = 0.1
 """Drawn depths below this share of the median count as this share: the slope of 1 / d has no
 bound, and one Gaussian before the lens would drown the rest."""
 
+_ROUNDS = 10
 _FEWEST = 20
 """Start points that a relative depth map must show to be aligned."""
 
@@ -52,7 +53,7 @@ class DepthMaps:
         capture: Its start points align relative maps.
         options: ``metric`` maps hold z-depth. ``relative`` ones hold inverse depth up to a scale
             and a shift of each view, as networks that see one photograph give it; median and
-            mean deviation of the start points in view settle the two (as the 3DGS code does).
+            mean deviation of the start points in view settle the two (see `aligned_inverse`).
 
     Raises:
         InputError: If no view has a depth map, or relative maps have no points to align to.
@@ -150,8 +151,10 @@ def aligned_inverse(
 ) -> Float[Tensor, "rows columns"] | None:
     """A relative map as inverse depth, by the points that its view shows.
 
-    The line through medians and mean absolute deviations of both: hidden points and wrong
-    pixels shift it little. None where fewer than 20 points are in view, or the map is flat.
+    The line through medians and mean absolute deviations of both, as the 3DGS code has it; then
+    some rounds of least squares over the points that were nearest to the line, the nearer half,
+    because the others may be hidden. None where fewer than 20 points are in view, or the map is
+    flat.
     """
     straight = straightened(camera)
     at, z = straight.project(points.double())
@@ -169,6 +172,14 @@ def aligned_inverse(
     if float(spread) <= 0:
         return None
     scale = (wanted - goal).abs().mean() / spread
+    for _ in range(_ROUNDS):
+        off = ((seen - middle) * scale + goal - wanted).abs()
+        near = off <= off.median()
+        middle, goal = seen[near].mean(), wanted[near].mean()
+        across = seen[near] - middle
+        if float(across.square().sum()) <= 0:
+            return None
+        scale = (across * (wanted[near] - goal)).sum() / across.square().sum()
     inverse = ((values.double() - middle) * scale + goal).float()
     return torch.where(values > 0, inverse.clamp_min(0), 0.0)
 

@@ -14,6 +14,11 @@ from splatseg.fit._view_adam import ViewAdam
 _FINAL_RATE = 0.01
 """What is left of the rate at progress 1."""
 
+_POINTS = 5000
+"""Start points that are looked at, about."""
+
+_LONGEST = 1.5
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseShift:
@@ -33,25 +38,33 @@ class Poses:
 
     .. math:: T \leftarrow \exp \begin{pmatrix} [\omega]_\times & v \\ 0 & 0 \end{pmatrix} T
 
-    with T = ``cam_from_world``. Adam's step is taken in :math:`\omega` and in v over the depth of
-    the scene, so that both move pixels alike.
+    with T = ``cam_from_world``. Adam's step is taken in coordinates in which a unit moves the
+    start points in view by one pixel, whichever way it goes (see `pixel_twists`): a camera that
+    turns and one that moves aside show nearly the same, and plain steps do not tell them apart.
 
     Nothing but the start holds the whole scene in place, so it may drift; `aligned` takes the
     drift out.
 
     Args:
         cameras: The training views' cameras as given.
-        depth: A typical depth of the scene, scene units.
+        points: Start points, which say how far things are.
         options: The rate.
     """
 
-    def __init__(self, cameras: Sequence[Camera], *, depth: float, options: FitOptions) -> None:
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        *,
+        points: Float[Tensor, "n 3"],
+        options: FitOptions,
+    ) -> None:
         given = [camera.cam_from_world.detach().double().cpu() for camera in cameras]
         self._given = torch.stack(given)
         self._poses = self._given.clone()
-        self._depth = depth
+        chosen = points[:: max(1, len(points) // _POINTS)].double()
+        self._twists = torch.stack([pixel_twists(camera, chosen) for camera in cameras])
         self._rate = options.pose_rate
-        self._adam = ViewAdam(len(cameras), 6)
+        self._adam = ViewAdam(len(cameras), 6, together=True)
         self._leaf: Tensor | None = None
 
     def camera(self, index: int, camera: Camera) -> Camera:
@@ -69,10 +82,9 @@ class Poses:
         if leaf is None or leaf.grad is None:
             return
         slope = twist_gradient(leaf.grad, self._poses[index])
-        slope[3:] *= self._depth
+        twists = self._twists[index]
         rate = self._rate * _FINAL_RATE**progress
-        move = -rate * self._adam.direction(index, slope)
-        move[3:] *= self._depth
+        move = -rate * twists @ self._adam.direction(index, twists.mT @ slope)
         poses = self._poses.clone()
         poses[index, :3] = (exponential(move) @ poses[index])[:3]
         self._poses = poses
@@ -130,6 +142,36 @@ def centres_of(poses: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
     return -torch.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
+def pixel_twists(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "6 6"]:
+    r"""Twists as columns, each of which moves the points in view by about one pixel.
+
+    They are :math:`(J^\top J / n)^{-1/2}` with J the slopes of the pixels of the n points by
+    :math:`(\omega, v)`. No column is more than 1.5 times as long as the
+    shortest: steps along motions that the points hardly show would follow the noise.
+    """
+    pose = camera.cam_from_world.detach().double().cpu()
+    x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    u, v = x / z, y / z
+    seen = (z > 0) & ((camera.fx * u + camera.cx - camera.width / 2).abs() < camera.width / 2)
+    seen &= (camera.fy * v + camera.cy - camera.height / 2).abs() < camera.height / 2
+    if not bool(seen.any()):
+        u, v, z = (torch.tensor(value).double() for value in ([0.0], [0.0], [1.0]))
+    else:
+        u, v, z = u[seen], v[seen], z[seen]
+    none = torch.zeros_like(u)
+    # d(x / z) where d(x, y, z) = omega x (x, y, z) + v.
+    across = torch.stack((-u * v, 1 + u * u, -v, 1 / z, none, -u / z), dim=1) * camera.fx
+    down = torch.stack((-(1 + v * v), u * v, u, none, 1 / z, -v / z), dim=1) * camera.fy
+    slopes = torch.cat((across, down))
+    # Lengths are counted in the points' own depth, so that the unit of length does not matter.
+    unit = torch.ones(6, dtype=torch.float64)
+    unit[3:] = z.median()
+    slopes = slopes * unit
+    values, vectors = torch.linalg.eigh(slopes.mT @ slopes / len(u))
+    values = values.clamp_min(float(values[-1]) / _LONGEST**2)
+    return unit[:, None] * (vectors / values.sqrt()) @ vectors.mT
+
+
 def twist_gradient(
     gradient: Float[Tensor, "4 4"], pose: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "6"]:
@@ -151,7 +193,10 @@ def exponential(twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
     algebra = torch.zeros(4, 4, dtype=torch.float64)
     algebra[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     algebra[:3, 3] = twist[3:]
-    return torch.linalg.matrix_exp(algebra)
+    motion = torch.linalg.matrix_exp(algebra)
+    # It comes out within rounding only, and cameras insist on it.
+    motion[3] = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    return motion
 
 
 def aligning_similarity(

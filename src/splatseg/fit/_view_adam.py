@@ -12,9 +12,16 @@ class ViewAdam:
 
     A row ages only when its view is seen: moments that faded while the others had their turn
     would make each first step back too large.
+
+    Args:
+        views: Number of rows.
+        width: Numbers of each view.
+        together: Divide all numbers of a view by one root mean square, so that the direction of
+            the gradient is kept; else each by its own.
     """
 
-    def __init__(self, views: int, width: int) -> None:
+    def __init__(self, views: int, width: int, *, together: bool = False) -> None:
+        self._together = together
         self._first = torch.zeros(views, width, dtype=torch.float64)
         self._second = torch.zeros(views, width, dtype=torch.float64)
         self._seen = torch.zeros(views, dtype=torch.int64)
@@ -27,7 +34,8 @@ class ViewAdam:
         self._first[index] += (1 - _BETA1) * (slope - self._first[index])
         self._second[index] += (1 - _BETA2) * (slope.square() - self._second[index])
         mean = self._first[index] / (1 - _BETA1**seen)
-        spread = (self._second[index] / (1 - _BETA2**seen)).sqrt()
+        second = self._second[index] / (1 - _BETA2**seen)
+        spread = (second.mean() if self._together else second).sqrt()
         return mean / (spread + _EPSILON)
 
     def state(self) -> dict[str, Tensor]:

@@ -33,8 +33,8 @@ class ViewParts:
         """
         poses = None
         if options.refine_poses:
-            depth = _typical_depth(capture, views)
-            poses = Poses([view.camera for view in views], depth=depth, options=options)
+            points = torch.zeros(0, 3) if capture.points is None else capture.points.points
+            poses = Poses([view.camera for view in views], points=points, options=options)
         return cls(
             views=tuple(views),
             exposures=Exposures(len(views), options=options) if options.exposure else None,
@@ -98,11 +98,3 @@ class ViewParts:
             )
         return tuple(found)
 
-
-def _typical_depth(capture: Capture, views: Sequence[View]) -> float:
-    """Median distance of the start points from the cameras' middle; 1 without points."""
-    if capture.points is None or len(capture.points) == 0:
-        return 1.0
-    middle = torch.stack([view.camera.centre for view in views]).double().mean(dim=0)
-    distance = (capture.points.points.double() - middle).norm(dim=1).median()
-    return max(float(distance), 1e-6)

@@ -1,0 +1,185 @@
+"""Depth supervision: the loss by hand, relative maps by their points, and what a fit gains."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from splatseg.core import Camera, Capture, PointCloud, View
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.fit import FitOptions, fit
+from splatseg.fit._depth import DepthMaps, aligned_inverse
+from splatseg.io.depths import load_depth
+from splatseg.render import render
+
+OPTIONS = FitOptions(minutes=None, steps=1, depth="metric", depth_weight=0.5)
+
+
+def _camera(width: int, height: int) -> Camera:
+    return Camera(
+        width=width,
+        height=height,
+        fx=8.0,
+        fy=8.0,
+        cx=width / 2,
+        cy=height / 2,
+        cam_from_world=torch.eye(4),
+    )
+
+
+def _maps(folder: Path, values: np.ndarray, *, width: int, height: int, **changes) -> DepthMaps:
+    np.save(folder / "depth.npy", values)
+    view = View(
+        name="one",
+        camera=_camera(width, height),
+        image=folder / "one.png",
+        depth=folder / "depth.npy",
+        depth_unit=1.0,
+    )
+    capture = Capture(path=folder, format="test", views=(view,))
+    return DepthMaps([view], capture=capture, options=replace(OPTIONS, **changes))
+
+
+def test_the_loss_by_hand(tmp_path: Path) -> None:
+    """Measured 2, 4, unknown, 4, 2 with median 4; drawn 4, 4, 9, 2 and, too faint, 8.
+
+    The differences of 4 / depth are -1, 0, 1; of three pixels, times 0.5.
+    """
+    maps = _maps(tmp_path, np.array([[2.0, 4, 0, 4, 2]]), width=5, height=1)
+    drawn = torch.tensor([[4.0, 4, 9, 2, 8]])
+    alpha = torch.tensor([[1.0, 1, 1, 0.5, 0.49]])
+    # Inverse depths 0.5, 0.25, 0.25, 0.5: torch's median is the lower one, of depth 4.
+    loss = maps.loss(0, drawn, alpha, progress=0.0)
+    assert loss.value == pytest.approx(0.5 * (1 + 0 + 1) / 3)
+    # d |4 / d - 4 / D| / d d = -+ 4 / d^2.
+    expected = 0.5 / 3 * torch.tensor([[4 / 16, 0, 0, -4 / 4, 0]])
+    assert torch.allclose(loss.gradient, expected)
+    masked = torch.tensor([[True, True, True, False, True]])
+    assert maps.loss(0, drawn, alpha, progress=0.0, mask=masked).value == pytest.approx(0.25)
+    late = maps.loss(0, drawn, alpha, progress=1.0)
+    assert late.value == pytest.approx(0.01 * loss.value)
+    assert maps.loss(0, drawn, torch.zeros(1, 5), progress=0.0).value == 0
+
+
+def test_the_gradient_is_that_of_the_value(tmp_path: Path, rng: np.random.Generator) -> None:
+    maps = _maps(tmp_path, rng.uniform(1, 9, (6, 8)), width=8, height=6)
+    drawn = torch.from_numpy(rng.uniform(1, 9, (6, 8))).float()
+    alpha = torch.ones(6, 8)
+    slope = maps.loss(0, drawn, alpha, progress=0.3).gradient
+    move = torch.from_numpy(rng.normal(size=(6, 8))).float()
+    h = 1e-3
+    up, down = (maps.loss(0, drawn + s * h * move, alpha, progress=0.3).value for s in (1, -1))
+    assert (up - down) / (2 * h) == pytest.approx(float((slope * move).sum()), rel=2e-2)
+
+
+def test_a_gaussian_before_the_lens_does_not_drown_the_rest(tmp_path: Path) -> None:
+    maps = _maps(tmp_path, np.full((1, 2), 4.0), width=2, height=1)
+    loss = maps.loss(0, torch.tensor([[1e-6, 8.0]]), torch.ones(1, 2), progress=0.0)
+    # At a tenth of the median the slope is 4 / 0.4^2, and no more below.
+    assert float(loss.gradient[0, 0]) == pytest.approx(-0.25 * 4 / 0.16)
+    assert loss.value == pytest.approx(0.25 * (10 - 1 + 0.5))
+
+
+@pytest.mark.parametrize(("width", "height"), [(8, 6), (4, 3), (2, 3)])
+def test_maps_of_another_size(tmp_path: Path, width: int, height: int) -> None:
+    """A map of 4 x 3 and a rendering of any size: compared at the coarser one, no blending."""
+    values = np.array([[1.0, 2, 3, 4], [5, 6, 7, 8], [9, 10, 11, 12]])
+    maps = _maps(tmp_path, values, width=8, height=6)
+    truth = torch.from_numpy(values).float()
+    rows = torch.arange(height) * 3 // height
+    columns = torch.arange(width) * 4 // width
+    exact = truth[rows][:, columns]
+    loss = maps.loss(0, exact, torch.ones(height, width), progress=0.0)
+    assert loss.value == pytest.approx(0, abs=1e-6)
+    off = maps.loss(0, exact * 1.1, torch.ones(height, width), progress=0.0)
+    compared = min(width, 4) * min(height, 3)
+    assert int((off.gradient > 0).sum()) == compared
+
+
+def test_relative_maps_are_aligned_by_points(rng: np.random.Generator) -> None:
+    """A map a / z + b at points of known z becomes 1 / z; hidden points do not matter much."""
+    camera = _camera(40, 30)
+    depth = torch.from_numpy(rng.uniform(2, 10, (30, 40))).float()
+    values = 700 / depth + 150
+    pixels = camera.pixel_centres().reshape(-1, 2)[::3]
+    points = camera.unproject(pixels, depth.reshape(-1)[::3].double())
+    behind = torch.tensor([[0.0, 0.0, -3.0], [90.0, 0.0, 1.0]]).double()
+    found = aligned_inverse(values, camera, torch.cat((points, behind)).float())
+    assert torch.allclose(found, 1 / depth, atol=4e-3)
+    hidden = points.clone()
+    hidden[::3] *= 1.5
+    found = aligned_inverse(values, camera, hidden.float())
+    assert torch.allclose(found, 1 / depth, atol=4e-3)
+    assert aligned_inverse(values, camera, points[:19].float()) is None
+    assert aligned_inverse(torch.full((30, 40), 5.0), camera, points.float()) is None
+
+
+def test_what_a_depth_map_may_be(tmp_path: Path) -> None:
+    view = View(name="one", camera=_camera(2, 1), depth=tmp_path / "d.png", depth_unit=0.5)
+    Image.fromarray(np.array([[4, 0]], np.uint16)).save(view.depth)
+    assert load_depth(view).tolist() == [[2.0, 0.0]]
+    np.save(tmp_path / "d.npy", np.array([[[3.0], [np.nan]], [[-1.0], [np.inf]]]))
+    assert load_depth(replace(view, depth=tmp_path / "d.npy")).tolist() == [[1.5, 0], [0, 0]]
+    Image.fromarray(np.array([[2.5, 1]], np.float32)).save(tmp_path / "d.tiff")
+    assert load_depth(replace(view, depth=tmp_path / "d.tiff")).tolist() == [[1.25, 0.5]]
+    Image.fromarray(np.zeros((1, 2, 3), np.uint8)).save(tmp_path / "rgb.png")
+    with pytest.raises(FileFormatError, match="of one channel"):
+        load_depth(replace(view, depth=tmp_path / "rgb.png"))
+    with pytest.raises(MissingFileError):
+        load_depth(replace(view, depth=tmp_path / "none.npy"))
+    (tmp_path / "bad.npy").write_bytes(b"no array")
+    with pytest.raises(FileFormatError, match="cannot be read as an array"):
+        load_depth(replace(view, depth=tmp_path / "bad.npy"))
+    with pytest.raises(InputError, match="a view with a depth map"):
+        load_depth(replace(view, depth=None))
+
+
+def test_there_must_be_something_to_learn_from(photograph) -> None:
+    capture = photograph(count=4)
+    options = replace(OPTIONS, steps=1)
+    with pytest.raises(InputError, match="expected depth maps of training views"):
+        fit(capture, options=options)
+    with_maps = replace(
+        capture, views=tuple(replace(v, depth=v.image) for v in capture.views), points=None
+    )
+    with pytest.raises(InputError, match="start points to align relative depth maps"):
+        DepthMaps(
+            with_maps.train_views, capture=with_maps, options=replace(options, depth="relative")
+        )
+
+
+@pytest.mark.parametrize("kind", ["metric", "relative"])
+def test_depth_maps_make_the_depth_right(photograph, scene_photographed, kind: str) -> None:
+    """Five photographs of a thing of one colour leave its shape open; maps settle some of it."""
+    scene = scene_photographed.replace(sh=torch.full_like(scene_photographed.sh, 0.4))
+    capture = photograph(scene=scene, count=5, noise=0.12, depth_step=2)
+    if kind == "relative":
+        views, points = [], []
+        for view in capture.views:
+            depth = load_depth(view).numpy()
+            inverse = np.where(depth > 0, 5000 / np.maximum(depth, 1e-3) + 900, 0)
+            Image.fromarray(inverse.astype(np.uint16)).save(view.depth)
+            views.append(replace(view, depth_unit=1.0))
+            # Points as structure from motion finds them, on the surface.
+            pixels = view.camera.pixel_centres()[::2, ::2][depth > 0][::25]
+            z = torch.from_numpy(depth[depth > 0][::25]).double()
+            points.append(view.camera.unproject(pixels, z).float())
+        cloud = torch.cat(points)
+        capture = replace(capture, views=tuple(views), points=PointCloud(points=cloud))
+    options = FitOptions(minutes=None, steps=400, max_gaussians=150, background="black")
+    errors = []
+    for depth in ("off", kind):
+        found = fit(capture, options=replace(options, depth=depth, depth_weight=1.0)).gaussians
+        wrong = []
+        for view in capture.train_views:
+            with torch.no_grad():
+                drawn, true = render(found, view.camera), render(scene, view.camera)
+            both = (drawn.alpha > 0.5) & (true.alpha > 0.5)
+            wrong.append(float((drawn.depth - true.depth)[both].abs().mean()))
+        errors.append(sum(wrong) / len(wrong))
+    # Start points on the surface leave less to settle than wrong ones.
+    most = 0.93 if kind == "metric" else 0.97
+    assert errors[1] < most * errors[0], errors
