@@ -189,6 +189,11 @@ def test_another_fit_is_refused_by_what_differs(capture: Capture, path: Path) ->
     said = refusal(capture, replace(OPTIONS, seed=3, dssim_weight=0.5))
     assert "seed 0 instead of 3" in said
     assert "dssim_weight 0.2 instead of 0.5" in said
+    assert "steps" not in said
+    said = refusal(capture, replace(OPTIONS, max_gaussians=130))
+    assert "max_gaussians 120 instead of 130" in said
+    said = refusal(capture, replace(OPTIONS, max_gaussians=130, steps=80, seed=3))
+    assert "max_gaussians" not in said, "it goes with the length"
     assert "other photographs" not in said
     assert "other cameras" not in said
     assert "backend 'cpu' instead of 'reference'" in refusal(capture, OPTIONS, "reference")

@@ -75,6 +75,14 @@ class Command:
     """Where Gaussians start. points: at the capture's points. random: on rays of the photographs,
     where several of them agree. auto: at the points if there are any."""
 
+    background: str = "random"
+    """What is behind the Gaussians: random, black, white or #rrggbb. Photographs with an alpha
+    channel are blended over it; over random, which forbids holes in dark surfaces, they are over
+    white."""
+
+    prune_floaters: bool = _DEFAULT.prune_floaters
+    """Leave out of the finished scene what no training view needs."""
+
     resume: bool = False
     """Go on with the fit that was stopped in SCENE, with the same data and options; minutes or
     steps may be others. The result is that of a fit that was never stopped."""
@@ -209,6 +217,8 @@ def _options(command: Command) -> FitOptions:
     options = replace(
         options,
         start=command.start,
+        background=command.background,
+        prune_floaters=command.prune_floaters,
         antialiased=options.antialiased if command.antialiased is None else command.antialiased,
         exposure=command.exposure,
         masks=command.masks,

@@ -11,9 +11,10 @@ from splatseg.core import Camera, Capture, View
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 
-# The length may differ, and the number of Gaussians, which goes with it: a fit can be made longer
-# or shorter while it goes on.
-_FREE = ("minutes", "steps", "max_gaussians")
+# The length may differ: a fit can be made longer or shorter while it goes on. The number of
+# Gaussians goes with the length, and may differ with it.
+_LENGTH = {"minutes", "steps"}
+_WITH_LENGTH = "max_gaussians"
 # Files are told apart by their size and so many of their first bytes.
 _FILE_HEAD = 65_536
 
@@ -21,7 +22,7 @@ _FILE_HEAD = 65_536
 def fit_identity(
     capture: Capture, views: Iterable[View], *, options: FitOptions, backend: str
 ) -> dict[str, Any]:
-    """Digests of what a fit learns from, its options without the length, and its backend.
+    """Digests of what a fit learns from, its options, and its backend.
 
     Paths are no part of it: data may move. A photograph that is not there counts as an empty
     one; reading it says so.
@@ -29,7 +30,7 @@ def fit_identity(
     Args:
         capture: Its points are taken.
         views: The training views.
-        options: All but the length and the number of Gaussians is taken.
+        options: All of them.
         backend: Name of the renderer in use.
     """
     views = tuple(views)
@@ -42,9 +43,9 @@ def fit_identity(
         "depth maps": _digest([*map(_depth, views)]),
         "start points": _points(capture),
     }
-    kept = {name: value for name, value in asdict(options).items() if name not in _FREE}
     # Tuples come back from JSON as lists: compare what is written, not what was meant.
-    return {"data": data, "options": json.loads(json.dumps(kept)), "backend": backend}
+    kept = json.loads(json.dumps(asdict(options)))
+    return {"data": data, "options": kept, "backend": backend}
 
 
 def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -61,9 +62,12 @@ def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any])
     before, after = _of(saved, "data"), _of(now, "data")
     differing = [f"other {name}" for name in _differing(before, after)]
     before, after = _of(saved, "options"), _of(now, "options")
+    names = _differing(before, after)
+    free = {*_LENGTH, _WITH_LENGTH} if not _LENGTH.isdisjoint(names) else set[str]()
     differing += [
         f"{name} {json.dumps(before.get(name))} instead of {json.dumps(after.get(name))}"
-        for name in _differing(before, after)
+        for name in names
+        if name not in free
     ]
     if saved.get("backend") != now.get("backend"):
         differing.append(f"backend {saved.get('backend')!r} instead of {now.get('backend')!r}")

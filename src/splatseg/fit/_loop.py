@@ -12,6 +12,7 @@ from splatseg.fit._identity import fit_identity
 from splatseg.fit._interrupts import deferred_interrupts
 from splatseg.fit._options import FitOptions
 from splatseg.fit._photographs import Photographs
+from splatseg.fit._prune import without_floaters
 from splatseg.fit._records import FitProgress, FitResult
 from splatseg.fit._resume import CheckpointClock, Checkpoints
 from splatseg.fit._run import FitRun
@@ -91,15 +92,26 @@ def fit(
         wanted = interrupted or (checkpoints is not None and checkpoints.at_end)
         if wanted and run.between_steps and not interrupts.impatient:
             keep()
+    gaussians, refined = run.gaussians(), run.views.refined(capture)
+    notes = run.views.notes()
+    if options.prune_floaters and not interrupted:
+        with one_torch_thread():
+            pruned = without_floaters(gaussians, photographs, refined, backend=renderer.name)
+        notes = (
+            *notes,
+            f"{len(gaussians) - len(pruned)} of {len(gaussians)} Gaussians are left out, which "
+            "no photograph needs.",
+        )
+        gaussians = pruned
     return FitResult(
-        gaussians=run.gaussians(),
+        gaussians=gaussians,
         steps=run.steps,
         seconds=run.seconds,
         history=tuple(run.history),
         interrupted=interrupted,
         stages=dict(run.stages),
-        views=run.views.refined(capture),
-        notes=run.views.notes(),
+        views=refined,
+        notes=notes,
     )
 
 
