@@ -6,6 +6,8 @@
 the peak beyond the inputs (resident memory once scene, signal and image are there).
 `large`: 5 M Gaussians of degree 3 are written to a PLY, loaded, rendered and back-projected with
 3 channels; what is counted is the peak of the whole process that loads it.
+`fit`: 1 M start points are fitted to eight photographs of 1296 x 840, at full size, with rounds
+of relocation and checkpoints; what is counted is the peak of the whole process that fits.
 """
 
 import argparse
@@ -18,7 +20,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from splatseg.core import Camera, Gaussians
+from splatseg.core import Camera, Capture, Gaussians, PointCloud, View
+from splatseg.fit import Checkpoints, FitOptions, fit
+from splatseg.io.images import save_png
 from splatseg.io.splats import read_splats, write_splats
 from splatseg.render import back_project, render
 from splatseg.render.cpu import threads
@@ -45,15 +49,15 @@ def room(count: int, degree: int, seed: int = 0) -> Gaussians:
     )
 
 
-def camera() -> Camera:
-    """Eye height in a corner, looking across the room."""
-    eye, target = np.array([0.8, 0.7, 1.5]), np.array([4.5, 3.5, 0.8])
-    z = (target - eye) / np.linalg.norm(target - eye)
+def camera(eye: tuple[float, ...] = (0.8, 0.7, 1.5)) -> Camera:
+    """In a corner, at eye height, looking across the room."""
+    target = np.array([4.5 if eye[0] < 3 else 1.5, 3.5 if eye[1] < 2.5 else 1.5, 0.8])
+    z = (target - np.array(eye)) / np.linalg.norm(target - np.array(eye))
     x = np.cross(z, [0.0, 0, 1])
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([x, np.cross(z, x), z])
-    pose[:3, 3] = -pose[:3, :3] @ eye
+    pose[:3, 3] = -pose[:3, :3] @ np.array(eye)
     return Camera(
         width=1296, height=840, fx=660, fy=660, cx=648, cy=420,
         cam_from_world=torch.from_numpy(pose),
@@ -97,9 +101,48 @@ def large(path: Path) -> None:
     )
 
 
+def fit_views(folder: Path) -> tuple[View, ...]:
+    """From the four corners across the room, at two heights: each sees about half of it."""
+    corners = [(x, y, z) for z in (1.1, 1.7) for x in (0.5, 5.5) for y in (0.5, 4.5)]
+    return tuple(
+        View(name=f"view_{i}", camera=camera(eye), image=folder / f"view_{i}.png")
+        for i, eye in enumerate(corners)
+    )
+
+
+def photograph(folder: Path) -> None:
+    """Photographs of a room of 1 M Gaussians."""
+    scene = room(1_000_000, 0)
+    for view in fit_views(folder):
+        if view.image is not None:
+            save_png(render(scene, view.camera).image.clamp(0, 1), view.image)
+
+
+def fit_large(folder: Path) -> None:
+    """1 M Gaussians of degree 2 fitted to the photographs."""
+    start = room(1_000_000, 0, seed=1)
+    colours = (255 * start.colours.clamp(0, 1)).to(torch.uint8)
+    points = PointCloud(points=start.means, colours=colours)
+    capture = Capture(path=folder, format="generated", views=fit_views(folder), points=points)
+    del start, colours
+    before = peak_gb()
+    options = FitOptions(
+        minutes=None, steps=24, max_gaussians=1_000_000, quarter_until=0.0, half_until=0.0,
+        densify_from=6, densify_every=6, degree_interval=0.01,
+    )  # fmt: skip
+    checkpoints = Checkpoints(path=folder / "checkpoint", steps=8)
+    result = fit(capture, options=options, backend="cpu", checkpoints=checkpoints)
+    print(
+        f"fit of 1 M Gaussians of degree {result.gaussians.sh_degree} at 1296x840, {threads()} "
+        f"threads: {before:.2f} GB before, peak {peak_gb():.2f} GB (limit 6 GB); "
+        f"{len(result.gaussians)} Gaussians after {result.steps} steps of "
+        f"{1e3 * result.seconds / result.steps:.0f} ms"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", nargs="?", choices=["wide", "large", "write"])
+    parser.add_argument("part", nargs="?", choices=["wide", "large", "write", "photograph", "fit"])
     parser.add_argument("path", nargs="?", type=Path)
     args = parser.parse_args()
     if args.part == "wide":
@@ -108,8 +151,15 @@ def main() -> None:
         large(args.path)
     elif args.part == "write":
         write_splats(room(5_000_000, 3), args.path)
+    elif args.part == "photograph":
+        photograph(args.path)
+    elif args.part == "fit":
+        fit_large(args.path)
     else:
         subprocess.run([sys.executable, __file__, "wide"], check=True)
+        with tempfile.TemporaryDirectory() as folder:
+            subprocess.run([sys.executable, __file__, "photograph", folder], check=True)
+            subprocess.run([sys.executable, __file__, "fit", folder], check=True)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "large.ply"
             subprocess.run([sys.executable, __file__, "write", str(path)], check=True)
