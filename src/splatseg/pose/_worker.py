@@ -256,7 +256,12 @@ class Job:
     def _copied(self, name: str) -> Path:
         """A database of its own: calibration changes what it works on."""
         copy = self._folder / f"{name}.db"
-        shutil.copyfile(self._database, copy)
+        # What SQLite has not moved into the file yet lies in a second one beside it.
+        for ending in ("", "-wal"):
+            part = self._database.with_name(self._database.name + ending)
+            copy.with_name(copy.name + ending).unlink(missing_ok=True)
+            if part.is_file():
+                shutil.copyfile(part, copy.with_name(copy.name + ending))
         return copy
 
     def _calibrated(self) -> Path:

@@ -100,7 +100,7 @@ def _nothing_found(folder: Path) -> str:
     if photographs:
         return (
             f"{folder}: expected photographs with poses, got {photographs} photographs without; "
-            "poses come from COLMAP or another tool."
+            "poses come from COLMAP or another tool, or `splatseg fit` finds them."
         )
     return (
         f"{folder}: expected a capture (transforms.json, a COLMAP model, poses_bounds.npy or "
