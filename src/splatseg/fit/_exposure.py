@@ -5,6 +5,9 @@ The 3DGS code has an affine map of the colour for each training view as an optio
 is what automatic exposure and white balance change.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -61,7 +64,7 @@ class Exposures:
         """The image as a view's exposure shows it. Differentiable, also towards the exposure."""
         leaf = self._values[index].to(image).requires_grad_()
         self._leaf = leaf
-        return image * leaf[:3].exp() + alpha.unsqueeze(-1) * leaf[3:]
+        return _apply(image, alpha, leaf[:3].exp(), leaf[3:])
 
     def update(self, index: int, *, progress: float) -> None:
         """One step of Adam along the gradient of the last image that `applied` gave."""
@@ -85,3 +88,30 @@ class Exposures:
         """Go on from a `state`."""
         self._values = tensors["values"].cpu().clone()
         self._adam.restore(tensors)
+
+
+class _Exposed(torch.autograd.Function):
+    """gain * image + bias * alpha, in half the time that autograd takes for it.
+
+    Rows of pixels are multiplied as rows of numbers: a broadcast over an axis of three is slow.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, alpha: Tensor, gain: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(image, alpha, gain, bias)
+        exposed = (image.flatten(1) * gain.repeat(image.shape[1])).view_as(image)
+        exposed += alpha.unsqueeze(-1) * bias
+        return exposed
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        image, alpha, gain, bias = ctx.saved_tensors
+        rows = slopes[0].flatten(1)
+        pixels = rows.reshape(-1, 3)
+        v_image = (rows * gain.repeat(image.shape[1])).view_as(image)
+        v_alpha = (pixels @ bias).view_as(alpha)
+        v_gain = (rows * image.flatten(1)).sum(dim=0).view(-1, 3).sum(dim=0)
+        return v_image, v_alpha, v_gain, pixels.T @ alpha.flatten()
+
+
+_apply: Callable[..., Tensor] = _Exposed.apply  # pyright: ignore[reportAssignmentType]
