@@ -15,6 +15,7 @@ from splatseg.cli._work import is_cut_out, layer_of, open_scene, progress, views
 from splatseg.core import Labels, Scene, Selection, View
 from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_binary, evaluate_photographs, evaluate_semantic
+from splatseg.evaluate.lpips import Lpips, load_lpips
 from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.render import BackendName
 
@@ -55,6 +56,10 @@ class Command:
     """Insist on scoring the pictures (PSNR, SSIM). Without it they are scored where the
     photographs are at hand."""
 
+    lpips: tuple[Path, ...] = ()
+    """Also score LPIPS with your weights: AlexNet's or VGG-16's, and the heads', as .safetensors
+    or .npz with the names of torchvision and of the lpips package."""
+
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -69,6 +74,7 @@ def run(command: Command) -> None:
     """Evaluate a scene."""
     if (command.layer is None) != (command.truth is None):
         raise InputError("--layer, --truth: expected both or neither, got one of them.")
+    network = load_lpips(command.lpips) if command.lpips else None
     scene = open_scene(command.scene, command.data)
     views = views_of_split(scene, command.split)
     figures: dict[str, Any] = {"scene": str(command.scene), "split": command.split}
@@ -79,8 +85,8 @@ def run(command: Command) -> None:
         truth = open_evidence(command.truth, zero_is_class=command.zero_is_class, void=command.void)
         figures |= {"layer": command.layer, "metric": command.metric}
         figures |= _layer_figures(command, scene, views, layer, truth)
-    if _wants_photographs(command, views):
-        figures |= _photograph_figures(command, scene, views)
+    if network is not None or _wants_photographs(command, views):
+        figures |= _photograph_figures(command, scene, views, network)
     elif command.layer is None:
         raise InputError(
             f"{command.scene}: expected a layer with a truth, or photographs to score against, "
@@ -142,21 +148,27 @@ def _wants_photographs(command: Command, views: tuple[View, ...]) -> bool:
     return command.photographs or at_hand
 
 
-def _photograph_figures(command: Command, scene: Scene, views: tuple[View, ...]) -> dict[str, Any]:
+def _photograph_figures(
+    command: Command, scene: Scene, views: tuple[View, ...], network: Lpips | None
+) -> dict[str, Any]:
     with progress("photographs") as step:
         report = evaluate_photographs(
             scene.gaussians,
             views,
             cut_out=is_cut_out(scene),
+            lpips=network,
             backend=command.backend,
             progress=step,
         )
-    return {
+    figures: dict[str, Any] = {
         "PSNR": report.psnr,
         "SSIM": report.ssim,
         "PSNR_min": report.psnr_min,
         "photographs": len(report.views),
     }
+    if network is not None:
+        figures |= {"LPIPS": report.lpips, "LPIPS_network": network.network}
+    return figures
 
 
 def _print_table(figures: Mapping[str, Any], scene: Scene) -> None:
