@@ -35,7 +35,7 @@ from splatseg.render import default_options, get_backend, render
 from splatseg.render.cpu import isa, set_threads
 
 TILE, CHUNK = 16, 256
-NEAR, LOW_PASS, ALPHA_MAX, ALPHA_MIN, STOP, MARGIN = 0.01, 0.3, 0.99, 1 / 255, 1e-4, 0.3
+NEAR, ALPHA_MAX, ALPHA_MIN, STOP, MARGIN = 0.01, 0.99, 1 / 255, 1e-4, 0.3
 C1, C2 = 0.01**2, 0.03**2
 
 
@@ -108,7 +108,7 @@ class Slow:
         )
         axes = pose[:3, :3] @ rotation_from_quaternion(self.leaves["rotations"][seen])
         half = jacobian @ (axes * self.leaves["log_scales"][seen].exp()[:, None, :])
-        covariance = half @ half.transpose(1, 2) + LOW_PASS * torch.eye(2)
+        covariance = half @ half.transpose(1, 2) + self._options.low_pass_drawn * torch.eye(2)
         a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
         determinant = a * c - b * b
         opacities = opacities[seen]
@@ -218,7 +218,10 @@ def l1_dssim_plain(image: Tensor, photograph: Tensor, weight: float) -> Tensor:
 def agreement(slow: Slow, run: FitRun, camera: Camera, photograph: Tensor) -> str:
     """How far pictures, loss and slopes in the centres are apart at equal parameters."""
     weight = FitOptions().dssim_weight
-    gaussians = run._state[0].gaussians().replace(antialiased=FitOptions().antialiased)
+    gaussians = run._state[0].gaussians()
+    gaussians = gaussians.replace(
+        antialiased=FitOptions().antialiased, low_pass=FitOptions().low_pass_drawn
+    )
     means = gaussians.means.clone().requires_grad_()
     drawn = render(gaussians.replace(means=means), camera, backend="cpu").image
     ours = l1_dssim(drawn, photograph, dssim_weight=weight)
