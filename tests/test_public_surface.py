@@ -41,7 +41,7 @@ SURFACE = {
     "write_splats",
 }
 
-PACKAGES = {"core", "evaluate", "fit", "io", "lift", "pose", "render", "synthetic"}
+PACKAGES = {"adopt", "core", "evaluate", "fit", "io", "lift", "pose", "render", "synthetic"}
 
 
 def written_imports() -> dict[str, str]:

@@ -19,6 +19,7 @@ from splatseg.errors import InputError as InputError
 from splatseg.errors import SplatsegError as SplatsegError
 
 if TYPE_CHECKING:
+    from splatseg import adopt as adopt
     from splatseg import core as core
     from splatseg import evaluate as evaluate
     from splatseg import fit as fit
@@ -68,7 +69,9 @@ _HOMES = {
     "splatseg.lift": "uplift",
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
 }
-_PACKAGES = frozenset({"core", "evaluate", "fit", "io", "lift", "pose", "render", "synthetic"})
+_PACKAGES = frozenset(
+    {"adopt", "core", "evaluate", "fit", "io", "lift", "pose", "render", "synthetic"}
+)
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 

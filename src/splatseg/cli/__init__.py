@@ -46,6 +46,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.fit",
         summary="posed photographs and start points -> Gaussians",
     ),
+    "import": CommandEntry(
+        module="splatseg.cli.import_",
+        summary="any splat file, with or without photographs -> a scene",
+    ),
     "doctor": CommandEntry(
         module="splatseg.cli.doctor",
         summary="what is wrong with a capture's cameras and points, and a corrected copy",

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.core import Capture, View
+from splatseg.core import Capture, PointCloud, View
 from splatseg.pose.doctor._corrections import CameraCorrection, PointCorrection, no_correction
 from splatseg.pose.doctor._diagnosis import Diagnosis, Fault
-from splatseg.pose.doctor._frames import PointEvidence, unmoved
+from splatseg.pose.doctor._frames import PointEvidence, search_points, unmoved
 from splatseg.pose.doctor._judge import (
     HALF_PIXEL_SIGMA,
     camera_faults,
@@ -133,6 +133,40 @@ def diagnose(
     )
 
 
+def find_points(
+    capture: Capture, cloud: PointCloud, *, options: DoctorOptions | None = None
+) -> PointCorrection | None:
+    """What brings a cloud in an unknown frame onto a capture whose cameras are right.
+
+    The search of `diagnose` for start points, on any cloud, such as the centres of Gaussians.
+
+    Args:
+        capture: Photographs with cameras.
+        cloud: Points, with colours where they are known.
+        options: How thoroughly to look.
+
+    Returns:
+        The correction, a reflection perhaps; None where none that was tried fits.
+    """
+    options = options or DoctorOptions()
+    views = [view for view in capture.views if view.image is not None]
+    matches = match_views(
+        views, most_views=options.views, longest=options.longest, seed=options.seed
+    )
+    if len(matches) < _MATCHES:
+        return None
+    evidence = match_evidence(matches, [view.camera for view in views])
+    triangulated, depth = evidence.triangulated(no_correction())
+    held = PointEvidence(
+        photographs=load_photographs(views, _point_views(matches, views), longest=_POINT_LONGEST),
+        cameras=evidence.cameras,
+        triangulated=triangulated,
+        depth=depth,
+    )
+    best = search_points(held, cloud, fits=fits)
+    return best.correction if fits(best.score) else None
+
+
 def fits(score: PointScore) -> bool:
     """Whether start points fit the cameras."""
     return score.value >= (POINTS_FIT_COLOURS if score.place is None else POINTS_FIT)
@@ -155,11 +189,9 @@ class _Examination:
 def _examine(
     capture: Capture, views: Sequence[View], matches: Matches, *, seed: int
 ) -> _Examination:
-    used = np.unique(matches.views) if len(matches) else np.arange(len(views))
-    chosen = used[np.linspace(0, len(used) - 1, min(_POINT_VIEWS, len(used))).round().astype(int)]
-    point_views = [int(i) for i in chosen]
+    point_views = _point_views(matches, views)
     figures: dict[str, Any] = {
-        "photographs": len(used),
+        "photographs": len(np.unique(matches.views)),
         "pairs": len(matches.views),
         "matches": len(matches),
     }
@@ -191,6 +223,13 @@ def _examine(
         point_views=point_views,
         seed=seed,
     )
+
+
+def _point_views(matches: Matches, views: Sequence[View]) -> list[int]:
+    """Views to hold points against, among those that were matched."""
+    used = np.unique(matches.views) if len(matches) else np.arange(len(views))
+    chosen = used[np.linspace(0, len(used) - 1, min(_POINT_VIEWS, len(used))).round().astype(int)]
+    return [int(i) for i in chosen]
 
 
 def _choose(

@@ -22,9 +22,10 @@ _SCALES = (1.0, 0.001, 0.01, 0.1, 10.0, 100.0, 1000.0, 0.5, 2.0, 0.3048, 1 / 0.3
 _AROUND = np.exp(np.linspace(-1.0, 1.0, 41))
 _COARSE = 0.05
 _FEW = 400
-_KEEP = 10
+_KEEP = 6
 _FEWEST = 30
 _MATCHES = 50
+_FITTED_TO = 800
 _AS_GOOD = 0.97
 _ROUNDS = 12
 
@@ -101,7 +102,7 @@ def _best(
     """The first of those that are about as good as the best."""
     scored = [ScoredPoints(correction=c, score=evidence.score(cloud, c)) for c in tried]
     best = max(s.score.value for s in scored)
-    return next(s for s in scored if s.score.value >= _AS_GOOD * best)
+    return next(s for s in scored if s.score.value >= min(best, _AS_GOOD * best))
 
 
 def _polished(evidence: PointEvidence, cloud: PointCloud, start: ScoredPoints) -> ScoredPoints:
@@ -177,18 +178,20 @@ def _fitted(
 
     points = sample_points(cloud, 20000).points.double().numpy()
     tree = KDTree(points)
-    places, depth = evidence.triangulated, evidence.depth
+    index = np.random.default_rng(0).permutation(len(evidence.triangulated))[:_FITTED_TO]
+    places, depth = evidence.triangulated[index], evidence.depth[index]
     plain, free = replace(start, offset=(0.0, 0.0, 0.0)), start
     for k in range(_ROUNDS):
         tolerance = _COARSE * max(0.3, 1 - k / 8)
         for fit_offset in (False, True):
             now = free if fit_offset else plain
             moved = (places - np.array(now.offset)) @ now.matrix / now.scale
-            distance, index = tree.query(moved)
+            reach = float(tolerance * depth.max() / now.scale)
+            distance, nearest = tree.query(moved, distance_upper_bound=reach)
             good = distance * now.scale < tolerance * depth
             if good.sum() < _FEWEST:
                 continue
-            source, target = points[np.asarray(index)[good]], places[good]
+            source, target = points[np.asarray(nearest)[good]], places[good]
             if fit_offset:
                 free = _umeyama(source, target, start)
             else:

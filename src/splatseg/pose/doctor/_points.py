@@ -26,6 +26,9 @@ _NEAR = 0.02
 """Distance to the nearest start point, as a share of the depth, that counts as the same place."""
 
 
+_PLACES = 2000
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointScore:
     """What the photographs say of start points under some cameras."""
@@ -125,5 +128,8 @@ def place_score(triangulated: Array, depth: Array, points: Array) -> float | Non
 
     if len(triangulated) < 50 or len(points) == 0:
         return None
+    if len(triangulated) > _PLACES:
+        index = np.random.default_rng(0).permutation(len(triangulated))[:_PLACES]
+        triangulated, depth = triangulated[index], depth[index]
     distance, _ = KDTree(points).query(triangulated, distance_upper_bound=_NEAR * depth.max())
     return float((distance < _NEAR * depth).mean())
