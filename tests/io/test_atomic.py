@@ -133,3 +133,23 @@ def test_folder_comes_back_when_the_second_rename_fails(
     ):
         (temporary / "new").touch()
     assert names(tmp_path / "scene") == ["old"]
+
+
+def test_ctrl_c_between_the_two_renames_brings_the_old_folder_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with atomic_folder(tmp_path / "scene") as temporary:
+        (temporary / "old").touch()
+    replace = os.replace
+    calls: list[object] = []
+
+    def interrupted(source: object, target: object) -> None:
+        calls.append(source)
+        replace(source, target)  # type: ignore[arg-type]
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "scene") as temporary:
+        (temporary / "new").touch()
+    assert names(tmp_path / "scene") == ["old"]

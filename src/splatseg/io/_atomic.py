@@ -89,11 +89,12 @@ def _replace_folder(new: Path, target: Path, aside: Path) -> None:
         return
     if aside == new:  # the target itself is called "previous"
         aside = aside.with_name("previous.old")
-    target.replace(aside)
     try:
+        target.replace(aside)
         new.replace(target)
-    except OSError:
-        aside.replace(target)
+    except BaseException:  # Ctrl-C between the two too: what is aside would be gone
+        if aside.exists() and not target.exists():
+            aside.replace(target)
         raise
 
 
