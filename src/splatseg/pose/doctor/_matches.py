@@ -176,9 +176,13 @@ def _match(first: _Features, second: _Features, matcher: Any, cv2: Any) -> NDArr
     index = np.array(good)
     pixels = np.stack([first.pixels[index[:, 0]], second.pixels[index[:, 1]]], axis=1)
     cv2.setRNGSeed(0)
-    _, inliers = cv2.findFundamentalMat(
-        pixels[:, 0], pixels[:, 1], cv2.USAC_MAGSAC, _VERIFIED * first.scale, 0.999, 4000
-    )
+    try:
+        _, inliers = cv2.findFundamentalMat(
+            pixels[:, 0], pixels[:, 1], cv2.USAC_MAGSAC, _VERIFIED * first.scale, 0.999, 4000
+        )
+    except cv2.error:
+        # The estimator fails an assertion where no matrix explains the pair: it says nothing.
+        return None
     if inliers is None:
         return None
     pixels = pixels[inliers[:, 0] > 0]
