@@ -106,6 +106,34 @@ def test_a_drive_is_open_and_begins_and_ends_at_its_ends(rng) -> None:
     assert torch.allclose(steps, steps.mean().expand(49), rtol=2e-3)
 
 
+def test_a_tour_does_not_close_through_what_nobody_saw() -> None:
+    """Along a U, whose open side is shorter than the way back: a wall may stand there."""
+    eyes = [(0.0, 5 - 0.3 * i, 1.0) for i in range(17)]
+    eyes += [(0.3 * i, 0.0, 1.0) for i in range(1, 10)]
+    eyes += [(3.0, 0.3 * i, 1.0) for i in range(17)]
+    views = views_of([looking(eye, (1.5, 2.5, 1.2)) for eye in eyes])
+    centres = centres_of(camera_path(views, frames=100, up=UP))
+    apart = torch.cdist(centres, torch.tensor(eyes).double()).amin(dim=1)
+    assert float(apart.max()) < 0.6
+    assert float((centres[0] - centres[-1]).norm()) > 2.5
+
+
+def test_a_film_looks_about_less_than_people_do(rng) -> None:
+    """Along a line, with a glance to a random side from every place."""
+    yaws = rng.uniform(-1.2, 1.2, 40)
+    eyes = [(0.3 * i, 0.0, 1.0) for i in range(40)]
+    views = views_of(
+        [
+            looking(eye, (eye[0] + math.sin(yaw), math.cos(yaw), 1.0))
+            for eye, yaw in zip(eyes, yaws, strict=True)
+        ]
+    )
+    path = camera_path(views, frames=200, up=UP)
+    forward = torch.stack([camera.cam_from_world[2, :3] for camera in path])
+    turned = (forward[1:] * forward[:-1]).sum(dim=1).clamp(-1, 1).acos().sum()
+    assert float(turned) < 0.2 * float(np.abs(np.diff(yaws)).sum())
+
+
 def test_the_spline_is_the_uniform_cubic_b_spline(rng) -> None:
     """Against SciPy, through equally dense parameters instead of constant speed."""
     from splatseg.render import paths
