@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Camera, Capture, PointCloud, Similarity
+from splatseg.core import Camera, Capture, PointCloud, Similarity, View
 from splatseg.io.captures import read_capture
 from splatseg.pose.doctor import DoctorOptions, Matches, diagnose, match_views
+from splatseg.synthetic import look_at, room, write_capture
 
 OPTIONS = DoctorOptions(views=15, longest=512)
 FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
@@ -192,3 +193,61 @@ def test_too_few_matches_are_said(office) -> None:
     assert diagnosis.healthy
     assert diagnosis.unchecked[0].startswith("cameras against each other: only ")
     assert diagnosis.unchecked[1].startswith("start points against cameras: there are too few")
+
+
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory) -> tuple[Capture, Matches]:
+    """A generated room, photographed from a ring of sixteen places, small."""
+    scene = room()
+    low, high = np.array(scene.bounds[0]), np.array(scene.bounds[1])
+    middle, half = (low + high) / 2, (high - low) / 2
+    views = []
+    for i in range(16):
+        angle = 0.12 * i
+        away = np.array([np.cos(angle), np.sin(angle), 0.15])
+        camera = look_at(
+            (middle + 0.55 * half * away).tolist(),
+            (middle - 0.6 * half * away).tolist(),
+            width=240,
+            height=180,
+        )
+        views.append(View(name=f"train_{i:02d}", camera=camera))
+    folder = tmp_path_factory.mktemp("generated") / "capture"
+    write_capture(scene, folder, views=views, points=4000)
+    capture = read_capture(folder)
+    return capture, match_views(capture.views, most_views=16, longest=512)
+
+
+@pytest.mark.parametrize("names_of", [(), *((n,) for n in ("inverse", "points-in-mm"))])
+def test_a_generated_capture(names_of, generated) -> None:
+    capture, matches = generated
+    broken = capture
+    for name in names_of:
+        broken = FAULTS[name][0](broken)
+    diagnosis = diagnose(broken, options=OPTIONS, matches=matches)
+    assert names(diagnosis) == [n for name in names_of for n in FAULTS[name][1]]
+    if names_of:
+        assert reprojection(diagnosis.corrected, capture) < 0.15
+
+
+def test_a_colmap_capture_of_a_real_camera(shared_data) -> None:
+    """COLMAP's files hold world-to-camera matrices: what is inverted there is the other way."""
+    capture = read_capture(shared_data / "real" / "replica_office0")
+    matches = match_views(capture.views, most_views=15, longest=512)
+    healthy = diagnose(capture, options=OPTIONS, matches=matches)
+    assert healthy.healthy
+    assert healthy.unchecked[-1].startswith("the up axis: the capture does not state it")
+    broken = with_poses(torch.linalg.inv)(capture)
+    diagnosis = diagnose(broken, options=OPTIONS, matches=matches)
+    assert names(diagnosis) == ["inverted-poses"]
+    assert "camera-to-world matrices where world-to-camera" in diagnosis.faults[0].sentence
+    assert reprojection(diagnosis.corrected, capture) < 0.15
+
+
+def test_cameras_that_look_one_way_do_not_tell_half_a_pixel(shared_data) -> None:
+    capture = read_capture(shared_data / "real" / "llff_fern")
+    matches = match_views(capture.views, most_views=15, longest=512)
+    for broken in (capture, FAULTS["half-pixel-up"][0](capture)):
+        diagnosis = diagnose(broken, options=OPTIONS, matches=matches)
+        assert diagnosis.healthy
+        assert any(u.startswith("half a pixel of the principal") for u in diagnosis.unchecked)
