@@ -7,9 +7,9 @@
 For each number of minutes: ``splatseg fit`` with that budget, ``splatseg render --split test
 --what rgb``, then ``score.py image`` on what was written. The seconds of each command are wall
 time of the process. ``--prototype`` fits the same scene for as long with
-``shared/prototype/fit`` (compiled here with g++ for AVX2, with which it was measured: its
-AVX-512 form does not compile; its minutes are process CPU time over two threads) and prints the PSNR that it reports on the test views. What follows ``--fit`` goes to
-``splatseg fit`` as it stands.
+``shared/prototype/fit`` and prints the PSNR that it reports on the test views. It is compiled for
+AVX2, with which it was measured (its AVX-512 form does not compile); its minutes are process CPU
+time over two threads. What follows ``--fit`` goes to ``splatseg fit`` as it stands.
 """
 
 import argparse
