@@ -19,7 +19,7 @@ _MOST_COPIES = 51
 _LEAST_OPACITY = 0.005
 _LEAST_TRANSPARENCY = 1e-6
 # Growth of one round, as a share of what is there: copies need steps to grow apart.
-_MOST_GROWTH = 0.25
+_MOST_GROWTH = 0.5
 
 
 def shared_shape(
