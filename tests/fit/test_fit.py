@@ -289,3 +289,26 @@ def test_photographs_with_alpha_are_blended_over_the_background(
         replace(capture, views=tuple(cut_out)), options=replace(options, background="random")
     )
     assert float(covered) < 0.9 * float(render(over_white.gaussians, camera).alpha.mean())
+
+
+def test_millimetres_are_as_good_as_kilometres(capture: Capture) -> None:
+    """The same scene in other units takes the same steps: walk and penalties scale with it."""
+
+    def scaled(by: float) -> Capture:
+        assert capture.points is not None
+        views = []
+        for view in capture.views:
+            pose = view.camera.cam_from_world.clone()
+            pose[:3, 3] *= by
+            views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
+        points = replace(capture.points, points=capture.points.points * by)
+        return replace(capture, views=tuple(views), points=points)
+
+    options = replace(OPTIONS, steps=60, scale_penalty=1.0, noise=1e5, start_opacity=0.03)
+    one = fit(capture, options=options).gaussians
+    for by in (1024.0, 1 / 8):
+        other = fit(scaled(by), options=options).gaussians
+        assert len(other) == len(one)
+        moved = (other.means / by - one.means).norm(dim=1)
+        assert float(moved.median()) < 1e-3
+        assert float((other.scales / by / one.scales).log().abs().median()) < 1e-2

@@ -21,6 +21,16 @@ _SMALLEST_SHARE = 1e-5
 _LEAST_EXTENT_SHARE = 1e-3
 
 
+def scene_size(views: tuple[View, ...], points: Float[Tensor, "n 3"]) -> float:
+    """Size of what is shown: its usual distance from the cameras' middle, at least their extent.
+
+    It scales with the scene, as everything that is to work in metres and in millimetres must.
+    """
+    centres = torch.stack([view.camera.centre for view in views]).double()
+    reach = float((points.double() - centres.mean(dim=0)).norm(dim=1).median())
+    return max(scene_extent(views, points), reach)
+
+
 def scene_extent(views: tuple[View, ...], points: Float[Tensor, "n 3"]) -> float:
     """Size of a scene: 1.1 times the largest distance of a camera from their mean.
 

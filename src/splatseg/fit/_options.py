@@ -78,11 +78,11 @@ class FitOptions:
     """Weight of the mean opacity in the loss: what is not needed fades and is moved."""
 
     scale_penalty: float = 0.01
-    """Weight of the mean scale in the loss, one over scene units."""
+    """Weight of the mean scale in the loss, where the scene's size is 3."""
 
     noise: float = 1.5e5
     """Random walk of faint Gaussians, times the position rate and their covariance
-    (Kheradmand et al. 2024, eq. 8). 0 is none."""
+    (Kheradmand et al. 2024, eq. 8), where the scene's size is 3. 0 is none."""
 
     background: Background = "random"
     """What is behind the Gaussians while fitting: random, black, white, #rrggbb or three numbers

@@ -21,7 +21,7 @@ _FLOATER_VIEWS = 2
 _SEEN = 0.5
 _IN_FRONT = 0.5
 # Views are drawn reduced if all of them together have more pixels: a few seconds are enough.
-_MOST_PIXELS = 40_000_000
+_MOST_PIXELS = 10_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
