@@ -97,4 +97,3 @@ class ViewParts:
                 "on average, against those given."
             )
         return tuple(found)
-

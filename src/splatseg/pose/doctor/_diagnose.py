@@ -241,25 +241,22 @@ def _choose(
     as_given = _points_under(capture, views, evidence, none, point_views)
     if given.agreement >= AGREEING and (as_given is None or fits(as_given)):
         return none, given
-    scored = [
+    plain = search_cameras(evidence, world_axes=flipped_world(capture.format))
+    fitted = [
         replace(s, agreement=max(s.agreement, _after_estimate(evidence, s.correction)))
-        if i < _ESTIMATED
-        else s
-        for i, s in enumerate(search_cameras(evidence, world_axes=flipped_world(capture.format)))
+        for s in (given, *plain[:_ESTIMATED])
     ]
-    best = max(scored, key=lambda s: s.agreement)
-    given = replace(given, agreement=max(given.agreement, _after_estimate(evidence, none)))
-    if given.agreement >= AS_GOOD * best.agreement and (as_given is None or fits(as_given)):
-        return none, best
-    able = [s for s in scored if s.agreement >= AS_GOOD * best.agreement]
+    best = max((*fitted, *plain), key=lambda s: s.agreement)
+    # Corrections that need nothing fitted besides come first: a scale of all intrinsics says in
+    # one word what a focal length and a principal point say in two.
+    able = [s for s in (given, *plain) if s.agreement >= AS_GOOD * best.agreement] or [
+        s for s in fitted if s.agreement >= AS_GOOD * best.agreement
+    ]
 
     def worth(candidate: Scored) -> tuple[bool, int, float]:
         score = _points_under(capture, views, evidence, candidate.correction, point_views)
-        return (
-            score is not None and fits(score),
-            -candidate.correction.faults,
-            candidate.agreement,
-        )
+        fit = score is not None and fits(score)
+        return fit, -candidate.correction.faults, candidate.agreement
 
     # Candidates that matches cannot tell apart (a camera that only moves forward may roll) are
     # told apart by points, then by how little they change.

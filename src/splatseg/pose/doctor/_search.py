@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 _TOLERANCE = 0.002
 """A match agrees if it lies this close to its epipolar line, as a share of the longest side."""
 
-_SUBSET = 1500
+_SUBSET = 800
 _SCALES = (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
 _FOCALS = tuple(1.15**k for k in range(-12, 13) if k)
 _STEPS = tuple(float(v) for v in np.exp(np.linspace(-0.08, 0.08, 17)))
