@@ -107,9 +107,9 @@ def test_reduced_views_count_as_many_pixels() -> None:
 def test_views_are_reduced_as_far_as_needed() -> None:
     assert reduction_for([_camera()] * 10) == 1
     large = _camera(width=2000, height=1000)
-    assert reduction_for([large] * 20) == 1
-    assert reduction_for([large] * 21) == 2
-    assert reduction_for([large] * 81) == 3
+    assert reduction_for([large] * 5) == 1
+    assert reduction_for([large] * 6) == 2
+    assert reduction_for([large] * 21) == 3
     assert reduction_for([_camera(width=10**8, height=2)]) == 2
 
 
