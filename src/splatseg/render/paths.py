@@ -94,8 +94,9 @@ def camera_path(
         >>> poses[:, 2, 3] = torch.tensor([0.0, -1.0, -2.0])
         >>> views = [View(name=str(i), camera=Camera(width=8, height=6, fx=9.0, fy=9.0, cx=4.0,
         ...          cy=3.0, cam_from_world=pose)) for i, pose in enumerate(poses)]
-        >>> [round(float(camera.centre[2]), 2) for camera in camera_path(views, frames=3)]
-        [0.0, 1.0, 2.0]
+        >>> path = camera_path(views, frames=5)
+        >>> sorted(round(abs(float(camera.centre[2])), 2) for camera in path)
+        [0.0, 0.5, 1.0, 1.5, 2.0]
     """
     if not views:
         raise InputError("views: expected at least one view to make a path of, got none.")
