@@ -19,7 +19,7 @@ from splatseg.pose.doctor._judge import (
     shift_fault,
 )
 from splatseg.pose.doctor._matches import Matches, match_views
-from splatseg.pose.doctor._points import PointScore, load_photographs
+from splatseg.pose.doctor._points import Photographs, PointScore, load_photographs
 from splatseg.pose.doctor._refine import IntrinsicsEstimate, estimate_intrinsics
 from splatseg.pose.doctor._search import (
     MatchEvidence,
@@ -104,7 +104,7 @@ def diagnose(
     doubts, unchecked = list(examination.doubts), list(examination.unchecked)
     figures = dict(examination.figures)
     evidence = PointEvidence(
-        photographs=load_photographs(views, examination.point_views, longest=_POINT_LONGEST),
+        photographs=examination.photographs,
         cameras=tuple(examination.correction.apply(view.camera) for view in views),
         triangulated=examination.triangulated,
         depth=examination.depth,
@@ -181,7 +181,7 @@ class _Examination:
     doubts: list[str]
     unchecked: list[str]
     figures: dict[str, Any]
-    point_views: list[int]
+    photographs: Photographs
     triangulated: NDArray[np.float64]
     depth: NDArray[np.float64]
 
@@ -189,7 +189,7 @@ class _Examination:
 def _examine(
     capture: Capture, views: Sequence[View], matches: Matches, *, seed: int
 ) -> _Examination:
-    point_views = _point_views(matches, views)
+    photographs = load_photographs(views, _point_views(matches, views), longest=_POINT_LONGEST)
     figures: dict[str, Any] = {
         "photographs": len(np.unique(matches.views)),
         "pairs": len(matches.views),
@@ -205,22 +205,22 @@ def _examine(
                 f"{len(matches.views)} pairs of photographs were found"
             ],
             figures=figures,
-            point_views=point_views,
+            photographs=photographs,
             triangulated=np.zeros((0, 3)),
             depth=np.zeros(0),
         )
     evidence = match_evidence(matches, [view.camera for view in views])
-    correction, best = _choose(capture, views, evidence, point_views)
+    correction, best = _choose(capture, views, evidence, photographs)
     given = evidence.agreement(no_correction())
     figures["agreement"] = round(given, 4)
     if best.agreement < EXPLAINED:
-        return _unexplained(evidence, best, figures, point_views)
+        return _unexplained(evidence, best, figures, photographs)
     return _judged(
         capture,
         evidence,
         correction,
         figures=figures,
-        point_views=point_views,
+        photographs=photographs,
         seed=seed,
     )
 
@@ -233,12 +233,12 @@ def _point_views(matches: Matches, views: Sequence[View]) -> list[int]:
 
 
 def _choose(
-    capture: Capture, views: Sequence[View], evidence: MatchEvidence, point_views: list[int]
+    capture: Capture, views: Sequence[View], evidence: MatchEvidence, photographs: Photographs
 ) -> tuple[CameraCorrection, Scored]:
     """The correction to take, and the best one by matches alone."""
     none = no_correction()
     given = Scored(correction=none, agreement=evidence.agreement(none))
-    as_given = _points_under(capture, views, evidence, none, point_views)
+    as_given = _points_under(capture, views, evidence, none, photographs)
     if given.agreement >= AGREEING and (as_given is None or fits(as_given)):
         return none, given
     plain = search_cameras(evidence, world_axes=flipped_world(capture.format))
@@ -254,7 +254,7 @@ def _choose(
     ]
 
     def worth(candidate: Scored) -> tuple[bool, int, float]:
-        score = _points_under(capture, views, evidence, candidate.correction, point_views)
+        score = _points_under(capture, views, evidence, candidate.correction, photographs)
         fit = score is not None and fits(score)
         return fit, -candidate.correction.faults, candidate.agreement
 
@@ -282,13 +282,13 @@ def _points_under(
     views: Sequence[View],
     evidence: MatchEvidence,
     correction: CameraCorrection,
-    point_views: list[int],
+    photographs: Photographs,
 ) -> PointScore | None:
     if capture.points is None or not len(capture.points):
         return None
     triangulated, depth = evidence.triangulated(correction)
     held = PointEvidence(
-        photographs=load_photographs(views, point_views, longest=_POINT_LONGEST),
+        photographs=photographs,
         cameras=tuple(correction.apply(view.camera) for view in views),
         triangulated=triangulated,
         depth=depth,
@@ -297,7 +297,7 @@ def _points_under(
 
 
 def _unexplained(
-    evidence: MatchEvidence, best: Scored, figures: dict[str, Any], point_views: list[int]
+    evidence: MatchEvidence, best: Scored, figures: dict[str, Any], photographs: Photographs
 ) -> _Examination:
     given = figures["agreement"]
     fault = Fault(
@@ -314,7 +314,7 @@ def _unexplained(
         doubts=[],
         unchecked=[],
         figures=figures,
-        point_views=point_views,
+        photographs=photographs,
         triangulated=triangulated,
         depth=depth,
     )
@@ -326,7 +326,7 @@ def _judged(
     correction: CameraCorrection,
     *,
     figures: dict[str, Any],
-    point_views: list[int],
+    photographs: Photographs,
     seed: int,
 ) -> _Examination:
     """Name the faults of the correction found, and look for small errors besides."""
@@ -358,7 +358,7 @@ def _judged(
         doubts=doubts,
         unchecked=unchecked,
         figures=figures,
-        point_views=point_views,
+        photographs=photographs,
         triangulated=triangulated,
         depth=depth,
     )
