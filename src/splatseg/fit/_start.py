@@ -26,8 +26,10 @@ _DEPTHS = 48
 _LEAST_COSINE = 0.5
 # Unseen by a second view, a place costs as much as the worst disagreement.
 _UNSEEN = 1.0
-# A place outside the region that the cameras look at must agree so much better, mean of [0, 1].
-_OUTSIDE = 0.02
+# Where nothing tells depths apart (a white wall, a black sky) the usual one is the best guess, and
+# one close to the camera the worst: what is there hides everything. So much better must a place
+# agree that is e times nearer, mean difference of colours in [0, 1].
+_PRIOR = 0.03
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +38,7 @@ class Region:
 
     near: float
     far: float
+    usual: float
 
     core: tuple[float, float] | None
     """Depths of what all cameras look at, where they look at one thing."""
@@ -95,10 +98,11 @@ def visible_region(cameras: list[Camera]) -> Region:
         slope = [min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]
         radius = min(0.9, float(torch.tensor(slope).median())) * distance
         core = (distance - radius, distance + radius)
-        return Region(near=min(distance / 3, core[0]), far=20 * distance, core=core)
+        near = min(distance / 3, core[0])
+        return Region(near=near, far=20 * distance, usual=distance, core=core)
     spread = float((centres - centres.mean(dim=0)).norm(dim=1).median())
     spread = spread if spread > 0 else 1.0
-    return Region(near=0.1 * spread, far=50 * spread, core=None)
+    return Region(near=0.1 * spread, far=50 * spread, usual=spread, core=None)
 
 
 def random_points(
@@ -124,12 +128,12 @@ def random_points(
         pixels = _drawn_pixels(example, wanted, generator)
         if len(pixels) == 0:
             continue
-        depths, in_core = _drawn_depths(region, len(pixels), generator)
+        depths = _drawn_depths(region, len(pixels), generator)
         at = pixels[:, None].expand(-1, depths.shape[1], -1).to(torch.float64) + 0.5
         places = example.camera.unproject(at, depths.double())
         own = pictures[i][pixels[:, 1], pixels[:, 0]]
         costs = _disagreement(places, own, [(examples[j], pictures[j]) for j in order[i]])
-        best = torch.where(in_core, costs, costs + _OUTSIDE).argmin(dim=1)
+        best = (costs + _unlikeliness(region, depths)).argmin(dim=1)
         points.append(places[torch.arange(len(pixels)), best].float())
         colours.append(example.photograph[pixels[:, 1], pixels[:, 0]])
     if not points:
@@ -192,18 +196,25 @@ def _drawn_pixels(
 
 def _drawn_depths(
     region: Region, count: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "count depths"], Tensor]:
-    """Depths along each ray, evenly in their logarithm, and which of them are in the core."""
+) -> Float[Tensor, "count depths"]:
+    """Depths along each ray, evenly in their logarithm, half of them in the core if there is one."""
     jitter = torch.rand(count, 1, generator=generator)
     whole = _DEPTHS if region.core is None else _DEPTHS // 2
     share = (torch.arange(whole) + jitter) / whole
     depths = region.near * (region.far / region.near) ** share
     if region.core is None:
-        return depths, torch.ones_like(depths, dtype=torch.bool)
+        return depths
     low, high = region.core
     within = low + (high - low) * (torch.arange(_DEPTHS - whole) + jitter) / (_DEPTHS - whole)
-    depths = torch.cat((depths, within), dim=1)
-    return depths, (depths >= low) & (depths <= high)
+    return torch.cat((depths, within), dim=1)
+
+
+def _unlikeliness(
+    region: Region, depths: Float[Tensor, "count depths"]
+) -> Float[Tensor, "count depths"]:
+    """What is added to the disagreement at a depth. Far ones cost only where a thing is near."""
+    away = (depths / region.usual).log()
+    return _PRIOR * (-away if region.core is None else away.abs()).clamp_min(0)
 
 
 def _disagreement(
