@@ -32,6 +32,13 @@ class Labels:
     shares: Float[Tensor, "n k"] | None = None
     """Their shares of the evidence, which add up to at most 1."""
 
+    evidence: Float[Tensor, "n"] | None = None
+    """How much spoke for any id: blending weight summed over voting pixels and views. One fully
+    visible pixel counts 1; 0 where no view saw the Gaussian."""
+
+    inferred: Bool[Tensor, "n"] | None = None
+    """True where the id comes from neighbours and not from evidence of the Gaussian's own."""
+
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """How it was made, in values that JSON holds: method, options, evidence, id names."""
 
@@ -47,6 +54,12 @@ class Labels:
         if self.candidates is not None and self.shares is not None:
             check_shape("candidates", self.candidates, (n, None))
             check_shape("shares", self.shares, tuple(self.candidates.shape))
+        if self.evidence is not None:
+            check_shape("evidence", self.evidence, (n,))
+        if self.inferred is not None:
+            check_shape("inferred", self.inferred, (n,))
+            if self.inferred.dtype != torch.bool:
+                raise InputError(f"inferred: expected booleans, got {self.inferred.dtype}.")
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -59,6 +72,8 @@ class Labels:
             background=self.background,
             candidates=None if self.candidates is None else self.candidates[index],
             shares=None if self.shares is None else self.shares[index],
+            evidence=None if self.evidence is None else self.evidence[index],
+            inferred=None if self.inferred is None else self.inferred[index],
             metadata=self.metadata,
         )
 

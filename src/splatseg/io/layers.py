@@ -46,6 +46,10 @@ def save_layer(path: Path, layer: Layer) -> None:
                     "candidates": _ids(layer.candidates),
                     "shares": _floats(layer.shares),
                 }
+            if layer.evidence is not None:
+                arrays |= {"evidence": _floats(layer.evidence.float())}
+            if layer.inferred is not None:
+                arrays |= {"inferred": layer.inferred.cpu().numpy()}
         case Features():
             header |= {"kind": "features"}
             arrays = {"values": _floats(layer.values)}
@@ -83,6 +87,12 @@ def load_layer(path: Path) -> Layer:
                 else None,
                 shares=torch.from_numpy(_array(path, arrays, "shares", "f4", (count, None)))
                 if pair
+                else None,
+                evidence=torch.from_numpy(_array(path, arrays, "evidence", "f4", (count,)))
+                if "evidence" in arrays
+                else None,
+                inferred=torch.from_numpy(_array(path, arrays, "inferred", "?", (count,)))
+                if "inferred" in arrays
                 else None,
                 metadata=metadata,
             )
