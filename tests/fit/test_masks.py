@@ -138,7 +138,7 @@ def test_a_thing_is_cut_out_of_its_surroundings(before_a_wall, scene_photographe
     assert max(outside) < 0.06, outside
     assert max(errors) < 0.05, errors
     # Cut out, the pictures are those of the photographs; as they are, the wall is missing.
-    as_cut = evaluate_photographs(cut, capture.test_views, cut_out=True)
+    as_cut = evaluate_photographs(cut, capture.test_views, masks="alpha")
     as_they_are = evaluate_photographs(cut, capture.test_views)
     assert as_cut.psnr > 20
     assert as_they_are.psnr < as_cut.psnr - 5

@@ -1,7 +1,6 @@
 """The end of ``splatseg fit``: held-out views are scored and reports/fit.html is written."""
 
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 from splatseg.core import Capture, View
 from splatseg.evaluate import PhotographReport, evaluate_photographs, picture_and_photograph
 from splatseg.evaluate.fit_report import FitStory, fit_record, fit_report
+from splatseg.evaluate.held_out import MaskUse
 from splatseg.evaluate.pictures import Gallery, Picture, colour_difference
 from splatseg.evaluate.report import report_html
 from splatseg.fit import FitOptions, FitResult
@@ -39,7 +39,9 @@ def score_and_report(
     views = [view for view in capture.test_views if view.image is not None]
     scores = None
     if views and scoring:
-        scores = _scored(result, views, options=options, backend=backend)
+        scores = evaluate_photographs(
+            result.gaussians, views, masks=options.masks, seconds=_SCORING, backend=backend
+        )
     story = FitStory(
         capture=replace(capture, views=result.views or capture.views),
         options=options,
@@ -53,7 +55,7 @@ def score_and_report(
     )
     pairs = None
     if scores is not None:
-        pairs = _pairs(result, views, scores, cut_out=options.masks == "alpha", backend=backend)
+        pairs = _pairs(result, views, scores, masks=options.masks, backend=backend)
     folder = root / "reports"
     folder.mkdir(exist_ok=True)
     with atomic_file(folder / "fit.html") as path:
@@ -63,35 +65,12 @@ def score_and_report(
     return _told(scores, len(views)) + f"report: {folder / 'fit.html'}\n"
 
 
-def _scored(
-    result: FitResult, views: Sequence[View], *, options: FitOptions, backend: BackendName
-) -> PhotographReport:
-    """The scores of the first views, until the time is over; at least one."""
-    begin = time.monotonic()
-    cut_out = options.masks == "alpha"
-    reports: list[PhotographReport] = []
-    for view in views:
-        if reports and time.monotonic() - begin > _SCORING:
-            break
-        reports.append(
-            evaluate_photographs(result.gaussians, [view], cut_out=cut_out, backend=backend)
-        )
-    count = len(reports)
-    return PhotographReport(
-        psnr=sum(report.psnr for report in reports) / count,
-        psnr_min=min(report.psnr for report in reports),
-        ssim=sum(report.ssim for report in reports) / count,
-        views=tuple(name for report in reports for name in report.views),
-        per_view=tuple(score for report in reports for score in report.per_view),
-    )
-
-
 def _pairs(
     result: FitResult,
     views: Sequence[View],
     scores: PhotographReport,
     *,
-    cut_out: bool,
+    masks: MaskUse,
     backend: BackendName,
 ) -> Gallery:
     """Photograph, picture and difference of the worst, the middle and the best view."""
@@ -104,7 +83,7 @@ def _pairs(
     for rank, label in ranks.items():
         score = ordered[rank]
         picture, photograph = picture_and_photograph(
-            result.gaussians, names[score.name], cut_out=cut_out, backend=backend
+            result.gaussians, names[score.name], masks=masks, backend=backend
         )
         rows.append(
             (
@@ -144,5 +123,5 @@ def _told(scores: PhotographReport | None, count: int) -> str:
         return ""
     scored = f"{count} held-out views"
     if len(scores.views) < count:
-        scored = f"the first {len(scores.views)} of {count} held-out views"
+        scored = f"{len(scores.views)} of {count} held-out views"
     return f"PSNR {scores.psnr:.2f} dB on {scored}, SSIM {scores.ssim:.3f}\n"

@@ -9,6 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from splatseg.core import Features, Labels, Scene, Selection, View
 from splatseg.errors import InputError
+from splatseg.evaluate.held_out import MaskUse
 from splatseg.io.scene import load_scene, load_scene_layer
 
 
@@ -35,10 +36,11 @@ def open_scene(root: Path, data: Path | None) -> Scene:
     return load_scene(root, data=data)
 
 
-def is_cut_out(scene: Scene) -> bool:
-    """Whether a scene is what masks or alpha channels cut out of its photographs."""
+def mask_use(scene: Scene) -> MaskUse:
+    """What the masks of the photographs meant when the scene was fitted."""
     options = scene.provenance.get("options")
-    return isinstance(options, Mapping) and options.get("masks") == "alpha"  # pyright: ignore[reportUnknownMemberType]
+    said = options.get("masks") if isinstance(options, Mapping) else None  # pyright: ignore[reportUnknownMemberType]
+    return "alpha" if said == "alpha" else "ignore" if said == "ignore" else "off"
 
 
 def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:

@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._work import is_cut_out, layer_of, open_scene, progress, views_of_split
+from splatseg.cli._work import layer_of, mask_use, open_scene, progress, views_of_split
 from splatseg.core import Labels, Scene, Selection, View
 from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_binary, evaluate_photographs, evaluate_semantic
@@ -155,7 +155,7 @@ def _photograph_figures(
         report = evaluate_photographs(
             scene.gaussians,
             views,
-            cut_out=is_cut_out(scene),
+            masks=mask_use(scene),
             lpips=network,
             backend=command.backend,
             progress=step,

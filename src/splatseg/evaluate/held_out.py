@@ -5,8 +5,10 @@ that learned from a view it is scored on is said to, in the report's `learned_fr
 """
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import UInt8
@@ -15,6 +17,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, Selection, View
 from splatseg.errors import InputError
 from splatseg.evaluate.metrics import (
+    SSIM_WINDOW,
     BinaryScore,
     Confusion,
     SemanticScore,
@@ -24,12 +27,15 @@ from splatseg.evaluate.metrics import (
     semantic_score,
     ssim,
 )
-from splatseg.io.images import load_alpha, load_image
+from splatseg.io.images import load_alpha, load_image, load_mask
 from splatseg.lift import LabelSource, label_map
 from splatseg.lift.uplift import camera_of_map
 from splatseg.render import RenderOptions, render
 
 Progress = Callable[[int, int], None]
+
+MaskUse = Literal["off", "ignore", "alpha"]
+"""What the masks of views mean, as in a fit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,8 +196,9 @@ def evaluate_photographs(
     gaussians: Gaussians,
     views: Sequence[View],
     *,
-    cut_out: bool = False,
+    masks: MaskUse = "off",
     lpips: Callable[[torch.Tensor, torch.Tensor], float] | None = None,
+    seconds: float = math.inf,
     options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Progress | None = None,
@@ -201,44 +208,75 @@ def evaluate_photographs(
     Args:
         gaussians: The Gaussians of the scene.
         views: Views with photographs.
-        cut_out: Score what the view's mask, or the alpha channel of its photograph, cuts out:
-            photograph and picture over white, as is the custom for such scenes. A view without
-            either is scored as it is.
+        masks: What masks mean. ``ignore``: only pixels that a view's mask keeps are scored, for a
+            fit that ignored the others knows nothing of them; a view of which nothing is kept is
+            left out. ``alpha``: what the mask, or the alpha channel of the photograph, cuts out is
+            scored, photograph and picture over white, as is the custom for such scenes. ``off``,
+            and a view without a mask: every pixel.
         lpips: A network with weights (`splatseg.evaluate.lpips.load_lpips`); None leaves that
             score out.
+        seconds: After so long no further view is begun; at least one is scored.
         options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and their number.
 
     Raises:
-        InputError: If there are no views, or one has no photograph.
+        InputError: If there are no views, one has no photograph, or masks leave nothing to score.
         MissingFileError: If a photograph is not where it was.
     """
     if not views:
         raise InputError("views: expected at least one view with a photograph, got none.")
     scores: list[ViewScore] = []
+    begin = time.monotonic()
     for done, view in enumerate(views, start=1):
-        picture, photograph = picture_and_photograph(
-            gaussians, view, cut_out=cut_out, options=options, backend=backend
+        score = _view_score(
+            gaussians, view, masks=masks, lpips=lpips, options=options, backend=backend
         )
-        scores.append(
-            ViewScore(
-                name=view.name,
-                psnr=psnr(picture, photograph),
-                ssim=ssim(picture, photograph),
-                lpips=None if lpips is None else lpips(picture, photograph),
-            )
-        )
+        if score is not None:
+            scores.append(score)
         if progress is not None:
             progress(done, len(views))
+        if scores and time.monotonic() - begin > seconds:
+            break
+    if not scores:
+        raise InputError(f"views: expected pixels to score, but masks keep none of {len(views)}.")
     distances = [score.lpips for score in scores if score.lpips is not None]
     return PhotographReport(
         psnr=math.fsum(score.psnr for score in scores) / len(scores),
         psnr_min=min(score.psnr for score in scores),
         ssim=math.fsum(score.ssim for score in scores) / len(scores),
-        views=tuple(view.name for view in views),
+        views=tuple(score.name for score in scores),
         per_view=tuple(scores),
         lpips=math.fsum(distances) / len(distances) if distances else None,
+    )
+
+
+def _view_score(
+    gaussians: Gaussians,
+    view: View,
+    *,
+    masks: MaskUse,
+    lpips: Callable[[torch.Tensor, torch.Tensor], float] | None,
+    options: RenderOptions | None,
+    backend: str,
+) -> ViewScore | None:
+    """The scores of a view; None where its mask keeps nothing that could be scored."""
+    picture, photograph = picture_and_photograph(
+        gaussians, view, masks=masks, options=options, backend=backend
+    )
+    mask = load_mask(view) if masks == "ignore" else None
+    keep = None if mask is None else mask > 0
+    if keep is not None:
+        border = SSIM_WINDOW // 2
+        if not keep[border:-border, border:-border].any():
+            return None
+        # A network sees whole pictures: where nothing is known, the photograph stands.
+        picture = torch.where(keep[..., None], picture, photograph)
+    return ViewScore(
+        name=view.name,
+        psnr=psnr(picture, photograph, keep),
+        ssim=ssim(picture, photograph, keep),
+        lpips=None if lpips is None else lpips(picture, photograph),
     )
 
 
@@ -246,7 +284,7 @@ def picture_and_photograph(
     gaussians: Gaussians,
     view: View,
     *,
-    cut_out: bool = False,
+    masks: MaskUse = "off",
     options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> tuple[UInt8[Tensor, "height width 3"], UInt8[Tensor, "height width 3"]]:
@@ -258,7 +296,7 @@ def picture_and_photograph(
     with torch.no_grad():
         drawn = render(gaussians, view.camera, options=options, backend=backend)
     image = drawn.image.cpu().double()
-    opaque = load_alpha(view) if cut_out else None
+    opaque = load_alpha(view) if masks == "alpha" else None
     if opaque is not None:
         image = image + (1 - drawn.alpha.cpu().double())[..., None]
         photograph = _over_white(photograph, opaque, view)

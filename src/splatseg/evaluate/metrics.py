@@ -203,27 +203,37 @@ def binary_score(
 def psnr(
     image: Float[Tensor, "height width channels"],
     truth: Float[Tensor, "height width channels"],
+    keep: Bool[Tensor, "height width"] | None = None,
 ) -> float:
     r"""Peak signal-to-noise ratio in decibels, :math:`-10 \log_{10} \mathrm{MSE}`.
 
     Args:
         image: Picture, uint8 or floating point with white at 1.
         truth: The photograph, alike.
+        keep: Pixels that count, at least one; None counts all.
 
     Returns:
         At most 120 dB, what a mean square error of 1e-12 amounts to.
+
+    Raises:
+        ShapeError: If sizes differ.
+        InputError: If `keep` keeps nothing.
 
     Example:
         >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.1)), 3)
         20.0
     """
     a, b = _picture_pair(image, truth)
-    return -10 * math.log10(max(float(((a - b) ** 2).mean()), _LEAST_ERROR))
+    squares = (a - b) ** 2
+    if keep is not None:
+        squares = squares[_kept(keep, squares)]
+    return -10 * math.log10(max(float(squares.mean()), _LEAST_ERROR))
 
 
 def ssim(
     image: Float[Tensor, "height width channels"],
     truth: Float[Tensor, "height width channels"],
+    keep: Bool[Tensor, "height width"] | None = None,
 ) -> float:
     r"""Structural similarity, mean over pixels and channels, at most 1.
 
@@ -236,9 +246,11 @@ def ssim(
     Args:
         image: Picture of at least 11 x 11 pixels, uint8 or floating point with white at 1.
         truth: The photograph, alike.
+        keep: Pixels that count: those windows whose middle is one of them. None counts all.
 
     Raises:
         ShapeError: If the sizes differ or are smaller than the window.
+        InputError: If `keep` keeps no window's middle.
     """
     a, b = _picture_pair(image, truth)
     if min(a.shape[:2]) < SSIM_WINDOW:
@@ -246,6 +258,12 @@ def ssim(
             f"image: expected at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, "
             f"got {a.shape[0]} x {a.shape[1]}."
         )
+    inner = None
+    if keep is not None:
+        border = SSIM_WINDOW // 2
+        check_shape("keep", keep, tuple(a.shape[:2]))
+        inner = keep[border:-border, border:-border]
+        inner = _kept(inner, inner)
     a, b = a.movedim(-1, 0), b.movedim(-1, 0)
     moments = _window_means(torch.stack((a, b, a * a, b * b, a * b)))
     mean_a, mean_b, square_a, square_b, product = moments.unbind(0)
@@ -253,7 +271,15 @@ def ssim(
     covariance = product - mean_a * mean_b
     likeness = (2 * mean_a * mean_b + _SSIM_C1) * (2 * covariance + _SSIM_C2)
     likeness = likeness / ((mean_a**2 + mean_b**2 + _SSIM_C1) * (variances + _SSIM_C2))
-    return float(likeness.mean())
+    return float(likeness.mean() if inner is None else likeness[:, inner].mean())
+
+
+def _kept(keep: Tensor, pixels: Tensor) -> Tensor:
+    """A checked mask of pixels, on the CPU."""
+    check_shape("keep", keep, tuple(pixels.shape[:2]))
+    if keep.dtype != torch.bool or not bool(keep.any()):
+        raise InputError(f"keep: expected booleans with a True among them, got {keep.dtype}.")
+    return keep.cpu()
 
 
 def _window_means(images: Tensor) -> Tensor:

@@ -197,7 +197,7 @@ def _drawn_pixels(
 def _drawn_depths(
     region: Region, count: int, generator: torch.Generator
 ) -> Float[Tensor, "count depths"]:
-    """Depths along each ray, evenly in their logarithm, half of them in the core if there is one."""
+    """Depths along each ray, evenly in their logarithm; half of them in the core, if any."""
     jitter = torch.rand(count, 1, generator=generator)
     whole = _DEPTHS if region.core is None else _DEPTHS // 2
     share = (torch.arange(whole) + jitter) / whole
