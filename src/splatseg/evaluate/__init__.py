@@ -1,5 +1,9 @@
 """How good a result is: pure measures, and scenes held against truth on chosen views."""
 
+from splatseg.evaluate.boundary import BoundaryCounts as BoundaryCounts
+from splatseg.evaluate.boundary import BoundaryScore as BoundaryScore
+from splatseg.evaluate.boundary import boundary_overlap as boundary_overlap
+from splatseg.evaluate.boundary import boundary_score as boundary_score
 from splatseg.evaluate.held_out import BinaryReport as BinaryReport
 from splatseg.evaluate.held_out import PhotographReport as PhotographReport
 from splatseg.evaluate.held_out import SemanticReport as SemanticReport
@@ -16,3 +20,12 @@ from splatseg.evaluate.metrics import per_image_miou as per_image_miou
 from splatseg.evaluate.metrics import psnr as psnr
 from splatseg.evaluate.metrics import semantic_score as semantic_score
 from splatseg.evaluate.metrics import ssim as ssim
+from splatseg.evaluate.overlaps import InstanceScore as InstanceScore
+from splatseg.evaluate.overlaps import Overlaps as Overlaps
+from splatseg.evaluate.overlaps import instance_score as instance_score
+from splatseg.evaluate.panoptic import Detections as Detections
+from splatseg.evaluate.panoptic import PanopticScore as PanopticScore
+from splatseg.evaluate.panoptic import PrecisionScore as PrecisionScore
+from splatseg.evaluate.panoptic import average_precision as average_precision
+from splatseg.evaluate.panoptic import panoptic_score as panoptic_score
+from splatseg.evaluate.panoptic import segment_keys as segment_keys

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_shape, check_values
 from splatseg.core import UNLABELLED
 from splatseg.errors import InputError, RangeError, ShapeError
 
@@ -49,9 +49,9 @@ class Confusion:
                 [0, 1]])
     """
 
-    counts: Int[Tensor, "classes_plus_1 classes_plus_1"]
+    counts: Num[Tensor, "classes_plus_1 classes_plus_1"]
     """``counts[t + 1, p + 1]``: pixels of true class t given class p; row and column 0 are -1.
-    Row 0 is all zero, for void pixels do not count."""
+    Row 0 is all zero, for void pixels do not count. int64, or float64 sums of weights."""
 
     def __post_init__(self) -> None:
         size = int(self.counts.shape[0]) if self.counts.ndim else 0
@@ -59,24 +59,41 @@ class Confusion:
 
     @classmethod
     def of(
-        cls, predicted: Int[Tensor, "height width"], truth: Int[Tensor, "height width"]
+        cls,
+        predicted: Int[Tensor, "height width"],
+        truth: Int[Tensor, "height width"],
+        weights: Float[Tensor, "height width"] | None = None,
     ) -> "Confusion":
         """Count one map, or any other array of ids.
 
+        Args:
+            predicted: Ids, -1 none.
+            truth: Ids, -1 void.
+            weights: What each entry counts, 0 or more, for entries that are no pixels; None
+                counts every one as 1.
+
         Raises:
             ShapeError: If the sizes differ; nothing is resized.
-            RangeError: If an id is below -1.
+            RangeError: If an id is below -1, or a weight is negative or not finite.
         """
-        predicted, truth = _id_pair(predicted, truth)
+        predicted, truth = id_pair(predicted, truth)
         real = truth != UNLABELLED
         p, t = predicted[real] + 1, truth[real] + 1
         size = 1 + max((int(ids.max()) + 1 for ids in (predicted, truth) if ids.numel()), default=0)
-        counts = torch.bincount(t * size + p, minlength=size * size)
+        if weights is None:
+            counts = torch.bincount(t * size + p, minlength=size * size)
+        else:
+            check_shape("weights", weights, tuple(truth.shape))
+            check_values("weights", weights, 0.0, math.inf)
+            counts = torch.bincount(
+                t * size + p, weights=weights.cpu().double()[real], minlength=size * size
+            )
         return cls(counts=counts.reshape(size, size))
 
     def __add__(self, other: "Confusion") -> "Confusion":
         size = max(len(self.counts), len(other.counts))
-        counts = self.counts.new_zeros(size, size)
+        kind = torch.promote_types(self.counts.dtype, other.counts.dtype)
+        counts = self.counts.new_zeros(size, size, dtype=kind)
         for part in (self.counts, other.counts):
             counts[: len(part), : len(part)] += part
         return Confusion(counts=counts)
@@ -299,7 +316,13 @@ def _window_means(images: Tensor) -> Tensor:
     return means
 
 
-def _id_pair(predicted: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+def id_pair(predicted: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Ids of a prediction and of the truth as int64 on the CPU, checked.
+
+    Raises:
+        ShapeError: If the sizes differ.
+        RangeError: If an id is below -1.
+    """
     if predicted.shape != truth.shape:
         raise ShapeError(
             f"predicted: expected the truth's size {tuple(truth.shape)}, "
@@ -308,7 +331,7 @@ def _id_pair(predicted: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     for name, ids in (("predicted", predicted), ("truth", truth)):
         if ids.numel() and int(ids.min()) < UNLABELLED:
             raise RangeError(f"{name}: expected ids of -1 or more, got {int(ids.min())}.")
-    return predicted.long(), truth.long()
+    return predicted.cpu().long(), truth.cpu().long()
 
 
 def _picture_pair(image: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,293 @@
+r"""Panoptic quality over a scene, and average precision of instances in its views.
+
+A segment is one instance of a class of things, or all of a class of stuff, over all views
+together (:math:`PQ^{scene}`). A true and a predicted segment match where their classes agree and
+their IoU is above 0.5, which at most one pair of each can be. For each class
+
+.. math:: PQ = \frac{\sum_{matches} \mathrm{IoU}}{TP + \frac{1}{2} FP + \frac{1}{2} FN}
+
+and PQ is the mean over the classes that the truth or the prediction has. A pixel of a thing that
+belongs to no instance counts to one segment "no instance" of its class.
+
+AP50 looks at each view for itself: predicted instances in the order of their scores, each a hit
+if the true instance of its class that it overlaps most has an IoU of at least 0.5 and was not hit
+before; the area under the envelope of precision over recall (all-point interpolation), mean over
+the classes of things that the truth has.
+
+References:
+    Siddiqui et al., Panoptic Lifting for 3D Scene Understanding with Neural Fields (2023),
+    section 4: PQ^scene.
+    Kirillov et al., Panoptic Segmentation (2019), section 4: PQ.
+    Everingham et al., The Pascal Visual Object Classes Challenge (2015): AP at IoU 0.5.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from splatseg._check import check_range
+from splatseg.core import UNLABELLED
+from splatseg.errors import InputError, ShapeError
+from splatseg.evaluate.overlaps import Overlaps
+
+MATCH_IOU = 0.5
+"""A pair matches above it for PQ, and at it or above for AP50."""
+
+_INSTANCE_BITS = 32
+
+
+def segment_keys(
+    classes: Int[Tensor, "*shape"], instances: Int[Tensor, "*shape"], *, things: Collection[int]
+) -> Int[Tensor, "*shape"]:
+    """One int64 key a segment: its class, and its instance where the class is one of things.
+
+    Keys ascend with the class, then with the instance (-1 first). -1 where there is no class.
+
+    Args:
+        classes: Class ids, -1 none.
+        instances: Instance ids, -1 none; not looked at where the class is stuff.
+        things: Ids of the classes whose instances are told apart.
+
+    Raises:
+        ShapeError: If the sizes differ.
+    """
+    if classes.shape != instances.shape:
+        raise ShapeError(
+            f"instances: expected the size {tuple(classes.shape)} of the classes, "
+            f"got {tuple(instances.shape)}."
+        )
+    classes, instances = classes.long(), instances.long()
+    thing = torch.isin(classes, torch.tensor(sorted(things), dtype=torch.int64))
+    keys = (classes << _INSTANCE_BITS) + torch.where(thing, instances + 1, 0)
+    return torch.where(classes == UNLABELLED, UNLABELLED, keys)
+
+
+def key_class(key: int) -> int:
+    """The class of a segment's key."""
+    return key >> _INSTANCE_BITS
+
+
+def key_instance(key: int) -> int:
+    """The instance of a segment's key, -1 where it has none or its class is stuff."""
+    return (key & ((1 << _INSTANCE_BITS) - 1)) - 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClassQuality:
+    """Panoptic quality of one class."""
+
+    pq: float
+    """In [0, 1]."""
+
+    sq: float
+    """Segmentation quality, the mean IoU of the matches; 0 where there are none."""
+
+    rq: float
+    """Recognition quality, TP / (TP + FP/2 + FN/2); PQ is the product of the two."""
+
+    tp: int
+    fp: int
+    fn: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PanopticScore:
+    """Panoptic quality over all views together."""
+
+    pq: float
+    """Mean over the classes of the truth or the prediction."""
+
+    pq_things: float
+    """Mean over those that are things; 0 where there are none."""
+
+    pq_stuff: float
+    """Mean over those that are stuff; 0 where there are none."""
+
+    per_class: Mapping[int, ClassQuality]
+
+    @property
+    def tp(self) -> int:
+        """Matches of all classes."""
+        return sum(one.tp for one in self.per_class.values())
+
+    @property
+    def fp(self) -> int:
+        """Predicted segments without a match."""
+        return sum(one.fp for one in self.per_class.values())
+
+    @property
+    def fn(self) -> int:
+        """True segments without a match."""
+        return sum(one.fn for one in self.per_class.values())
+
+
+def panoptic_score(overlaps: Overlaps, *, things: Collection[int]) -> PanopticScore:
+    """Score segments counted over all views.
+
+    Args:
+        overlaps: Of keys that `segment_keys` gives.
+        things: The classes given to `segment_keys`.
+
+    Raises:
+        InputError: If the truth has no segment.
+    """
+    true_keys, _ = overlaps.truth_sizes
+    keys, _ = overlaps.predicted_sizes
+    if not len(true_keys):
+        raise InputError("truth: expected at least one segment, all pixels are void.")
+    pairs, iou = overlaps.ious()
+    in_truth, in_predicted = _by_class(true_keys), _by_class(keys)
+    matched: dict[int, list[float]] = {}
+    for (true_key, key), value in zip(pairs.tolist(), iou.tolist(), strict=True):
+        if value > MATCH_IOU and key_class(true_key) == key_class(key):
+            matched.setdefault(key_class(key), []).append(value)
+    per_class: dict[int, ClassQuality] = {}
+    for one in sorted(in_truth.keys() | in_predicted.keys()):
+        hits = matched.get(one, [])
+        false, missed = in_predicted.get(one, 0) - len(hits), in_truth.get(one, 0) - len(hits)
+        weight = len(hits) + (false + missed) / 2
+        per_class[one] = ClassQuality(
+            pq=sum(hits) / weight,
+            sq=sum(hits) / max(len(hits), 1),
+            rq=len(hits) / weight,
+            tp=len(hits),
+            fp=false,
+            fn=missed,
+        )
+    return PanopticScore(
+        pq=_mean([one.pq for one in per_class.values()]),
+        pq_things=_mean([one.pq for id, one in per_class.items() if id in things]),
+        pq_stuff=_mean([one.pq for id, one in per_class.items() if id not in things]),
+        per_class=MappingProxyType(per_class),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detection:
+    """A predicted instance in one view."""
+
+    class_id: int
+    score: float
+    """How sure it is; only the order counts."""
+
+    iou: float
+    """With the true instance of its class that it overlaps most; 0 where it overlaps none."""
+
+    target: tuple[str, int] | None
+    """View and key of that instance."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detections:
+    """Predicted instances, view by view, and how many there truly are. Views add up."""
+
+    rows: tuple[Detection, ...] = ()
+    truth: Mapping[int, int] = field(default_factory=dict[int, int])
+    """True instances, counted in each view, by class."""
+
+    @classmethod
+    def of(
+        cls,
+        overlaps: Overlaps,
+        *,
+        view: str,
+        things: Collection[int],
+        scores: Mapping[int, float] | None = None,
+    ) -> "Detections":
+        """The detections of one view.
+
+        Args:
+            overlaps: Of keys that `segment_keys` gives, in this view alone.
+            view: Its name; two views of one sum must not share it.
+            things: The classes given to `segment_keys`.
+            scores: Score by instance id, 1 where there is none.
+        """
+        pairs, ious = overlaps.ious()
+        best: dict[int, tuple[float, int]] = {}
+        for (true_key, key), iou in zip(pairs.tolist(), ious.tolist(), strict=True):
+            if key_class(true_key) == key_class(key) and iou > best.get(key, (0.0, 0))[0]:
+                best[key] = (iou, true_key)
+        rows: list[Detection] = []
+        for key in overlaps.predicted_sizes[0].tolist():
+            if key_class(key) in things:
+                iou, target = best.get(key, (0.0, None))
+                rows.append(
+                    Detection(
+                        class_id=key_class(key),
+                        score=(scores or {}).get(key_instance(key), 1.0),
+                        iou=iou,
+                        target=None if target is None else (view, target),
+                    )
+                )
+        in_truth = _by_class(overlaps.truth_sizes[0])
+        truth = {id: count for id, count in in_truth.items() if id in things}
+        return cls(rows=tuple(rows), truth=MappingProxyType(truth))
+
+    def __add__(self, other: "Detections") -> "Detections":
+        classes = sorted(self.truth.keys() | other.truth.keys())
+        truth = {id: self.truth.get(id, 0) + other.truth.get(id, 0) for id in classes}
+        return Detections(rows=self.rows + other.rows, truth=MappingProxyType(truth))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrecisionScore:
+    """Average precision of instances in views, in [0, 1]."""
+
+    mean: float
+    """Over the classes of things that the truth has; 0 where it has none."""
+
+    per_class: Mapping[int, float]
+
+
+def average_precision(detections: Detections, *, iou: float = MATCH_IOU) -> PrecisionScore:
+    """Average precision at one IoU; AP50 unless told otherwise.
+
+    Detections of equal score keep the order of the views and, within one, of their keys: give
+    views sorted by name where the figure is to be that of other scorers.
+
+    Args:
+        detections: Of all views.
+        iou: Least IoU of a hit, in [0, 1].
+    """
+    check_range("iou", iou, 0.0, 1.0)
+    per_class: dict[int, float] = {}
+    for id, count in sorted(detections.truth.items()):
+        rows = [row for row in detections.rows if row.class_id == id]
+        rows.sort(key=lambda row: -row.score)
+        used: set[tuple[str, int]] = set()
+        hits = np.zeros(len(rows))
+        for i, row in enumerate(rows):
+            if row.target is not None and row.iou >= iou and row.target not in used:
+                used.add(row.target)
+                hits[i] = 1
+        per_class[id] = _area(hits, count)
+    return PrecisionScore(
+        mean=_mean(list(per_class.values())), per_class=MappingProxyType(per_class)
+    )
+
+
+def _area(hits: np.ndarray, count: int) -> float:
+    """The area under the envelope of precision over recall."""
+    if not len(hits):
+        return 0.0
+    found = np.cumsum(hits)
+    precision = found / np.arange(1, len(hits) + 1)
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(np.sum(np.diff(np.concatenate(([0.0], found / count))) * envelope))
+
+
+def _by_class(keys: Tensor) -> dict[int, int]:
+    """How many keys each class has."""
+    counts: dict[int, int] = {}
+    for key in keys.tolist():
+        counts[key_class(key)] = counts.get(key_class(key), 0) + 1
+    return counts
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else 0.0
