@@ -1,0 +1,105 @@
+"""The table of objects as CSV, for spreadsheets, and as JSON, for programs."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import UNLABELLED
+from splatseg.core.rigid import quaternion_from_rotation
+from splatseg.errors import InputError
+from splatseg.io._atomic import atomic_file
+from splatseg.io._json import write_json
+from splatseg.io.export._objects import ObjectRow
+
+MADE_BY = "splatseg export"
+_DIGITS = 6
+
+
+def write_object_table(
+    rows: Sequence[ObjectRow], path: Path, *, about: Mapping[str, Any] | None = None
+) -> None:
+    """Write a table of objects; atomic. The ending, .csv or .json, gives the format.
+
+    Args:
+        rows: The objects.
+        path: The file.
+        about: Further members of the JSON: scene, layers, units. CSV has no place for them.
+
+    Raises:
+        InputError: If the name ends otherwise.
+        MissingFileError: If the folder of `path` does not exist.
+    """
+    match path.suffix.lower():
+        case ".json":
+            objects = [object_content(row) for row in rows]
+            write_json(path, {"made_by": MADE_BY} | dict(about or {}) | {"objects": objects})
+        case ".csv":
+            _write_csv(rows, path)
+        case _:
+            raise InputError(f"{path}: expected a table's name to end in .csv or .json.")
+
+
+def object_content(row: ObjectRow) -> dict[str, Any]:
+    """A row as JSON: lengths in scene units, quaternion (w, x, y, z) world_from_box."""
+    return {
+        "id": row.id,
+        "name": row.name,
+        "class_id": None if row.class_id == UNLABELLED else row.class_id,
+        "class": row.class_name,
+        "gaussians": row.gaussians,
+        "centroid": _rounded(row.centroid.tolist()),
+        "box": {
+            "centre": _rounded(row.box.centre.tolist()),
+            "size": _rounded(row.box.size.tolist()),
+            "rotation": _rounded(quaternion_from_rotation(row.box.rotation).tolist()),
+        },
+        "volume": _figure(row.box.volume),
+        "colour": [round(255 * value) for value in row.colour.tolist()],
+        "confidence": _figure(row.confidence),
+        "evidence": None if row.evidence is None else _figure(row.evidence),
+        "inferred": None if row.inferred is None else _figure(row.inferred),
+    }
+
+
+def _write_csv(rows: Sequence[ObjectRow], path: Path) -> None:
+    with (
+        atomic_file(path) as temporary,
+        # The byte order mark is what makes spreadsheets read names as UTF-8.
+        temporary.open("w", encoding="utf-8-sig", newline="") as file,
+    ):
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_HEADER)
+        writer.writerows(_cells(object_content(row)) for row in rows)
+
+
+_HEADER = (
+    "id", "name", "class_id", "class", "gaussians", "centroid_x", "centroid_y", "centroid_z",
+    "box_x", "box_y", "box_z", "size_1", "size_2", "size_3", "rot_w", "rot_x", "rot_y", "rot_z",
+    "volume", "red", "green", "blue", "confidence", "evidence", "inferred",
+)  # fmt: skip
+
+
+def _cells(content: Mapping[str, Any]) -> list[Any]:
+    box = content["box"]
+    cells = [
+        content["id"], _text(content["name"]), content["class_id"], _text(content["class"]),
+        content["gaussians"], *content["centroid"],
+        *box["centre"], *box["size"], *box["rotation"], content["volume"],
+        *content["colour"], content["confidence"], content["evidence"], content["inferred"],
+    ]  # fmt: skip
+    return ["" if cell is None else cell for cell in cells]
+
+
+def _text(name: str) -> str:
+    """A name that no spreadsheet takes for a formula: names may come from files of others."""
+    return f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
+
+
+def _rounded(values: Sequence[float]) -> list[float]:
+    return [_figure(value) for value in values]
+
+
+def _figure(value: float) -> float:
+    """Six significant digits: more than what is measured, and the same on every machine."""
+    return float(f"{value:.{_DIGITS}g}") + 0.0  # the sum turns -0.0 into 0.0
