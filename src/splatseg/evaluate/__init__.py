@@ -12,6 +12,12 @@ from splatseg.evaluate.held_out import evaluate_binary as evaluate_binary
 from splatseg.evaluate.held_out import evaluate_photographs as evaluate_photographs
 from splatseg.evaluate.held_out import evaluate_semantic as evaluate_semantic
 from splatseg.evaluate.held_out import picture_and_photograph as picture_and_photograph
+from splatseg.evaluate.held_out_segments import InstanceReport as InstanceReport
+from splatseg.evaluate.held_out_segments import PanopticReport as PanopticReport
+from splatseg.evaluate.held_out_segments import PointReport as PointReport
+from splatseg.evaluate.held_out_segments import evaluate_instances as evaluate_instances
+from splatseg.evaluate.held_out_segments import evaluate_panoptic as evaluate_panoptic
+from splatseg.evaluate.held_out_segments import evaluate_points as evaluate_points
 from splatseg.evaluate.metrics import BinaryScore as BinaryScore
 from splatseg.evaluate.metrics import Confusion as Confusion
 from splatseg.evaluate.metrics import SemanticScore as SemanticScore
@@ -29,3 +35,7 @@ from splatseg.evaluate.panoptic import PrecisionScore as PrecisionScore
 from splatseg.evaluate.panoptic import average_precision as average_precision
 from splatseg.evaluate.panoptic import panoptic_score as panoptic_score
 from splatseg.evaluate.panoptic import segment_keys as segment_keys
+from splatseg.evaluate.solid import gaussian_score as gaussian_score
+from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
+from splatseg.evaluate.solid import labels_from_points as labels_from_points
+from splatseg.evaluate.solid import labels_of_points as labels_of_points

@@ -90,6 +90,12 @@ class BoundaryCounts:
     """Pixels in both bands of an id, in the truth's, in the prediction's."""
 
     @classmethod
+    def none(cls) -> "BoundaryCounts":
+        """Counts of no view, to begin a sum with."""
+        empty = torch.zeros(0, 3, dtype=torch.int64)
+        return cls(ids=empty[:, 0], counts=empty)
+
+    @classmethod
     def of(
         cls,
         predicted: Int[Tensor, "height width"],

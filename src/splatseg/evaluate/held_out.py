@@ -6,7 +6,7 @@ that learned from a view it is scored on is said to, in the report's `learned_fr
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,6 +16,12 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, Selection, View
 from splatseg.errors import InputError
+from splatseg.evaluate.boundary import (
+    BoundaryCounts,
+    BoundaryScore,
+    boundary_overlap,
+    boundary_score,
+)
 from splatseg.evaluate.metrics import (
     SSIM_WINDOW,
     BinaryScore,
@@ -48,6 +54,9 @@ class SemanticReport:
     per_image_miou: float
     """Mean over views of each view's own mean IoU."""
 
+    boundary: BoundaryScore
+    """Boundary IoU, pooled over all views."""
+
     views: tuple[str, ...]
     """Views that were scored."""
 
@@ -60,6 +69,12 @@ class BinaryReport:
     """Scores of one object, or of a selection."""
 
     score: BinaryScore
+    boundary_mean: float
+    """Mean over views of boundary IoU; a view where both masks are empty counts 1."""
+
+    boundary_pooled: float
+    """Boundary IoU of all views' pixels together; 0 where there are none."""
+
     views: tuple[str, ...]
     """Views that were scored."""
 
@@ -130,20 +145,22 @@ def evaluate_semantic(
         InputError: If no view has a truth.
         ShapeError: If a truth does not have its photograph's proportions.
     """
-    scored = _with_truth(views, truth)
+    scored = with_truth(views, truth)
     confusions: list[Confusion] = []
+    outlines = BoundaryCounts.none()
     for done, view in enumerate(scored, start=1):
         true = truth.label_map(view.name)
-        drawn = _drawn(gaussians, view, labels, true, options=options, backend=backend)
+        drawn = drawn_like(gaussians, view, labels, true, options=options, backend=backend)
         confusions.append(Confusion.of(drawn.ids, true.ids))
+        outlines = outlines + BoundaryCounts.of(drawn.ids, true.ids)
         if progress is not None:
             progress(done, len(scored))
-    pooled = sum(confusions[1:], start=confusions[0])
     return SemanticReport(
-        score=semantic_score(pooled),
+        score=semantic_score(sum(confusions, start=Confusion.none())),
         per_image_miou=per_image_miou(confusions),
+        boundary=boundary_score(outlines),
         views=tuple(view.name for view in scored),
-        learned_from=_learned_from(labels, scored),
+        learned_from=learned_from(labels, scored),
     )
 
 
@@ -175,20 +192,29 @@ def evaluate_binary(
         InputError: If no view has a truth.
         ShapeError: If a truth does not have its photograph's proportions.
     """
-    scored = _with_truth(views, truth)
+    scored = with_truth(views, truth)
     labels = layer if isinstance(layer, Labels) else labels_of(layer)
     wanted = id if isinstance(layer, Labels) else None
-    pairs: list[tuple[torch.Tensor, torch.Tensor]] = []
-    for done, view in enumerate(scored, start=1):
-        true = truth.label_map(view.name)
-        drawn = _drawn(gaussians, view, labels, true, options=options, backend=backend)
-        pairs.append((_mask(drawn, wanted), _mask(true, id)))
-        if progress is not None:
-            progress(done, len(scored))
+    outlines: list[tuple[int, int]] = []
+
+    def pairs() -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        for done, view in enumerate(scored, start=1):
+            true = truth.label_map(view.name)
+            drawn = drawn_like(gaussians, view, labels, true, options=options, backend=backend)
+            masks = _mask(drawn, wanted), _mask(true, id)
+            outlines.append(boundary_overlap(*masks))
+            yield masks
+            if progress is not None:
+                progress(done, len(scored))
+
+    score = binary_score(pairs())
+    both, either = (sum(counts) for counts in zip(*outlines, strict=True))
     return BinaryReport(
-        score=binary_score(pairs),
+        score=score,
+        boundary_mean=math.fsum(b / e if e else 1.0 for b, e in outlines) / len(outlines),
+        boundary_pooled=both / max(either, 1),
         views=tuple(view.name for view in scored),
-        learned_from=_learned_from(layer, scored),
+        learned_from=learned_from(layer, scored),
     )
 
 
@@ -317,15 +343,20 @@ def labels_of(selection: Selection) -> Labels:
     return Labels(ids=ids, confidence=selection.mask.float(), metadata=selection.metadata)
 
 
-def _drawn(
+def drawn_like(
     gaussians: Gaussians,
     view: View,
     labels: Labels,
     truth: LabelMap,
     *,
-    options: RenderOptions | None,
-    backend: str,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
 ) -> LabelMap:
+    """A layer drawn in a view, in the pixels of its truth.
+
+    Raises:
+        ShapeError: If the truth does not have the photograph's proportions.
+    """
     camera = camera_of_map(view, truth.height, truth.width)
     return label_map(gaussians, camera, labels, options=options, backend=backend)
 
@@ -334,7 +365,12 @@ def _mask(ids: LabelMap, id: int | None) -> torch.Tensor:
     return ids.ids != UNLABELLED if id is None else ids.ids == id
 
 
-def _with_truth(views: Sequence[View], truth: LabelSource) -> list[View]:
+def with_truth(views: Sequence[View], truth: LabelSource) -> list[View]:
+    """The views that have a truth.
+
+    Raises:
+        InputError: If none has.
+    """
     known = set(truth.view_names)
     scored = [view for view in views if view.name in known]
     if not scored:
@@ -342,7 +378,8 @@ def _with_truth(views: Sequence[View], truth: LabelSource) -> list[View]:
     return scored
 
 
-def _learned_from(layer: Labels | Selection, views: Sequence[View]) -> tuple[str, ...]:
+def learned_from(layer: Labels | Selection, views: Sequence[View]) -> tuple[str, ...]:
+    """Names of those views that a layer says it was made from."""
     voters = layer.metadata.get("views")
     known = set(map(str, voters)) if isinstance(voters, (list, tuple)) else set[str]()  # pyright: ignore[reportUnknownArgumentType]
     return tuple(view.name for view in views if view.name in known)

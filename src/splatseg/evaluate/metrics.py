@@ -58,6 +58,11 @@ class Confusion:
         check_shape("counts", self.counts, (size, size))
 
     @classmethod
+    def none(cls) -> "Confusion":
+        """Counts of no view, to begin a sum with."""
+        return cls(counts=torch.zeros(1, 1, dtype=torch.int64))
+
+    @classmethod
     def of(
         cls,
         predicted: Int[Tensor, "height width"],

@@ -1,0 +1,149 @@
+"""What ``splatseg evaluate`` says, by the names that scorers use, and the small files it reads."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatseg.errors import FileFormatError
+from splatseg.evaluate import (
+    BinaryReport,
+    InstanceReport,
+    PanopticReport,
+    PointReport,
+    SemanticReport,
+    SemanticScore,
+)
+from splatseg.evaluate.overlaps import InstanceScore
+from splatseg.io._json import read_json
+from splatseg.io.evidence._features import read_npz
+
+
+def semantic_figures(report: SemanticReport) -> dict[str, Any]:
+    """Classes, pooled over views unless they say otherwise."""
+    figures = _views(report) | _classes(report.score)
+    per_class = figures.pop("per_class")
+    return figures | {
+        "mIoU_per_image": report.per_image_miou,
+        "boundary_mIoU": report.boundary.mean,
+        "classes": len(per_class),
+        "per_class": per_class,
+    }
+
+
+def binary_figures(report: BinaryReport) -> dict[str, Any]:
+    """One object as a mask."""
+    return _views(report) | {
+        "IoU_mean_over_views": report.score.iou_mean,
+        "IoU_pooled": report.score.iou_pooled,
+        "accuracy": report.score.accuracy,
+        "boundary_IoU_mean_over_views": report.boundary_mean,
+        "boundary_IoU_pooled": report.boundary_pooled,
+    }
+
+
+def instance_figures(report: InstanceReport) -> dict[str, Any]:
+    """Instances matched over the scene; mIoU is the mean over the true ones."""
+    return _views(report) | _instances(report.score)
+
+
+def panoptic_figures(report: PanopticReport) -> dict[str, Any]:
+    """Panoptic quality over the scene, AP50 in views, and the classes alone."""
+    score = report.score
+    return _views(report) | {
+        "PQ_scene": score.pq,
+        "PQ_things": score.pq_things,
+        "PQ_stuff": score.pq_stuff,
+        "mAP50": report.precision.mean,
+        "mIoU": report.semantic.miou,
+        "tp": score.tp,
+        "fp": score.fp,
+        "fn": score.fn,
+        "PQ_per_class": {
+            str(id): {
+                "PQ": one.pq,
+                "SQ": one.sq,
+                "RQ": one.rq,
+                "tp": one.tp,
+                "fp": one.fp,
+                "fn": one.fn,
+            }
+            for id, one in score.per_class.items()
+        },
+        "AP50_per_class": {str(id): value for id, value in report.precision.per_class.items()},
+    }
+
+
+def point_figures(report: PointReport, *, rule: str) -> dict[str, Any]:
+    """Labels of points, under names that begin with points_."""
+    scores: dict[str, Any] = {}
+    if report.semantic is not None:
+        scores |= _classes(report.semantic)
+    if report.instances is not None:
+        scores |= _instances(report.instances)
+    scores |= {"unlabelled": report.unlabelled, "rule": rule}
+    return {"points": report.points} | {f"points_{key}": value for key, value in scores.items()}
+
+
+def read_points(path: Path, name: str) -> tuple[Tensor, Tensor]:
+    """Places and true ids (-1 void) from an npz with xyz and an array `name` of ids.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it lacks one of them, or they do not fit together.
+    """
+    arrays = read_npz(path, ["xyz", name])
+    xyz, ids = arrays["xyz"], arrays[name]
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or ids.shape != xyz.shape[:1]:
+        raise FileFormatError(
+            f"{path}: expected xyz of n x 3 and {name} of n, got {xyz.shape} and {ids.shape}."
+        )
+    if ids.dtype.kind not in "iu" or xyz.dtype.kind != "f" or not np.isfinite(xyz).all():
+        raise FileFormatError(
+            f"{path}: expected finite places and whole ids, got {xyz.dtype} and {ids.dtype}."
+        )
+    whole = torch.from_numpy(ids.astype(np.int64))
+    return torch.from_numpy(xyz), torch.where(whole <= 0, -1, whole)
+
+
+def read_scores(path: Path) -> dict[int, float]:
+    """Score by instance id from a JSON object.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If a key is no id or a value no number.
+    """
+    scores: dict[int, float] = {}
+    for key, value in read_json(path).items():
+        if not key.isdecimal() or isinstance(value, bool) or not isinstance(value, int | float):
+            raise FileFormatError(f"{path}: expected scores by instance id, got {key!r}: {value}.")
+        scores[int(key) or -1] = float(value)
+    return scores
+
+
+def _views(
+    report: SemanticReport | BinaryReport | InstanceReport | PanopticReport,
+) -> dict[str, Any]:
+    return {"views": len(report.views), "learned_from": len(report.learned_from)}
+
+
+def _classes(score: SemanticScore) -> dict[str, Any]:
+    return {
+        "mIoU": score.miou,
+        "fwIoU": score.fwiou,
+        "accuracy": score.accuracy,
+        "mAcc": score.mean_accuracy,
+        "per_class": {str(id): value for id, value in score.per_class.items()},
+    }
+
+
+def _instances(score: InstanceScore) -> dict[str, Any]:
+    return {
+        "mIoU": score.miou,
+        "recall50": score.recall50,
+        "precision50": score.precision50,
+        "truth_instances": score.truth_instances,
+        "predicted_instances": score.predicted_instances,
+    }

@@ -1,0 +1,236 @@
+"""Instances and panoptic labels held against truth: in views, and at labelled points.
+
+As in `splatseg.evaluate.held_out`, predictions are drawn in the pixels of the truth, and views
+that a layer learned from are named. Counts are kept by pair of segments that overlap, so memory
+does not grow with the number of views.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatseg._check import check_shape
+from splatseg.core import ClassTable, Gaussians, Labels, View
+from splatseg.errors import InputError, ShapeError
+from splatseg.evaluate.held_out import Progress, drawn_like, learned_from, with_truth
+from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
+from splatseg.evaluate.overlaps import InstanceScore, Overlaps, instance_score
+from splatseg.evaluate.panoptic import (
+    Detections,
+    PanopticScore,
+    PrecisionScore,
+    average_precision,
+    panoptic_score,
+    segment_keys,
+)
+from splatseg.evaluate.solid import MIN_OPACITY, NEIGHBOURS, PointRule, labels_of_points
+from splatseg.lift import LabelSource
+from splatseg.render import RenderOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstanceReport:
+    """Scores of a layer's instances, classes aside."""
+
+    score: InstanceScore
+    views: tuple[str, ...]
+    """Views that were scored."""
+
+    learned_from: tuple[str, ...]
+    """Those of them that the layer was made from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PanopticReport:
+    """Scores of a layer of classes with a layer of instances."""
+
+    score: PanopticScore
+    """PQ over the scene."""
+
+    precision: PrecisionScore
+    """AP50 of instances in views."""
+
+    semantic: SemanticScore
+    """Of the classes alone."""
+
+    views: tuple[str, ...]
+    """Views that were scored."""
+
+    learned_from: tuple[str, ...]
+    """Those of them that either layer was made from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointReport:
+    """Scores of the labels that a layer gives to points."""
+
+    semantic: SemanticScore | None
+    """Where ids of the layer and of the points mean the same."""
+
+    instances: InstanceScore | None
+    """Where they do not, and are matched."""
+
+    points: int
+    """Points that are not void."""
+
+    unlabelled: float
+    """Share of them that got no label."""
+
+
+def evaluate_instances(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    labels: Labels,
+    truth: LabelSource,
+    *,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Progress | None = None,
+) -> InstanceReport:
+    """Match the instances of a layer to the true ones over the whole scene, and score them.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Where to look; those without a truth are left out.
+        labels: The layer; its ids need not be the truth's.
+        truth: Instance maps by view name; -1 is void.
+        options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and their number.
+
+    Raises:
+        InputError: If no view has a truth, or there is no true instance in them.
+        ShapeError: If a truth does not have its photograph's proportions.
+    """
+    scored = with_truth(views, truth)
+    total = Overlaps.none()
+    for done, view in enumerate(scored, start=1):
+        true = truth.label_map(view.name)
+        drawn = drawn_like(gaussians, view, labels, true, options=options, backend=backend)
+        total = total + Overlaps.of(drawn.ids, true.ids)
+        if progress is not None:
+            progress(done, len(scored))
+    return InstanceReport(
+        score=instance_score(total),
+        views=tuple(view.name for view in scored),
+        learned_from=learned_from(labels, scored),
+    )
+
+
+def evaluate_panoptic(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    *,
+    classes: Labels,
+    instances: Labels,
+    true_classes: LabelSource,
+    true_instances: LabelSource,
+    table: ClassTable,
+    scores: Mapping[int, float] | None = None,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Progress | None = None,
+) -> PanopticReport:
+    """Score a layer of classes and a layer of instances together.
+
+    Views are gone through by name, so that AP50 without scores is that of other scorers.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Where to look; those without a truth are left out.
+        classes: The layer of classes, in the ids of the truth.
+        instances: The layer of instances; its ids need not be the truth's.
+        true_classes: Class maps by view name; -1 is void.
+        true_instances: Instance maps by view name, of the same views.
+        table: Which classes are things. A class that it does not know is stuff.
+        scores: How sure each instance is, by its id, for AP50; 1 where there is none.
+        options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and their number.
+
+    Raises:
+        InputError: If no view has a truth, or one has classes but no instances.
+        ShapeError: If a truth does not have its photograph's proportions, or the two differ.
+    """
+    things = frozenset(row.id for row in table.rows if row.isthing)
+    scored = sorted(with_truth(views, true_classes), key=lambda view: view.name)
+    known = set(true_instances.view_names)
+    lacking = [view.name for view in scored if view.name not in known]
+    if lacking:
+        raise InputError(
+            f"true_instances: expected those of all {len(scored)} views with true classes, "
+            f"{len(lacking)} lack them, the first is {lacking[0]}."
+        )
+    total, detections, confusion = Overlaps.none(), Detections(), Confusion.none()
+    for done, view in enumerate(scored, start=1):
+        true, true_ids = true_classes.label_map(view.name), true_instances.label_map(view.name)
+        if true.ids.shape != true_ids.ids.shape:
+            raise ShapeError(
+                f"true_instances: {view.name}: expected the size {tuple(true.ids.shape)} of the "
+                f"true classes, got {tuple(true_ids.ids.shape)}."
+            )
+        drawn = drawn_like(gaussians, view, classes, true, options=options, backend=backend)
+        found = drawn_like(gaussians, view, instances, true, options=options, backend=backend)
+        one = Overlaps.of(
+            segment_keys(drawn.ids, found.ids, things=things),
+            segment_keys(true.ids, true_ids.ids, things=things),
+        )
+        total = total + one
+        detections = detections + Detections.of(one, view=view.name, things=things, scores=scores)
+        confusion = confusion + Confusion.of(drawn.ids, true.ids)
+        if progress is not None:
+            progress(done, len(scored))
+    both = {*learned_from(classes, scored), *learned_from(instances, scored)}
+    return PanopticReport(
+        score=panoptic_score(total, things=things),
+        precision=average_precision(detections),
+        semantic=semantic_score(confusion),
+        views=tuple(view.name for view in scored),
+        learned_from=tuple(view.name for view in scored if view.name in both),
+    )
+
+
+def evaluate_points(
+    gaussians: Gaussians,
+    labels: Labels,
+    *,
+    points: Float[Tensor, "p 3"],
+    truth: Int[Tensor, "p"],
+    matched: bool = False,
+    rule: PointRule = "weighted",
+    neighbours: int = NEIGHBOURS,
+    min_opacity: float = MIN_OPACITY,
+) -> PointReport:
+    """Score the labels that a layer gives to labelled points of the scene.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        labels: The layer; its ids, whether hard or soft.
+        points: Places in the world, scene units.
+        truth: Their true ids, -1 void.
+        matched: Ids of the layer are instances that mean something else than the truth's.
+        rule: How points take labels, see `labels_of_points`; so are the next two.
+        neighbours: Gaussians that vote at a point.
+        min_opacity: Fainter Gaussians are not there.
+
+    Raises:
+        ShapeError: If there is not one true id a point, or one label a Gaussian.
+        InputError: If all points are void.
+    """
+    check_shape("truth", truth, (len(points),))
+    ids = labels_of_points(
+        gaussians,
+        labels.ids,
+        points,
+        rule=rule,
+        neighbours=neighbours,
+        min_opacity=min_opacity,
+    )
+    return PointReport(
+        semantic=None if matched else semantic_score(Confusion.of(ids, truth)),
+        instances=instance_score(Overlaps.of(ids, truth)) if matched else None,
+        points=int((truth >= 0).sum()),
+        unlabelled=float((ids[truth >= 0] < 0).double().mean()),
+    )

@@ -1,0 +1,226 @@
+"""evaluate: every metric equals the independent scorer's on the maps that render writes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from splatseg.core import Labels, Selection
+from splatseg.io.scene import load_scene, save_scene_layer
+
+CPU = ("--backend", "cpu")
+CLASSES = [
+    {"id": 1, "name": "sky", "isthing": False},
+    {"id": 2, "name": "left wall", "isthing": True},
+    {"id": 7, "name": "right wall", "isthing": True},
+]
+
+
+def labels_of(ids: torch.Tensor, background: int = -1) -> Labels:
+    return Labels(
+        ids=ids,
+        confidence=torch.ones(len(ids)),
+        background=background,
+        metadata={"views": ["train_0"]},
+    )
+
+
+@pytest.fixture
+def labelled(small):
+    """Layers of classes and of instances with mistakes, and the true instances of every view."""
+    means = load_scene(small.scene).gaussians.means
+    x, y = means[:, 0], means[:, 1]
+    classes = torch.where(x < 0.15, 2, 7)
+    classes[(x > 1.2) & (y > 0.5)] = -1
+    classes[(x < -1.4) & (y > 0.9)] = 7
+    instances = torch.where(x < -0.3, 4, torch.where(x < 0.7, 5, 600))
+    save_scene_layer(small.scene, "classes", labels_of(classes, background=1))
+    save_scene_layer(small.scene, "objects", labels_of(instances))
+    (small.capture / "instance").mkdir()
+    for path in sorted((small.capture / "semantic").iterdir()):
+        truth = np.array(Image.open(path))
+        ids = np.where(truth == 2, 21, np.where(truth == 7, 22, 0))
+        ids[:, 24:] = np.where(truth[:, 24:] == 7, 23, ids[:, 24:])
+        Image.fromarray(ids.astype(np.uint16)).save(small.capture / "instance" / path.name)
+    (small.capture / "metadata.json").write_text(json.dumps({"classes": CLASSES}))
+    return small
+
+
+@pytest.fixture
+def both(labelled, splatseg, shared_data, tmp_path):
+    """Run evaluate, and the scorer on what render writes of the same views."""
+    script = shared_data.parent / "score" / "score.py"
+    out = tmp_path / "out"
+    words = ("--split", "all", "--what", "classes,objects", "-o", out, *CPU)
+    assert splatseg("render", labelled.scene, *words)[0] == 0
+
+    def run(ours: tuple, theirs: tuple) -> tuple[dict, dict]:
+        status, text, err = splatseg(
+            "evaluate", labelled.scene, *ours, "--split", "all", "--json", *CPU
+        )
+        assert status == 0, err
+        done = subprocess.run(
+            [sys.executable, str(script), *map(str, theirs)], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return json.loads(text), json.loads(done.stdout)
+
+    run.out = out
+    return run
+
+
+def test_instances_agree_with_the_scorer(labelled, both) -> None:
+    truth = labelled.capture / "instance"
+    ours, theirs = both(
+        ("--layer", "objects", "--truth", truth, "--metric", "instances"),
+        ("instances", "--pred", both.out / "objects", "--truth", truth),
+    )
+    assert 0.3 < theirs["mIoU"] < 0.95, "the case must test something"
+    for key, value in theirs.items():
+        assert ours[key] == pytest.approx(value, abs=1e-9), key
+    assert ours["learned_from"] == 1
+
+
+@pytest.mark.parametrize("ranked", [False, True])
+def test_panoptic_agrees_with_the_scorer(labelled, both, tmp_path, ranked) -> None:
+    capture, metadata = labelled.capture, labelled.capture / "metadata.json"
+    scores: tuple = ()
+    if ranked:
+        (tmp_path / "scores.json").write_text(json.dumps({"4": 0.1, "5": 0.5, "600": 0.9}))
+        scores = ("--scores", tmp_path / "scores.json")
+    ours, theirs = both(
+        (
+            "--layer", "classes", "--truth", capture / "semantic", "--metric", "panoptic",
+            "--instances", "objects", "--truth-instances", capture / "instance", *scores,
+        ),
+        (
+            "panoptic", "--pred-instance", both.out / "objects",
+            "--pred-semantic", both.out / "classes", "--truth-instance", capture / "instance",
+            "--truth-semantic", capture / "semantic", "--metadata", metadata, *scores,
+        ),
+    )  # fmt: skip
+    assert 0.1 < theirs["PQ_things"] < 0.95, "the case must test something"
+    assert 0.1 < theirs["mAP50"] < 1
+    for key, value in theirs.items():
+        assert ours[key] == pytest.approx(value, abs=1e-9), key
+    assert set(ours["PQ_per_class"]) == {"1", "2", "7"}
+    assert set(ours["AP50_per_class"]) == {"2", "7"}
+
+
+def test_points_agree_with_the_scorer(labelled, both, rng, tmp_path) -> None:
+    gaussians = load_scene(labelled.scene).gaussians
+    xyz = gaussians.means[rng.integers(0, len(gaussians), 400)].numpy()
+    xyz = (xyz + rng.normal(0, 0.05, xyz.shape)).astype(np.float32)
+    semantic = np.where(xyz[:, 0] < 0, 2, 7).astype(np.uint8)
+    semantic[:30] = 0
+    instance = np.where(xyz[:, 0] < 0, 21, 22).astype(np.uint16)
+    np.savez(tmp_path / "points.npz", xyz=xyz, semantic=semantic, instance=instance)
+    from splatseg.evaluate import labels_of_points
+    from splatseg.io.scene import load_scene_layer
+
+    ids = load_scene_layer(labelled.scene, "classes").ids
+    given = labels_of_points(gaussians, ids, torch.from_numpy(xyz)).numpy()
+    np.savez(tmp_path / "pred.npz", semantic=given)
+    ours, theirs = both(
+        ("--layer", "classes", "--points", tmp_path / "points.npz"),
+        ("points", "--pred", tmp_path / "pred.npz", "--truth", tmp_path / "points.npz"),
+    )
+    assert 0.5 < theirs["mIoU"] < 1
+    for key in ("mIoU", "fwIoU", "accuracy", "mAcc"):
+        assert ours[f"points_{key}"] == pytest.approx(theirs[key], abs=1e-9)
+    assert ours["points"] == 370
+    assert ours["points_unlabelled"] == pytest.approx((given[semantic > 0] < 0).mean())
+    assert "mIoU" not in ours
+    ours, _ = both(
+        (
+            "--layer", "objects", "--points", tmp_path / "points.npz", "--metric", "instances",
+            "--points-rule", "nearest",
+        ),
+        ("points", "--pred", tmp_path / "pred.npz", "--truth", tmp_path / "points.npz"),
+    )  # fmt: skip
+    assert ours["points_truth_instances"] == 2
+    assert ours["points_rule"] == "nearest"
+
+
+def test_tables_and_a_file(labelled, splatseg, tmp_path) -> None:
+    capture = labelled.capture
+    status, text, err = splatseg(
+        "evaluate", labelled.scene, "--layer", "classes", "--truth", capture / "semantic",
+        "--metric", "panoptic", "--instances", "objects",
+        "--truth-instances", capture / "instance", "--json-file", tmp_path / "a.json", *CPU,
+    )  # fmt: skip
+    assert status == 0, err
+    for word in ("PQ_scene", "mAP50", "left wall", "SQ", "average precision"):
+        assert word in text
+    figures = json.loads((tmp_path / "a.json").read_text())
+    assert figures["metric"] == "panoptic"
+    assert figures["views"] == 1
+    status, text, _ = splatseg(
+        "evaluate", labelled.scene, "--layer", "classes", "--truth", capture / "semantic", *CPU
+    )
+    assert status == 0
+    assert "boundary_mIoU" in text
+
+
+def test_boundaries_of_a_mask(labelled, splatseg) -> None:
+    ids = load_scene(labelled.scene).gaussians.means[:, 0]
+    save_scene_layer(labelled.scene, "right", Selection(mask=ids > 0.2))
+    words = ("--truth", labelled.capture / "semantic", "--metric", "binary", "--id", 7, "--json")
+    status, text, err = splatseg("evaluate", labelled.scene, "--layer", "right", *words, *CPU)
+    assert status == 0, err
+    figures = json.loads(text)
+    # One view: the mean over views is the pooled figure. An outline is harder than an area.
+    assert figures["boundary_IoU_pooled"] == figures["boundary_IoU_mean_over_views"]
+    assert 0.2 < figures["boundary_IoU_pooled"] < figures["IoU_pooled"] <= 1
+
+
+def refusals(labelled, tmp_path):
+    semantic, instance = labelled.capture / "semantic", labelled.capture / "instance"
+    layer = ("--layer", "classes")
+    panoptic = (*layer, "--truth", semantic, "--metric", "panoptic")
+    whole = (*panoptic, "--instances", "objects", "--truth-instances", instance)
+    np.savez(tmp_path / "flat.npz", xyz=np.zeros((3, 2)), semantic=np.ones(3, np.int64))
+    np.savez(tmp_path / "floats.npz", xyz=np.zeros((3, 3)), semantic=np.ones(3))
+    np.savez(tmp_path / "bare.npz", xyz=np.zeros((3, 3)))
+    (tmp_path / "bad.json").write_text('{"4": "high"}')
+    (tmp_path / "part").mkdir()
+    return [
+        (("--truth", semantic), "--layer"),
+        (layer, "--truth"),
+        (panoptic, "--instances"),
+        ((*layer, "--truth", semantic, "--instances", "objects"), "--metric panoptic"),
+        ((*whole, "--scores", tmp_path / "bad.json"), "bad.json: expected scores"),
+        ((*whole, "--instances", "nothing"), "nothing"),
+        ((*whole, "--metadata", tmp_path / "no.json"), "no.json"),
+        ((*whole, "--metadata", tmp_path / "bad.json"), "bad.json: expected a list of classes"),
+        ((*whole, "--truth-instances", tmp_path / "part"), "part: expected evidence"),
+        ((*layer, "--points", tmp_path / "no.npz"), "no.npz"),
+        ((*layer, "--points", tmp_path / "flat.npz"), "flat.npz: expected xyz of n x 3"),
+        ((*layer, "--points", tmp_path / "floats.npz"), "floats.npz: expected finite places"),
+        ((*layer, "--points", tmp_path / "bare.npz"), "bare.npz: expected an array 'semantic'"),
+        ((*layer, "--points", tmp_path / "bare.npz", "--metric", "binary"), "--points"),
+    ]
+
+
+def test_bad_input_gets_one_sentence(labelled, splatseg, tmp_path: Path) -> None:
+    for words, told in refusals(labelled, tmp_path):
+        status, _, err = splatseg("evaluate", labelled.scene, *words, *CPU)
+        assert status == 2, words
+        assert told in " ".join(err.split()), err
+        assert len(err.strip().splitlines()) <= 3
+
+
+def test_true_instances_of_every_view_are_needed(labelled, splatseg) -> None:
+    (labelled.capture / "instance" / "test_2.png").unlink()
+    words = (
+        "--layer", "classes", "--truth", labelled.capture / "semantic", "--metric", "panoptic",
+        "--instances", "objects", "--truth-instances", labelled.capture / "instance",
+    )  # fmt: skip
+    status, _, err = splatseg("evaluate", labelled.scene, *words, *CPU)
+    assert status == 2
+    assert "the first is test_2" in err
