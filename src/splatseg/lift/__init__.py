@@ -1,5 +1,7 @@
 """2D evidence to per-Gaussian layers, and layers back to label maps of views."""
 
+from splatseg.lift.complete import CompletionOptions as CompletionOptions
+from splatseg.lift.complete import complete as complete
 from splatseg.lift.label_maps import label_map as label_map
 from splatseg.lift.uplift import LabelSource as LabelSource
 from splatseg.lift.uplift import UpliftOptions as UpliftOptions

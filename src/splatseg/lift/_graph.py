@@ -1,0 +1,243 @@
+r"""The neighbour graph of Gaussians, and diffusion of label shares over it.
+
+Nodes are Gaussians, edges their nearest neighbours. An edge is as strong as its ends are alike:
+
+.. math:: w_{ij} = \exp\Bigl(-\frac{|x_i - x_j|^2}{2\,\sigma_i \sigma_j}
+              - \frac{|c_i - c_j|^2}{2\,\sigma_c^2}\Bigr)
+              \; \exp\Bigl(-\frac{|f_i - f_j|^2}{b\, m^2}\Bigr)
+
+with :math:`\sigma_i` the distance to node i's farthest neighbour, so that the graph does not
+depend on the unit of length, c colours in [0, 1], f features of unit length and m the median
+:math:`|f_i - f_j|` of all edges.
+
+Shares of ids are kept sparsely, a few a node, so that memory does not grow with the number of
+ids.
+
+References:
+    Zelnik-Manor and Perona, Self-Tuning Spectral Clustering (2004), eq. 5: the local widths.
+    Marrie et al., LUDVIG (2024), section 3.3: the feature affinity.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_ROWS = 65536
+"""Nodes handled at a time."""
+
+_FAINT = 1e-6
+"""Shares below this are dropped."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NodeAttributes:
+    """What edges compare, one row a node."""
+
+    positions: NDArray[np.float64]
+    colours: NDArray[np.float32] | None = None
+    features: NDArray[np.float32] | None = None
+    """Of any length; a row of zeros is a node of which nothing is known."""
+
+
+def neighbour_graph(
+    nodes: NodeAttributes, *, neighbours: int, colour_width: float, feature_width: float
+) -> Any:
+    """Symmetric edge strengths, scipy sparse rows (n, n), nothing on the diagonal.
+
+    An edge is there where either end is among the nearest of the other. Every node with a
+    neighbour keeps at least a trace of its edges, however unlike its neighbours are.
+
+    Args:
+        nodes: What edges compare.
+        neighbours: Nearest neighbours of a node, itself not counted, at least 1.
+        colour_width: Standard deviation of colours that count as alike.
+        feature_width: The factor b of the squared median distance of features.
+    """
+    import scipy.sparse
+
+    count = len(nodes.positions)
+    neighbours = min(neighbours, count - 1)
+    if neighbours < 1:
+        return scipy.sparse.csr_matrix((count, count), dtype=np.float32)
+    near, distance = _nearest(nodes.positions, neighbours)
+    # Where neighbours share a place all of them are as near as can be.
+    width = np.maximum(distance[:, -1].astype(np.float64), 1e-30)
+    unlike = np.empty((count, neighbours), dtype=np.float32)
+    for rows in _blocks(count):
+        scale = width[rows, None] * width[near[rows]]
+        unlike[rows] = distance[rows] ** 2 / (2 * scale)
+        if nodes.colours is not None:
+            apart = _squared(nodes.colours, rows, near[rows])
+            unlike[rows] += apart / (2 * colour_width**2)
+    if nodes.features is not None:
+        unlike += _feature_distances(nodes.features, near) / feature_width
+    # Beyond this float32 would leave a node with unlike neighbours without any.
+    strength = np.exp(-np.minimum(unlike, 60.0))
+    starts = np.arange(count + 1, dtype=np.int64) * neighbours
+    graph = scipy.sparse.csr_matrix(
+        (strength.reshape(-1), near.reshape(-1), starts), shape=(count, count)
+    )
+    graph = graph.maximum(graph.T).tocsr()
+    graph.sort_indices()
+    return graph
+
+
+def _nearest(
+    positions: NDArray[np.float64], neighbours: int
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Each node's nearest others (n, k) and how far they are, near ones first.
+
+    The tree's answer does not depend on how many threads ask it.
+    """
+    from scipy.spatial import KDTree
+
+    count = len(positions)
+    tree: Any = KDTree(positions)
+    near = np.empty((count, neighbours), dtype=np.int32)
+    distance = np.empty((count, neighbours), dtype=np.float32)
+    for rows in _blocks(count):
+        far, found = tree.query(positions[rows], k=neighbours + 1, workers=-1)
+        own = np.arange(rows.start, rows.start + len(found))[:, None]
+        # Where many share a place, a node may not be among its own nearest.
+        other = found != own
+        other[other.all(axis=1), -1] = False
+        near[rows] = found[other].reshape(-1, neighbours)
+        distance[rows] = far[other].reshape(-1, neighbours)
+    return near, distance
+
+
+def _squared(
+    values: NDArray[np.float32], rows: slice, near: NDArray[np.int32]
+) -> NDArray[np.float32]:
+    """Squared distances of a block of nodes to their neighbours, a channel at a time."""
+    total = np.zeros(near.shape, dtype=np.float32)
+    for channel in range(values.shape[1]):
+        column = values[:, channel]
+        total += (column[rows, None] - column[near]) ** 2
+    return total
+
+
+def _feature_distances(
+    features: NDArray[np.float32], near: NDArray[np.int32]
+) -> NDArray[np.float32]:
+    """Squared distances of unit features along edges, over their squared median.
+
+    Edges with an end of which nothing is known count as the median.
+    """
+    length = np.linalg.norm(features, axis=1)
+    known = length > 0
+    unit = (features / np.where(known, length, 1)[:, None]).astype(np.float32)
+    apart = np.concatenate([_squared(unit, rows, near[rows]) for rows in _blocks(len(near))])
+    both = known[:, None] & known[near]
+    median = float(np.median(apart[both])) if both.any() else 0.0
+    if not median > 0:
+        return np.zeros_like(apart)
+    return np.where(both, apart / median, np.float32(1.0))
+
+
+def walk(graph: Any) -> Any:
+    r"""Rows that add up to 1: :math:`P = D^{-1} W`, a step of a random walk.
+
+    Power iterations of P are those of the symmetric :math:`D^{-1/2} W D^{-1/2}` in other
+    coordinates, :math:`P = D^{-1/2} (D^{-1/2} W D^{-1/2}) D^{1/2}`; P's values are probabilities.
+    """
+    import scipy.sparse
+
+    degree = np.asarray(graph.sum(axis=1)).reshape(-1)
+    inverse = np.divide(1.0, degree, out=np.zeros_like(degree), where=degree > 0)
+    return (scipy.sparse.diags(inverse.astype(np.float32)) @ graph).tocsr()
+
+
+def diffuse(
+    step: Any,
+    shares: Any,
+    own: NDArray[np.float32],
+    *,
+    strength: float,
+    steps: int,
+    kept: int,
+) -> Any:
+    r"""Shares after some steps of giving neighbours a say.
+
+    .. math:: x_i \leftarrow \frac{o_i\, y_i + s \sum_j P_{ij} x_j}{o_i + s}
+
+    for nodes with finite o; a node with infinite o keeps its shares. The fixed point balances
+    what a node has seen itself against what its neighbours say.
+
+    Args:
+        step: P, sparse (n, n), rows that add up to at most 1.
+        shares: y, sparse (n, ids), rows that add up to at most 1.
+        own: o, (n,): how much a node's own shares count; 0 for a node that knows nothing.
+        strength: s, how much neighbours count, positive.
+        steps: How often.
+        kept: Largest shares of a node that are carried on, at least 1.
+
+    Returns:
+        x, sparse (n, ids).
+    """
+    import scipy.sparse
+
+    bound = np.isinf(own)
+    free, fixed = np.flatnonzero(~bound), np.flatnonzero(bound)
+    if not len(free):
+        return shares
+    held = own[free].astype(np.float64)
+    inward = scipy.sparse.diags((strength / (held + strength)).astype(np.float32)) @ step[free]
+    # What free nodes hear of themselves and of those that are bound never changes.
+    source = scipy.sparse.diags((held / (held + strength)).astype(np.float32)) @ shares[free]
+    source = (source + inward[:, fixed] @ shares[fixed]).tocsr()
+    inward = inward[:, free].tocsr()
+    now = shares[free]
+    for _ in range(steps):
+        now = scipy.sparse.vstack(
+            [
+                _strongest((source[rows] + inward[rows] @ now).tocsr(), kept)
+                for rows in _blocks(len(free))
+            ],
+            format="csr",
+        )
+    order = np.argsort(np.concatenate((free, fixed)), kind="stable")
+    together: Any = scipy.sparse.vstack([now, shares[fixed]], format="csr")
+    return together[order]
+
+
+def _strongest(table: Any, kept: int) -> Any:
+    """Each row's largest entries; of equals the one with the smaller id."""
+    import scipy.sparse
+
+    table.data[table.data < _FAINT] = 0
+    table.eliminate_zeros()
+    table.sort_indices()
+    sizes = np.diff(table.indptr)
+    if not len(sizes) or sizes.max() <= kept:
+        return table
+    row = np.repeat(np.arange(len(sizes)), sizes)
+    order = np.lexsort((table.indices, -table.data, row))
+    rank = np.arange(len(order)) - np.repeat(table.indptr[:-1], sizes)
+    chosen = np.sort(order[rank < kept])
+    starts = np.concatenate(([0], np.cumsum(np.minimum(sizes, kept))))
+    return scipy.sparse.csr_matrix(
+        (table.data[chosen], table.indices[chosen], starts), shape=table.shape
+    )
+
+
+def ranked(table: Any, kept: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Columns (n, kept), largest first, -1 where there are fewer, and their values."""
+    table = _strongest(table.tocsr().copy(), kept)
+    sizes = np.diff(table.indptr)
+    row = np.repeat(np.arange(len(sizes)), sizes)
+    order = np.lexsort((table.indices, -table.data, row))
+    rank = np.arange(len(order)) - np.repeat(table.indptr[:-1], sizes)
+    columns = np.full((len(sizes), kept), -1, dtype=np.int64)
+    values = np.zeros((len(sizes), kept), dtype=np.float32)
+    columns[row, rank] = table.indices[order]
+    values[row, rank] = table.data[order]
+    return columns, values
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    for start in range(0, count, _ROWS):
+        yield slice(start, min(start + _ROWS, count))

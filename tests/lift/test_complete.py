@@ -1,0 +1,338 @@
+"""Labels that spread to Gaussians without evidence."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+
+from splatseg.core import Features, Gaussians, Labels
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift import CompletionOptions, complete
+from splatseg.lift._graph import NodeAttributes, diffuse, neighbour_graph, ranked, walk
+
+from .conftest import gaussians_at
+
+
+def on_a_line(places, *, colours=None) -> Gaussians:
+    means = torch.zeros(len(places), 3)
+    means[:, 0] = torch.as_tensor(places, dtype=torch.float32)
+    gaussians = gaussians_at(means)
+    if colours is None:
+        return gaussians
+    sh = (torch.as_tensor(colours, dtype=torch.float32) - 0.5) / 0.28209479177387814
+    return gaussians.replace(sh=sh.reshape(-1, 1, 3))
+
+
+def hard(ids, *, confidence=None, evidence=None, **rest) -> Labels:
+    ids = torch.tensor(ids)
+    sure = (ids >= 0).float() if confidence is None else torch.tensor(confidence)
+    evidence = None if evidence is None else torch.tensor(evidence)
+    return Labels(ids=ids, confidence=sure, evidence=evidence, **rest)
+
+
+def labelled(gaussians, labels, features=None, **changes) -> Labels:
+    return complete(gaussians, labels, options=CompletionOptions(**changes), features=features)
+
+
+def test_edges_are_as_strong_as_the_formula_says() -> None:
+    """Four nodes on a line at 0, 1, 3, 4 with two neighbours each."""
+    positions = np.zeros((4, 3))
+    positions[:, 0] = (0, 1, 3, 4)
+    colours = np.zeros((4, 3), dtype=np.float32)
+    colours[1] = (0.3, 0, 0)
+    features = np.array([[2, 0], [1, 0], [0, 5], [0, 0]], dtype=np.float32)
+    nodes = NodeAttributes(positions=positions, colours=colours, features=features)
+    graph = neighbour_graph(nodes, neighbours=2, colour_width=0.2, feature_width=0.5).toarray()
+
+    width = (3.0, 2.0, 2.0, 3.0)  # to the second neighbour
+    # Squared distances of unit features along the edges i -> its two neighbours, known ends
+    # only: 0-1: 0, 0-2: 2, 1-0: 0, 1-2: 2, 2-1: 2; their median is 2.
+    apart = {(0, 1): 0.0, (0, 2): 2.0, (1, 2): 2.0, (2, 3): None, (1, 3): None}
+
+    def strength(i: int, j: int) -> float:
+        far = (positions[i, 0] - positions[j, 0]) ** 2 / (2 * width[i] * width[j])
+        coloured = ((colours[i] - colours[j]) ** 2).sum() / (2 * 0.2**2)
+        features = 1.0 if apart[i, j] is None else apart[i, j] / 2.0
+        return math.exp(-far - coloured - features / 0.5)
+
+    expected = np.zeros((4, 4))
+    for i, j in apart:
+        expected[i, j] = expected[j, i] = strength(i, j)
+    np.testing.assert_allclose(graph, expected, rtol=1e-5)
+
+
+def test_a_graph_keeps_its_edges_when_the_unit_of_length_changes(rng) -> None:
+    positions = rng.normal(size=(60, 3))
+
+    def graph(scale: float) -> np.ndarray:
+        nodes = NodeAttributes(positions=positions * scale)
+        return neighbour_graph(nodes, neighbours=5, colour_width=1, feature_width=1).toarray()
+
+    reference = graph(1.0)
+    assert np.array_equal(reference, reference.T)
+    assert not reference.diagonal().any()
+    np.testing.assert_allclose(graph(1000.0), reference, rtol=1e-4)
+    np.testing.assert_allclose(np.asarray(walk(graph_of(reference)).sum(axis=1)), 1, rtol=1e-6)
+
+
+def graph_of(dense: np.ndarray) -> scipy.sparse.csr_matrix:
+    return scipy.sparse.csr_matrix(dense.astype(np.float32))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_many_in_one_place_and_few_at_all(count: int) -> None:
+    """More neighbours are asked for than there are, and all are at the same place."""
+    nodes = NodeAttributes(positions=np.ones((count, 3)))
+    graph = neighbour_graph(nodes, neighbours=8, colour_width=1, feature_width=1).toarray()
+    np.testing.assert_array_equal(graph, np.ones((count, count)) - np.eye(count))
+
+
+def test_diffusion_is_the_formula(rng) -> None:
+    """Against dense matrices: some nodes held, some that know nothing, some that listen."""
+    count, ids, strength = 30, 4, 0.7
+    nodes = NodeAttributes(positions=rng.normal(size=(count, 3)))
+    step = walk(neighbour_graph(nodes, neighbours=4, colour_width=1, feature_width=1))
+    own = rng.uniform(0.1, 3.0, count).astype(np.float32)
+    own[::3] = np.inf
+    own[1::3] = 0
+    shares = rng.dirichlet(np.ones(ids), count).astype(np.float32)
+    expected = shares.astype(np.float64)
+    for _ in range(7):
+        heard = step.toarray() @ expected
+        with np.errstate(invalid="ignore"):
+            told = (own[:, None] * shares + strength * heard) / (own[:, None] + strength)
+        expected = np.where(np.isinf(own)[:, None], shares, told)
+    sparse = scipy.sparse.csr_matrix(shares)
+    result = diffuse(step, sparse, own, strength=strength, steps=7, kept=ids)
+    np.testing.assert_allclose(result.toarray(), expected, atol=1e-6)
+    columns, values = ranked(result, 2)
+    np.testing.assert_array_equal(columns[:, 0], expected.argmax(axis=1))
+    np.testing.assert_allclose(values, np.sort(expected, axis=1)[:, :-3:-1], atol=1e-6)
+
+
+def test_only_the_strongest_shares_are_carried() -> None:
+    """A node that hears of three ids alike passes on the two with the smaller names."""
+    step = scipy.sparse.csr_matrix(np.array([[0, 1 / 3, 1 / 3, 1 / 3], *np.zeros((3, 4))]))
+    shares = scipy.sparse.csr_matrix(np.array([[0, 0, 0], *np.eye(3)], dtype=np.float32))
+    own = np.array([0, np.inf, np.inf, np.inf], dtype=np.float32)
+    result = diffuse(step.astype(np.float32), shares, own, strength=1.0, steps=1, kept=2)
+    np.testing.assert_allclose(result.toarray()[0], [1 / 3, 1 / 3, 0], atol=1e-6)
+    columns, _ = ranked(result, 3)
+    assert columns[0].tolist() == [0, 1, -1]
+
+
+def test_the_unknown_between_two_known_takes_the_nearer_label() -> None:
+    gaussians = on_a_line([0.0, 1.0, 2.9, 4.0])
+    labels = hard([3, -1, -1, 8], evidence=[5.0, 0.0, 0.0, 5.0])
+    completed = labelled(gaussians, labels, neighbours=2)
+    assert completed.ids.tolist() == [3, 3, 8, 8]
+    assert completed.inferred is not None
+    assert completed.inferred.tolist() == [False, True, True, False]
+    assert completed.confidence[[0, 3]].tolist() == [1.0, 1.0]
+    assert bool((completed.confidence[1:3] > 0.5).all())
+    assert bool((completed.confidence[1:3] < 1.0).all())
+    assert completed.evidence is not None
+    assert completed.evidence.tolist() == [5.0, 0.0, 0.0, 5.0]
+    facts = completed.metadata["completion"]
+    assert (facts["inferred"], facts["corrected"], facts["unreached"]) == (2, 0, 0)
+
+
+def test_inferred_confidence_is_where_a_random_walk_ends() -> None:
+    """A chain of equal edges, known at both ends: the gambler's ruin."""
+    gaussians = on_a_line([0.0, 1.0, 2.0, 3.0, 4.0])
+    labels = hard([1, -1, -1, -1, 2], confidence=[1.0, 0.0, 0.0, 0.0, 0.8])
+    completed = labelled(gaussians, labels, neighbours=1, spread_steps=500)
+    assert completed.ids.tolist() == [1, 1, 1, 2, 2]
+    expected = [1.0, 0.75, 0.5, 0.75 * 0.8, 0.8]
+    assert completed.confidence.tolist() == pytest.approx(expected, abs=1e-3)
+
+
+def test_labels_go_no_farther_than_asked() -> None:
+    gaussians = on_a_line([0.0, 1.0, 2.0, 3.0])
+    labels = hard([1, -1, -1, -1])
+    for steps in (1, 2):
+        completed = labelled(gaussians, labels, neighbours=1, spread_steps=steps)
+        assert completed.ids.tolist() == [1] * (1 + steps) + [-1] * (3 - steps)
+        assert completed.metadata["completion"]["unreached"] == 3 - steps
+    unsure = labelled(gaussians, labels, neighbours=1, spread_steps=2, min_inferred=0.3)
+    assert unsure.ids.tolist() == [1, 1, -1, -1]
+    assert unsure.confidence.tolist()[2:] == [0.0, 0.0]
+
+
+def test_colour_and_features_say_to_whom_a_gaussian_belongs() -> None:
+    """The unknown lies in the middle of two known ones."""
+    places, labels = [0.0, 1.0, 2.0], hard([1, -1, 2])
+    red, blue = [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]
+    for left, right, wanted in ((red, blue, 1), (blue, red, 2)):
+        gaussians = on_a_line(places, colours=[left, red, right])
+        assert labelled(gaussians, labels, neighbours=2).ids.tolist() == [1, wanted, 2]
+        wide = labelled(gaussians, labels, neighbours=2, colour_width=1e3)
+        assert wide.confidence[1] == pytest.approx(0.5, abs=1e-3)
+    gaussians = on_a_line(places)
+    for values, wanted in (([[2, 0], [3, 0.1], [0, 1]], 1), ([[0, 1], [3, 0.1], [2, 0]], 2)):
+        features = Features(values=torch.tensor(values, dtype=torch.float32))
+        completed = labelled(gaussians, labels, features, neighbours=2)
+        assert completed.ids.tolist() == [1, wanted, 2]
+        assert float(completed.confidence[1]) > 0.6
+    nothing = Features(values=torch.zeros(3, 2))
+    assert labelled(gaussians, labels, nothing, neighbours=2).confidence[1] == pytest.approx(0.5)
+
+
+def test_little_evidence_does_not_speak_for_itself() -> None:
+    gaussians = on_a_line([0.0, 1.0, 2.0])
+    labels = hard([1, 7, 1], evidence=[3.0, 0.2, 3.0])
+    kept = labelled(gaussians, labels, neighbours=2)
+    assert kept.ids.tolist() == [1, 7, 1]
+    assert not bool(kept.inferred.any())
+    replaced = labelled(gaussians, labels, neighbours=2, own_evidence=0.2)
+    assert replaced.ids.tolist() == [1, 1, 1]
+    assert replaced.inferred.tolist() == [False, True, False]
+    nobody = labelled(gaussians, labels, own_evidence=3.0)
+    assert nobody.ids.tolist() == [-1, -1, -1]
+    assert nobody.confidence.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_soft_layers_stay_soft_and_known_rows_stay_as_they_are() -> None:
+    gaussians = on_a_line([0.0, 1.0, 2.0])
+    labels = Labels(
+        ids=torch.tensor([4, -1, 9]),
+        confidence=torch.tensor([0.7, 0.0, 0.9]),
+        candidates=torch.tensor([[4, 9], [-1, -1], [9, -1]]),
+        shares=torch.tensor([[0.7, 0.3], [0.0, 0.0], [0.9, 0.0]]),
+        background=2,
+    )
+    soft = labelled(gaussians, labels, neighbours=2)
+    assert soft.background == 2
+    assert soft.candidates is not None
+    assert soft.shares is not None
+    assert soft.candidates.tolist() == [[4, 9], [9, 4], [9, -1]]
+    # Both neighbours are alike: the mean of their shares.
+    expected = torch.tensor([[0.7, 0.3], [0.6, 0.35], [0.9, 0.0]])
+    torch.testing.assert_close(soft.shares, expected, rtol=0, atol=1e-4)
+    assert soft.ids.tolist() == [4, 9, 9]
+    flat = labelled(gaussians, labels, neighbours=2, completed_layer="hard")
+    assert flat.candidates is None
+    assert flat.shares is None
+    assert flat.ids.tolist() == [4, 9, 9]
+    unsure = labelled(gaussians, labels, neighbours=2, min_inferred=0.8)
+    assert unsure.candidates.tolist() == [[4, 9], [-1, -1], [9, -1]]
+
+
+def smoothed_by_hand(labels: Labels, *, strength: float, scale: float) -> torch.Tensor:
+    """Three in a row with equal edges and ids 1 and 2, iterated in full precision."""
+    step = torch.tensor([[0.0, 1, 0], [0.5, 0, 0.5], [0, 1, 0]], dtype=torch.float64)
+    own = labels.evidence.double().unsqueeze(1) / scale
+    given = (labels.ids.unsqueeze(1) == torch.tensor([1, 2])).double()
+    given = given * labels.confidence.double().unsqueeze(1)
+    now = given
+    for _ in range(10):
+        now = (own * given + strength * step @ now) / (own + strength)
+    return now
+
+
+def test_smoothing_corrects_what_little_evidence_says() -> None:
+    gaussians = on_a_line([0.0, 1.0, 2.0])
+    labels = hard([1, 2, 1], confidence=[0.9, 0.6, 0.9], evidence=[40.0, 2.0, 40.0])
+    given = {"neighbours": 1, "smoothing_evidence": 4.0}
+    assert labelled(gaussians, labels, **given).ids.tolist() == [1, 2, 1]
+    weak = labelled(gaussians, labels, smoothing=0.1, **given)
+    assert weak.ids.tolist() == [1, 2, 1]
+    assert not bool(weak.inferred.any())
+    strong = labelled(gaussians, labels, smoothing=2.0, **given)
+    assert strong.ids.tolist() == [1, 1, 1]
+    assert strong.inferred.tolist() == [False, True, False]
+    assert strong.metadata["completion"]["corrected"] == 1
+    for result, strength in ((weak, 0.1), (strong, 2.0)):
+        expected = smoothed_by_hand(labels, strength=strength, scale=4.0).amax(dim=1)
+        torch.testing.assert_close(result.confidence.double(), expected, rtol=0, atol=1e-5)
+
+
+def test_smoothing_and_filling_go_together() -> None:
+    gaussians = on_a_line([0.0, 1.0, 2.0, 3.0])
+    labels = hard([1, 2, 1, -1], evidence=[40.0, 1.0, 40.0, 0.0])
+    both = labelled(gaussians, labels, neighbours=2, smoothing=2.0)
+    assert both.ids.tolist() == [1, 1, 1, 1]
+    assert both.inferred.tolist() == [False, True, False, True]
+
+
+def test_completing_twice_is_completing_once(rng) -> None:
+    gaussians = gaussians_at(rng.normal(size=(80, 3)))
+    ids = rng.integers(-1, 4, 80)
+    evidence = np.where(ids < 0, 0, rng.uniform(0.1, 9, 80)).astype(np.float32)
+    labels = hard(ids.tolist(), evidence=evidence.tolist())
+    once = complete(gaussians, labels)
+    twice = complete(gaussians, once)
+    assert bool((once.ids >= 0).all())
+    assert torch.equal(once.ids, twice.ids)
+    assert torch.equal(once.confidence, twice.confidence)
+    assert torch.equal(once.inferred, twice.inferred)
+
+
+def test_order_of_the_gaussians_changes_nothing(rng) -> None:
+    gaussians = gaussians_at(rng.normal(size=(120, 3)))
+    ids = rng.integers(-1, 5, 120)
+    labels = hard(ids.tolist(), evidence=rng.uniform(0.1, 9, 120).astype(np.float32).tolist())
+    order = torch.from_numpy(rng.permutation(120))
+    for smoothing in (0.0, 1.0):
+        here = labelled(gaussians, labels, smoothing=smoothing)[order]
+        there = labelled(gaussians[order], labels[order], smoothing=smoothing)
+        assert torch.equal(here.ids, there.ids)
+        assert torch.equal(here.inferred, there.inferred)
+        torch.testing.assert_close(here.confidence, there.confidence, rtol=0, atol=1e-5)
+
+
+def test_nothing_known_nothing_there() -> None:
+    unknown = complete(on_a_line([0.0, 1.0]), hard([-1, -1]))
+    assert unknown.ids.tolist() == [-1, -1]
+    assert unknown.metadata["completion"]["unreached"] == 2
+    assert len(complete(gaussians_at(torch.zeros(0, 3)), hard([]))) == 0
+    assert complete(on_a_line([0.0]), hard([3])).ids.tolist() == [3]
+    assert complete(on_a_line([0.0]), hard([-1])).ids.tolist() == [-1]
+    # A label whose confidence is 0 is still known.
+    sure = complete(on_a_line([0.0, 1.0]), hard([6, -1], confidence=[0.0, 0.0]))
+    assert sure.ids.tolist() == [6, 6]
+
+
+def test_what_was_done_is_recorded() -> None:
+    labels = hard([1, -1], metadata={"method": "uplift"})
+    metadata = json.loads(json.dumps(dict(complete(on_a_line([0.0, 1.0]), labels).metadata)))
+    assert metadata["method"] == "uplift"
+    assert metadata["completion"]["options"]["spread_steps"] == 50
+
+
+def test_bad_input_is_refused() -> None:
+    gaussians, labels = on_a_line([0.0, 1.0]), hard([1, -1], evidence=[1.0, 0.0])
+    with pytest.raises(ShapeError, match="labels: expected 2 rows, one a Gaussian, got 1"):
+        complete(gaussians, hard([1]))
+    with pytest.raises(ShapeError, match="features: expected 2 rows, one a Gaussian, got 3"):
+        complete(gaussians, labels, features=Features(values=torch.ones(3, 1)))
+    with pytest.raises(RangeError, match=r"features\.values: 1 of 2 values are not finite"):
+        complete(gaussians, labels, features=Features(values=torch.tensor([[1.0], [math.nan]])))
+    with pytest.raises(RangeError, match=r"labels\.evidence: 1 of 2"):
+        complete(gaussians, hard([1, -1], evidence=[math.inf, 0.0]))
+    with pytest.raises(RangeError, match=r"labels\.confidence: 1 of 2"):
+        complete(gaussians, hard([1, -1], confidence=[math.nan, 0.0]))
+    with pytest.raises(RangeError, match="means"):
+        complete(on_a_line([0.0, math.nan]), labels)
+    with pytest.raises(InputError, match="smoothing: expected a layer that says how much"):
+        labelled(gaussians, hard([1, -1]), smoothing=1.0)
+    for wrong in (
+        {"neighbours": 0},
+        {"spread_steps": 0},
+        {"smoothing_steps": 0},
+        {"own_evidence": -1.0},
+        {"own_evidence": math.inf},
+        {"smoothing": -0.1},
+        {"smoothing": math.nan},
+        {"smoothing_evidence": 0.0},
+        {"colour_width": 0.0},
+        {"feature_width": -1.0},
+        {"min_inferred": 1.5},
+    ):
+        with pytest.raises(RangeError, match=next(iter(wrong))):
+            CompletionOptions(**wrong)
+    with pytest.raises(InputError, match="completed_layer"):
+        CompletionOptions(completed_layer="sharp")
