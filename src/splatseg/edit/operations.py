@@ -1,0 +1,209 @@
+r"""Edits of Gaussians: pure functions from Gaussians and a selection to `Edited`.
+
+Nothing is changed in place. Rows that stay keep their order; what is added comes behind them.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg._check import check_finite
+from splatseg.core import Gaussians, Selection, Similarity
+from splatseg.core.sh import SH_C0, degree_of
+from splatseg.edit._edited import NEW, Edited
+from splatseg.errors import InputError, RangeError, ShapeError
+
+
+def extract(gaussians: Gaussians, selection: Selection) -> Edited:
+    """Keep what is selected, and nothing else.
+
+    Raises:
+        ShapeError: If the selection is of other Gaussians.
+        InputError: If nothing is selected.
+    """
+    rows = _selected(gaussians, selection)
+    return Edited(gaussians=gaussians[rows], rows=rows)
+
+
+def remove(gaussians: Gaussians, selection: Selection) -> Edited:
+    """Leave out what is selected.
+
+    Raises:
+        ShapeError: If the selection is of other Gaussians.
+        InputError: If nothing is selected, or everything: an empty scene is no edit of one.
+    """
+    if len(_selected(gaussians, selection)) == len(gaussians):
+        raise InputError(f"selection: expected to leave Gaussians, got all {len(gaussians)}.")
+    rows = (~selection).ids
+    return Edited(gaussians=gaussians[rows], rows=rows)
+
+
+def duplicate(
+    gaussians: Gaussians,
+    selection: Selection,
+    target_from_source: Similarity,
+) -> Edited:
+    """Add a copy of what is selected, moved by a similarity; copies keep their labels.
+
+    Raises:
+        ShapeError: If the selection is of other Gaussians.
+        InputError: If nothing is selected.
+    """
+    rows = _selected(gaussians, selection)
+    copy = gaussians[rows].transformed(target_from_source)
+    return Edited(
+        gaussians=Gaussians.concatenate([gaussians, copy]),
+        rows=torch.cat((torch.arange(len(gaussians)), rows)),
+    )
+
+
+def transform(
+    gaussians: Gaussians,
+    target_from_source: Similarity,
+    *,
+    selection: Selection | None = None,
+) -> Edited:
+    """Move, turn and scale what is selected, in place; None is everything.
+
+    Centres, axes, sizes and harmonics follow (`Gaussians.transformed`); opacities stay.
+
+    Raises:
+        ShapeError: If the selection is of other Gaussians.
+        InputError: If nothing is selected.
+    """
+    if selection is None:
+        moved = gaussians.transformed(target_from_source)
+        return Edited(gaussians=moved, rows=torch.arange(len(gaussians)))
+    rows = _selected(gaussians, selection)
+    moved = gaussians[rows].transformed(target_from_source)
+    return Edited(
+        gaussians=gaussians.replace(
+            means=gaussians.means.index_copy(0, rows, moved.means),
+            rotations=gaussians.rotations.index_copy(0, rows, moved.rotations),
+            scales=gaussians.scales.index_copy(0, rows, moved.scales),
+            sh=gaussians.sh.index_copy(0, rows, moved.sh),
+        ),
+        rows=torch.arange(len(gaussians)),
+    )
+
+
+def recolour(
+    gaussians: Gaussians,
+    selection: Selection | None = None,
+    *,
+    colour: Sequence[float] | None = None,
+    scale: Sequence[float] = (1.0, 1.0, 1.0),
+    shift: Sequence[float] = (0.0, 0.0, 0.0),
+    view_dependent: bool = True,
+) -> Edited:
+    r"""Change colours: set them, or scale and shift them.
+
+    A colour is :math:`c(d) = 0.5 + Y_0 f_0 + \sum_{k > 0} Y_k(d) f_k`. With scale a and shift b
+    it becomes :math:`a \, c(d) + b` for every direction d:
+
+    .. math:: f_0' = \frac{a (0.5 + Y_0 f_0) + b - 0.5}{Y_0}, \qquad f_k' = a f_k
+
+    A colour that is set replaces :math:`0.5 + Y_0 f_0`, the mean over directions, first.
+
+    Args:
+        gaussians: The Gaussians.
+        selection: Which; None is all of them.
+        colour: Red, green and blue in [0, 1] that the mean colour becomes; None keeps it.
+        scale: Factor of each channel, not negative.
+        shift: Added to each channel after that, in [-1, 1].
+        view_dependent: Whether what changes with the direction stays, scaled. Without, the
+            Gaussians look the same from everywhere.
+
+    Raises:
+        ShapeError: If the selection is of other Gaussians, or a colour has not three channels.
+        RangeError: If a value is out of range.
+        InputError: If nothing is selected.
+    """
+    rows = torch.arange(len(gaussians)) if selection is None else _selected(gaussians, selection)
+    factor = _channels("scale", scale, 0.0, math.inf)
+    added = _channels("shift", shift, -1.0, 1.0)
+    sh = gaussians.sh[rows]
+    mean = 0.5 + SH_C0 * sh[:, 0]
+    if colour is not None:
+        mean = _channels("colour", colour, 0.0, 1.0).to(sh).expand_as(mean)
+    first = (factor.to(sh) * mean + added.to(sh) - 0.5) / SH_C0
+    rest = sh[:, 1:] * factor.to(sh) if view_dependent else torch.zeros_like(sh[:, 1:])
+    changed = torch.cat((first.unsqueeze(1), rest), dim=1)
+    return Edited(
+        gaussians=gaussians.replace(sh=gaussians.sh.index_copy(0, rows, changed)),
+        rows=torch.arange(len(gaussians)),
+    )
+
+
+def merge(
+    gaussians: Gaussians,
+    other: Gaussians,
+    *,
+    target_from_other: Similarity | None = None,
+) -> Edited:
+    """Add the Gaussians of another scene behind these; their rows are -1.
+
+    Harmonics of the lower degree are filled up with zeros, which changes no colour. Extra
+    columns that only one of the two has are 0 for the other.
+
+    Args:
+        gaussians: The scene that keeps its frame.
+        other: What is added.
+        target_from_other: From the frame of `other` to that of `gaussians`; None where they
+            share one.
+
+    Raises:
+        InputError: If the two are meant for different rendering, or a column of theirs differs
+            in width.
+    """
+    if target_from_other is not None:
+        other = other.transformed(target_from_other)
+    other = other.to(device=gaussians.device, dtype=gaussians.dtype)
+    coefficients = max(gaussians.sh.shape[1], other.sh.shape[1])
+    names = {**dict(gaussians.extra), **dict(other.extra)}
+    parts = [_filled_up(part, coefficients, names) for part in (gaussians, other)]
+    rows = torch.cat((torch.arange(len(gaussians)), torch.full((len(other),), NEW)))
+    return Edited(gaussians=Gaussians.concatenate(parts), rows=rows)
+
+
+def _filled_up(part: Gaussians, coefficients: int, columns: dict[str, Tensor]) -> Gaussians:
+    missing = coefficients - part.sh.shape[1]
+    degree_of(coefficients)
+    extra: dict[str, Tensor] = {}
+    for name, example in columns.items():
+        own = part.extra.get(name)
+        if own is not None and own.shape[1:] != example.shape[1:]:
+            raise InputError(
+                f"extra[{name!r}]: expected the same width in both scenes, got "
+                f"{tuple(own.shape[1:])} and {tuple(example.shape[1:])}."
+            )
+        extra[name] = example.new_zeros(len(part), *example.shape[1:]) if own is None else own
+    return part.replace(
+        sh=torch.cat((part.sh, part.sh.new_zeros(len(part), missing, 3)), dim=1), extra=extra
+    )
+
+
+def _selected(gaussians: Gaussians, selection: Selection) -> Tensor:
+    """Rows of a selection, after a check that it belongs to these Gaussians and has any."""
+    if len(selection) != len(gaussians):
+        raise ShapeError(
+            f"selection: expected one over {len(gaussians)} Gaussians, "
+            f"got one over {len(selection)}."
+        )
+    rows = selection.ids
+    if not len(rows):
+        raise InputError("selection: expected at least one Gaussian, got none.")
+    return rows.to(gaussians.device)
+
+
+def _channels(name: str, values: Sequence[float], low: float, high: float) -> Float[Tensor, "3"]:
+    tensor = torch.tensor([float(value) for value in values], dtype=torch.float64)
+    if tensor.shape != (3,):
+        raise ShapeError(f"{name}: expected red, green and blue, got {len(tensor)} numbers.")
+    check_finite(name, tensor)
+    if bool(((tensor < low) | (tensor > high)).any()):
+        raise RangeError(f"{name}: expected values in [{low:g}, {high:g}], got {tensor.tolist()}.")
+    return tensor
