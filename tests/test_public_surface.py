@@ -41,7 +41,19 @@ SURFACE = {
     "write_splats",
 }
 
-PACKAGES = {"adopt", "core", "evaluate", "fit", "io", "lift", "pose", "render", "synthetic"}
+PACKAGES = {
+    "adopt",
+    "core",
+    "edit",
+    "evaluate",
+    "fit",
+    "io",
+    "lift",
+    "models",
+    "pose",
+    "render",
+    "synthetic",
+}
 
 
 def written_imports() -> dict[str, str]:

@@ -21,10 +21,12 @@ from splatseg.errors import SplatsegError as SplatsegError
 if TYPE_CHECKING:
     from splatseg import adopt as adopt
     from splatseg import core as core
+    from splatseg import edit as edit
     from splatseg import evaluate as evaluate
     from splatseg import fit as fit
     from splatseg import io as io
     from splatseg import lift as lift
+    from splatseg import models as models
     from splatseg import pose as pose
     from splatseg import render as render
     from splatseg import synthetic as synthetic
@@ -70,7 +72,19 @@ _HOMES = {
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
 }
 _PACKAGES = frozenset(
-    {"adopt", "core", "evaluate", "fit", "io", "lift", "pose", "render", "synthetic"}
+    {
+        "adopt",
+        "core",
+        "edit",
+        "evaluate",
+        "fit",
+        "io",
+        "lift",
+        "models",
+        "pose",
+        "render",
+        "synthetic",
+    }
 )
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 

@@ -54,6 +54,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.doctor",
         summary="what is wrong with a capture's cameras and points, and a corrected copy",
     ),
+    "see": CommandEntry(
+        module="splatseg.cli.see",
+        summary="a 2D model, or evidence recorded elsewhere -> evidence of the photographs",
+    ),
     "segment": CommandEntry(
         module="splatseg.cli.segment",
         summary="evidence (label maps, masks, features) -> a layer of the scene",

@@ -429,8 +429,8 @@ def test_the_header_tells_kind_classes_and_version(tmp_path) -> None:
     (folder / "evidence.json").write_text(json.dumps(header | {"version": 2}))
     with pytest.raises(FileFormatError, match="version 1 or less, got version 2"):
         open_evidence(folder)
-    with pytest.raises(InputError, match="kind: expected one of labels, masks, features"):
-        create_evidence(tmp_path / "f", kind="tracked")
+    with pytest.raises(InputError, match="kind: expected one of labels, panoptic, tracked, masks"):
+        create_evidence(tmp_path / "f", kind="depth")
     with pytest.raises(InputError, match="metadata"):
         create_evidence(tmp_path / "f", kind="labels", metadata={"a": object()})
     assert not (tmp_path / "f").exists()

@@ -14,7 +14,7 @@ HEADER_FILE = "evidence.json"
 CONFIDENCE_FOLDER = "_confidence"
 # Files of a folder of evidence that are not of a view.
 _TABLES = frozenset({HEADER_FILE, "segments.json", "tracks.json", "legend.json"})
-_SHARED_ARRAYS = frozenset({"quant.npz", "basis.npz"})
+_SHARED_ARRAYS = frozenset({"quant.npz", "basis.npz", "text_embeddings.npz"})
 
 
 class Evidence(ABC):

@@ -25,10 +25,13 @@ from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"
+TEXT_FILE = "text_embeddings.npz"
 
 
-def read_npz(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Named arrays of an npz.
+def read_npz(
+    path: Path, names: Sequence[str], *, optional: Sequence[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Named arrays of an npz, and those of the optional ones that are there.
 
     Raises:
         MissingFileError: If there is no such file.
@@ -44,7 +47,8 @@ def read_npz(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
             if missing:
                 found = ", ".join(archive.files)
                 raise FileFormatError(f"{path}: expected an array {missing[0]!r}, got {found}.")
-            return {name: archive[name] for name in names}
+            there = [name for name in optional if name in archive.files]
+            return {name: archive[name] for name in (*names, *there)}
     except FileFormatError:
         raise
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -194,8 +198,9 @@ def load_text_embeddings(path: Path) -> TextEmbeddings:
         MissingFileError: If there is none.
         FileFormatError: If it holds something else.
     """
-    path = path / "text_embeddings.npz" if path.is_dir() else path
+    path = path / TEXT_FILE if path.is_dir() else path
     arrays = read_npz(path, ["labels", "vectors", "kind", "target_id"])
+    _check_finite(path, "vectors", arrays["vectors"])
     count = len(arrays["labels"])
     if arrays["vectors"].ndim != 2 or any(len(array) != count for array in arrays.values()):
         raise FileFormatError(f"{path}: expected one vector, kind and target_id a label.")
@@ -212,6 +217,8 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
     if (folder / BASIS_FILE).is_file():
         path = folder / BASIS_FILE
         shared = read_npz(path, ["scale", "offset", "stride", "basis", "mean"])
+        for name in ("scale", "offset", "basis", "mean"):
+            _check_finite(path, name, shared[name])
         return FeatureEvidence(
             root=folder,
             files=files,
@@ -222,7 +229,10 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
             mean=shared["mean"].astype(np.float32),
         )
     if (folder / QUANTISATION_FILE).is_file():
-        shared = read_npz(folder / QUANTISATION_FILE, ["scale", "offset", "stride", "blocks"])
+        path = folder / QUANTISATION_FILE
+        shared = read_npz(path, ["scale", "offset", "stride", "blocks"])
+        for name in ("scale", "offset"):
+            _check_finite(path, name, shared[name])
         return FeatureEvidence(
             root=folder,
             files=files,
@@ -234,11 +244,29 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
     return FeatureEvidence(root=folder, files=files)
 
 
+def _check_finite(path: Path, name: str, values: NDArray[Any]) -> None:
+    bad = values.size - int(np.isfinite(values).sum()) if values.dtype.kind == "f" else 0
+    if bad:
+        raise FileFormatError(
+            f"{path}: expected finite {name}, got {bad} of {values.size} values that are NaN or "
+            "infinite."
+        )
+
+
+def holds_masks(path: Path) -> bool:
+    """Whether a file is an npz with masks."""
+    return _holds(path, "masks.npy")
+
+
 def holds_features(path: Path) -> bool:
     """Whether a file is an npz with features in our own layout."""
+    return _holds(path, "features.npy")
+
+
+def _holds(path: Path, entry: str) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
-            return "features.npy" in archive.namelist()
+            return entry in archive.namelist()
     except (OSError, zipfile.BadZipFile):
         return False
 
@@ -246,6 +274,7 @@ def holds_features(path: Path) -> bool:
 def _own_features(path: Path) -> FeatureMap:
     arrays = read_npz(path, ["features", "stride", "size"])
     features, size = arrays["features"], arrays["size"]
+    _check_finite(path, "features", features)
     if features.ndim != 3 or features.dtype.kind != "f" or size.shape != (2,):
         raise FileFormatError(
             f"{path}: expected features of shape (rows, columns, channels) and a size, "

@@ -1,10 +1,14 @@
-"""Masks: a JSON a view with COCO run lengths, as SAM's automatic mask generator writes them."""
+"""Masks: COCO run lengths, an npz, or a folder of pictures a view.
 
+The JSON and the folder are what SAM's automatic mask generator writes.
+"""
+
+import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -14,6 +18,11 @@ from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet, Rle
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io._json import read_json
 from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
+from splatseg.io.evidence._features import read_npz
+from splatseg.io.evidence._labels import read_id_map
+
+MASK_TABLE = "metadata.csv"
+"""What SAM's tool writes beside the pictures of masks of one photograph."""
 
 _SCORES = ("score", "predicted_iou")
 
@@ -56,11 +65,102 @@ class MaskEvidence(Evidence):
 
     @override
     def masks(self, name: str) -> MaskSet:
-        return read_masks(file_of(self.files, name, self.root))
+        return read_any_masks(file_of(self.files, name, self.root))
 
     @override
     def features(self, name: str) -> FeatureMap:
         refuse(self, "features")
+
+
+def read_any_masks(path: Path) -> MaskSet:
+    """The masks of one view: a JSON, an npz or a folder of pictures."""
+    if path.is_dir():
+        return read_mask_pictures(path)
+    return read_mask_arrays(path) if path.suffix == ".npz" else read_masks(path)
+
+
+def read_mask_arrays(path: Path) -> MaskSet:
+    """The masks of an npz: ``masks`` (m, height, width), ``scores`` and ``levels`` may lack.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it holds anything else.
+    """
+    arrays = read_npz(path, ["masks"], optional=["scores", "levels"])
+    masks = arrays["masks"]
+    if masks.ndim != 3 or masks.dtype.kind not in "bui" or (masks.size and masks.min() < 0):
+        raise FileFormatError(
+            f"{path}: expected masks of shape (masks, height, width) in booleans or 0 and 1, "
+            f"got {masks.dtype} of {masks.shape}."
+        )
+    count = len(masks)
+    scores, levels = arrays.get("scores", np.ones(count)), arrays.get("levels", np.zeros(count))
+    if scores.shape != (count,) or levels.shape != (count,) or not np.isfinite(scores).all():
+        raise FileFormatError(
+            f"{path}: expected a finite score and a level for each of {count} masks, "
+            f"got {scores.shape} and {levels.shape}."
+        )
+    return MaskSet(
+        height=int(masks.shape[1]),
+        width=int(masks.shape[2]),
+        masks=tuple(Rle.encode(torch.from_numpy(mask != 0)) for mask in masks),
+        scores=torch.from_numpy(scores.astype(np.float32)).clamp(0, 1),
+        levels=torch.from_numpy(levels.astype(np.int32)),
+    )
+
+
+def read_mask_pictures(folder: Path) -> MaskSet:
+    """The masks of a folder of pictures, zero outside a mask, in the order of their numbers.
+
+    Scores are ``predicted_iou`` of the metadata.csv that SAM's tool writes beside them, else 1.
+
+    Raises:
+        FileFormatError: If they differ in size, have colours, or metadata.csv does not fit.
+    """
+    files = sorted(folder.glob("*.png"), key=lambda p: (len(p.stem), p.stem))
+    if not files:
+        raise FileFormatError(f"{folder}: expected PNG pictures of masks, got none.")
+    scores = _picture_scores(folder / MASK_TABLE)
+    arrays = [read_id_map(path) for path in files]
+    for path, array in zip(files, arrays, strict=True):
+        if array.shape != arrays[0].shape:
+            raise FileFormatError(
+                f"{path}: expected {arrays[0].shape[1]}x{arrays[0].shape[0]} pixels as "
+                f"{files[0].name} has, got {array.shape[1]}x{array.shape[0]}."
+            )
+    return MaskSet(
+        height=int(arrays[0].shape[0]),
+        width=int(arrays[0].shape[1]),
+        masks=tuple(Rle.encode(torch.from_numpy(array != 0)) for array in arrays),
+        scores=torch.tensor([scores.get(path.stem, 1.0) for path in files]).clamp(0, 1),
+        levels=torch.zeros(len(files), dtype=torch.int32),
+    )
+
+
+def mask_folders(folder: Path, *, told_by: Literal["metadata.csv", "*.png"]) -> dict[str, Path]:
+    """Folders of mask pictures by view name: those with SAM's metadata.csv, or any with PNGs."""
+    named = {path.parent for path in folder.rglob(told_by)}
+    return {
+        path.relative_to(folder).as_posix(): path
+        for path in sorted(named - {folder})
+        if not any(part.startswith((".", "_")) for part in path.relative_to(folder).parts)
+    }
+
+
+def _picture_scores(path: Path) -> dict[str, float]:
+    if not path.is_file():
+        return {}
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        scores = {row["id"]: float(row["predicted_iou"]) for row in rows}
+    except (KeyError, TypeError, ValueError, csv.Error, OSError) as error:
+        raise FileFormatError(
+            f"{path}: expected the columns id and predicted_iou, as SAM's tool writes ({error})."
+        ) from error
+    if not all(math.isfinite(score) for score in scores.values()):
+        raise FileFormatError(f"{path}: expected finite scores, got others.")
+    return scores
 
 
 def read_masks(path: Path) -> MaskSet:

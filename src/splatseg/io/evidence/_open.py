@@ -9,15 +9,16 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io._class_rows import class_table
 from splatseg.io._json import read_json
 from splatseg.io.captures import read_metadata
-from splatseg.io.evidence._base import HEADER_FILE, Evidence, view_files
+from splatseg.io.evidence._base import HEADER_FILE, Evidence, EvidenceKind, view_files
 from splatseg.io.evidence._features import (
     BASIS_FILE,
     QUANTISATION_FILE,
     holds_features,
+    holds_masks,
     open_features,
 )
 from splatseg.io.evidence._labels import LabelEvidence, check_rule
-from splatseg.io.evidence._masks import MaskEvidence
+from splatseg.io.evidence._masks import MaskEvidence, mask_folders
 from splatseg.io.evidence._segments import (
     SEGMENTS_FILE,
     TRACKS_FILE,
@@ -37,7 +38,11 @@ _TRUTH_TABLES = {"instance": "instances", "part": "parts", "depth": ""}
 
 
 def open_evidence(
-    folder: Path | str, *, zero_is_class: bool = False, void: int | None = None
+    folder: Path | str,
+    *,
+    zero_is_class: bool = False,
+    void: int | None = None,
+    kind: EvidenceKind | None = None,
 ) -> Evidence:
     """Open a folder of evidence, ours or recorded by others; no view is read yet.
 
@@ -49,6 +54,8 @@ def open_evidence(
         zero_is_class: Of label maps whose 0 is a real class: every id grows by 1 in memory,
             and `Evidence.source_ids` tells the ids of the files.
         void: A further id of label maps that means none, such as 255.
+        kind: What it holds, where its files could be two things; None looks at them. A folder
+            of folders of PNGs is label maps unless SAM's metadata.csv or this says masks.
 
     Raises:
         MissingFileError: If there is no such folder.
@@ -62,8 +69,10 @@ def open_evidence(
     rule = check_rule(zero_is_class, void)
     maps, arrays = view_files(folder, ".png"), view_files(folder, ".npz")
     objects = view_files(folder, ".json")
-    kind = header.get("kind") or _kind(folder, maps, objects, arrays)
-    if kind in ("labels", "panoptic", "tracked"):
+    if kind is not None and header.get("kind", kind) != kind:
+        raise InputError(f"{folder}: expected evidence of {kind}, got {header['kind']}.")
+    found: str | None = kind or header.get("kind") or _kind(folder, maps, objects, arrays)
+    if found in ("labels", "panoptic", "tracked"):
         labels = LabelEvidence(
             root=folder,
             files=maps,
@@ -71,17 +80,30 @@ def open_evidence(
             rule=rule,
             recorded=_recorded_ids(folder, header),
         )
-        if kind == "labels":
+        if found == "labels":
             return labels
-        return open_panoptic(labels) if kind == "panoptic" else open_tracked(labels)
-    if kind == "masks":
-        return MaskEvidence(root=folder, files=objects)
-    if kind == "features":
+        return open_panoptic(labels) if found == "panoptic" else open_tracked(labels)
+    if found == "masks":
+        files = objects or arrays or mask_folders(folder, told_by="*.png")
+        return MaskEvidence(root=folder, files=files)
+    if found == "features":
         return open_features(folder, arrays)
     raise InputError(
         f"{folder}: expected evidence (PNG label maps, JSON masks or npz features, one a view), "
         "got a folder of something else."
     )
+
+
+def evidence_header(folder: Path | str) -> dict[str, Any] | None:
+    """The evidence.json of a folder that splatseg wrote, None where there is none.
+
+    ``metadata`` tells how it was made; ``metadata.complete`` is false while views are missing
+    because the work was stopped.
+
+    Raises:
+        FileFormatError: If it is broken, or of a later version.
+    """
+    return _header(Path(folder)) or None
 
 
 def find_evidence(places: Iterable[Path], name: str) -> Path:
@@ -146,6 +168,8 @@ def _kind(
     arrays: Mapping[str, Path],
 ) -> str | None:
     """The kind that files without a header show; the first one must hold what its kind has."""
+    if maps and mask_folders(folder, told_by="metadata.csv"):
+        return "masks"
     if maps:
         if (folder / SEGMENTS_FILE).is_file():
             return "panoptic"
@@ -156,6 +180,8 @@ def _kind(
         return "features" if arrays else None
     if arrays and holds_features(next(iter(arrays.values()))):
         return "features"
+    if arrays and holds_masks(next(iter(arrays.values()))):
+        return "masks"
     return None
 
 

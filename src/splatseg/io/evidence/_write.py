@@ -1,6 +1,6 @@
 """Writes evidence: a folder with evidence.json and one file a view, each whole or not there."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,10 @@ from splatseg.io.evidence._base import CONFIDENCE_FOLDER, HEADER_FILE, EvidenceK
 from splatseg.io.evidence._labels import CONFIDENCE_STEPS
 from splatseg.io.evidence._masks import masks_content
 from splatseg.io.evidence._open import FORMAT, VERSION
+from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE, Segment, Track
 from splatseg.io.images import write_png
 
-_WRITTEN = ("labels", "masks", "features")
+_WRITTEN = ("labels", "panoptic", "tracked", "masks", "features")
 _MAX_ID = 65535
 
 
@@ -38,7 +39,8 @@ def create_evidence(
 
     Args:
         folder: The folder, usually SCENE/evidence/NAME. Its parent must exist.
-        kind: labels, masks or features.
+        kind: labels, panoptic, tracked, masks or features. The label maps of panoptic and
+            tracked evidence need the table of `save_segments` or `save_tracks` beside them.
         classes: Names of the ids, where they have some.
         source_ids: The model's own id by id written, where they differ.
         metadata: How it was made, in values that JSON holds.
@@ -105,6 +107,41 @@ def save_masks(folder: Path | str, name: str, masks: MaskSet) -> None:
     path = _view_path(Path(folder), name, ".json")
     with atomic_file(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
+
+
+def save_segments(folder: Path | str, segments: Mapping[str, Sequence[Segment]]) -> None:
+    """Write the table of panoptic evidence: the segments of each view by its name.
+
+    Raises:
+        InputError: If an id or category is 0 or less (a category of -1 is none), or two
+            segments of a view share an id.
+    """
+    content: dict[str, Any] = {}
+    for name, rows in segments.items():
+        ids = [segment.id for segment in rows]
+        if any(id < 1 for id in ids) or len(set(ids)) != len(ids):
+            raise InputError(f"{name}: expected segments with ids of their own from 1 on.")
+        content[name] = {
+            "segments_info": [
+                {
+                    "id": segment.id,
+                    "category_id": max(segment.category, 0),
+                    "isthing": segment.isthing,
+                    "score": segment.score,
+                }
+                for segment in rows
+            ]
+        }
+    write_json(Path(folder) / SEGMENTS_FILE, content)
+
+
+def save_tracks(folder: Path | str, tracks: Sequence[Track], *, order: Sequence[str]) -> None:
+    """Write the table of tracked evidence: the tracks, and the views as they were gone through."""
+    content = {
+        "order": list(order),
+        "tracks": {str(track.id): {"category_votes": dict(track.votes)} for track in tracks},
+    }
+    write_json(Path(folder) / TRACKS_FILE, content)
 
 
 def save_features(folder: Path | str, name: str, features: FeatureMap) -> None:

@@ -1,0 +1,183 @@
+"""Evidence from a model that is run, directly or through a cache."""
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from typing_extensions import override
+
+from splatseg._check import check_choice
+from splatseg.core import ClassTable, FeatureMap, LabelMap, View
+from splatseg.errors import InputError, ShapeError
+from splatseg.io._json import read_json, write_json
+from splatseg.io.evidence import (
+    SEGMENTS_FILE,
+    EvidenceKind,
+    save_features,
+    save_label_map,
+    save_masks,
+    save_segments,
+)
+from splatseg.io.images import load_image
+from splatseg.models._cache import ModelCache
+from splatseg.models._protocols import (
+    AutomaticMasks,
+    DenseFeatures,
+    Image,
+    Model,
+    PanopticSegments,
+    SemanticLabels,
+    TextFeatures,
+)
+from splatseg.models._sources import SEGMENT_PARTS, Source, What, some, without_empty
+
+_PROTOCOLS: dict[What, type[Any]] = {
+    "masks": AutomaticMasks,
+    "panoptic": PanopticSegments,
+    "labels": SemanticLabels,
+    "text": TextFeatures,
+    "features": DenseFeatures,
+}
+_KINDS: dict[What, EvidenceKind] = {
+    "masks": "masks",
+    "panoptic": "panoptic",
+    "labels": "labels",
+    "text": "features",
+    "features": "features",
+}
+
+
+def abilities(model: Model) -> tuple[What, ...]:
+    """What a model can be asked for, the most telling first."""
+    return tuple(what for what, protocol in _PROTOCOLS.items() if isinstance(model, protocol))
+
+
+def computed(model: Model, *, what: What | None, cache: ModelCache | None) -> Source:
+    """Evidence from running a model.
+
+    Raises:
+        InputError: If the model cannot give this, or nothing at all.
+    """
+    can = abilities(model)
+    if not can:
+        raise InputError(f"model {model.name!r}: expected one that gives evidence of views.")
+    if what is None:
+        what = can[0]
+    check_choice("what", what, _PROTOCOLS)
+    if what not in can:
+        raise InputError(
+            f"model {model.name!r}: expected one of what it gives ({', '.join(can)}), got {what!r}."
+        )
+    return _Computed(model=model, asked=what, cache=cache)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Computed(Source):
+    model: Any
+    asked: What
+    cache: ModelCache | None
+    counts: dict[str, int] = field(default_factory=dict[str, int])
+    """Masks by view, for the notes."""
+
+    @property
+    @override
+    def kind(self) -> EvidenceKind:
+        return _KINDS[self.asked]
+
+    @property
+    @override
+    def what(self) -> str:
+        return self.asked
+
+    @override
+    def available(self, views: Sequence[View]) -> frozenset[str]:
+        return frozenset(view.name for view in views)
+
+    @override
+    def classes(self) -> ClassTable | None:
+        if self.asked == "labels":
+            return self.model.classes
+        return self.model.categories if self.asked == "panoptic" else None
+
+    @override
+    def source_ids(self) -> Mapping[int, int] | None:
+        return None
+
+    @override
+    def details(self) -> Mapping[str, Any]:
+        return {}
+
+    @override
+    def check_target(self, folder: Path) -> None:
+        return None
+
+    @override
+    def start(self, folder: Path, views: Sequence[View]) -> None:
+        return None
+
+    @override
+    def write(self, folder: Path, view: View) -> int:
+        image = load_image(view)
+        if self.asked == "masks":
+            masks = without_empty(self._ask(ModelCache.masks, self.model.masks, image))
+            self._check_size(view, masks.height, masks.width)
+            save_masks(folder, view.name, masks)
+            self.counts[view.name] = len(masks)
+            return len(masks)
+        if self.asked == "labels":
+            ids = self._ask(ModelCache.label_map, self.model.label_map, image)
+            self._check_size(view, ids.height, ids.width)
+            save_label_map(folder, view.name, ids)
+        elif self.asked == "panoptic":
+            self._write_panoptic(folder, view, image)
+        elif self.asked == "features":
+            deep = self._ask(ModelCache.features, self.model.features, image)
+            self._write_features(folder, view, deep.maps[-1])
+        else:
+            features = self._ask(ModelCache.text_features, self.model.text_features, image)
+            self._write_features(folder, view, features)
+        return 0
+
+    @override
+    def finish(self, folder: Path) -> None:
+        if self.asked != "panoptic":
+            return
+        parts, path = folder / SEGMENT_PARTS, folder / SEGMENTS_FILE
+        table = read_json(path) if path.is_file() else {}
+        for part in sorted(parts.rglob(SEGMENTS_FILE)):
+            table |= read_json(part)
+        write_json(path, table)
+        shutil.rmtree(parts, ignore_errors=True)
+
+    @override
+    def notes(self) -> tuple[str, ...]:
+        none = [name for name, count in self.counts.items() if not count]
+        if not none:
+            return ()
+        return (f"{len(none)} of {len(self.counts)} views have no mask at all ({some(none)}).",)
+
+    def _ask(self, cached: Callable[..., Any], direct: Callable[[Image], Any], image: Image) -> Any:
+        return direct(image) if self.cache is None else cached(self.cache, self.model, image)
+
+    def _check_size(self, view: View, height: int, width: int) -> None:
+        camera = view.camera
+        if (height, width) != (camera.height, camera.width):
+            raise ShapeError(
+                f"model {self.model.name!r}: view {view.name!r}: expected {camera.width}x"
+                f"{camera.height} pixels as the photograph has, got {width}x{height}."
+            )
+
+    def _write_features(self, folder: Path, view: View, features: FeatureMap) -> None:
+        self._check_size(view, features.height, features.width)
+        save_features(folder, view.name, features)
+
+    def _write_panoptic(self, folder: Path, view: View, image: Image) -> None:
+        found = self._ask(ModelCache.panoptic, self.model.panoptic, image)
+        self._check_size(view, found.ids.height, found.ids.width)
+        part = folder / SEGMENT_PARTS / view.name
+        part.mkdir(parents=True, exist_ok=True)
+        # Before the label map, which is what tells that the view is done.
+        save_segments(part, {view.name: found.segments})
+        save_label_map(folder, view.name, LabelMap(ids=found.ids.ids))

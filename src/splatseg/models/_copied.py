@@ -1,0 +1,210 @@
+"""Evidence that others recorded, checked against the views and copied into our own layout."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from typing_extensions import override
+
+from splatseg.core import UNLABELLED, ClassTable, LabelMap, View
+from splatseg.errors import InputError
+from splatseg.io._atomic import atomic_file
+from splatseg.io.evidence import (
+    TEXT_FILE,
+    Evidence,
+    EvidenceKind,
+    FeatureEvidence,
+    LabelEvidence,
+    PanopticEvidence,
+    TrackedEvidence,
+    save_features,
+    save_label_map,
+    save_masks,
+    save_segments,
+    save_tracks,
+)
+from splatseg.models._sources import Source, some, without_empty
+from splatseg.models.recorded import AnyRecorded, check_grid, check_size
+
+_SHARED = ("quant.npz", "basis.npz")
+_ASKED: Mapping[str, tuple[EvidenceKind, ...]] = {
+    "masks": ("masks",),
+    "labels": ("labels", "tracked"),
+    "panoptic": ("panoptic",),
+    "features": ("features",),
+    "text": ("features",),
+}
+
+
+def copied(
+    model: AnyRecorded,
+    views: Sequence[View],
+    *,
+    what: str | None,
+    missing: Literal["refuse", "skip"],
+) -> Source:
+    """Evidence from a folder.
+
+    Raises:
+        InputError: If it is of another kind, or lacks views.
+    """
+    evidence = model.recording.evidence
+    if what is not None and evidence.kind not in _ASKED.get(what, ()):
+        raise InputError(f"{evidence.folder}: expected evidence of {what}, got {evidence.kind}.")
+    there = frozenset(evidence.view_names)
+    lacking = [view.name for view in views if view.name not in there]
+    if len(lacking) == len(views):
+        raise InputError(
+            f"{evidence.folder}: expected evidence of the views asked for ({some(lacking)}), got "
+            f"none of them but {len(there)} others ({some(sorted(there))})."
+        )
+    if lacking and missing == "refuse":
+        raise InputError(
+            f"{evidence.folder}: {len(lacking)} of the {len(views)} views asked for are missing "
+            f"({some(lacking)}); name those that are there, or allow missing ones."
+        )
+    return _Copied(evidence=evidence, lacking=tuple(lacking))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Copied(Source):
+    evidence: Evidence
+    lacking: tuple[str, ...]
+    empty: list[str] = field(default_factory=list[str])
+    """Views with empty masks, one entry a mask."""
+
+    bare: list[str] = field(default_factory=list[str])
+    """Views without any mask or id."""
+
+    unnamed: set[int] = field(default_factory=set[int])
+    """Ids that the class table does not name."""
+
+    @property
+    @override
+    def kind(self) -> EvidenceKind:
+        return self.evidence.kind
+
+    @property
+    @override
+    def what(self) -> str:
+        return self.evidence.kind
+
+    @override
+    def available(self, views: Sequence[View]) -> frozenset[str]:
+        return frozenset(self.evidence.view_names)
+
+    @override
+    def classes(self) -> ClassTable | None:
+        if isinstance(self.evidence, TrackedEvidence):
+            return self.evidence.maps.table  # of the categories; tracks name themselves
+        return self.evidence.classes
+
+    @override
+    def source_ids(self) -> Mapping[int, int] | None:
+        return self.evidence.source_ids
+
+    @override
+    def details(self) -> Mapping[str, Any]:
+        return {"views_missing": list(self.lacking)}
+
+    @override
+    def check_target(self, folder: Path) -> None:
+        source, target = self.evidence.folder.resolve(), folder.resolve()
+        if source == target or target in source.parents or source in target.parents:
+            raise InputError(
+                f"{folder}: expected another folder than the recorded evidence itself, "
+                f"{self.evidence.folder}."
+            )
+
+    @override
+    def start(self, folder: Path, views: Sequence[View]) -> None:
+        evidence = self.evidence
+        if isinstance(evidence, PanopticEvidence):
+            save_segments(folder, {view.name: evidence.segments(view.name) for view in views})
+        elif isinstance(evidence, TrackedEvidence):
+            save_tracks(folder, evidence.tracks, order=evidence.order)
+        elif isinstance(evidence, FeatureEvidence):
+            for name in _SHARED:
+                _copy(evidence.folder / name, folder / name)
+            words = evidence.folder / TEXT_FILE
+            beside = evidence.folder.absolute().parent / TEXT_FILE
+            if evidence.basis is not None or words.is_file():
+                _copy(words if words.is_file() else beside, folder / TEXT_FILE)
+
+    @override
+    def write(self, folder: Path, view: View) -> int:
+        name, size = view.name, (view.camera.height, view.camera.width)
+        evidence = self.evidence
+        if evidence.kind == "masks":
+            masks = evidence.masks(name)
+            check_size(evidence, name, (masks.height, masks.width), size)
+            whole = without_empty(masks)
+            self.empty.extend([name] * (len(masks) - len(whole)))
+            if not len(whole):
+                self.bare.append(name)
+            save_masks(folder, name, whole)
+            return len(whole)
+        if isinstance(evidence, FeatureEvidence):
+            self._write_features(evidence, folder, view)
+            return 0
+        maps = (
+            evidence.maps if isinstance(evidence, (PanopticEvidence, TrackedEvidence)) else evidence
+        )
+        ids = maps.label_map(name)
+        check_size(evidence, name, (ids.height, ids.width), size)
+        self._note_ids(ids)
+        if not bool((ids.ids != UNLABELLED).any()):
+            self.bare.append(name)
+        save_label_map(folder, name, ids)
+        return 0
+
+    @override
+    def finish(self, folder: Path) -> None:
+        return None
+
+    @override
+    def notes(self) -> tuple[str, ...]:
+        notes: list[str] = []
+        if self.lacking:
+            notes.append(f"{len(self.lacking)} views have no evidence ({some(self.lacking)}).")
+        if self.empty:
+            views = sorted(set(self.empty))
+            notes.append(
+                f"{len(self.empty)} masks without a pixel were left out (in {some(views)})."
+            )
+        if self.bare:
+            what = "mask" if self.evidence.kind == "masks" else "label"
+            notes.append(f"{len(self.bare)} views have no {what} at all ({some(self.bare)}).")
+        if self.unnamed:
+            ids = some([str(id) for id in sorted(self.unnamed)])
+            notes.append(
+                f"Ids that the class table does not name are used ({ids}); --void makes one none."
+            )
+        return tuple(notes)
+
+    def _note_ids(self, ids: LabelMap) -> None:
+        table = self.evidence.classes if isinstance(self.evidence, LabelEvidence) else None
+        if table is not None:
+            named = {row.id for row in table.rows}
+            present = {int(id) for id in torch.unique(ids.ids).tolist()}
+            self.unnamed.update(present - named - {UNLABELLED})
+
+    def _write_features(self, evidence: FeatureEvidence, folder: Path, view: View) -> None:
+        features = evidence.features(view.name)
+        check_grid(evidence, view.name, features, (view.camera.height, view.camera.width))
+        if evidence.scale is None:
+            save_features(folder, view.name, features)
+            return
+        # Quantised features stay as they are: all depths, at their size.
+        target = folder / f"{view.name}.npz"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _copy(evidence.files[view.name], target)
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.is_file():
+        with atomic_file(target) as temporary:
+            shutil.copyfile(source, temporary)

@@ -1,0 +1,205 @@
+"""Evidence of a scene's views, written view by view: what ``splatseg see`` does."""
+
+import importlib.metadata
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from splatseg.core import View
+from splatseg.errors import InputError
+from splatseg.io._json import json_text, parse_object
+from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header
+from splatseg.models._cache import ModelCache
+from splatseg.models._computed import computed
+from splatseg.models._copied import copied
+from splatseg.models._protocols import Model
+from splatseg.models._sources import Source, What, some, views_done
+from splatseg.models.recorded import AnyRecorded
+
+_SAME = ("model", "settings", "what")
+"""What must be as it was for interrupted work to go on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenEvidence:
+    """What was written."""
+
+    folder: Path
+    kind: EvidenceKind
+    views: int
+    """Views with evidence, those that were there before included."""
+
+    kept: int
+    """Views that were there before."""
+
+    masks: int | None
+    """Masks of the views written now; None where the kind has none."""
+
+    seconds: float
+    """Wall time of the views written now."""
+
+    bytes: int
+    """Size of the folder."""
+
+    notes: tuple[str, ...]
+    """What the user should know of the evidence, a sentence each."""
+
+
+def record_evidence(
+    model: Model,
+    views: Sequence[View],
+    folder: Path | str,
+    *,
+    what: What | None = None,
+    asked: str = "train",
+    overwrite: bool = False,
+    missing: Literal["refuse", "skip"] = "refuse",
+    cache: ModelCache | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> SeenEvidence:
+    """Write what a model sees in views, one view at a time; a second call does what is left.
+
+    A recorded model's evidence is checked and copied; no photograph is read for it.
+
+    Args:
+        model: The model, or a recorded one.
+        views: The views to look at.
+        folder: Where to write, usually SCENE/evidence/NAME. Its parent must exist.
+        what: Masks, labels, panoptic, features or text; None takes what the model has, masks
+            before the others.
+        asked: How the views were asked for; recorded, so that it can be seen later what the
+            evidence may be used for.
+        overwrite: Whether evidence of the same name is deleted first.
+        missing: Whether it is an error that recorded evidence lacks a view.
+        cache: Where to look before the model is run.
+        progress: Called with the number of views done and of all.
+
+    Raises:
+        InputError: If the model has no such thing, the folder holds something else or was made
+            with other settings, or recorded evidence lacks views.
+        FileFormatError: If recorded evidence is broken or has not the photograph's size.
+    """
+    folder = Path(folder)
+    if not views:
+        raise InputError("views: expected at least one view, got none.")
+    source = (
+        copied(model, views, what=what, missing=missing)
+        if isinstance(model, AnyRecorded)
+        else computed(model, what=what, cache=cache)
+    )
+    source.check_target(folder)
+    available = source.available(views)
+    wanted = [view for view in views if view.name in available]
+    metadata = _metadata(model, source, asked)
+    done = _begin(folder, source, wanted, metadata, overwrite=overwrite)
+    todo = [view for view in wanted if view.name not in done]
+    source.start(folder, wanted)
+    started = time.monotonic()
+    masks = 0
+    for i, view in enumerate(todo):
+        if progress is not None:
+            progress(len(done) + i, len(wanted))
+        masks += source.write(folder, view)
+    if progress is not None:
+        progress(len(wanted), len(wanted))
+    seconds = time.monotonic() - started
+    source.finish(folder)
+    _write_header(folder, source, metadata | {"complete": True})
+    return SeenEvidence(
+        folder=folder,
+        kind=source.kind,
+        views=len(wanted),
+        kept=len(done),
+        masks=masks if source.kind == "masks" else None,
+        seconds=seconds,
+        bytes=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
+        notes=source.notes(),
+    )
+
+
+def _metadata(model: Model, source: Source, asked: str) -> dict[str, Any]:
+    metadata = {
+        "model": model.name,
+        "settings": dict(model.settings),
+        "what": source.what,
+        "note": model.note,
+        "views_asked": asked,
+        "versions": {"splatseg": importlib.metadata.version("splatseg")},
+        "complete": False,
+        **source.details(),
+    }
+    # As it will be read back, so that the two can be compared.
+    return parse_object(json_text("metadata", metadata), where="metadata")
+
+
+def _begin(
+    folder: Path,
+    source: Source,
+    wanted: Sequence[View],
+    metadata: Mapping[str, Any],
+    *,
+    overwrite: bool,
+) -> frozenset[str]:
+    """Make the folder, or see what of the work is done there; gives the views to skip."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder to write evidence to, got a file.")
+    if not folder.parent.is_dir():
+        raise InputError(f"{folder}: expected a folder of evidence in a folder that is there.")
+    header = evidence_header(folder) if folder.is_dir() else None
+    if folder.is_dir() and header is None and any(folder.iterdir()):
+        raise InputError(
+            f"{folder}: expected a new folder or evidence that splatseg wrote, got other files."
+        )
+    if header is not None and overwrite:
+        shutil.rmtree(folder)
+        header = None
+    if header is None:
+        folder.mkdir(exist_ok=True)
+        _write_header(folder, source, metadata)
+        return frozenset()
+    _check_same(folder, header, source, metadata)
+    there = views_done(folder, source.kind)
+    extra = sorted(there - {view.name for view in wanted})
+    if extra:
+        raise InputError(
+            f"{folder}: holds {len(extra)} views that are not asked for now ({some(extra)}); ask "
+            "for them too, overwrite it, or choose another name."
+        )
+    _write_header(folder, source, metadata)
+    return there
+
+
+def _check_same(
+    folder: Path, header: Mapping[str, Any], source: Source, metadata: Mapping[str, Any]
+) -> None:
+    recorded = header.get("metadata")
+    before: Mapping[str, Any] = recorded if isinstance(recorded, dict) else {}  # pyright: ignore[reportUnknownVariableType]
+    differs = [key for key in _SAME if before.get(key) != metadata[key]]
+    if header.get("kind") != source.kind or differs:
+        changed = ", ".join(_difference(key, before.get(key), metadata[key]) for key in differs)
+        raise InputError(
+            f"{folder}: holds evidence made in another way "
+            f"({changed or 'kind ' + str(header.get('kind'))}); overwrite it or choose another "
+            "name."
+        )
+
+
+def _difference(key: str, before: object, now: object) -> str:
+    """What differs, down to the setting."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        keys = [k for k in {**now, **before} if before.get(k) != now.get(k)]  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]
+        return ", ".join(_difference(str(k), before.get(k), now.get(k)) for k in keys)  # pyright: ignore[reportUnknownArgumentType, reportUnknownMemberType]
+    return f"{key} {before!r:.60} there, {now!r:.60} now"
+
+
+def _write_header(folder: Path, source: Source, metadata: Mapping[str, Any]) -> None:
+    create_evidence(
+        folder,
+        kind=source.kind,
+        classes=source.classes(),
+        source_ids=source.source_ids(),
+        metadata=metadata,
+    )

@@ -1,0 +1,218 @@
+"""Greedy merging of neighbouring regions into one binary tree.
+
+Leaves are superpixels 0..n-1; merge k makes node n + k. The next merge is always the pair of
+neighbours with the least cost; ties go to the smaller pair of numbers, so that the tree depends
+on the image alone.
+"""
+
+import heapq
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.models.classical._boundary import PixelFeatures
+
+_COLOUR_SCALE = 25.0
+"""Distance of mean colours, in units of Lab, that counts as a full one."""
+
+_AREA_POWER = 0.25
+"""How much small regions come first: cost grows with the smaller area to this power."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MergeTree:
+    """A binary tree over superpixels; costs never fall on the way to the root."""
+
+    leaves: int
+    left: NDArray[np.int64]
+    """(merges,): first child of node leaves + k."""
+
+    right: NDArray[np.int64]
+    cost: NDArray[np.float64]
+    """(merges,): cost at which node leaves + k came to be, monotone."""
+
+    contrast: NDArray[np.float64]
+    """(nodes,): mean boundary strength along the outline shared with neighbours."""
+
+    area: NDArray[np.int64]
+    """(nodes,): pixels."""
+
+    @property
+    def nodes(self) -> int:
+        """Leaves and merges."""
+        return self.leaves + len(self.cost)
+
+    def birth(self) -> NDArray[np.float64]:
+        """Cost at which each node came to be; 0 of leaves."""
+        return np.concatenate((np.zeros(self.leaves), self.cost))
+
+    def death(self) -> NDArray[np.float64]:
+        """Cost at which each node was merged into another; infinite of roots."""
+        death = np.full(self.nodes, np.inf)
+        death[self.left] = self.cost
+        death[self.right] = self.cost
+        return death
+
+    def members(self, nodes: Iterable[int]) -> dict[int, NDArray[np.int64]]:
+        """Leaves below each of some nodes."""
+        # Leaves in the order of a walk through the tree: below a node they are neighbours.
+        first = np.zeros(self.nodes, np.int64)
+        count = np.ones(self.nodes, np.int64)
+        for k, (left, right) in enumerate(zip(self.left, self.right, strict=True)):
+            count[self.leaves + k] = count[left] + count[right]
+        place = 0
+        for root in np.flatnonzero(np.isinf(self.death())).tolist():
+            first[root] = place
+            place += int(count[root])
+        for k in range(len(self.cost) - 1, -1, -1):
+            node, left, right = self.leaves + k, self.left[k], self.right[k]
+            first[left] = first[node]
+            first[right] = first[node] + count[left]
+        order = np.empty(self.leaves, np.int64)
+        order[first[: self.leaves]] = np.arange(self.leaves)
+        return {node: order[first[node] : first[node] + count[node]] for node in nodes}
+
+
+def merge_tree(labels: NDArray[np.int32], features: PixelFeatures) -> MergeTree:
+    """Merge the regions of a label map (0..n-1, each connected) until none has a neighbour."""
+    state = _Merging(labels, features)
+    state.run()
+    return state.tree()
+
+
+class _Merging:
+    """The regions as they are now. Rows of the arrays are nodes; edges live in dictionaries."""
+
+    def __init__(self, labels: NDArray[np.int32], features: PixelFeatures) -> None:
+        n = int(labels.max()) + 1
+        size = 2 * n - 1
+        self.leaves = n
+        self.next = n
+        flat = labels.reshape(-1)
+        self.total = flat.size
+        self.area = np.zeros(size)
+        self.area[:n] = np.bincount(flat, minlength=n)
+        self.lab = self._means(flat, features.lab, n, size)
+        self.bins = self._means(flat, features.bins, n, size)
+        self.texture = self._means(flat, features.texture, n, size)
+        self.neighbours = _edges(labels, features.strength, size)
+        self.outline = {k: _outline(edges) for k, edges in enumerate(self.neighbours[:n])}
+        self.left: list[int] = []
+        self.right: list[int] = []
+        self.cost: list[float] = []
+
+    def _means(
+        self, flat: NDArray[np.int32], image: NDArray[np.float32], n: int, size: int
+    ) -> NDArray[np.float64]:
+        out = np.zeros((size, image.shape[2]))
+        for k in range(image.shape[2]):
+            out[:n, k] = np.bincount(flat, weights=image[..., k].reshape(-1), minlength=n)
+        out[:n] /= np.maximum(self.area[:n, None], 1)
+        return out
+
+    def costs(self, a: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Cost of merging `a` with each of its neighbours."""
+        edges = self.neighbours[a]
+        shared = np.array([edges[b] for b in others.tolist()])
+        boundary = shared[:, 0] / shared[:, 1]
+        overlap = np.sqrt(self.bins[a] * self.bins[others]).sum(1) / 3
+        mixture = np.sqrt(np.maximum(1 - overlap, 0))
+        colour = np.sqrt(((self.lab[a] - self.lab[others]) ** 2).sum(1)) / _COLOUR_SCALE
+        grain = np.sqrt(((self.texture[a] - self.texture[others]) ** 2).sum(1))
+        unlike = boundary + 0.5 * mixture + 0.5 * np.minimum(colour, 2.0) + 0.5 * grain
+        smaller = np.minimum(self.area[a], self.area[others]) / self.total
+        return unlike * smaller**_AREA_POWER
+
+    def run(self) -> None:
+        heap: list[tuple[float, int, int]] = []
+        for a in range(self.leaves):
+            others = np.array([b for b in sorted(self.neighbours[a]) if b > a], np.int64)
+            if len(others):
+                for b, cost in zip(others.tolist(), self.costs(a, others).tolist(), strict=True):
+                    heap.append((cost, a, b))
+        heapq.heapify(heap)
+        alive = np.zeros(2 * self.leaves - 1, bool)
+        alive[: self.leaves] = True
+        while heap:
+            cost, a, b = heapq.heappop(heap)
+            if not (alive[a] and alive[b]):
+                continue
+            node = self.merge(a, b, cost)
+            alive[a] = alive[b] = False
+            alive[node] = True
+            others = np.array(sorted(self.neighbours[node]), np.int64)
+            if len(others):
+                new = self.costs(node, others).tolist()
+                for other, value in zip(others.tolist(), new, strict=True):
+                    heapq.heappush(heap, (value, other, node))
+
+    def merge(self, a: int, b: int, cost: float) -> int:
+        """Make one node of two."""
+        node = self.next
+        self.next += 1
+        wa, wb = self.area[a], self.area[b]
+        self.area[node] = wa + wb
+        for values in (self.lab, self.bins, self.texture):
+            values[node] = (wa * values[a] + wb * values[b]) / (wa + wb)
+        joined: dict[int, tuple[float, float]] = {}
+        for old in (a, b):
+            for other, (strength, length) in self.neighbours[old].items():
+                if other in (a, b):
+                    continue
+                s, m = joined.get(other, (0.0, 0.0))
+                joined[other] = (s + strength, m + length)
+                del self.neighbours[other][old]
+        for other, edge in joined.items():
+            self.neighbours[other][node] = edge
+        self.neighbours[node] = joined
+        self.outline[node] = _outline(joined)
+        self.left.append(a)
+        self.right.append(b)
+        self.cost.append(max(cost, self.cost[-1] if self.cost else 0.0))
+        return node
+
+    def tree(self) -> MergeTree:
+        nodes = self.leaves + len(self.cost)
+        return MergeTree(
+            leaves=self.leaves,
+            left=np.array(self.left, np.int64),
+            right=np.array(self.right, np.int64),
+            cost=np.array(self.cost),
+            contrast=np.array([self.outline[k] for k in range(nodes)]),
+            area=self.area[:nodes].astype(np.int64),
+        )
+
+
+def _outline(edges: Mapping[int, tuple[float, float]]) -> float:
+    """Mean boundary strength along the outline of a region; 0 of one without neighbours."""
+    length = sum(length for _, length in edges.values())
+    return sum(strength for strength, _ in edges.values()) / length if length else 0.0
+
+
+def _edges(
+    labels: NDArray[np.int32], strength: NDArray[np.float32], size: int
+) -> list[dict[int, tuple[float, float]]]:
+    """Of each region its neighbours: boundary strength summed along the border, and its length."""
+    n = int(labels.max()) + 1
+    codes: list[NDArray[np.int64]] = []
+    values: list[NDArray[np.float64]] = []
+    for here, there in (
+        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+    ):
+        a, b = labels[here].astype(np.int64), labels[there].astype(np.int64)
+        differ = a != b
+        low, high = np.minimum(a, b)[differ], np.maximum(a, b)[differ]
+        codes.append(low * n + high)
+        values.append(np.maximum(strength[here], strength[there])[differ].astype(np.float64))
+    code = np.concatenate(codes)
+    pairs, place = np.unique(code, return_inverse=True)
+    lengths = np.bincount(place, minlength=len(pairs)).astype(np.float64)
+    sums = np.bincount(place, weights=np.concatenate(values), minlength=len(pairs))
+    found: list[dict[int, tuple[float, float]]] = [{} for _ in range(size)]
+    for pair, total, length in zip(pairs.tolist(), sums.tolist(), lengths.tolist(), strict=True):
+        found[pair // n][pair % n] = (total, length)
+        found[pair % n][pair // n] = (total, length)
+    return found
