@@ -1,0 +1,277 @@
+"""Segments of all views, and how much of each Gaussian each of them holds.
+
+Views are taken in the order of their names and segments in that of their first pixels, so that
+neither the order in which views come nor what their segments are called has any influence.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg.core import UNLABELLED, Gaussians, LabelMap, MaskSet, View
+from splatseg.errors import InputError
+from splatseg.lift._clustering import Agreement
+from splatseg.lift._masses import view_masses
+from splatseg.lift.uplift import camera_of_map
+from splatseg.render import RenderOptions
+
+_LEAST_WEIGHT = 0.05
+"""A view that sees less of a Gaussian than so many pixels says nothing about it."""
+
+_LEAST_SHARE = 0.1
+"""A segment that holds less than this share of what a view sees of a Gaussian only touches it."""
+
+_LEAST_MASS = 1e-3
+
+
+class SegmentSource(Protocol):
+    """Segments of views, each view with ids of its own."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have segments."""
+        ...
+
+    @property
+    def overlapping(self) -> bool:
+        """Whether segments of one view may overlap."""
+        ...
+
+    def segments_of(self, name: str) -> LabelMap | MaskSet:
+        """The segments of one view: a label map, or masks that may overlap."""
+        ...
+
+    def categories_of(self, name: str) -> Mapping[int, int]:
+        """Category by segment, where it is known."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SegmentTable:
+    """Nonzero masses of all segments, sorted by view, segment and Gaussian."""
+
+    gaussians: int
+    gaussian: NDArray[np.int32]
+    """(entries,): row of the Gaussian."""
+
+    segment: NDArray[np.int32]
+    """(entries,): row of the segment."""
+
+    mass: NDArray[np.float32]
+    """(entries,): blending weight of the Gaussian over the segment's pixels."""
+
+    seen: NDArray[np.float32]
+    """(entries,): blending weight of the Gaussian over all of the view's pixels that tell."""
+
+    views: tuple[str, ...]
+    """Names, sorted."""
+
+    view: NDArray[np.int64]
+    """(segments,): place of the view of each segment."""
+
+    name: NDArray[np.int64]
+    """(segments,): id in its label map, or place in its set of masks."""
+
+    size: NDArray[np.float64]
+    """(segments,): mass of each segment over all Gaussians."""
+
+    category: NDArray[np.int64]
+    """(segments,): category, -1 where it is not known."""
+
+    score: NDArray[np.float64]
+    """(segments,): how sure the model was, in [0, 1]."""
+
+    def votes(self, group: NDArray[np.int64], weight: NDArray[np.float64]) -> Any:
+        """Sparse (Gaussians, groups): mass by group; segments of group -1 have no vote."""
+        import scipy.sparse
+
+        of = group[self.segment]
+        there = of >= 0
+        values = self.mass[there] * weight[self.segment[there]]
+        shape = (self.gaussians, int(group.max(initial=-1)) + 1)
+        return scipy.sparse.csr_matrix((values, (self.gaussian[there], of[there])), shape=shape)
+
+    def agreement(self) -> Agreement:
+        """What the segments share on the Gaussians that their views both see.
+
+        A Gaussian counts with the geometric mean of what the two views see of it.
+        """
+        import scipy.sparse
+
+        told = self.seen > _LEAST_WEIGHT
+        share = self.mass / np.maximum(self.seen, _LEAST_MASS)
+        root = np.sqrt(self.seen, dtype=np.float32)
+        holds = told & (share > _LEAST_SHARE)
+        count = len(self.view)
+        masses: Any = scipy.sparse.csr_matrix(
+            ((root * share)[holds], (self.gaussian[holds], self.segment[holds])),
+            shape=(self.gaussians, count),
+        )
+        # Segments of one view repeat what that view sees of a Gaussian; it is wanted once.
+        place = self.view[self.segment[told]] * self.gaussians + self.gaussian[told]
+        places, first = np.unique(place, return_index=True)
+        sights: Any = scipy.sparse.csr_matrix(
+            (root[told][first], (places % self.gaussians, places // self.gaussians)),
+            shape=(self.gaussians, len(self.views)),
+        )
+        return Agreement(
+            shared=(masses.T @ masses).tocsr(), seen=(masses.T @ sights).tocsr(), view=self.view
+        )
+
+
+def segment_table(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    source: SegmentSource,
+    *,
+    most_views: int,
+    render_options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> SegmentTable:
+    """Collect the segments of views.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Those whose segments count.
+        source: Their segments.
+        most_views: Views kept of each Gaussian, those that see most of it: this bounds memory.
+        render_options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and their number.
+
+    Raises:
+        InputError: If there are no views, if one has no segments, or none has any.
+        ShapeError: If segments do not have their photograph's proportions.
+    """
+    known = set(source.view_names)
+    for view in views:
+        if view.name not in known:
+            raise InputError(f"evidence: there are no segments of view {view.name!r}.")
+    ordered = sorted(views, key=lambda view: view.name)
+    entries = _Entries(len(gaussians), most_views)
+    rows: list[tuple[int, int, int, float]] = []
+    for place, view in enumerate(ordered):
+        segments = source.segments_of(view.name)
+        names, scores = _in_order(segments)
+        categories = source.categories_of(view.name)
+        camera = camera_of_map(view, segments.height, segments.width)
+        if isinstance(segments, LabelMap):
+            segments = LabelMap(ids=segments.ids)
+        found = view_masses(gaussians, camera, segments, options=render_options, backend=backend)
+        row_of = {name: len(rows) + i for i, name in enumerate(names)}
+        rows += [
+            (place, name, categories.get(name, UNLABELLED), score)
+            for name, score in zip(names, scores, strict=True)
+        ]
+        kept = found.weight > _LEAST_MASS
+        used, compact = torch.unique(found.segment[kept], return_inverse=True)
+        segment = torch.tensor([row_of[int(i)] for i in used.tolist()])
+        gaussian, mass = found.gaussian[kept].numpy(), found.weight[kept].numpy()
+        if isinstance(segments, LabelMap):
+            # Pixels without a label tell nothing; pixels outside all masks do.
+            sight = np.bincount(gaussian, mass, minlength=len(gaussians))
+        else:
+            sight = found.visible.numpy()
+        number = segment[compact].numpy() if len(segment) else np.zeros(0, np.int64)
+        entries.add(gaussian, number, mass, sight[gaussian], place)
+        if progress is not None:
+            progress(place + 1, len(ordered))
+    if not rows:
+        raise InputError(f"evidence: expected a segment in {len(views)} views, found none.")
+    view_of, name_of, category, score = (np.array(column) for column in zip(*rows, strict=True))
+    gaussian, segment, mass, seen = entries.result()
+    return SegmentTable(
+        gaussians=len(gaussians),
+        gaussian=gaussian,
+        segment=segment,
+        mass=mass,
+        seen=seen,
+        views=tuple(view.name for view in ordered),
+        view=view_of.astype(np.int64),
+        name=name_of.astype(np.int64),
+        size=np.bincount(segment, mass, minlength=len(rows)).astype(np.float64),
+        category=category.astype(np.int64),
+        score=score.astype(np.float64),
+    )
+
+
+class _Entries:
+    """Masses so far: of each Gaussian those in the views that see most of it."""
+
+    def __init__(self, gaussians: int, most_views: int) -> None:
+        self._most = most_views
+        self._limit = max(2 * most_views * gaussians, 1 << 22)
+        self._parts: list[tuple[NDArray[Any], ...]] = []
+        self._count = 0
+
+    def add(
+        self,
+        gaussian: NDArray[Any],
+        segment: NDArray[Any],
+        mass: NDArray[Any],
+        seen: NDArray[Any],
+        view: int,
+    ) -> None:
+        self._parts.append(
+            (
+                gaussian.astype(np.int32),
+                segment.astype(np.int32),
+                mass.astype(np.float32),
+                seen.astype(np.float32),
+                np.full(len(gaussian), view, np.int32),
+            )
+        )
+        self._count += len(gaussian)
+        if self._count > self._limit:
+            self._parts = [self._best()]
+            self._count = len(self._parts[0][0])
+            # Where segments overlap, the views kept may hold more than was thought.
+            self._limit = max(self._limit, 2 * self._count)
+
+    def result(self) -> tuple[NDArray[Any], ...]:
+        return self._best()[:4]
+
+    def _best(self) -> tuple[NDArray[Any], ...]:
+        """Entries of each Gaussian's `most_views` views with most of it, by segment."""
+        columns = tuple(np.concatenate(column) for column in zip(*self._parts, strict=True))
+        gaussian, segment, _, seen, view = columns
+        order = np.lexsort((segment, view, -seen, gaussian))
+        sorted_gaussian, sorted_view = gaussian[order], view[order]
+        new = np.ones(len(order), bool)
+        new[1:] = (np.diff(sorted_gaussian) != 0) | (np.diff(sorted_view) != 0)
+        run = np.cumsum(new)
+        starts = np.flatnonzero(np.diff(sorted_gaussian, prepend=-1))
+        first = np.repeat(run[starts], np.diff(np.append(starts, len(order))))
+        kept = np.sort(order[run - first < self._most])
+        return tuple(column[kept] for column in columns)
+
+
+def _in_order(segments: LabelMap | MaskSet) -> tuple[list[int], list[float]]:
+    """Names of segments by their first pixel, of masks with the same one by area, and scores."""
+    if isinstance(segments, MaskSet):
+        starts = [
+            (_first_pixel(segments, i), mask.area, mask.counts.tobytes(), i)
+            for i, mask in enumerate(segments.masks)
+        ]
+        order = [i for _, area, _, i in sorted(starts) if area > 0]
+        return order, [float(segments.scores[i]) for i in order]
+    ids = segments.ids.reshape(-1).numpy()
+    names, first = np.unique(ids, return_index=True)
+    pairs = sorted(
+        (int(at), int(name)) for name, at in zip(names, first, strict=True) if name != UNLABELLED
+    )
+    if segments.confidence is None:
+        return [name for _, name in pairs], [1.0] * len(pairs)
+    sure = segments.confidence.reshape(-1)
+    return [name for _, name in pairs], [float(sure[at]) for at, _ in pairs]
+
+
+def _first_pixel(segments: MaskSet, index: int) -> int:
+    """The first pixel of a mask down the columns; behind all others where it is empty."""
+    counts = segments.masks[index].counts
+    return int(counts[0]) if len(counts) > 1 else segments.height * segments.width
