@@ -1,7 +1,27 @@
 """Edits as pure functions: Gaussians and their layers change in step, and a history replays."""
 
+from splatseg.edit._document import Document as Document
+from splatseg.edit._document import load_document as load_document
+from splatseg.edit._document import save_document as save_document
 from splatseg.edit._edited import Edited as Edited
 from splatseg.edit._edited import apply_rows as apply_rows
+from splatseg.edit._merge import merged_layers as merged_layers
+from splatseg.edit._operation import CutBy as CutBy
+from splatseg.edit._operation import Operation as Operation
+from splatseg.edit._operation import Recolour as Recolour
+from splatseg.edit._where import Where as Where
+from splatseg.edit._where import ids_named as ids_named
+from splatseg.edit._where import select as select
+from splatseg.edit.cut import Cut as Cut
+from splatseg.edit.cut import CutOptions as CutOptions
+from splatseg.edit.cut import cut_box as cut_box
+from splatseg.edit.cut import cut_labels as cut_labels
+from splatseg.edit.cut import cut_masks as cut_masks
+from splatseg.edit.history import Prepared as Prepared
+from splatseg.edit.history import apply as apply
+from splatseg.edit.history import prepare as prepare
+from splatseg.edit.history import replay as replay
+from splatseg.edit.history import undo as undo
 from splatseg.edit.operations import duplicate as duplicate
 from splatseg.edit.operations import extract as extract
 from splatseg.edit.operations import merge as merge

@@ -77,28 +77,34 @@ def _holds_only(folder: Path, names: Sequence[str]) -> bool:
     )
 
 
-def save_scene(scene: Scene, root: Path | str) -> Scene:
+def save_scene(
+    scene: Scene, root: Path | str, *, layers: Mapping[str, Layer] | None = None
+) -> Scene:
     """Write a scene folder; layers, evidence and reports that are there stay.
 
-    A new folder appears whole or not at all. In one that is there, be it a scene or the
-    checkpoint of one that was being fitted, each file is replaced whole, scene.json last.
+    A new folder appears whole or not at all, with its `layers`. In one that is there, be it a
+    scene or the checkpoint of one that was being fitted, each file is replaced whole,
+    scene.json last.
 
     Returns:
         The scene with `root` set.
 
     Raises:
-        InputError: If `root` is a folder of something else, or a value has no place in JSON.
+        InputError: If `root` is a folder of something else, a value has no place in JSON, or a
+            layer has not one row a Gaussian.
         MissingFileError: If the parent of `root` does not exist.
     """
     root = Path(root)
+    for name, layer in (layers or {}).items():
+        _check_layer(name, layer, len(scene.gaussians))
     there = is_scene(root) or is_unfinished(root)
     if root.is_dir() and not there and any(root.iterdir()):
         raise InputError(f"{root}: expected an empty folder or a scene to write to, got neither.")
     if there:
-        _write(scene, root, final=root)
+        _write(scene, root, layers or {}, final=root)
     else:
         with atomic_folder(root) as temporary:
-            _write(scene, temporary, final=root)
+            _write(scene, temporary, layers or {}, final=root)
     return replace(scene, root=root)
 
 
@@ -175,12 +181,7 @@ def save_scene_layer(root: Path | str, name: str, layer: Layer) -> Path:
         MissingFileError: If there is no scene.
     """
     root = Path(root)
-    check_name("layer", name)
-    count = _scene_content(root)["gaussians"]
-    if len(layer) != count:
-        raise InputError(
-            f"layer {name!r}: expected {count} rows as the scene has Gaussians, got {len(layer)}."
-        )
+    _check_layer(name, layer, _scene_content(root)["gaussians"])
     folder = root / "layers"
     folder.mkdir(exist_ok=True)
     save_layer(folder / f"{name}.npz", layer)
@@ -196,7 +197,15 @@ def check_name(what: str, name: str) -> None:
         )
 
 
-def _write(scene: Scene, folder: Path, *, final: Path) -> None:
+def _check_layer(name: str, layer: Layer, count: int) -> None:
+    check_name("layer", name)
+    if len(layer) != count:
+        raise InputError(
+            f"layer {name!r}: expected {count} rows as the scene has Gaussians, got {len(layer)}."
+        )
+
+
+def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Path) -> None:
     """Write into `folder`, with paths as they will be seen from `final`."""
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
@@ -205,6 +214,8 @@ def _write(scene: Scene, folder: Path, *, final: Path) -> None:
     cameras = cameras_content(views, folder=final / "cameras", source=source)
     write_splats(scene.gaussians, folder / GAUSSIANS_FILE)
     write_json(folder / CAMERAS_FILE, cameras)
+    for name, layer in layers.items():
+        save_layer(folder / "layers" / f"{name}.npz", layer)
     splits = sorted({view.split for view in scene.views})
     write_json(
         folder / SCENE_FILE,
