@@ -57,7 +57,8 @@ def test_labels_are_the_strongest_votes(rng, lens) -> None:
 
 
 @pytest.mark.parametrize("memory", [1, 14 * 4 * 2, 1 << 30])
-def test_passes_over_the_ids_change_nothing(rng, views, memory) -> None:
+def test_candidates_are_exact_whatever_the_memory(rng, views, memory) -> None:
+    """Fewer ids than slots: what each Gaussian remembers is all there is. One pass."""
     gaussians = random_gaussians(rng)
     maps = random_maps(rng, views, IDS)
     votes = votes_of(gaussians, views, maps, IDS)
@@ -69,19 +70,21 @@ def test_passes_over_the_ids_change_nothing(rng, views, memory) -> None:
         gaussians,
         views,
         maps,
-        options=UpliftOptions(candidates=3, memory=memory),
+        options=UpliftOptions(candidates=3, memory=memory, slots=4),
         backend=BACKEND,
         progress=lambda done, total: calls.append((done, total)),
     )
 
     assert labels.shares is not None
     assert labels.candidates is not None
+    assert labels.evidence is not None
     torch.testing.assert_close(labels.shares.double(), expected[:, :3], rtol=0, atol=1e-5)
+    torch.testing.assert_close(labels.evidence.double(), votes.sum(dim=1), rtol=1e-5, atol=1e-5)
     real = expected[:, :3] > 0
     assert torch.equal(labels.candidates[real].long(), torch.tensor(IDS)[order[:, :3]][real])
     assert bool((labels.candidates[~real] == -1).all())
-    passes = {1: 4, 14 * 4 * 2: 2, 1 << 30: 1}[memory]
-    assert calls == [(i + 1, 3 * passes) for i in range(3 * passes)]
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert labels.metadata["largest_doubt"] == 0
 
 
 def test_voids_cast_no_vote_and_unseen_gaussians_have_no_label(views) -> None:
