@@ -2,6 +2,8 @@
 
 from splatseg.lift.complete import CompletionOptions as CompletionOptions
 from splatseg.lift.complete import complete as complete
+from splatseg.lift.confusion import ConfusionOptions as ConfusionOptions
+from splatseg.lift.confusion import reconsider as reconsider
 from splatseg.lift.label_maps import label_map as label_map
 from splatseg.lift.uplift import LabelSource as LabelSource
 from splatseg.lift.uplift import UpliftOptions as UpliftOptions
