@@ -12,8 +12,10 @@ from splatseg.evaluate.pictures import (
     colour_depth,
     colour_labels,
     colour_of,
+    colour_share,
     contact_sheet,
     mark_errors,
+    overlay_labels,
 )
 
 CLASSES = ClassTable(
@@ -119,3 +121,23 @@ def test_the_legend_shows_every_colour_and_wraps():
 def test_an_empty_sheet_is_refused():
     with pytest.raises(InputError, match="at least one row"):
         contact_sheet(Gallery(title="T", columns=("c",), rows=()))
+
+
+def test_labels_tint_a_photograph() -> None:
+    image = torch.full((3, 4, 3), 100, dtype=torch.uint8)
+    ids = torch.tensor([[1, 1, -1, -1]] * 3)
+    classes = ClassTable(rows=(ClassInfo(id=1, name="a", colour=(200, 0, 0)),))
+    out = overlay_labels(image, ids, classes)
+    assert out[1, 0].tolist() == [155, 45, 45]
+    assert out[1, 3].tolist() == [100, 100, 100]
+    # The border between the two is lighter than either.
+    assert out[1, 2].tolist() == [170, 170, 170]
+
+
+def test_shares_go_from_dark_to_light() -> None:
+    colours = colour_share(torch.tensor([[0.0, 0.5, 1.0, -1.0]]))[0].int()
+    brightness = colours[:3].sum(dim=1)
+    assert brightness.tolist() == sorted(brightness.tolist())
+    assert colours[0].tolist() == [22, 24, 60]
+    assert colours[2].tolist() == [244, 226, 150]
+    assert colours[3].tolist() == [24, 24, 28]

@@ -1,5 +1,7 @@
 """How good a result is: pure measures, and scenes held against truth on chosen views."""
 
+from splatseg.evaluate.agreement import contested as contested
+from splatseg.evaluate.agreement import views_that_show as views_that_show
 from splatseg.evaluate.boundary import BoundaryCounts as BoundaryCounts
 from splatseg.evaluate.boundary import BoundaryScore as BoundaryScore
 from splatseg.evaluate.boundary import boundary_overlap as boundary_overlap
@@ -35,6 +37,9 @@ from splatseg.evaluate.panoptic import PrecisionScore as PrecisionScore
 from splatseg.evaluate.panoptic import average_precision as average_precision
 from splatseg.evaluate.panoptic import panoptic_score as panoptic_score
 from splatseg.evaluate.panoptic import segment_keys as segment_keys
+from splatseg.evaluate.segment_report import (
+    write_segmentation_report as write_segmentation_report,
+)
 from splatseg.evaluate.solid import gaussian_score as gaussian_score
 from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
 from splatseg.evaluate.solid import labels_from_points as labels_from_points

@@ -117,13 +117,35 @@ def colour_depth(
     if far is None:
         far = float(torch.quantile(_thinned(values), 0.99))
     share = ((far - depth.double()) / max(far - near, 1e-9)).clamp(0, 1)
-    steps = torch.tensor(_DEPTH_STEPS, dtype=torch.float64)
-    place = share * (len(steps) - 1)
-    low = place.floor().long().clamp(max=len(steps) - 2)
-    mixed = torch.lerp(steps[low], steps[low + 1], (place - low).unsqueeze(-1))
     return torch.where(
-        known.unsqueeze(-1), mixed.round(), torch.tensor(_NOTHING, dtype=torch.float64)
+        known.unsqueeze(-1), _ramp(share).round(), torch.tensor(_NOTHING, dtype=torch.float64)
     ).to(torch.uint8)
+
+
+def overlay_labels(
+    image: UInt8[Tensor, "height width 3"],
+    ids: Int[Tensor, "height width"],
+    classes: ClassTable | None = None,
+) -> UInt8[Tensor, "height width 3"]:
+    """A photograph tinted by its labels, with a light line where the label changes.
+
+    Pixels without a label keep their colours.
+    """
+    check_shape("ids", ids, image.shape[:2])
+    tinted = 0.45 * image.double() + 0.55 * colour_labels(ids, classes).double()
+    out = torch.where((ids < 0).unsqueeze(-1), image.double(), tinted)
+    edge = torch.zeros(ids.shape, dtype=torch.bool)
+    edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    edge[1:] |= ids[1:] != ids[:-1]
+    return torch.where(edge.unsqueeze(-1), 0.5 * out + 120, out).round().to(torch.uint8)
+
+
+def colour_share(values: Float[Tensor, "height width"]) -> UInt8[Tensor, "height width 3"]:
+    """Values from dark blue (0) to sand (1); nearly black where they are negative, nothing."""
+    check_shape("values", values, (None, None))
+    mixed = _ramp(values.double().clamp(0, 1)).round()
+    nothing = torch.tensor(_NOTHING, dtype=torch.float64)
+    return torch.where((values >= 0).unsqueeze(-1), mixed, nothing).to(torch.uint8)
 
 
 def colour_difference(
@@ -221,6 +243,14 @@ def _swatches(
         out.append((x, y, row.name, colour_of(row.id, classes)))
         x += needed
     return out
+
+
+def _ramp(share: Tensor) -> Tensor:
+    """Colours, as float64, of values in [0, 1]."""
+    steps = torch.tensor(_DEPTH_STEPS, dtype=torch.float64)
+    place = share * (len(steps) - 1)
+    low = place.floor().long().clamp(max=len(steps) - 2)
+    return torch.lerp(steps[low], steps[low + 1], (place - low).unsqueeze(-1))
 
 
 def _thinned(values: Tensor) -> Tensor:

@@ -315,10 +315,11 @@ thead th { color: var(--quiet); font-weight: 550; font-size: .88rem; }
 .number { text-align: right; font-variant-numeric: tabular-nums; }
 .gallery { width: 100%; }
 .gallery th, .gallery td { border: 0; padding: .2rem .35rem .2rem 0; }
-.gallery tbody th { font-weight: 450; font-size: .82rem; color: var(--quiet); white-space: nowrap; }
+.gallery tbody th { font-weight: 450; font-size: .82rem; color: var(--quiet);
+  overflow-wrap: anywhere; min-width: 4.5rem; }
 figure { margin: 0; }
 figcaption { color: var(--quiet); font-size: .78rem; }
-img { display: block; width: 100%; min-width: 11rem; max-width: 24rem; height: auto;
+img { display: block; width: 100%; min-width: 10rem; max-width: 24rem; height: auto;
   border-radius: .3rem; }
 .keys { display: flex; flex-wrap: wrap; gap: .3rem 1.1rem; font-size: .9rem;
   margin-bottom: .75rem; }

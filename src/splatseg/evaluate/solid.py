@@ -131,8 +131,8 @@ def labels_of_points(
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)
     for start in range(0, len(points), _POINTS):
         part = points[start : start + _POINTS].detach().cpu().double()
-        _, found = tree.query(part.numpy(), k=[*range(1, near + 1)])
-        index = torch.from_numpy(found).long()
+        _, found = tree.query(part.numpy(), k=near)
+        index = torch.from_numpy(found).long().reshape(len(part), near)
         at = kept[index]
         if rule == "nearest":
             out[start : start + _POINTS] = at[:, 0]
