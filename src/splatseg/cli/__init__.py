@@ -70,6 +70,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.evaluate",
         summary="score a layer against label maps of held-out views",
     ),
+    "edit": CommandEntry(
+        module="splatseg.cli.edit",
+        summary="things removed, kept alone, copied, moved, coloured, joined -> a new scene",
+    ),
     "export": CommandEntry(
         module="splatseg.cli.export",
         summary="a scene and its labels as files that other tools read",
