@@ -1,5 +1,8 @@
 """2D evidence to per-Gaussian layers, and layers back to label maps of views."""
 
+from splatseg.lift.attach import Attached as Attached
+from splatseg.lift.attach import AttachOptions as AttachOptions
+from splatseg.lift.attach import attach as attach
 from splatseg.lift.complete import CompletionOptions as CompletionOptions
 from splatseg.lift.complete import complete as complete
 from splatseg.lift.confusion import ConfusionOptions as ConfusionOptions
@@ -8,3 +11,5 @@ from splatseg.lift.label_maps import label_map as label_map
 from splatseg.lift.uplift import LabelSource as LabelSource
 from splatseg.lift.uplift import UpliftOptions as UpliftOptions
 from splatseg.lift.uplift import uplift as uplift
+from splatseg.lift.vote import VoteOptions as VoteOptions
+from splatseg.lift.vote import vote as vote
