@@ -68,6 +68,13 @@ class VoteTable:
         """Whether every id still has its column."""
         return self._summary is None
 
+    @property
+    def nbytes(self) -> int:
+        """Memory it holds."""
+        if self._summary is not None:
+            return self._summary.nbytes
+        return sum(column.nbytes for column in self._columns.values())
+
     def add(self, ids: Sequence[int], sums: Float[Tensor, "n ids"]) -> None:
         """Take in the votes of a view, one column an id."""
         self._make_room(ids)
@@ -147,6 +154,11 @@ class SlotTable:
         self._votes = torch.zeros(count, slots)
         self._total = torch.zeros(count)
         self._doubt = torch.zeros(count)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory it holds."""
+        return sum(t.nbytes for t in (self._ids, self._votes, self._total, self._doubt))
 
     def fill(
         self, rows: slice, names: Int64[Tensor, "ids"], votes: Float[Tensor, "rows ids"]
