@@ -126,6 +126,10 @@ def _views(scene: Scene, asked: str) -> tuple[View, ...]:
 
 def _model(command: Command) -> Model:
     model = find_model(command.model)
+    if not isinstance(model, Classical) and command.regions != RegionOptions():
+        raise InputError(
+            f"expected settings of regions with --model classical, got --model {command.model}."
+        )
     if isinstance(model, AnyRecorded):
         kind = "masks" if command.what == "masks" else None
         return recorded_model(
@@ -136,13 +140,7 @@ def _model(command: Command) -> Model:
             f"--zero-is-class, --void: expected with recorded label maps, got --model "
             f"{command.model}."
         )
-    if isinstance(model, Classical):
-        return Classical(regions=command.regions)
-    if command.regions != RegionOptions():
-        raise InputError(
-            f"expected settings of regions with --model classical, got --model {command.model}."
-        )
-    return model
+    return Classical(regions=command.regions) if isinstance(model, Classical) else model
 
 
 def _say(sentence: str) -> None:

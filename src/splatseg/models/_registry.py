@@ -56,12 +56,17 @@ def _known() -> dict[str, EntryPoint]:
 
 def _load(entry: EntryPoint) -> Model:
     try:
-        make = cast(Callable[[], Any], entry.load())
+        make: object = entry.load()
     except (ImportError, AttributeError) as error:
         raise MissingPackageError(
             f"model {entry.name!r} ({entry.value}) cannot be loaded: {error}."
         ) from error
-    model = make()
+    if not callable(make):
+        raise InputError(
+            f"model {entry.name!r} ({entry.value}): expected something to call, "
+            f"got {type(make).__name__}."
+        )
+    model = cast(Callable[[], Any], make)()
     if not isinstance(model, Model):
         raise InputError(
             f"model {entry.name!r} ({entry.value}): expected an object with name, settings and "

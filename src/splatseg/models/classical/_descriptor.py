@@ -106,5 +106,5 @@ def _described(cells: list[NDArray[np.float32]], reach: float) -> NDArray[np.flo
     colour, squares, energy = means[..., :3], means[..., 3:6], means[..., 6:]
     spread = np.sqrt(np.maximum(squares - colour**2, 0))
     weighted = colour * np.array([_LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32)
-    values = np.concatenate((weighted, 2 * spread, energy / (energy + 4.0)), axis=2)
+    values = np.concatenate((weighted, spread, energy / (energy + 4.0)), axis=2)
     return np.ascontiguousarray(values, dtype=np.float32)

@@ -110,7 +110,7 @@ def _trimap(
     if prompt.mask is not None:
         rough = prompt.mask.cpu().numpy().astype(np.uint8)
         small = np.asarray(cv2.resize(rough, (w, h), interpolation=cv2.INTER_NEAREST))
-        trimap[small > 0] = cv2.GC_PR_FGD
+        _mark_rough(trimap, small > 0)
     elif prompt.box is not None:
         trimap[:] = cv2.GC_PR_FGD
     else:
@@ -126,6 +126,20 @@ def _trimap(
         disc = (columns - x) ** 2 + (rows - y) ** 2 <= radius**2
         trimap[disc] = cv2.GC_FGD if positive else cv2.GC_BGD
     return trimap
+
+
+def _mark_rough(trimap: NDArray[np.uint8], rough: NDArray[np.bool_]) -> None:
+    """The core of a rough mask is foreground, what is as far outside as it is thick background."""
+    import cv2
+
+    if not rough.any() or rough.all():
+        trimap[rough] = cv2.GC_PR_FGD
+        return
+    inside = np.asarray(cv2.distanceTransform(rough.astype(np.uint8), cv2.DIST_L2, 5))
+    outside = np.asarray(cv2.distanceTransform((~rough).astype(np.uint8), cv2.DIST_L2, 5))
+    trimap[rough] = cv2.GC_PR_FGD
+    trimap[inside > 0.6 * inside.max()] = cv2.GC_FGD
+    trimap[outside > inside.max()] = cv2.GC_BGD
 
 
 def _scaled_points(

@@ -1,0 +1,141 @@
+"""Models by name, those of other packages, and the ten lines of docs/models.md."""
+
+import re
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+import torch
+
+from splatseg.core import MaskSet
+from splatseg.errors import InputError, MissingPackageError
+from splatseg.models import (
+    ENTRY_POINT_GROUP,
+    AutomaticMasks,
+    DeepFeatures,
+    DenseFeatures,
+    Model,
+    PromptableMasks,
+    _registry,
+    find_model,
+    model_names,
+    record_evidence,
+)
+
+
+class Halves:
+    name = "halves"
+    settings: ClassVar[dict] = {}
+    note = ""
+
+    def masks(self, image) -> MaskSet:
+        height, width = image.shape[:2]
+        left = torch.zeros(1, height, width, dtype=torch.bool)
+        left[..., : width // 2] = True
+        return MaskSet.from_dense(left)
+
+
+class NoModel:
+    pass
+
+
+NOT_CALLABLE = 3
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Entry points as if another package had been installed with them."""
+
+    def install(**values: str) -> None:
+        entries = [EntryPoint(name=n, value=v, group=ENTRY_POINT_GROUP) for n, v in values.items()]
+        monkeypatch.setattr(
+            _registry, "entry_points", lambda group: entries if group == ENTRY_POINT_GROUP else []
+        )
+
+    return install
+
+
+HERE = __name__
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
+    """This file under a name that an entry point can import."""
+    import sys
+
+    monkeypatch.setitem(sys.modules, "models_of_another_package", sys.modules[HERE])
+
+
+def test_another_packages_model_is_found_by_its_name(installed, views, tmp_path) -> None:
+    installed(halves="models_of_another_package:Halves")
+    assert model_names() == ("classical", "halves")
+    model = find_model("halves")
+    assert isinstance(model, Model)
+    assert isinstance(model, AutomaticMasks)
+    assert not isinstance(model, PromptableMasks)
+    seen = record_evidence(model, views, tmp_path / "halves")
+    assert (seen.kind, seen.views, seen.masks) == ("masks", 3, 3)
+
+
+def test_names_that_nobody_knows_are_answered_with_those_that_are(installed) -> None:
+    installed(halves="models_of_another_package:Halves")
+    with pytest.raises(InputError) as caught:
+        find_model("sam")
+    assert str(caught.value) == (
+        "model: expected one of classical, halves, or a folder of recorded evidence, got 'sam'."
+    )
+
+
+def test_another_package_cannot_take_the_place_of_a_name_of_ours(installed) -> None:
+    installed(classical="models_of_another_package:Halves")
+    assert type(find_model("classical")).__name__ == "Classical"
+
+
+def test_a_name_comes_before_a_folder(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "classical").mkdir()
+    assert find_model("classical").name == "classical"
+    with pytest.raises(InputError, match="expected evidence"):
+        find_model("./classical")
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "words"),
+    [
+        ("package_that_is_not_there:Model", MissingPackageError, "cannot be loaded: No module"),
+        ("models_of_another_package:Gone", MissingPackageError, "no attribute 'Gone'"),
+        ("models_of_another_package:NoModel", InputError, "name, settings and note, got NoModel"),
+        ("models_of_another_package:NOT_CALLABLE", InputError, "something to call, got int"),
+    ],
+)
+def test_what_cannot_be_loaded_is_said(installed, value, error, words) -> None:
+    installed(broken=value)
+    assert "broken" in model_names(), "names are listed without loading anything"
+    with pytest.raises(error, match=words) as caught:
+        find_model("broken")
+    assert str(caught.value).startswith(f"model 'broken' ({value})")
+
+
+def test_deep_features_have_a_name_a_depth() -> None:
+    with pytest.raises(InputError, match="one name a map"):
+        DeepFeatures(maps=(), depths=())
+
+
+def test_the_models_of_the_documentation_run(project_root: Path, views, tmp_path) -> None:
+    """The code of docs/models.md, the model in ten lines among it."""
+    text = (project_root / "docs" / "models.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) >= 2
+    names: dict[str, object] = {}
+    for block in blocks:
+        exec(compile(block, "docs/models.md", "exec"), names)
+    model = names["BrightSide"]
+    lines = next(b for b in blocks if "class BrightSide" in b).strip().splitlines()
+    body = [line for line in lines if line.strip() and not line.startswith(("import", "from"))]
+    assert len(body) <= 10
+    instance = model()
+    assert isinstance(instance, AutomaticMasks)
+    assert not isinstance(instance, DenseFeatures)
+    seen = record_evidence(instance, views, tmp_path / "bright")
+    assert seen.masks == 3
