@@ -1,0 +1,136 @@
+"""Where the centres of Gaussians fall in a view, and what the view has to say there."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int, Int64
+from torch import Tensor
+
+from splatseg.core import UNLABELLED, Camera, Gaussians
+from splatseg.errors import InputError
+from splatseg.render import RenderOptions, SparseWeights, render, weights
+
+_FOLD_TOLERANCE = 1e-2
+"""A point whose pixel straightens to elsewhere, in pixels, lies beyond the fold of the lens."""
+
+_PIXELS = 32768
+"""Rows of W held at a time; bounds memory."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Centres:
+    """The Gaussians whose centres a view has a pixel for."""
+
+    gaussians: Int64[Tensor, "m"]
+    """Which, ascending."""
+
+    pixels: Int64[Tensor, "m 2"]
+    """Column and row of each."""
+
+    depth: Float[Tensor, "m"]
+    """z-depth of each centre, scene units."""
+
+    def __getitem__(self, index: Tensor) -> "Centres":
+        """Some of them."""
+        return Centres(
+            gaussians=self.gaussians[index], pixels=self.pixels[index], depth=self.depth[index]
+        )
+
+
+def centres_in(means: Float[Tensor, "n 3"], camera: Camera, *, near: float) -> Centres:
+    """Project centres into the pixels of any camera, distortion included.
+
+    What lies nearer than `near`, outside the image or beyond the fold of the lens, where the
+    polynomial leads back into the image, is left out.
+    """
+    points = means.detach().cpu().double()
+    at, depth = camera.project(points)
+    size = at.new_tensor([camera.width, camera.height])
+    inside = (depth > near) & ((at >= 0) & (at < size)).all(dim=-1)
+    rows = torch.nonzero(inside).squeeze(1)
+    if not camera.is_pinhole:
+        straight = replace(camera, model="pinhole", distortion=()).project(points[rows])[0]
+        back = camera.undistort_pixels(at[rows])
+        rows = rows[torch.linalg.vector_norm(back - straight, dim=-1) < _FOLD_TOLERANCE]
+    return Centres(gaussians=rows, pixels=at[rows].floor().long(), depth=depth[rows])
+
+
+def in_front(
+    centres: Centres,
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    tolerance: float,
+    options: RenderOptions,
+    backend: str,
+) -> Tensor:
+    """Which centres are not behind what the view shows, bool (m,).
+
+    What a pixel shows is where half of its light is spent (`Rendered.median_depth`); a pixel
+    whose light mostly passes hides nothing.
+    """
+    with torch.no_grad():
+        signal = gaussians.means.new_zeros(len(gaussians), 1)
+        drawn = render(gaussians, camera, signal, options=options, backend=backend, warp="nearest")
+    surface = drawn.median_depth.cpu().double()[centres.pixels[:, 1], centres.pixels[:, 0]]
+    return (surface <= 0) | (centres.depth <= surface * (1 + tolerance))
+
+
+def own_weights(
+    centres: Centres,
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    options: RenderOptions,
+    backend: str,
+) -> Float[Tensor, "m"]:
+    """Blending weight of each Gaussian at the pixel of its centre, float32."""
+    flat = centres.pixels[:, 1] * camera.width + centres.pixels[:, 0]
+    wanted = torch.unique(flat)
+    home = torch.full((len(gaussians),), -1, dtype=torch.int64)
+    home[centres.gaussians] = flat
+    found = torch.zeros(len(gaussians))
+    for part in torch.split(wanted, _PIXELS):
+        asked = torch.stack((part % camera.width, part // camera.width), dim=-1)
+        rows = weights(gaussians, camera, asked, options=options, backend=backend)
+        if not isinstance(rows, SparseWeights):
+            raise InputError(f"backend: expected one with sparse rows, got {backend!r}.")
+        ids = rows.ids.cpu().long()
+        pixel = torch.repeat_interleave(part, torch.diff(rows.indptr.cpu()))
+        own = home[ids] == pixel
+        found[ids[own]] = rows.weights.cpu().float()[own]
+    return found[centres.gaussians]
+
+
+def majority_map(ids: Int[Tensor, "height width"], radius: int) -> Int[Tensor, "height width"]:
+    """The commonest id in the square around each pixel, -1 among them, ties to the smaller id.
+
+    The square is cut at the border of the image.
+    """
+    if radius == 0:
+        return ids
+    best = torch.full(ids.shape, -1.0)
+    winner = torch.full_like(ids, UNLABELLED)
+    for id in torch.unique(ids).tolist():
+        here = (ids == id).double().cumsum(0).cumsum(1)
+        count = _square_sums(here, radius)
+        better = count > best
+        best = torch.where(better, count, best.to(count))
+        winner[better] = id
+    return winner
+
+
+def _square_sums(sums: Float[Tensor, "height width"], radius: int) -> Tensor:
+    """Sums over squares, from cumulative sums along both axes."""
+    height, width = sums.shape
+    padded = torch.zeros(height + 1, width + 1, dtype=sums.dtype)
+    padded[1:, 1:] = sums
+    row, column = torch.arange(height), torch.arange(width)
+    top, bottom = (row - radius).clamp_min(0), (row + radius + 1).clamp_max(height)
+    left, right = (column - radius).clamp_min(0), (column + radius + 1).clamp_max(width)
+    return (
+        padded[bottom][:, right]
+        - padded[top][:, right]
+        - padded[bottom][:, left]
+        + padded[top][:, left]
+    )

@@ -1,0 +1,294 @@
+"""Votes at the pixels that centres fall into."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splatseg.core import Camera, ClassInfo, ClassTable, LabelMap, View
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift import VoteOptions, vote
+from splatseg.lift._centres import centres_in, majority_map, own_weights
+from splatseg.render import RenderOptions, weights
+
+from .conftest import (
+    BACKEND,
+    BARREL,
+    Maps,
+    camera_at,
+    gaussians_at,
+    matrix_of,
+    random_gaussians,
+    random_maps,
+)
+
+
+def halves(left: int, right: int, *, confidence=None) -> LabelMap:
+    ids = torch.full((12, 16), left)
+    ids[:, 8:] = right
+    return LabelMap(ids=ids, confidence=confidence)
+
+
+def ballots(*maps: LabelMap) -> tuple[list[View], Maps]:
+    views = [View(name=f"v{i}", camera=camera_at()) for i in range(len(maps))]
+    return views, Maps({view.name: paper for view, paper in zip(views, maps, strict=True)})
+
+
+def voted(gaussians, views, maps, **changes):
+    return vote(gaussians, views, maps, options=VoteOptions(**changes), backend=BACKEND)
+
+
+LEFT, RIGHT = [-5 / 14.4, 1 / 14.4, 2.0], [5 / 14.4, 1 / 14.4, 2.0]
+"""Points on the centres of the pixels (5, 6) and (10, 6)."""
+
+
+@pytest.mark.parametrize("lens", [{}, BARREL])
+@pytest.mark.parametrize("memory", [1, 1 << 30])
+def test_each_view_votes_for_the_id_at_the_centre(rng, lens, memory) -> None:
+    ids = (1, 4, 900)
+    views = [View(name=f"v{i}", camera=camera_at(x, **lens)) for i, x in enumerate((-0.2, 0, 0.3))]
+    gaussians = random_gaussians(rng, 30)
+    maps = random_maps(rng, views, ids)
+    counts = torch.zeros(30, 3)
+    for view in views:
+        pixels, depth = view.camera.project(gaussians.means.double())
+        for i, ((u, v), z) in enumerate(zip(pixels.tolist(), depth.tolist(), strict=True)):
+            if z > 0.01 and 0 <= u < 16 and 0 <= v < 12:
+                id = int(maps.label_map(view.name).ids[math.floor(v), math.floor(u)])
+                if id != -1:
+                    counts[i, ids.index(id)] += 1
+    total = counts.sum(dim=1)
+    assert int((total > 0).sum()) > 10
+    share, column = (counts / total.clamp_min(1).unsqueeze(1)).max(dim=1)
+    expected = torch.where(total > 0, torch.tensor(ids)[column], -1)
+
+    labels = voted(gaussians, views, maps, vote_memory=memory)
+
+    assert labels.ids.tolist() == expected.tolist()
+    assert labels.confidence.tolist() == pytest.approx(share.tolist())
+    assert labels.evidence is not None
+    assert labels.evidence.tolist() == total.tolist()
+    assert labels.background == -1
+
+
+def test_published_votes_are_of_all_views() -> None:
+    """Id 1 in three of four views; in the fourth the camera looks away."""
+    views, maps = ballots(*(halves(1, 2),) * 4)
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    views[3] = View(name="v3", camera=replace(camera_at(), cam_from_world=away))
+    gaussians = gaussians_at([LEFT])
+    visible = voted(gaussians, views, maps)
+    assert (visible.ids.tolist(), visible.confidence.tolist()) == ([1], [1.0])
+    published = voted(gaussians, views, maps, vote_rule="published")
+    assert (published.ids.tolist(), published.confidence.tolist()) == ([1], [0.75])
+    strict = voted(gaussians, views, maps, vote_rule="published", vote_share=0.75)
+    assert (strict.ids.tolist(), strict.confidence.tolist()) == ([-1], [0.0])
+    # With two of four views looking away, SA-GS loses it and Prompt SA-GS as well.
+    views[2] = View(name="v2", camera=views[3].camera)
+    for share in (None, 0.6):
+        lost = voted(gaussians, views, maps, vote_rule="published", vote_share=share)
+        assert lost.ids.tolist() == [-1]
+    assert voted(gaussians, views, maps).ids.tolist() == [1]
+    assert VoteOptions(vote_rule="published").needed_share == 0.7
+    assert VoteOptions().needed_share == 0.0
+
+
+def test_void_pixels_say_nothing_or_no() -> None:
+    views, maps = ballots(halves(1, -1), halves(-1, -1), halves(-1, -1))
+    gaussians = gaussians_at([LEFT, RIGHT])
+    labels = voted(gaussians, views, maps)
+    assert labels.ids.tolist() == [1, -1]
+    assert labels.confidence.tolist() == [1.0, 0.0]
+    against = voted(gaussians, views, maps, vote_void=True)
+    assert against.ids.tolist() == [1, -1]
+    assert against.confidence.tolist() == pytest.approx([1 / 3, 0.0])
+    assert voted(gaussians, views, maps, vote_void=True, vote_share=0.5).ids.tolist() == [-1, -1]
+
+
+def test_what_is_hidden_is_not_asked() -> None:
+    """A wall in front of a Gaussian, in one of two views; the other looks from behind."""
+    front, hidden = [LEFT[0], LEFT[1], 2.0], [1.5 * LEFT[0], 1.5 * LEFT[1], 3.0]
+    gaussians = gaussians_at([front, hidden], opacity=0.98, scale=0.2)
+    behind = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    behind[2, 3] = 5.0
+    views = [
+        View(name="a", camera=camera_at()),
+        View(name="b", camera=replace(camera_at(), cam_from_world=behind)),
+    ]
+    maps = Maps({"a": halves(1, 1), "b": halves(2, 2)})
+    labels = voted(gaussians, views, maps)
+    assert labels.confidence.tolist() == [0.5, 0.5]
+    assert labels.ids.tolist() == [1, 1]  # ties to the smaller id
+    for how in ("depth", "weight"):
+        seen = voted(gaussians, views, maps, vote_occlusion=how, vote_min_weight=0.1)
+        assert seen.ids.tolist() == [1, 2]
+        assert seen.confidence[1] == 1.0
+    far = voted(gaussians, views, maps, vote_occlusion="depth", vote_depth_tolerance=0.6)
+    assert far.confidence.tolist() == [0.5, 0.5]
+    # No median depth, nothing hidden: both are faint.
+    faint = gaussians.replace(opacities=torch.full((2,), 0.3))
+    assert voted(faint, views, maps, vote_occlusion="depth").confidence.tolist() == [0.5, 0.5]
+
+
+def test_transmittance_weighs_the_votes(rng, views) -> None:
+    gaussians = random_gaussians(rng, 20)
+    maps = random_maps(rng, views, (1, 2, 3), void=0.0)
+    votes = torch.zeros(20, 3, dtype=torch.float64)
+    for view in views:
+        matrix = matrix_of(gaussians, view.camera)
+        pixels, _ = view.camera.project(gaussians.means.double())
+        for i, (u, v) in enumerate(pixels.floor().long().tolist()):
+            if 0 <= u < 16 and 0 <= v < 12:
+                id = int(maps.label_map(view.name).ids[v, u])
+                votes[i, id - 1] += matrix[v, u, i]
+    labels = voted(gaussians, views, maps, vote_weight="transmittance", vote_candidates=3)
+    assert labels.evidence is not None
+    assert labels.shares is not None
+    torch.testing.assert_close(labels.evidence.double(), votes.sum(dim=1), rtol=0, atol=5e-3)
+    shares = votes / votes.sum(dim=1, keepdim=True).clamp_min(1e-9)
+    expected = shares.sort(dim=1, descending=True).values
+    torch.testing.assert_close(labels.shares.double(), expected, rtol=0, atol=5e-3)
+    unseen = votes.sum(dim=1) == 0
+    assert bool((labels.ids[unseen] == -1).all())
+    least = voted(gaussians, views, maps, vote_occlusion="weight", vote_min_weight=0.5)
+    strong = sum(
+        float(matrix_of(gaussians, view.camera)[v, u, 3]) >= 0.5
+        for view in views
+        for u, v in [view.camera.project(gaussians.means.double())[0][3].floor().long().tolist()]
+        if 0 <= u < 16 and 0 <= v < 12
+    )
+    assert least.evidence is not None
+    assert float(least.evidence[3]) == strong
+
+
+def test_own_weights_are_entries_of_w(rng) -> None:
+    gaussians, camera = random_gaussians(rng, 40), camera_at(**BARREL)
+    centres = centres_in(gaussians.means, camera, near=0.01)
+    found = own_weights(centres, gaussians, camera, options=RenderOptions(), backend=BACKEND)
+    rows = weights(gaussians, camera, centres.pixels, backend=BACKEND)
+    for m, i in enumerate(centres.gaussians.tolist()):
+        span = slice(int(rows.indptr[m]), int(rows.indptr[m + 1]))
+        mine = rows.weights[span][rows.ids[span] == i].float()
+        assert float(found[m]) == float(mine.sum())
+    assert float(found.max()) > 0.1
+
+
+def test_centres_beyond_the_fold_of_the_lens_are_not_seen() -> None:
+    """A strong barrel: the polynomial brings far points back into the image."""
+    camera = Camera(
+        width=16, height=12, fx=14.4, fy=14.4, cx=8, cy=6, cam_from_world=torch.eye(4),
+        model="opencv", distortion=(-0.3,),
+    )  # fmt: skip
+    radius = math.sqrt(1 / 0.3)  # r (1 - 0.3 r^2) is 0 there
+    means = torch.tensor([[0.1, 0.0, 1.0], [0.99 * radius, 0.0, 1.0], [0.1, 0.0, -1.0]])
+    at = camera.project(means)[0]
+    assert abs(float(at[1, 0]) - 8) < 1
+    assert centres_in(means, camera, near=0.01).gaussians.tolist() == [0]
+
+
+def test_near_and_border() -> None:
+    camera = replace(camera_at(), fx=16, fy=16)
+    means = torch.tensor([[0, 0, 0.5], [0, 0, 0.25], [-0.5, 0, 1], [0.5, 0, 1], [0, 0.375, 1]])
+    assert centres_in(means, camera, near=0.25).gaussians.tolist() == [0, 2]
+
+
+def test_regions_vote_for_their_commonest_id() -> None:
+    ids = torch.tensor([[1, 1, 2], [3, 2, 2], [-1, -1, -1]], dtype=torch.int32)
+    assert torch.equal(majority_map(ids, 0), ids)
+    # Counted by hand: corners have four pixels, edges six, the middle nine (three -1, three 2).
+    expected = torch.tensor([[1, 2, 2], [-1, -1, 2], [-1, -1, -1]], dtype=torch.int32)
+    assert torch.equal(majority_map(ids, 1), expected)
+    whole = torch.where(torch.rand(12, 16, generator=torch.Generator().manual_seed(1)) < 0.6, 7, 2)
+    assert bool((majority_map(whole, 20) == 7).all())
+    speck = halves(1, 2).ids.clone()
+    views, maps = ballots(LabelMap(ids=speck))
+    gaussians = gaussians_at([LEFT])
+    column, row = views[0].camera.project(gaussians.means)[0][0].floor().long().tolist()
+    speck[row, column] = 9
+    maps = Maps({"v0": LabelMap(ids=speck)})
+    assert voted(gaussians, views, maps).ids.tolist() == [9]
+    assert voted(gaussians, views, maps, vote_region=1).ids.tolist() == [1]
+
+
+def test_confidence_and_reduced_maps() -> None:
+    sure = torch.full((12, 16), 0.9)
+    views, maps = ballots(
+        halves(1, 1, confidence=sure), halves(2, 2, confidence=0.5 * sure), halves(2, 2)
+    )
+    labels = voted(gaussians_at([LEFT]), views, maps, vote_candidates=2)
+    assert labels.ids.tolist() == [2]
+    assert labels.candidates is not None
+    assert labels.shares is not None
+    assert labels.candidates.tolist() == [[2, 1]]
+    assert labels.shares[0].tolist() == pytest.approx([1.45 / 2.35, 0.9 / 2.35])
+    full = [View(name="v0", camera=camera_at(width=32, height=24))]
+    assert voted(gaussians_at([RIGHT]), full, Maps({"v0": halves(1, 2)})).ids.tolist() == [2]
+
+
+def test_order_of_views_changes_nothing(rng, views) -> None:
+    gaussians = random_gaussians(rng, 20)
+    maps = random_maps(rng, views, (1, 2, 3))
+    calls = []
+    options = VoteOptions(vote_weight="transmittance", vote_candidates=2)
+    a = vote(gaussians, views, maps, options=options, backend=BACKEND)
+    b = vote(
+        gaussians,
+        views[::-1],
+        maps,
+        options=options,
+        backend=BACKEND,
+        progress=lambda done, total: calls.append((done, total)),
+    )
+    assert torch.equal(a.ids, b.ids)
+    assert torch.equal(a.shares, b.shares)
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_metadata_says_how_it_was_made(rng, views) -> None:
+    classes = ClassTable(rows=(ClassInfo(id=4, name="chair"), ClassInfo(id=77, name="unseen")))
+    maps = random_maps(rng, views, (1, 4))
+    labels = vote(random_gaussians(rng, 30), views, maps, classes=classes, backend=BACKEND)
+    metadata = json.loads(json.dumps(dict(labels.metadata)))
+    assert metadata["method"] == "vote"
+    assert metadata["options"]["vote_rule"] == "visible"
+    assert metadata["views"] == ["v0", "v1", "v2"]
+    assert metadata["names"] == {"4": "chair"}
+
+
+def test_an_empty_scene_has_no_votes() -> None:
+    views, maps = ballots(halves(1, 2))
+    assert len(voted(gaussians_at(torch.zeros(0, 3)), views, maps)) == 0
+
+
+def test_bad_input_is_refused(rng, views) -> None:
+    gaussians = random_gaussians(rng)
+    maps = random_maps(rng, views[:2], (1,))
+    with pytest.raises(InputError, match="at least one view"):
+        vote(gaussians, [], maps, backend=BACKEND)
+    with pytest.raises(InputError, match="1 of 3 have none, the first is v2"):
+        vote(gaussians, views, maps, backend=BACKEND)
+    void = Maps({"v0": LabelMap(ids=torch.full((12, 16), -1))})
+    with pytest.raises(InputError, match="a labelled pixel at a Gaussian's centre in 1 views"):
+        vote(gaussians, views[:1], void, backend=BACKEND)
+    stretched = Maps({"v0": LabelMap(ids=torch.ones(12, 12, dtype=torch.int32))})
+    with pytest.raises(ShapeError, match=r"v0: expected a map of 16x12 .* got 12x12"):
+        vote(gaussians, views[:1], stretched, backend=BACKEND)
+    broken = gaussians.replace(means=torch.full_like(gaussians.means, math.nan))
+    with pytest.raises(RangeError, match="means"):
+        vote(broken, views[:2], maps, backend=BACKEND)
+    for wrong in (
+        {"vote_share": 1.1},
+        {"vote_min_weight": -0.1},
+        {"vote_depth_tolerance": -1.0},
+        {"vote_depth_tolerance": math.inf},
+        {"vote_region": -1},
+        {"vote_candidates": 0},
+        {"vote_memory": 0},
+    ):
+        with pytest.raises(RangeError, match=next(iter(wrong))):
+            VoteOptions(**wrong)
+    for wrong in ({"vote_rule": "most"}, {"vote_occlusion": "x"}, {"vote_weight": "two"}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            VoteOptions(**wrong)
