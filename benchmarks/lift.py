@@ -1,0 +1,138 @@
+"""Time and peak memory of lifting, each part in a process of its own.
+
+    python benchmarks/lift.py [features | masks | labels] [--views N]
+
+`features`: 64-d features of 100 views at 512x384 onto 200 000 Gaussians; cells of 16 pixels,
+read between their centres. Goal: under 60 s and 2 GB on two cores.
+`labels`: label maps with 500 ids in each of 1 000 views and other ids in each view, 500 000 ids
+in all, into the table of slots. Goal: under 3 GB.
+`masks`: 500 overlapping masks of each of 1 000 views, each a disc or a union of stripes, onto the
+Gaussians. Goal: under 3 GB.
+
+Evidence is made when it is asked for and kept nowhere, so what is measured is the lifting. Memory
+is the peak of the whole process.
+"""
+
+import argparse
+import math
+import resource
+import subprocess
+import sys
+import time
+
+import numpy as np
+import torch
+from memory import room
+
+from splatseg.core import Camera, FeatureMap, LabelMap, MaskSet, Rle, View
+from splatseg.lift import UpliftOptions, uplift
+from splatseg.lift._masses import view_masses
+from splatseg.lift.features import uplift_features
+from splatseg.render.cpu import threads
+
+WIDTH, HEIGHT = 512, 384
+GAUSSIANS = 200_000
+IDS = 500
+
+
+def camera(index: int) -> Camera:
+    """From a round through the middle of the room, outwards, 61 degrees further each time."""
+    angle = math.radians(61 * index)
+    eye = np.array([3 + math.cos(angle), 2.5 + math.sin(angle), 1.4])
+    z = np.array([math.cos(angle), math.sin(angle), -0.1 * math.cos(index)])
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0.0, 0, 1])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return Camera(
+        width=WIDTH, height=HEIGHT, fx=333, fy=333, cx=WIDTH / 2, cy=HEIGHT / 2,
+        cam_from_world=torch.from_numpy(pose),
+    )  # fmt: skip
+
+
+class Made:
+    """Evidence that is made when it is asked for."""
+
+    def __init__(self, views: int) -> None:
+        self.views = [View(name=f"view_{i:04d}", camera=camera(i)) for i in range(views)]
+        self.view_names = tuple(view.name for view in self.views)
+        self._coarse = math.ceil(math.sqrt(IDS))
+
+    def features(self, name: str) -> FeatureMap:
+        """64 channels in cells of 16 pixels."""
+        rng = np.random.default_rng(int(name[-4:]))
+        values = rng.normal(size=(HEIGHT // 16, WIDTH // 16, 64)).astype(np.float32)
+        return FeatureMap(features=torch.from_numpy(values), stride=16, height=HEIGHT, width=WIDTH)
+
+    def label_map(self, name: str) -> LabelMap:
+        """500 patches, whose ids are used in no other view."""
+        rows = torch.arange(HEIGHT) * self._coarse // HEIGHT
+        columns = torch.arange(WIDTH) * self._coarse // WIDTH
+        patch = (rows[:, None] * self._coarse + columns[None]) % IDS
+        return LabelMap(ids=patch + 1 + IDS * int(name[-4:]))
+
+    def masks(self, name: str) -> MaskSet:
+        """Discs of 1 to 60 pixels radius; each covers a hundredth of the image on average."""
+        rng = np.random.default_rng(int(name[-4:]))
+        y, x = np.mgrid[:HEIGHT, :WIDTH]
+        masks: list[Rle] = []
+        for _ in range(IDS):
+            u, v, radius = rng.random() * WIDTH, rng.random() * HEIGHT, 60 * rng.random() ** 2 + 1
+            masks.append(Rle.encode(torch.from_numpy((x - u) ** 2 + (y - v) ** 2 < radius**2)))
+        return MaskSet(
+            height=HEIGHT, width=WIDTH, masks=tuple(masks),
+            scores=torch.ones(IDS), levels=torch.zeros(IDS, dtype=torch.int32),
+        )  # fmt: skip
+
+
+def features(made: Made) -> str:
+    """64-d features."""
+    found = uplift_features(room(GAUSSIANS, 0), made.views, made)
+    seen = int((found.weights > 0).sum())
+    return f"{found.values.shape[1]}-d features onto {GAUSSIANS} Gaussians, {seen} seen"
+
+
+def labels(made: Made) -> str:
+    """More ids than any table holds."""
+    options = UpliftOptions(memory=1 << 28, candidates=4)
+    found = uplift(room(GAUSSIANS, 0), made.views, made, options=options)
+    seen = int((found.ids >= 0).sum())
+    return f"{IDS * len(made.views)} ids onto {GAUSSIANS} Gaussians, {seen} labelled"
+
+
+def masks(made: Made) -> str:
+    """Overlapping masks, one view after the other."""
+    gaussians, entries = room(GAUSSIANS, 0), 0
+    for view in made.views:
+        entries += len(view_masses(gaussians, view.camera, made.masks(view.name)).weight)
+    return f"{IDS * len(made.views)} masks, {entries} masses on {GAUSSIANS} Gaussians"
+
+
+PARTS = {"features": (features, 100), "labels": (labels, 1000), "masks": (masks, 1000)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", nargs="?", choices=list(PARTS))
+    parser.add_argument("--views", type=int)
+    args = parser.parse_args()
+    if args.part is None:
+        for part in PARTS:
+            subprocess.run([sys.executable, __file__, part, *sys.argv[1:]], check=True)
+        return
+    measure, usual = PARTS[args.part]
+    made = Made(args.views or usual)
+    started, worked = time.perf_counter(), time.process_time()
+    what = measure(made)
+    wall, cpu = time.perf_counter() - started, time.process_time() - worked
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(
+        f"{args.part}: {len(made.views)} views at {WIDTH}x{HEIGHT}, {what}: {wall:.1f} s "
+        f"({cpu:.1f} s of CPU, {threads()} threads), peak {peak:.2f} GB"
+    )
+
+
+if __name__ == "__main__":
+    main()
