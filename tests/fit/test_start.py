@@ -145,5 +145,59 @@ def test_the_capture_keeps_its_points(capture: Capture) -> None:
         assert found.points is not None
         return len(found.points)
 
-    assert points("auto") == points("points") == 60
+    assert points("points") == points("auto", strategy="classic") == 60
+    assert points("auto", max_gaussians=120) == 60, "half of the budget is there already"
     assert points("random", max_gaussians=77) == 77
+
+
+def test_few_points_are_joined_by_places_where_photographs_agree(capture: Capture) -> None:
+    """The capture's points come first, as they were; those beside them lie between their depths."""
+    photographs = Photographs(capture.train_views, longest=1600)
+
+    def filled(**options: object) -> Capture:
+        generator = torch.Generator().manual_seed(0)
+        chosen = FitOptions(max_gaussians=4000, **options)
+        return with_start_points(capture, photographs, options=chosen, generator=generator)
+
+    cloud, own = filled().points, capture.points
+    assert cloud is not None
+    assert own is not None
+    assert 1000 < len(cloud) <= 2000
+    assert torch.equal(cloud.points[:60], own.points)
+    assert cloud.colours is not None
+    assert own.colours is not None
+    assert torch.equal(cloud.colours[:60], own.colours)
+    bounds = []
+    for view in capture.train_views:
+        pixels, depth = view.camera.project(own.points.double())
+        inside = (pixels >= 0).all(1) & (pixels[:, 0] < 56) & (pixels[:, 1] < 48) & (depth > 0)
+        bounds.append(depth[inside])
+    low, high = float(torch.cat(bounds).min()), float(torch.cat(bounds).max())
+    _, from_first = capture.train_views[0].camera.project(cloud.points[60:100].double())
+    assert float(from_first.min()) > 0.75 * low
+    assert float(from_first.max()) < 1.3 * high
+    example = photographs.example(0)
+    pixels, _ = capture.train_views[0].camera.project(cloud.points[60:100].double())
+    found = example.photograph[pixels[:, 1].long(), pixels[:, 0].long()]
+    torch.testing.assert_close(found, cloud.colours[60:100] / 255.0, atol=0.003, rtol=0)
+    grey = replace(capture, points=replace(own, colours=None))
+    mixed = with_start_points(
+        grey,
+        photographs,
+        options=FitOptions(max_gaussians=4000),
+        generator=torch.Generator().manual_seed(0),
+    ).points
+    assert mixed is not None
+    assert torch.equal(mixed.points, cloud.points)
+    assert mixed.colours is None
+
+
+def test_places_that_views_disagree_about_are_left_out(capture: Capture) -> None:
+    """Photographs that have nothing in common agree nowhere."""
+    photographs = Photographs(capture.train_views, longest=1600)
+    generator = torch.Generator().manual_seed(0)
+    none = random_points(photographs, count=500, generator=generator, agreed=0.0)
+    assert len(none) == 0
+    generator = torch.Generator().manual_seed(0)
+    some = random_points(photographs, count=500, generator=generator, agreed=0.02)
+    assert 0 < len(some) < 500

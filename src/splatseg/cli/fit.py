@@ -237,7 +237,8 @@ def _beginning(capture: Capture, options: FitOptions) -> str:
     points = 0 if capture.points is None else len(capture.points)
     drawn = ""
     if (number := random_start_count(capture, options)) > 0:
-        drawn = f"; starting at {number} places where photographs agree"
+        where = "at" if points == 0 or options.start == "random" else "at these and up to"
+        drawn = f"; starting {where} {number} places where photographs agree"
     return (
         f"{capture.path} ({capture.format}): {train} training views, {test} held out, "
         f"{points} start points{drawn}\n"

@@ -129,7 +129,8 @@ class FitOptions:
 
     start: Literal["auto", "points", "random"] = "auto"
     """Where Gaussians start. points: at the capture's points. random: on rays of the photographs,
-    where several of them agree. auto: at the points if there are any."""
+    where several of them agree. auto: at the points, and where there are none or few (the mcmc
+    strategy: under 30 000) at places where photographs agree beside them."""
 
     start_opacity: float = 0.1
     """Opacity of a start point, in (0, 1)."""

@@ -1,8 +1,10 @@
-"""Start points where a capture has none: on rays of the photographs, where others agree.
+"""Start points where a capture has none or few: on rays of the photographs, where others agree.
 
 A pixel's ray is cut at many depths, and each place is looked up in views nearby. Where they
 show what the pixel shows there may be a surface; elsewhere there is none. That is rough, but far
-better than a cloud drawn blindly: floaters are hard to get rid of.
+better than a cloud drawn blindly: floaters are hard to get rid of. Where a capture has points,
+but few, as after structure from motion, they say how deep things may lie, and only places where
+the views really agree are added to them.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +18,17 @@ from splatseg.fit._options import FitOptions
 from splatseg.fit._photographs import Example, Photographs
 
 COUNT = 30_000
-"""Points drawn, unless `max_gaussians` is less."""
+"""Points drawn where a capture has none, unless `max_gaussians` is less."""
+
+_FULL_SHARE = 0.5
+"""The capture's own points are filled up to `COUNT`, or to so much of `max_gaussians`."""
+
+_AGREED = 0.05
+"""Places beside the capture's own points agree to so much, mean difference of colours in
+[0, 1]."""
+
+_FEWEST_DEPTHS = 100
+"""Depths of the capture's points in its views that it takes to say how deep things lie."""
 
 _LONGEST = 200  # pixels of a photograph at which it is looked up
 _MOST_SOURCES = 150  # views that rays start from
@@ -62,15 +74,57 @@ def with_start_points(
     count = random_start_count(capture, options)
     if count == 0:
         return capture
-    return replace(capture, points=random_points(photographs, count=count, generator=generator))
+    own = None if options.start == "random" else capture.points
+    if own is None or len(own) == 0:
+        points = random_points(photographs, count=count, generator=generator)
+        return replace(capture, points=points)
+    if not bool(own.points.isfinite().all()):
+        return capture  # and be refused
+    more = random_points(
+        photographs,
+        count=count,
+        generator=generator,
+        region=_region_of(own, photographs),
+        agreed=_AGREED,
+    )
+    return replace(capture, points=_together(own, more))
 
 
 def random_start_count(capture: Capture, options: FitOptions) -> int:
-    """How many points a fit of this capture would start from that are not the capture's."""
-    own = capture.points is not None and len(capture.points) > 0
-    if options.start == "points" or (options.start == "auto" and own):
+    """How many places a fit of this capture would try that are not the capture's points."""
+    own = 0 if capture.points is None else len(capture.points)
+    if options.start == "points":
         return 0
-    return min(COUNT, options.max_gaussians)
+    if options.start == "random" or own == 0:
+        return min(COUNT, options.max_gaussians)
+    if options.strategy == "classic":
+        return 0  # as published
+    return max(0, min(COUNT, int(_FULL_SHARE * options.max_gaussians)) - own)
+
+
+def _region_of(points: PointCloud, photographs: Photographs) -> Region:
+    """Depths at which points lie in the views, with some room; of all cameras if few do."""
+    cameras = [photographs.camera(i) for i in range(len(photographs))]
+    found: list[Tensor] = []
+    for camera in cameras:
+        pixels, depth = camera.project(points.points.double())
+        shown = (depth > 0) & (pixels >= 0).all(dim=1)
+        shown &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+        found.append(depth[shown])
+    depths = torch.cat(found).sort().values
+    if len(depths) < _FEWEST_DEPTHS:
+        return visible_region(cameras)
+    near, usual, far = (float(depths[int(q * (len(depths) - 1))]) for q in (0.01, 0.5, 0.99))
+    return Region(near=0.8 * near, far=1.25 * far, usual=usual, core=None)
+
+
+def _together(own: PointCloud, more: PointCloud) -> PointCloud:
+    """Both; points without a colour are grey."""
+    points = torch.cat((own.points.float(), more.points))
+    if own.colours is None or more.colours is None:
+        colours = own.colours if len(more) == 0 else None
+        return PointCloud(points=points, colours=colours)
+    return PointCloud(points=points, colours=torch.cat((own.colours, more.colours)))
 
 
 def visible_region(cameras: list[Camera]) -> Region:
@@ -106,7 +160,12 @@ def visible_region(cameras: list[Camera]) -> Region:
 
 
 def random_points(
-    photographs: Photographs, *, count: int, generator: torch.Generator
+    photographs: Photographs,
+    *,
+    count: int,
+    generator: torch.Generator,
+    region: Region | None = None,
+    agreed: float | None = None,
 ) -> PointCloud:
     """Points on rays of random pixels, each at the depth at which most views agree on it.
 
@@ -114,8 +173,14 @@ def random_points(
         photographs: At least one.
         count: How many points.
         generator: Source of randomness, on the CPU.
+        region: Depths worth looking at; None is `visible_region` of the cameras, of which near
+            depths must agree better.
+        agreed: Places at which views differ by this much or more are left out, mean difference
+            of colours in [0, 1]; None keeps all.
     """
-    region = visible_region([photographs.camera(i) for i in range(len(photographs))])
+    guessed = region is None
+    if region is None:
+        region = visible_region([photographs.camera(i) for i in range(len(photographs))])
     sources = torch.linspace(0, len(photographs) - 1, min(len(photographs), _MOST_SOURCES))
     indices = sources.round().long().unique().tolist()
     examples = [_reduced(photographs, index) for index in indices]
@@ -133,9 +198,11 @@ def random_points(
         places = example.camera.unproject(at, depths.double())
         own = pictures[i][pixels[:, 1], pixels[:, 0]]
         costs = _disagreement(places, own, [(examples[j], pictures[j]) for j in order[i]])
-        best = (costs + _unlikeliness(region, depths)).argmin(dim=1)
-        points.append(places[torch.arange(len(pixels)), best].float())
-        colours.append(example.photograph[pixels[:, 1], pixels[:, 0]])
+        best = (costs + _unlikeliness(region, depths) if guessed else costs).argmin(dim=1)
+        chosen = torch.arange(len(pixels))
+        kept = chosen if agreed is None else (costs[chosen, best] < agreed).nonzero().squeeze(1)
+        points.append(places[chosen, best].float()[kept])
+        colours.append(example.photograph[pixels[:, 1], pixels[:, 0]][kept])
     if not points:
         return PointCloud(points=torch.zeros(0, 3))
     bytes_ = (torch.cat(colours).clamp(0, 1) * 255 + 0.5).to(torch.uint8)
