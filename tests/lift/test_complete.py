@@ -221,14 +221,14 @@ def test_soft_layers_stay_soft_and_known_rows_stay_as_they_are() -> None:
     assert unsure.candidates.tolist() == [[4, 9], [-1, -1], [9, -1]]
 
 
-def smoothed_by_hand(labels: Labels, *, strength: float, scale: float) -> torch.Tensor:
+def smoothed_by_hand(labels: Labels, *, strength: float) -> torch.Tensor:
     """Three in a row with equal edges and ids 1 and 2, iterated in full precision."""
     step = torch.tensor([[0.0, 1, 0], [0.5, 0, 0.5], [0, 1, 0]], dtype=torch.float64)
-    own = labels.evidence.double().unsqueeze(1) / scale
+    own = labels.evidence.double().unsqueeze(1)
     given = (labels.ids.unsqueeze(1) == torch.tensor([1, 2])).double()
     given = given * labels.confidence.double().unsqueeze(1)
     now = given
-    for _ in range(10):
+    for _ in range(5):
         now = (own * given + strength * step @ now) / (own + strength)
     return now
 
@@ -236,17 +236,17 @@ def smoothed_by_hand(labels: Labels, *, strength: float, scale: float) -> torch.
 def test_smoothing_corrects_what_little_evidence_says() -> None:
     gaussians = on_a_line([0.0, 1.0, 2.0])
     labels = hard([1, 2, 1], confidence=[0.9, 0.6, 0.9], evidence=[40.0, 2.0, 40.0])
-    given = {"neighbours": 1, "smoothing_evidence": 4.0}
+    given = {"neighbours": 1}
     assert labelled(gaussians, labels, **given).ids.tolist() == [1, 2, 1]
-    weak = labelled(gaussians, labels, smoothing=0.1, **given)
+    weak = labelled(gaussians, labels, smoothing=0.4, **given)
     assert weak.ids.tolist() == [1, 2, 1]
     assert not bool(weak.inferred.any())
-    strong = labelled(gaussians, labels, smoothing=2.0, **given)
+    strong = labelled(gaussians, labels, smoothing=8.0, **given)
     assert strong.ids.tolist() == [1, 1, 1]
     assert strong.inferred.tolist() == [False, True, False]
     assert strong.metadata["completion"]["corrected"] == 1
-    for result, strength in ((weak, 0.1), (strong, 2.0)):
-        expected = smoothed_by_hand(labels, strength=strength, scale=4.0).amax(dim=1)
+    for result, strength in ((weak, 0.4), (strong, 8.0)):
+        expected = smoothed_by_hand(labels, strength=strength).amax(dim=1)
         torch.testing.assert_close(result.confidence.double(), expected, rtol=0, atol=1e-5)
 
 
@@ -327,7 +327,6 @@ def test_bad_input_is_refused() -> None:
         {"own_evidence": math.inf},
         {"smoothing": -0.1},
         {"smoothing": math.nan},
-        {"smoothing_evidence": 0.0},
         {"colour_width": 0.0},
         {"feature_width": -1.0},
         {"min_inferred": 1.5},

@@ -12,7 +12,7 @@ that a random walk over the graph first meets evidence for that id.
 
 With ``smoothing`` known Gaussians listen too, the more the weaker their own evidence e is:
 
-.. math:: x_i \leftarrow \frac{(e_i / e_0)\, y_i + s \sum_j P_{ij} x_j}{e_i / e_0 + s}
+.. math:: x_i \leftarrow \frac{e_i\, y_i + s \sum_j P_{ij} x_j}{e_i + s}
 
 References:
     Zhu and Ghahramani, Learning from Labeled and Unlabeled Data with Label Propagation (2002),
@@ -68,14 +68,10 @@ class CompletionOptions:
     """Width of the feature affinity, in squared median distances of features along edges."""
 
     smoothing: float = 0.0
-    """How much neighbours count beside a Gaussian's own evidence; 0 leaves labels with evidence
-    as they are."""
+    """How much the neighbours of a Gaussian count together beside its own evidence, in pixels'
+    worth of blending weight; 50 is a good start. 0 leaves labels with evidence as they are."""
 
-    smoothing_evidence: float = 10.0
-    """Evidence, in pixels' worth of blending weight, that counts as much as the neighbours of
-    a Gaussian do at a smoothing of 1."""
-
-    smoothing_steps: int = 10
+    smoothing_steps: int = 5
     """How many neighbours far known labels are smoothed."""
 
     completed_layer: CompletedLayer = "as_given"
@@ -90,7 +86,7 @@ class CompletionOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise RangeError(f"{name}: expected 0 or more, got {value}.")
-        for name in ("colour_width", "feature_width", "smoothing_evidence"):
+        for name in ("colour_width", "feature_width"):
             value = getattr(self, name)
             if not value > 0:
                 raise RangeError(f"{name}: expected a positive number, got {value}.")
@@ -154,8 +150,7 @@ def complete(
         )
     )
     if options.smoothing > 0 and labels.evidence is not None:
-        weight = labels.evidence.cpu().double().numpy() / options.smoothing_evidence
-        own = np.where(known, weight, 0.0).astype(np.float32)
+        own = np.where(known, labels.evidence.cpu().float().numpy(), 0.0).astype(np.float32)
         table = diffuse(
             step,
             table,
