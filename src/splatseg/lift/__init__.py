@@ -1,5 +1,8 @@
 """2D evidence to per-Gaussian layers, and layers back to label maps of views."""
 
+from splatseg.lift._recorded import EvidenceSegments as EvidenceSegments
+from splatseg.lift.associate import AssociateOptions as AssociateOptions
+from splatseg.lift.associate import associate as associate
 from splatseg.lift.attach import Attached as Attached
 from splatseg.lift.attach import AttachOptions as AttachOptions
 from splatseg.lift.attach import attach as attach

@@ -1,0 +1,292 @@
+"""Segments of unordered views become instances."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, View
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift import AssociateOptions, associate
+from splatseg.lift._segment_table import segment_table
+
+from .conftest import camera_at, gaussians_at
+
+BACKEND = "reference"
+
+# Three squares of four Gaussians each, side by side, and one Gaussian that no view shows.
+LEFT, MIDDLE, RIGHT = -0.6, 0.0, 0.6
+SPREAD = ((-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1), (0.1, 0.1))
+CENTRES = [(x + dx, dy, 2.0) for x in (LEFT, MIDDLE, RIGHT) for dx, dy in SPREAD]
+GAUSSIANS = gaussians_at([*CENTRES, (0.0, 0.0, -5.0)], scale=0.06, opacity=0.95)
+TRUTH = [1] * 4 + [2] * 4 + [3] * 4
+VIEWS = [
+    View(name=f"v{i}", camera=camera_at(x, width=64, height=32))
+    for i, x in enumerate((-0.1, 0.0, 0.1, 0.05))
+]
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Segments in memory."""
+
+    of: Mapping[str, LabelMap | MaskSet]
+    categories: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
+    overlapping: bool = False
+
+    @property
+    def view_names(self) -> tuple[str, ...]:
+        return tuple(self.of)
+
+    def segments_of(self, name: str) -> LabelMap | MaskSet:
+        return self.of[name]
+
+    def categories_of(self, name: str) -> Mapping[int, int]:
+        return self.categories.get(name, {})
+
+
+def columns(view: View, *borders: float) -> torch.Tensor:
+    """Which strip between borders (world x at depth 2) each pixel is in, from 0; -1 outside."""
+    camera = view.camera
+    x = torch.arange(camera.width) + 0.5
+    world = (x - camera.cx) / camera.fx * 2.0 - float(camera.cam_from_world[0, 3])
+    strip = torch.bucketize(world.float(), torch.tensor(borders)) - 1
+    strip[strip == len(borders) - 1] = -1
+    return strip.expand(camera.height, camera.width)
+
+
+def mapped(strips: torch.Tensor, names: list[int]) -> LabelMap:
+    table = torch.tensor([*names, -1], dtype=torch.int32)
+    return LabelMap(ids=table[strips])
+
+
+BORDERS = (-1.2, -0.3, 0.3, 1.2)
+
+
+def clean(names: Mapping[str, list[int]]) -> Segments:
+    return Segments({v.name: mapped(columns(v, *BORDERS), names[v.name]) for v in VIEWS})
+
+
+NAMES = {"v0": [7, 8, 9], "v1": [9, 7, 8], "v2": [1, 2, 3], "v3": [70000, 5, 1]}
+SAME = {name: [1, 2, 3] for name in NAMES}
+
+
+def run(source: Segments, views=VIEWS, **options):
+    chosen = AssociateOptions(**options)
+    return associate(GAUSSIANS, views, source, options=chosen, backend=BACKEND)
+
+
+def groups(ids: torch.Tensor) -> list[frozenset[int]]:
+    """The Gaussians of each instance."""
+    return sorted(
+        (frozenset((ids == i).nonzero().squeeze(1).tolist()) for i in ids.unique() if i > 0),
+        key=min,
+    )
+
+
+THINGS = [frozenset(range(4)), frozenset(range(4, 8)), frozenset(range(8, 12))]
+
+
+def test_ids_of_each_views_own_become_instances() -> None:
+    labels = run(clean(NAMES))
+    assert groups(labels.ids) == THINGS
+    assert int(labels.ids[12]) == -1
+    assert labels.evidence is not None
+    assert float(labels.evidence[12]) == 0
+    assert bool((labels.confidence[:12] > 0.95).all())
+    # Outer things are as large as each other, and larger than the middle one in no way; each has
+    # a segment in all four views.
+    rows = labels.metadata["instances"]
+    assert [row["segments"] for row in rows] == [4, 4, 4]
+    assert [row["views"] for row in rows] == [4, 4, 4]
+    assert labels.metadata["associate"] == {
+        "segments": 12,
+        "instances": 3,
+        "left_out": 0,
+        "joined_within_views": 0,
+    }
+    json.dumps(labels.metadata)
+
+
+def test_neither_order_nor_names_matter() -> None:
+    one = run(clean(NAMES))
+    other = run(
+        clean({"v0": [3, 1, 2], "v1": [1, 2, 3], "v2": [5, 900, 4], "v3": [2, 3, 1]}), VIEWS[::-1]
+    )
+    assert torch.equal(one.ids, other.ids)
+    assert torch.equal(one.confidence, other.confidence)
+    assert one.metadata["associate"] == other.metadata["associate"]
+
+
+def test_a_split_in_one_view_is_outvoted() -> None:
+    source = clean(NAMES)
+    # In v2 the left thing falls apart into one fifth and four fifths.
+    halves = mapped(columns(VIEWS[2], -1.2, -0.62, -0.3, 0.3, 1.2), [10, 11, 12, 13])
+    labels = run(Segments({**source.of, "v2": halves}))
+    assert groups(labels.ids) == THINGS
+    assert labels.metadata["associate"]["segments"] == 13
+
+
+def test_a_merger_in_one_view_is_outvoted() -> None:
+    source = clean(NAMES)
+    merged = mapped(columns(VIEWS[1], *BORDERS), [4, 4, 6])
+    labels = run(Segments({**source.of, "v1": merged}))
+    assert groups(labels.ids) == THINGS
+
+
+def test_a_switch_of_tracks_is_repaired() -> None:
+    """Ids that mean the same in all views but for two that change places: geometry decides."""
+
+    labels = run(clean({**SAME, "v3": [2, 1, 3]}))
+    assert groups(labels.ids) == THINGS
+
+
+def test_things_that_are_out_of_a_picture_are_not_missed_there() -> None:
+    """One view shows the right thing alone, another the left one: they are compared with others."""
+    source = clean(NAMES)
+    of = dict(source.of)
+    for name, kept in (("v0", 2), ("v2", 0)):
+        view = next(view for view in VIEWS if view.name == name)
+        ids = torch.where(columns(view, *BORDERS) == kept, 1, -1).int()
+        of[name] = LabelMap(ids=ids)
+    labels = run(Segments(of))
+    assert groups(labels.ids) == THINGS
+    assert sorted(row["segments"] for row in labels.metadata["instances"]) == [2, 3, 3]
+
+
+def test_small_things_speak_louder_than_what_swallows_them() -> None:
+    """The middle thing is seen by three views and swallowed by its larger neighbours in four."""
+    wide = [
+        View(name=f"w{i}", camera=camera_at(x, width=64, height=32))
+        for i, x in enumerate((-0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2))
+    ]
+    of = {}
+    for i, view in enumerate(wide):
+        strips = columns(view, *BORDERS)
+        of[view.name] = mapped(strips, [1, 2, 1] if i < 3 else [1, 1, 1])
+    labels = {
+        exponent: run(Segments(of), wide, small_things=exponent, agreement=0.5).ids[4:8]
+        for exponent in (0.0, 0.6)
+    }
+    # The outer things have one id in every view: one instance, and the larger one.
+    assert labels[0.0].unique().tolist() == [1]
+    assert labels[0.6].unique().tolist() == [2]
+
+
+def test_accidents_are_left_out() -> None:
+    source = clean(NAMES)
+    # Only v1 sees a fourth thing in the upper half of the middle one.
+    ids = source.of["v1"].ids.clone()
+    ids[:16][ids[:16] == 7] = 4
+    source = Segments({**source.of, "v1": LabelMap(ids=ids)})
+    assert run(source, least_views=2).metadata["associate"]["instances"] == 3
+    assert run(source, least_views=5).metadata["associate"]["instances"] == 3, "4 views are all"
+    alone = run(source, VIEWS[1:2], least_views=2)
+    assert alone.metadata["associate"]["instances"] == 4, "one view is all there is"
+
+
+def test_names_come_from_categories() -> None:
+    source = replace(
+        clean(SAME),
+        categories={"v0": {1: 5, 2: 6}, "v1": {1: 6, 2: 6}, "v2": {1: 5}, "v3": {}},
+    )
+    classes = ClassTable(
+        rows=(ClassInfo(id=5, name="cup", isthing=True), ClassInfo(id=6, name="book", isthing=True))
+    )
+    labels = associate(GAUSSIANS, VIEWS, source, classes=classes, backend=BACKEND)
+    by_thing = {int(labels.ids[4 * i]): i for i in range(3)}
+    rows = {by_thing[row["id"]]: row for row in labels.metadata["instances"]}
+    assert [rows[i]["class"] for i in range(3)] == [5, 6, 0]
+    assert rows[0]["name"] == f"cup {rows[0]['id']}"
+    assert rows[2]["name"] == f"object {rows[2]['id']}"
+    assert labels.metadata["names"][str(rows[1]["id"])] == rows[1]["name"]
+
+
+def nested(view: View, *, parts: bool, pair: bool, whole: bool) -> MaskSet:
+    """Masks of a view: things, their upper and lower halves, and two things as one."""
+    strips = columns(view, *BORDERS)
+    upper = torch.arange(view.camera.height).unsqueeze(1) < view.camera.height // 2
+    found = []
+    if whole:
+        found += [strips == i for i in range(3)]
+    if parts:
+        found += [(strips == 0) & upper, (strips == 0) & ~upper]
+    if pair:
+        found += [(strips == 1) | (strips == 2)]
+    found.append(torch.zeros_like(found[0]))
+    return MaskSet.from_dense(torch.stack(found))
+
+
+def test_of_nested_masks_those_that_most_views_have_are_taken() -> None:
+    things = Segments(
+        {v.name: nested(v, parts=i < 2, pair=i == 2, whole=True) for i, v in enumerate(VIEWS)},
+        overlapping=True,
+    )
+    assert groups(run(things).ids) == THINGS
+    # Parts everywhere, wholes in one view only: then the halves of the left thing are taken.
+    of = {v.name: nested(v, parts=True, pair=False, whole=i in (0, 1)) for i, v in enumerate(VIEWS)}
+    labels = run(Segments(of, overlapping=True))
+    assert groups(labels.ids) == [
+        frozenset((0, 1)),
+        frozenset((2, 3)),
+        THINGS[1],
+        THINGS[2],
+    ]
+
+
+def test_memory_is_bounded_by_the_views_that_see_most() -> None:
+    table = segment_table(GAUSSIANS, VIEWS, clean(NAMES), most_views=2, backend=BACKEND)
+    whole = segment_table(GAUSSIANS, VIEWS, clean(NAMES), most_views=4, backend=BACKEND)
+    pairs = np.unique(np.stack((table.gaussian, table.view[table.segment])), axis=1)
+    assert np.bincount(pairs[0]).max() == 2
+    for i in range(12):
+        best = np.sort(np.unique(whole.seen[whole.gaussian == i]))[-2:]
+        assert set(table.seen[table.gaussian == i]) <= set(best)
+    assert groups(run(clean(NAMES), most_views=3).ids) == THINGS
+
+
+def test_masses_are_those_of_the_masks() -> None:
+    table = segment_table(GAUSSIANS, VIEWS, clean(NAMES), most_views=9, backend=BACKEND)
+    assert table.views == ("v0", "v1", "v2", "v3")
+    assert len(table.view) == 12
+    assert table.view.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert table.name.tolist() == [7, 8, 9, 9, 7, 8, 1, 2, 3, 70000, 5, 1]
+    # A strip holds its own thing and nothing else; what a view sees of it is what the strip holds.
+    for row in range(12):
+        entries = table.segment == row
+        held = table.gaussian[entries][table.mass[entries] > 0.05]
+        assert set(held.tolist()) == THINGS[row % 3]
+        np.testing.assert_allclose(
+            table.mass[entries][table.mass[entries] > 0.05],
+            table.seen[entries][table.mass[entries] > 0.05],
+            rtol=0.01,
+        )
+    np.testing.assert_allclose(
+        table.size, np.bincount(table.segment, table.mass, minlength=12), rtol=1e-6
+    )
+
+
+def test_hostile_input() -> None:
+    source = clean(NAMES)
+    with pytest.raises(InputError, match="no segments of view 'v9'"):
+        run(source, [View(name="v9", camera=camera_at())])
+    void = LabelMap(ids=torch.full((32, 64), -1, dtype=torch.int32))
+    with pytest.raises(InputError, match="expected a segment in 4 views, found none"):
+        run(Segments(dict.fromkeys(NAMES, void)))
+    with pytest.raises(ShapeError, match="v0"):
+        run(Segments({**source.of, "v0": LabelMap(ids=torch.ones(5, 64, dtype=torch.int32))}))
+    with pytest.raises(RangeError, match="agreement"):
+        AssociateOptions(agreement=1.5)
+    with pytest.raises(RangeError, match="small_things"):
+        AssociateOptions(small_things=-1.0)
+    with pytest.raises(RangeError, match="least_views"):
+        AssociateOptions(least_views=0)
+    # Segments where no Gaussian is: no instance, no error.
+    corner = torch.full((32, 64), -1, dtype=torch.int32)
+    corner[0, 0] = 1
+    empty = run(Segments(dict.fromkeys(NAMES, LabelMap(ids=corner))))
+    assert empty.ids.unique().tolist() == [-1]
+    assert empty.metadata["associate"]["instances"] == 0
