@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ import torch
 from PIL import Image
 
 from splatseg.core import Labels, Selection
-from splatseg.io.scene import load_scene, save_scene_layer
+from splatseg.evaluate import labels_of_points
+from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 
 CPU = ("--backend", "cpu")
 CLASSES = [
@@ -112,6 +114,33 @@ def test_panoptic_agrees_with_the_scorer(labelled, both, tmp_path, ranked) -> No
     assert set(ours["AP50_per_class"]) == {"2", "7"}
 
 
+def test_a_layer_that_tells_the_classes_of_its_instances(labelled, both) -> None:
+    capture = labelled.capture
+    layer = load_scene_layer(labelled.scene, "objects")
+    rows = [{"id": 4, "class": 2}, {"id": 5, "class": 7}, {"id": 600, "class": 0}, "odd"]
+    metadata = {**layer.metadata, "instances": rows}
+    save_scene_layer(labelled.scene, "objects", replace(layer, metadata=metadata))
+    (both.out / "named").mkdir()
+    for path in (both.out / "objects").glob("*.png"):
+        ids = np.array(Image.open(path))
+        named = np.where(ids == 4, 2, np.where(ids == 5, 7, 0)).astype(np.uint16)
+        Image.fromarray(named).save(both.out / "named" / path.name)
+    ours, theirs = both(
+        (
+            "--layer", "objects", "--truth", capture / "semantic", "--metric", "panoptic",
+            "--truth-instances", capture / "instance",
+        ),
+        (
+            "panoptic", "--pred-instance", both.out / "objects",
+            "--pred-semantic", both.out / "named", "--truth-instance", capture / "instance",
+            "--truth-semantic", capture / "semantic", "--metadata", capture / "metadata.json",
+        ),
+    )  # fmt: skip
+    assert theirs["tp"] > 0
+    for key, value in theirs.items():
+        assert ours[key] == pytest.approx(value, abs=1e-9), key
+
+
 def test_points_agree_with_the_scorer(labelled, both, rng, tmp_path) -> None:
     gaussians = load_scene(labelled.scene).gaussians
     xyz = gaussians.means[rng.integers(0, len(gaussians), 400)].numpy()
@@ -120,9 +149,6 @@ def test_points_agree_with_the_scorer(labelled, both, rng, tmp_path) -> None:
     semantic[:30] = 0
     instance = np.where(xyz[:, 0] < 0, 21, 22).astype(np.uint16)
     np.savez(tmp_path / "points.npz", xyz=xyz, semantic=semantic, instance=instance)
-    from splatseg.evaluate import labels_of_points
-    from splatseg.io.scene import load_scene_layer
-
     ids = load_scene_layer(labelled.scene, "classes").ids
     given = labels_of_points(gaussians, ids, torch.from_numpy(xyz)).numpy()
     np.savez(tmp_path / "pred.npz", semantic=given)
@@ -192,7 +218,8 @@ def refusals(labelled, tmp_path):
     return [
         (("--truth", semantic), "--layer"),
         (layer, "--truth"),
-        (panoptic, "--instances"),
+        (panoptic, "--truth-instances"),
+        ((*panoptic, "--truth-instances", instance), "tells the class of each instance"),
         ((*layer, "--truth", semantic, "--instances", "objects"), "--metric panoptic"),
         ((*whole, "--scores", tmp_path / "bad.json"), "bad.json: expected scores"),
         ((*whole, "--instances", "nothing"), "nothing"),

@@ -249,7 +249,11 @@ def test_what_association_says_is_shown(write) -> None:
         "odd": {"a": [1] * 500},
         "empty": [],
     }
-    page = write(labels=layer_of(write.scene, metadata={"associate": said}))
+    listed = [{"id": 2, "segments": 31, "views": 4}, {"id": 3, "segments": 17}, "odd", {"id": "x"}]
+    metadata = {"associate": said, "instances": listed}
+    page = write(labels=layer_of(write.scene, metadata=metadata))
+    row = re.search(r"<td>red &lt;wall&gt;</td>.*?</tr>", page)
+    assert re.findall(r">([^<>]+)</td>", row[0])[3:] == ["31", "4"]
     for words in ("Segments to instances", "812", "Merged", "Split", "4, 5", "x &amp; y", "Odd"):
         assert words in page, words
     assert "Empty" not in page

@@ -74,7 +74,8 @@ class Command:
     --metric instances."""
 
     instances: str | None = None
-    """With panoptic: name of the layer of instances; --layer is that of the classes."""
+    """With panoptic: name of the layer of instances; --layer is that of the classes. None takes
+    --layer for both: its metadata must tell each instance's class, as that of associate does."""
 
     truth_instances: Path | None = None
     """With panoptic: folder of the true instance maps; --truth is that of the classes."""
@@ -159,13 +160,18 @@ def _check(command: Command) -> None:
         raise InputError("--layer: expected the layer that --truth and --points are to score.")
     if command.layer is not None and not (command.truth or command.points):
         raise InputError("--truth: expected a folder of true id maps (or --points), got none.")
-    panoptic = (command.instances, command.truth_instances)
-    if command.metric == "panoptic" and None in panoptic and command.truth is not None:
+    panoptic = (
+        command.instances,
+        command.truth_instances,
+        command.metadata,
+        command.scores,
+    )
+    if command.metric == "panoptic" and command.truth_instances is None:
         raise InputError(
-            "--metric panoptic: expected --instances LAYER and --truth-instances DIR beside "
-            "--layer and --truth, which are of classes."
+            "--truth-instances: expected the folder of true instance maps beside --truth, which "
+            "is of classes, got none."
         )
-    if command.metric != "panoptic" and any((*panoptic, command.metadata, command.scores)):
+    if command.metric != "panoptic" and any(panoptic):
         raise InputError(
             "--instances, --truth-instances, --metadata, --scores: expected --metric panoptic "
             f"with them, got {command.metric}."
@@ -218,8 +224,11 @@ def _layer_figures(
         return binary_figures(report)
     if not isinstance(layer, Labels):
         raise InputError("--metric: a selection has no classes; use --metric binary.")
-    if command.metric == "panoptic":
-        return _panoptic_figures(command, scene, views, layer, truth)
+    if command.metric == "panoptic" and command.truth_instances is not None:
+        true_instances = open_evidence(command.truth_instances)
+        return _panoptic_figures(
+            command, scene, views, layer, truth=truth, true_instances=true_instances
+        )
     method = evaluate_semantic if command.metric == "semantic" else evaluate_instances
     with progress("evaluate") as step:
         report = method(
@@ -234,20 +243,22 @@ def _panoptic_figures(
     command: Command,
     scene: Scene,
     views: tuple[View, ...],
-    classes: Labels,
+    layer: Labels,
+    *,
     truth: Evidence,
+    true_instances: Evidence,
 ) -> dict[str, Any]:
-    if command.instances is None or command.truth_instances is None:
-        raise InputError("--instances, --truth-instances: expected both with --metric panoptic.")
-    instances = _labels(scene, command.instances, "--instances")
+    other = None
+    if command.instances is not None:
+        other = _labels(scene, command.instances, "--instances")
     with progress("evaluate") as step:
         report = evaluate_panoptic(
             scene.gaussians,
             views,
-            classes=classes,
-            instances=instances,
+            classes=None if other is None else layer,
+            instances=layer if other is None else other,
             true_classes=truth,
-            true_instances=open_evidence(command.truth_instances),
+            true_instances=true_instances,
             table=_thing_table(command, scene, truth),
             scores=None if command.scores is None else read_scores(command.scores),
             backend=command.backend,

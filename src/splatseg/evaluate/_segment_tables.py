@@ -171,7 +171,12 @@ def association_tables(metadata: Mapping[str, Any]) -> list[Block]:
 def id_table(
     labels: Labels, classes: ClassTable, *, scores: Mapping[int, float], scored: str
 ) -> Table:
-    """One row an id: how many Gaussians, how sure, how good where that is known."""
+    """One row an id: how many Gaussians, how sure, how good where that is known.
+
+    Where the method lists its instances, also how many segments and views each was seen in.
+    """
+    told = _told_of_instances(labels.metadata)
+    also = [key for key in ("segments", "views") if any(key in row for row in told.values())]
     ids, confidence = labels.ids.cpu().long(), labels.confidence.detach().double().cpu()
     rows: list[tuple[Cell, ...]] = []
     for row in classes.rows:
@@ -179,6 +184,7 @@ def id_table(
         count = int(mask.sum())
         mean = float(confidence[mask].mean()) if count else None
         values: list[Cell] = [row.id, row.name, count, mean]
+        values += [_cell(told.get(row.id, {}).get(key)) for key in also]
         if scores:
             values.append(scores.get(row.id))
         rows.append(tuple(values))
@@ -187,8 +193,16 @@ def id_table(
     notes = [f"The {_ROWS} largest; {more} more are left out."] if more > 0 else []
     if scores:
         notes.append(f"IoU is of {scored}; a dash where the truth has none of it.")
-    columns = ("id", "name", "Gaussians", "confidence", *(("IoU",) if scores else ()))
+    columns = ("id", "name", "Gaussians", "confidence", *also, *(("IoU",) if scores else ()))
     return Table(title="Labels", columns=columns, rows=tuple(rows[:_ROWS]), note=" ".join(notes))
+
+
+def _told_of_instances(metadata: Mapping[str, Any]) -> dict[int, Mapping[str, Any]]:
+    """What the metadata lists under ``instances``, by id."""
+    rows: Any = metadata.get("instances")
+    listed = cast(list[Any], rows) if isinstance(rows, list) else []
+    objects = [cast(Mapping[str, Any], row) for row in listed if isinstance(row, Mapping)]
+    return {row["id"]: row for row in objects if isinstance(row.get("id"), int)}
 
 
 def fact_rows(values: object) -> list[tuple[Cell, ...]]:

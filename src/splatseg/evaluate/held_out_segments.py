@@ -7,12 +7,14 @@ does not grow with the number of views.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.core import ClassTable, Gaussians, Labels, View
+from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, View
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.held_out import Progress, drawn_like, learned_from, with_truth
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
@@ -123,7 +125,7 @@ def evaluate_panoptic(
     gaussians: Gaussians,
     views: Sequence[View],
     *,
-    classes: Labels,
+    classes: Labels | None,
     instances: Labels,
     true_classes: LabelSource,
     true_instances: LabelSource,
@@ -140,7 +142,8 @@ def evaluate_panoptic(
     Args:
         gaussians: The Gaussians of the scene.
         views: Where to look; those without a truth are left out.
-        classes: The layer of classes, in the ids of the truth.
+        classes: The layer of classes, in the ids of the truth. None takes the class that the
+            layer of instances says each of them has (`classes_of_instances`), pixel by pixel.
         instances: The layer of instances; its ids need not be the truth's.
         true_classes: Class maps by view name; -1 is void.
         true_instances: Instance maps by view name, of the same views.
@@ -151,11 +154,13 @@ def evaluate_panoptic(
         progress: Called with the views done and their number.
 
     Raises:
-        InputError: If no view has a truth, or one has classes but no instances.
+        InputError: If no view has a truth, one has classes but no instances, or a layer that
+            should tell the classes of its instances does not.
         ShapeError: If a truth does not have its photograph's proportions, or the two differ.
     """
     things = frozenset(row.id for row in table.rows if row.isthing)
     scored = sorted(with_truth(views, true_classes), key=lambda view: view.name)
+    class_of = None if classes is not None else classes_of_instances(instances)
     known = set(true_instances.view_names)
     lacking = [view.name for view in scored if view.name not in known]
     if lacking:
@@ -171,18 +176,22 @@ def evaluate_panoptic(
                 f"true_instances: {view.name}: expected the size {tuple(true.ids.shape)} of the "
                 f"true classes, got {tuple(true_ids.ids.shape)}."
             )
-        drawn = drawn_like(gaussians, view, classes, true, options=options, backend=backend)
-        found = drawn_like(gaussians, view, instances, true, options=options, backend=backend)
+        found = drawn_like(gaussians, view, instances, true, options=options, backend=backend).ids
+        if classes is not None:
+            drawn = drawn_like(gaussians, view, classes, true, options=options, backend=backend).ids
+        else:
+            drawn = _looked_up(found, class_of or {})
         one = Overlaps.of(
-            segment_keys(drawn.ids, found.ids, things=things),
+            segment_keys(drawn, found, things=things),
             segment_keys(true.ids, true_ids.ids, things=things),
         )
         total = total + one
         detections = detections + Detections.of(one, view=view.name, things=things, scores=scores)
-        confusion = confusion + Confusion.of(drawn.ids, true.ids)
+        confusion = confusion + Confusion.of(drawn, true.ids)
         if progress is not None:
             progress(done, len(scored))
-    both = {*learned_from(classes, scored), *learned_from(instances, scored)}
+    layers = [layer for layer in (classes, instances) if layer is not None]
+    both = {name for layer in layers for name in learned_from(layer, scored)}
     return PanopticReport(
         score=panoptic_score(total, things=things),
         precision=average_precision(detections),
@@ -190,6 +199,28 @@ def evaluate_panoptic(
         views=tuple(view.name for view in scored),
         learned_from=tuple(view.name for view in scored if view.name in both),
     )
+
+
+def classes_of_instances(instances: Labels) -> dict[int, int]:
+    """Class by instance id, -1 none, as the layer's metadata lists it under ``instances``.
+
+    Raises:
+        InputError: If it does not.
+    """
+    rows: Any = instances.metadata.get("instances")
+    listed = cast(list[Any], rows) if isinstance(rows, list) else []
+    found: dict[int, int] = {}
+    for row in listed:
+        fields = cast(Mapping[str, Any], row) if isinstance(row, Mapping) else {}
+        id, category = fields.get("id"), fields.get("class")
+        if isinstance(id, int) and isinstance(category, int):
+            found[id] = category if category > 0 else UNLABELLED
+    if not found:
+        raise InputError(
+            "instances: expected a layer whose metadata tells the class of each instance, "
+            "as associate writes it, or a layer of classes beside it."
+        )
+    return found
 
 
 def evaluate_points(
@@ -234,3 +265,9 @@ def evaluate_points(
         points=int((truth >= 0).sum()),
         unlabelled=float((ids[truth >= 0] < 0).double().mean()),
     )
+
+
+def _looked_up(ids: Int[Tensor, "height width"], names: Mapping[int, int]) -> Tensor:
+    """What each id stands for; -1 where nothing says."""
+    present, at = torch.unique(ids, return_inverse=True)
+    return torch.tensor([names.get(i, UNLABELLED) for i in present.tolist()])[at]
