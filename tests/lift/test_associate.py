@@ -36,6 +36,7 @@ class Segments:
     of: Mapping[str, LabelMap | MaskSet]
     categories: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
     overlapping: bool = False
+    persistent: bool = False
 
     @property
     def view_names(self) -> tuple[str, ...]:
@@ -139,6 +140,11 @@ def test_a_merger_in_one_view_is_outvoted() -> None:
 
 def test_a_switch_of_tracks_is_repaired() -> None:
     """Ids that mean the same in all views but for two that change places: geometry decides."""
+    switched = clean({**SAME, "v3": [2, 1, 3]})
+    told = run(replace(switched, persistent=True)).metadata["associate"]
+    left, middle = (int(i) for i in run(switched).ids[[0, 4]])
+    assert told["merged"] == [{"id": i, "from": [1, 2]} for i in sorted((left, middle))]
+    assert told["split"] == [{"from": i, "ids": sorted((left, middle))} for i in (1, 2)]
 
     labels = run(clean({**SAME, "v3": [2, 1, 3]}))
     assert groups(labels.ids) == THINGS

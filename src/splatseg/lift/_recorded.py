@@ -35,6 +35,11 @@ class EvidenceSegments:
         """Masks may overlap, label maps cannot."""
         return self.evidence.kind == "masks"
 
+    @property
+    def persistent(self) -> bool:
+        """Ids of tracks are meant to go through all views."""
+        return self.evidence.kind == "tracked"
+
     def segments_of(self, name: str) -> LabelMap | MaskSet:
         """What the file of a view holds."""
         return self.evidence.masks(name) if self.overlapping else self.evidence.label_map(name)

@@ -41,6 +41,11 @@ class SegmentSource(Protocol):
         """Whether segments of one view may overlap."""
         ...
 
+    @property
+    def persistent(self) -> bool:
+        """Whether ids are meant to go through all views, as those of a tracker."""
+        ...
+
     def segments_of(self, name: str) -> LabelMap | MaskSet:
         """The segments of one view: a label map, or masks that may overlap."""
         ...
@@ -95,6 +100,22 @@ class SegmentTable:
         shape = (self.gaussians, int(group.max(initial=-1)) + 1)
         return scipy.sparse.csr_matrix((values, (self.gaussian[there], of[there])), shape=shape)
 
+    def sights(self) -> Any:
+        """Sparse (Gaussians, views): the square root of what each view sees of each Gaussian."""
+        import scipy.sparse
+
+        told = self.seen > _LEAST_WEIGHT
+        # Segments of one view repeat what that view sees of a Gaussian; it is wanted once.
+        place = self.view[self.segment[told]] * self.gaussians + self.gaussian[told]
+        places, first = np.unique(place, return_index=True)
+        return scipy.sparse.csc_matrix(
+            (
+                np.sqrt(self.seen[told][first]),
+                (places % self.gaussians, places // self.gaussians),
+            ),
+            shape=(self.gaussians, len(self.views)),
+        )
+
     def agreement(self) -> Agreement:
         """What the segments share on the Gaussians that their views both see.
 
@@ -111,13 +132,7 @@ class SegmentTable:
             ((root * share)[holds], (self.gaussian[holds], self.segment[holds])),
             shape=(self.gaussians, count),
         )
-        # Segments of one view repeat what that view sees of a Gaussian; it is wanted once.
-        place = self.view[self.segment[told]] * self.gaussians + self.gaussian[told]
-        places, first = np.unique(place, return_index=True)
-        sights: Any = scipy.sparse.csr_matrix(
-            (root[told][first], (places % self.gaussians, places // self.gaussians)),
-            shape=(self.gaussians, len(self.views)),
-        )
+        sights = self.sights()
         return Agreement(
             shared=(masses.T @ masses).tocsr(), seen=(masses.T @ sights).tocsr(), view=self.view
         )

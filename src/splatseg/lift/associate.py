@@ -134,8 +134,9 @@ def associate(
             "options": asdict(options),
             "views": list(table.views),
             "names": {str(row["id"]): row["name"] for row in rows},
+            "class_of": {str(row["id"]): row["class"] for row in rows if row["class"] > 0},
             "instances": rows,
-            "associate": _account(table, group),
+            "associate": _account(table, group, tracked=source.persistent),
         },
     )
 
@@ -214,14 +215,29 @@ def _instances(
     return rows
 
 
-def _account(table: SegmentTable, group: NDArray[np.int64]) -> dict[str, Any]:
-    """What became of the segments."""
+def _account(
+    table: SegmentTable, group: NDArray[np.int64], *, tracked: bool
+) -> dict[str, Any]:
+    """What became of the segments; of tracks, which were joined and which were divided."""
     there = group >= 0
     pairs = np.stack((group[there], table.view[there]))
     _, counts = np.unique(pairs, axis=1, return_counts=True)
-    return {
+    said: dict[str, Any] = {
         "segments": len(group),
         "instances": int(group.max(initial=-1)) + 1,
         "left_out": int((~there).sum()),
         "joined_within_views": int((counts - 1).sum()),
+    }
+    if not tracked:
+        return said
+    of: dict[int, set[int]] = {}
+    names: dict[int, set[int]] = {}
+    for instance, name in zip(group[there].tolist(), table.name[there].tolist(), strict=True):
+        of.setdefault(name, set()).add(instance + 1)
+        names.setdefault(instance + 1, set()).add(name)
+    merged = {i: found for i, found in sorted(names.items()) if len(found) > 1}
+    split = {name: found for name, found in sorted(of.items()) if len(found) > 1}
+    return said | {
+        "merged": [{"id": i, "from": sorted(found)} for i, found in merged.items()],
+        "split": [{"from": name, "ids": sorted(found)} for name, found in split.items()],
     }
