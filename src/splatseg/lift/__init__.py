@@ -10,6 +10,11 @@ from splatseg.lift.complete import CompletionOptions as CompletionOptions
 from splatseg.lift.complete import complete as complete
 from splatseg.lift.confusion import ConfusionOptions as ConfusionOptions
 from splatseg.lift.confusion import reconsider as reconsider
+from splatseg.lift.identity import IdentityField as IdentityField
+from splatseg.lift.identity import IdentityOptions as IdentityOptions
+from splatseg.lift.identity import identity as identity
+from splatseg.lift.identity import identity_features as identity_features
+from splatseg.lift.identity import train_identity as train_identity
 from splatseg.lift.label_maps import label_map as label_map
 from splatseg.lift.uplift import LabelSource as LabelSource
 from splatseg.lift.uplift import UpliftOptions as UpliftOptions
