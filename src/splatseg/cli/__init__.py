@@ -78,6 +78,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.export",
         summary="a scene and its labels as files that other tools read",
     ),
+    "attach": CommandEntry(
+        module="splatseg.cli.attach",
+        summary="labels put back on splats that an editor cropped, moved or rounded",
+    ),
 }
 """Every command, in the order of the work."""
 

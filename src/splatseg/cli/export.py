@@ -11,9 +11,10 @@ import torch
 import tyro
 from torch import Tensor
 
+from splatseg.cli._columns import label_tables
 from splatseg.cli._export_panoptic import panoptic_frames, panoptic_segments
 from splatseg.cli._film import path_views
-from splatseg.cli._legend import colour_of, names_of
+from splatseg.cli._legend import names_of
 from splatseg.cli._work import layer_of, open_scene, progress, views_of_split
 from splatseg.core import UNLABELLED, Gaussians, Labels, Scene, Selection
 from splatseg.errors import InputError, RangeError
@@ -36,7 +37,6 @@ from splatseg.render import BackendName
 
 What = Literal["splat", "objects", "points", "coco", "table"]
 
-_NONE = 0
 _SELECTED = 1
 _NOTES = 3
 
@@ -273,40 +273,12 @@ def _columns(job: _Job) -> dict[str, Tensor]:
 def _meaning(job: _Job) -> dict[str, Any]:
     """What the columns mean, for the table beside a file."""
     table: dict[str, Any] = {}
-    if job.selection is not None:
-        table["selected"] = {
-            "layer": job.command.layer,
-            "meaning": "1 for selected Gaussians, 0 for others",
-        }
-    for labels, kind, name in (
-        (job.classes, "class", job.command.layer),
-        (job.instances, "instance", job.command.instances),
-    ):
-        if labels is None:
-            continue
-        table[f"{kind}_id"] = {
-            "layer": name,
-            "none": _NONE,
-            "background": _NONE if labels.background == UNLABELLED else labels.background,
-            "confidence": "confidence" if kind == "class" else "instance_confidence",
-            "ids": _rows(labels, job.scene),
-            "made": dict(labels.metadata),
-        }
+    classes = job.selection if job.classes is None else job.classes
+    if classes is not None and job.command.layer is not None:
+        table |= label_tables(classes, "class", job.command.layer, job.scene.classes)
+    if job.instances is not None and job.command.instances is not None:
+        table |= label_tables(job.instances, "instance", job.command.instances, job.scene.classes)
     return table
-
-
-def _rows(labels: Labels, scene: Scene) -> dict[str, Any]:
-    names = names_of(labels, scene.classes)
-    ids, counts = torch.unique(labels.ids, return_counts=True)
-    count_of = dict(zip(ids.tolist(), counts.tolist(), strict=True))
-    return {
-        str(id): {
-            "name": names.get(id, ""),
-            "colour": list(colour_of(id, scene.classes)),
-            "gaussians": count_of.get(id, 0),
-        }
-        for id in labels.present.tolist()
-    }
 
 
 def _objects(job: _Job) -> tuple[ObjectRow, ...]:

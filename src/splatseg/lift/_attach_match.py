@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from splatseg.lift._attach_rows import (
     SMALLEST_LOG,
@@ -139,6 +138,8 @@ class _Nearby:
 
     @classmethod
     def search(cls, edited: Rows, source: Rows, wanted: Indices, count: int) -> "_Nearby":
+        from scipy.spatial import KDTree
+
         count = min(count, len(source))
         tree = KDTree(source.means)
         _, indices = tree.query(edited.means[wanted], k=count, workers=threads())

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from splatseg.core import Similarity
 from splatseg.lift._attach_rows import Floats, Indices, Rows, extent_of, threads
@@ -89,6 +88,8 @@ def fit_similarity(origin: Floats, target: Floats) -> Similarity | None:
 
 def _pairs(edited: Rows, source: Rows, rng: np.random.Generator) -> tuple[Indices, Indices]:
     """Edited rows and the source rows like them, of the one change of size that most have."""
+    from scipy.spatial import KDTree
+
     rows = np.arange(len(edited))
     if len(rows) > _SAMPLE:
         rows = np.sort(rng.permutation(len(rows))[:_SAMPLE])

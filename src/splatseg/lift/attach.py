@@ -21,7 +21,7 @@ from splatseg.lift._attach_match import Matches, in_order, match
 from splatseg.lift._attach_move import Hypothesis, find_move, fit_similarity
 from splatseg.lift._attach_rows import Rows, extent_of, rows_of
 
-_Layer = TypeVar("_Layer", Labels, Features, Selection)
+_Layer = TypeVar("_Layer", bound=Labels | Features | Selection)
 
 _ROUNDS = 3
 _LEAST_SHARE = 0.02

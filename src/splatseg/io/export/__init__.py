@@ -8,6 +8,7 @@ from splatseg.io.export._coco import Frame as Frame
 from splatseg.io.export._coco import SegmentInfo as SegmentInfo
 from splatseg.io.export._coco import write_coco_panoptic as write_coco_panoptic
 from splatseg.io.export._columns import check_beside as check_beside
+from splatseg.io.export._columns import column_table_of as column_table_of
 from splatseg.io.export._columns import label_columns as label_columns
 from splatseg.io.export._columns import write_column_table as write_column_table
 from splatseg.io.export._columns import write_labelled_splats as write_labelled_splats

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Gaussians, Labels, Selection
 from splatseg.errors import InputError
 from splatseg.io._atomic import atomic_file
-from splatseg.io._json import write_json
+from splatseg.io._json import read_json, write_json
 from splatseg.io.export._folders import check_parent, is_ours
 from splatseg.io.export._tables import MADE_BY
 from splatseg.io.export._warnings import retold
@@ -93,6 +93,15 @@ def check_beside(path: Path) -> Path:
             f"choose another name than {path.name}."
         )
     return beside
+
+
+def column_table_of(path: Path) -> dict[str, Any]:
+    """What the columns of a splat file mean, as the table beside it says; empty without one."""
+    beside = path.with_suffix(".json")
+    if not is_ours(beside):
+        return {}
+    columns = read_json(beside).get("columns")
+    return dict(cast("Mapping[str, Any]", columns)) if isinstance(columns, Mapping) else {}
 
 
 def write_column_table(path: Path, content: Mapping[str, Any]) -> None:

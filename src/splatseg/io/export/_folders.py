@@ -42,4 +42,4 @@ def is_ours(path: Path) -> bool:
     except FileFormatError:
         return False
     # Version 0.1 wrote tables of columns without the word.
-    return content.get("made_by") == MADE_BY or {"gaussians", "columns"} == set(content)
+    return content.get("made_by") == MADE_BY or {"gaussians", "columns"} <= set(content)

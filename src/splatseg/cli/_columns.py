@@ -1,0 +1,47 @@
+"""What columns of labels mean, for the JSON table beside a file."""
+
+from typing import Any, Literal
+
+import torch
+
+from splatseg.cli._legend import colour_of, names_of
+from splatseg.core import UNLABELLED, ClassTable, Labels, Selection
+
+_NONE = 0
+
+
+def label_tables(
+    layer: Labels | Selection,
+    kind: Literal["class", "instance"],
+    name: str,
+    classes: ClassTable | None,
+) -> dict[str, Any]:
+    """The entry of the column that a layer becomes: where it is from and what its ids mean."""
+    if isinstance(layer, Selection):
+        return {
+            "selected": {"layer": name, "meaning": "1 for selected Gaussians, 0 for others"},
+        }
+    return {
+        f"{kind}_id": {
+            "layer": name,
+            "none": _NONE,
+            "background": _NONE if layer.background == UNLABELLED else layer.background,
+            "confidence": "confidence" if kind == "class" else "instance_confidence",
+            "ids": _rows(layer, classes),
+            "made": dict(layer.metadata),
+        }
+    }
+
+
+def _rows(layer: Labels, classes: ClassTable | None) -> dict[str, Any]:
+    names = names_of(layer, classes)
+    ids, counts = torch.unique(layer.ids, return_counts=True)
+    count_of = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    return {
+        str(id): {
+            "name": names.get(id, ""),
+            "colour": list(colour_of(id, classes)),
+            "gaussians": count_of.get(id, 0),
+        }
+        for id in layer.present.tolist()
+    }
