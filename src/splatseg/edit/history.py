@@ -94,10 +94,8 @@ def prepare(
         return Prepared(document=document, selection=None, split=0)
     gaussians = document.scene.gaussians
     chosen = select(gaussians, document.layers, where)
-    if not chosen.count:
-        described = where.to_json()
-        raise InputError(f"selection: expected at least one Gaussian, got none of {described}.")
     if operation.cut is None:
+        _check_some(chosen, where)
         return Prepared(document=document, selection=chosen, split=0)
     return _split_at(_Task(document, where, operation.cut, backend, progress))
 
@@ -135,7 +133,16 @@ def _split_at(task: _Task) -> Prepared:
         document = document.edited(boxed.edited)
         inside = inside[boxed.edited.rows] & boxed.inside
         split += boxed.split
-    return Prepared(document=document, selection=~inside if where.invert else inside, split=split)
+    selection = ~inside if where.invert else inside
+    _check_some(selection, where)
+    return Prepared(document=document, selection=selection, split=split)
+
+
+def _check_some(selection: Selection, where: Where) -> None:
+    if not selection.count:
+        raise InputError(
+            f"selection: expected at least one Gaussian, got none of {where.to_json()}."
+        )
 
 
 def _cut_layer(task: _Task, named: Selection) -> tuple[Edited, Selection, int]:

@@ -1,0 +1,269 @@
+"""`splatseg edit` as a person types it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.cli import main
+from splatseg.core import Camera, Gaussians, LabelMap, Scene, View
+from splatseg.io.evidence import save_label_map
+from splatseg.io.scene import load_scene, load_scene_layer, save_scene, save_scene_layer
+from splatseg.lift import UpliftOptions, uplift
+
+
+class Maps:
+    def __init__(self, maps) -> None:
+        self.maps = maps
+
+    @property
+    def view_names(self):
+        return tuple(self.maps)
+
+    def label_map(self, name):
+        return self.maps[name]
+
+
+def camera(x: float) -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 3], pose[2, 3] = -x, 4.0
+    return Camera(width=48, height=36, fx=50, fy=50, cx=24, cy=18, cam_from_world=pose)
+
+
+@pytest.fixture
+def room(tmp_path):
+    """A wall of Gaussians, the left half of it a thing; masks of two views say where it ends."""
+    rng = np.random.default_rng(5)
+    means = np.concatenate((rng.uniform(-1.5, 1.5, (400, 2)), rng.normal(0, 0.02, (400, 1))), 1)
+    n = len(means)
+    gaussians = Gaussians(
+        means=torch.from_numpy(means.astype(np.float32)),
+        rotations=torch.eye(4)[:1].expand(n, 4).clone(),
+        scales=torch.from_numpy(rng.uniform(0.05, 0.2, (n, 3)).astype(np.float32)),
+        opacities=torch.full((n,), 0.7),
+        sh=torch.from_numpy(rng.normal(0, 0.5, (n, 4, 3)).astype(np.float32)),
+    )
+    views = tuple(View(name=f"v{i}", camera=camera(0.2 * i)) for i in range(3))
+    maps = {}
+    for view in views:
+        u = view.camera.pixel_centres()[..., 0]
+        edge = 24 - 50 * float(-view.camera.cam_from_world[0, 3]) / 4
+        maps[view.name] = LabelMap(ids=torch.where(u < edge, 3, 8).int())
+    root = tmp_path / "room"
+    save_scene(Scene(gaussians=gaussians, views=views), root)
+    folder = root / "evidence" / "truth"
+    for name, paper in maps.items():
+        save_label_map(folder, name, paper)
+    labels = uplift(
+        gaussians, views, Maps(maps), options=UpliftOptions(candidates=2), backend="cpu"
+    )
+    metadata = dict(labels.metadata) | {"evidence": "truth", "names": {"3": "thing", "8": "wall"}}
+    save_scene_layer(
+        root,
+        "objects",
+        labels.__class__(
+            **{
+                f: getattr(labels, f)
+                for f in ("ids", "confidence", "background", "candidates", "shares")
+            },
+            metadata=metadata,
+        ),
+    )
+    return root
+
+
+def history(root):
+    return json.loads((root / "scene.json").read_text())["provenance"]["edits"]
+
+
+def test_a_thing_is_removed_at_its_masks_and_comes_back(room, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    words = ["edit", str(room), "-o", str(out), "--remove", "--layer", "objects"]
+    assert main([*words, "--names", "thing", "--min-weight", "0"]) == 0
+    said = capsys.readouterr().out
+    assert "Gaussians split at the boundary (masks): pictures before and after are" in said
+    (edit,) = history(out)
+    assert edit["kind"] == "remove"
+    assert edit["where"] == {"layer": "objects", "ids": [3]}
+    assert edit["cut"]["views"] == ["v0", "v1", "v2"]
+    assert edit["result"]["split"] > 20
+    assert edit["result"]["split_psnr"] > 30
+    scene, labels = load_scene(out), load_scene_layer(out, "objects")
+    assert len(scene.gaussians) == len(labels) == edit["result"]["after"]
+    assert set(labels.ids.tolist()) == {8}
+    assert [view.name for view in scene.views] == ["v0", "v1", "v2"]
+    assert float(scene.gaussians.means[:, 0].min()) > -0.15
+
+    again = tmp_path / "again"
+    assert (
+        main(
+            [
+                "edit",
+                str(out),
+                "-o",
+                str(again),
+                "--extract",
+                "--layer",
+                "objects",
+                "--ids",
+                "8",
+                "--box",
+                "-2",
+                "-2",
+                "-1",
+                "2",
+                "0",
+                "1",
+            ]
+        )
+        == 0
+    )
+    assert [e["kind"] for e in history(again)] == ["remove", "extract"]
+    assert history(again)[1]["cut"]["by"] == "layer"
+    back = tmp_path / "back"
+    assert main(["edit", str(again), "-o", str(back), "--undo"]) == 0
+    assert "undone: extract; 1 edits are left" in capsys.readouterr().out
+    for name in ("means", "scales", "opacities", "sh"):
+        assert torch.equal(
+            getattr(load_scene(back).gaussians, name), getattr(scene.gaussians, name)
+        )
+    assert torch.equal(load_scene_layer(back, "objects").ids, labels.ids)
+
+
+def test_a_copy_is_moved_and_a_thing_coloured(room, tmp_path) -> None:
+    out = tmp_path / "out"
+    thing = ["--layer", "objects", "--ids", "3", "--split", "off"]
+    assert (
+        main(
+            [
+                "edit",
+                str(room),
+                "-o",
+                str(out),
+                "--duplicate",
+                *thing,
+                "--move",
+                "0",
+                "0",
+                "5",
+                "--rotate",
+                "0",
+                "0",
+                "2",
+                "90",
+                "--scale",
+                "2",
+            ]
+        )
+        == 0
+    )
+    before, after = load_scene(room).gaussians, load_scene(out).gaussians
+    chosen = load_scene_layer(room, "objects").ids == 3
+    copy, own = after.means[len(before) :], before.means[chosen]
+    middle = own.double().median(dim=0).values.float()
+    turned = 2 * (own - middle) @ torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + middle
+    torch.testing.assert_close(copy, turned + torch.tensor([0.0, 0, 5]), atol=1e-5, rtol=0)
+
+    red = tmp_path / "red"
+    assert (
+        main(
+            [
+                "edit",
+                str(room),
+                "-o",
+                str(red),
+                *thing,
+                "--colour",
+                "1",
+                "0",
+                "0",
+                "--flat-colour",
+                "--move",
+                "1",
+                "0",
+                "0",
+            ]
+        )
+        == 0
+    )
+    assert [e["kind"] for e in history(red)] == ["recolour", "transform"]
+    coloured = load_scene(red).gaussians
+    torch.testing.assert_close(
+        coloured.colours[chosen], torch.tensor([[1.0, 0, 0]]).expand(int(chosen.sum()), 3)
+    )
+    torch.testing.assert_close(coloured.means[chosen], own + torch.tensor([1.0, 0, 0]))
+    assert torch.equal(coloured.means[~chosen], before.means[~chosen])
+
+
+def test_scenes_are_joined(room, tmp_path) -> None:
+    out = tmp_path / "out"
+    assert (
+        main(["edit", str(room), "-o", str(out), "--merge", str(room), "--move", "9", "0", "0"])
+        == 0
+    )
+    before, after = load_scene(room).gaussians, load_scene(out).gaussians
+    assert len(after) == 2 * len(before)
+    torch.testing.assert_close(after.means[400:], before.means + torch.tensor([9.0, 0, 0]))
+    labels = load_scene_layer(out, "objects")
+    assert torch.equal(labels.ids[400:], labels.ids[:400]), "the same names are the same ids"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "edit: expected something to do"),
+        (["--remove"], "--remove: expected --layer or --box, got neither"),
+        (["--remove", "--extract", "--layer", "objects"], "expected one of the two, got both"),
+        (["--remove", "--layer", "objects"], "ids: expected at least one id of layer 'objects'"),
+        (["--remove", "--layer", "objects", "--ids", "4"], "no Gaussian with id 4; it has 3, 8"),
+        (["--remove", "--layer", "things", "--ids", "4"], "expected one of the scene (objects)"),
+        (["--remove", "--layer", "objects", "--names", "cat"], "names of the layer (thing, wall)"),
+        (["--remove", "--box", "0", "0", "0", "0", "1", "1"], "a first corner below the second"),
+        (["--remove", "--box", "9", "9", "9", "10", "10", "10"], "expected at least one Gaussian"),
+        (["--remove", "--box", "-9", "-9", "-9", "9", "9", "9"], "expected to leave Gaussians"),
+        (["--ids", "3", "--move", "1", "0", "0"], "expected --layer that they are of"),
+        (["--rotate", "0", "0", "0", "30"], "expected an axis that is not zero"),
+        (["--scale", "0"], "scale: expected a positive finite number"),
+        (["--move", "nan", "0", "0"], "translation: 1 of 3 values are not finite"),
+        (["--colour", "2", "0", "0"], "colour: expected values in [0, 1]"),
+        (["--undo"], "expected a scene with an edit to undo, got one without"),
+        (["--merge", "nowhere"], "nowhere: expected a scene folder, got none"),
+        (["--merge", "nowhere", "--colour", "1", "0", "0"], "--merge: takes no colours"),
+        (
+            ["--remove", "--layer", "objects", "--ids", "3", "--parts", "7"],
+            "parts: expected one of",
+        ),
+        (
+            [
+                "--extract",
+                "--layer",
+                "objects",
+                "--ids",
+                "3",
+                "--split",
+                "masks",
+                "--evidence",
+                "no",
+            ],
+            "no",
+        ),
+    ],
+)
+def test_bad_edits_get_one_sentence_and_leave_nothing(
+    room, tmp_path, capsys, words, message
+) -> None:
+    out = tmp_path / "out"
+    assert main(["edit", str(room), "-o", str(out), *words]) == 2
+    said = capsys.readouterr().err
+    assert message in said.replace("\n", " ")
+    assert not out.exists()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["room"]
+
+
+def test_nothing_is_overwritten(room, capsys) -> None:
+    before = (room / "gaussians.ply").read_bytes()
+    words = ["edit", str(room), "-o", str(room), "--colour", "1", "0", "0"]
+    assert main(words) == 2
+    assert "expected a new folder, got one that is there" in capsys.readouterr().err
+    assert (room / "gaussians.ply").read_bytes() == before
