@@ -33,6 +33,7 @@ from splatseg.models.classical import (
 )
 from splatseg.models.classical._boundary import pixel_features
 from splatseg.models.classical._merge_tree import merge_tree
+from splatseg.models.classical._regions import _enlarged
 
 
 def truth(shape: tuple[int, int], rows: slice, columns: slice) -> torch.Tensor:
@@ -115,6 +116,19 @@ def test_masks_keep_the_photographs_size_and_outline(squares) -> None:
     assert best(masks, RED & ~BLUE) > 0.8
     odd = region_masks(squares[:95, :127], RegionOptions(working_size=50))
     assert (odd.height, odd.width) == (95, 127)
+
+
+def test_enlarged_borders_are_straight_and_labels_stay_labels() -> None:
+    """A diagonal at a quarter of the size stays within half a pixel of the line it stands for."""
+    small = (np.arange(40)[:, None] < np.arange(40)[None]).astype(np.int32) * 7
+    large = _enlarged(small, 160, 160)
+    assert set(np.unique(large).tolist()) == {0, 7}
+    first = np.argmax(large == 7, axis=1)[20:140]
+    steps = np.diff(first)
+    assert set(steps.tolist()) <= {0, 1, 2}, "nearest would give 0, 0, 0, 4"
+    ids = np.arange(12, dtype=np.int32).reshape(3, 4)
+    assert np.array_equal(_enlarged(ids, 3, 4), ids)
+    assert np.array_equal(_enlarged(ids, 9, 12)[1::3, 1::3], ids)
 
 
 def test_small_masks_are_dropped(squares) -> None:

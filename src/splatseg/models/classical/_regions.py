@@ -168,11 +168,40 @@ def _scores(tree: MergeTree) -> NDArray[np.float64]:
 
 
 def _enlarged(labels: NDArray[np.int32], height: int, width: int) -> NDArray[np.int32]:
-    """A label map at the photograph's own size: each pixel takes the nearest label."""
-    h, w = labels.shape
-    rows = np.minimum(((np.arange(height) + 0.5) * h / height).astype(np.int64), h - 1)
-    columns = np.minimum(((np.arange(width) + 0.5) * w / width).astype(np.int64), w - 1)
-    return labels[rows[:, None], columns[None, :]]
+    """A label map at the photograph's own size: the label with most bilinear weight.
+
+    Borders that run across the grid come out straight, not in steps as with the nearest label.
+    """
+    if labels.shape == (height, width):
+        return labels
+    top, bottom, down = _between(labels.shape[0], height)
+    left, right, across = _between(labels.shape[1], width)
+    down, across = down[:, None], across[None, :]
+    corners = [
+        (labels[top[:, None], left], (1 - down) * (1 - across)),
+        (labels[top[:, None], right], (1 - down) * across),
+        (labels[bottom[:, None], left], down * (1 - across)),
+        (labels[bottom[:, None], right], down * across),
+    ]
+    best = corners[0][0]
+    most = np.full((height, width), -1.0, np.float32)
+    for label, _ in corners:
+        weight = np.zeros((height, width), np.float32)
+        for other, share in corners:
+            weight += np.where(other == label, share, np.float32(0))
+        better = weight > most
+        best = np.where(better, label, best)
+        most = np.where(better, weight, most)
+    return best
+
+
+def _between(
+    short: int, long: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Of each of `long` pixel centres the two of `short` around it, and the share of the second."""
+    place = np.clip((np.arange(long) + 0.5) * short / long - 0.5, 0, short - 1)
+    first = np.floor(place).astype(np.int64)
+    return first, np.minimum(first + 1, short - 1), (place - first).astype(np.float32)
 
 
 def _encode(labels: NDArray[np.int32], tree: MergeTree, nodes: list[int]) -> list[Rle]:
