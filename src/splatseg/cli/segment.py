@@ -10,12 +10,32 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
+from splatseg.cli._segment_outputs import check_exports, write_exports, write_report
 from splatseg.cli._work import open_scene, progress
-from splatseg.core import UNLABELLED, Labels, Scene, View
+from splatseg.core import UNLABELLED, ClassTable, Labels, Scene, View
 from splatseg.errors import InputError
-from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_evidence
+from splatseg.io.evidence import (
+    Evidence,
+    EvidenceKind,
+    TrackedEvidence,
+    evidence_names,
+    find_evidence,
+    open_evidence,
+)
 from splatseg.io.scene import check_name, save_scene_layer
-from splatseg.lift import UpliftOptions, uplift
+from splatseg.lift import (
+    AssociateOptions,
+    CompletionOptions,
+    ConfusionOptions,
+    EvidenceSegments,
+    UpliftOptions,
+    VoteOptions,
+    associate,
+    complete,
+    reconsider,
+    uplift,
+    vote,
+)
 from splatseg.render import BackendName
 
 
@@ -29,8 +49,11 @@ class Command:
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """The scene folder."""
 
-    method: Literal["uplift"]
-    """How. uplift: every pixel votes for its label on the Gaussians it shows."""
+    method: Literal["uplift", "vote", "associate"]
+    """How. uplift: every pixel votes for its label on the Gaussians it shows. vote: views vote
+    for Gaussians by the pixels of their centres. Both need labels that mean the same in all
+    views. associate: segments of views, each with ids of its own (masks, panoptic maps, tracks),
+    become instances."""
 
     evidence: str | None = None
     """Name of the evidence: a folder of SCENE/evidence or of the capture, such as
@@ -50,8 +73,26 @@ class Command:
     """Which views may be used: train, all, or names with commas between them. What is asked for
     is recorded in the layer."""
 
+    complete: bool = True
+    """Label Gaussians that no view explains by their neighbours; they are marked as inferred."""
+
+    reconsider: bool = False
+    """With uplift: decide anew under how often the evidence takes one id for another, which
+    finds small things that most views miss. For class labels of a model that errs, not for
+    truth."""
+
+    export: bool = False
+    """Also write SCENE/exports/LAYER: one splat file an object, a table of objects, all
+    Gaussians with their labels as columns, and label maps of the held-out views."""
+
+    report: bool = False
+    """Also write SCENE/reports/LAYER.html: pictures, confidence, coverage and conflicts."""
+
+    truth: Path | None = None
+    """Folder of true maps, shown and scored in the report."""
+
     seed: int = 0
-    """Seed of random choices, recorded in the layer. uplift makes none."""
+    """Seed of random choices, recorded in the layer. uplift, vote and associate make none."""
 
     backend: BackendName = "auto"
     """Who renders. auto: cuda for scenes on a GPU, cpu otherwise."""
@@ -62,30 +103,55 @@ class Command:
     uplift: UpliftOptions = field(default_factory=UpliftOptions)
     """Settings of the method uplift."""
 
+    vote: VoteOptions = field(default_factory=VoteOptions)
+    """Settings of the method vote."""
+
+    associate: AssociateOptions = field(default_factory=AssociateOptions)
+    """Settings of the method associate."""
+
+    completion: CompletionOptions = field(default_factory=CompletionOptions)
+    """How neighbours' labels spread."""
+
+    confusion: ConfusionOptions = field(default_factory=ConfusionOptions)
+    """How the evidence errs, for --reconsider."""
+
+
+_KINDS: dict[str, tuple[EvidenceKind, ...]] = {
+    "uplift": ("labels", "tracked"),
+    "vote": ("labels", "tracked"),
+    "associate": ("masks", "panoptic", "tracked"),
+}
+_NEEDS = {
+    "uplift": "label maps whose ids mean the same in all views",
+    "vote": "label maps whose ids mean the same in all views",
+    "associate": "segments of objects",
+}
+_CANDIDATES = 8
+"""Ids that `reconsider` chooses from."""
+
 
 def run(command: Command) -> None:
     """Segment a scene."""
     started = time.monotonic()
+    timings: dict[str, float] = {}
     scene = open_scene(command.scene, command.data)
     evidence_name, evidence = _evidence(command, scene)
-    if evidence.kind not in ("labels", "tracked"):
+    kinds = _KINDS[command.method]
+    if evidence.kind not in kinds:
         raise InputError(
-            f"{evidence.folder}: --method uplift needs label maps whose ids mean the same in all "
-            f"views (labels, tracked), got {evidence.kind}."
+            f"{evidence.folder}: --method {command.method} needs {_NEEDS[command.method]} "
+            f"({', '.join(kinds)}), got {evidence.kind}."
         )
+    if command.reconsider and command.method != "uplift":
+        raise InputError(f"--reconsider: goes with --method uplift, not {command.method}.")
     layer_name = command.layer or evidence_name
     check_name("--layer", layer_name)
+    truth = None if command.truth is None else open_evidence(command.truth)
+    if command.export:
+        check_exports(command.scene, layer_name)
     views = _voters(scene, evidence, command.views)
-    with progress("segment") as step:
-        labels = uplift(
-            scene.gaussians,
-            views,
-            evidence,
-            options=command.uplift,
-            classes=(evidence.classes or scene.classes) if evidence.kind == "labels" else None,
-            backend=command.backend,
-            progress=step,
-        )
+    timings["open"] = time.monotonic() - started
+    labels = _labels(command, scene, evidence, views, timings)
     metadata = dict(labels.metadata) | {
         "evidence": evidence_name,
         "views_asked": command.views,
@@ -98,8 +164,97 @@ def run(command: Command) -> None:
     if evidence.source_ids is not None:
         present = labels.present.tolist()
         metadata["source_ids"] = {str(id): evidence.source_ids[id] for id in present}
-    path = save_scene_layer(command.scene, layer_name, replace(labels, metadata=metadata))
+    labels = replace(labels, metadata=metadata)
+    path = save_scene_layer(command.scene, layer_name, labels)
     sys.stdout.write(_summary(labels, len(views), time.monotonic() - started) + f"{path}\n")
+    if command.export:
+        begun = time.monotonic()
+        write_exports(scene, command.scene, layer_name, backend=command.backend)
+        timings["export"] = time.monotonic() - begun
+    if command.report:
+        where = write_report(
+            scene,
+            command.scene,
+            labels,
+            layer=layer_name,
+            evidence=evidence,
+            views=views,
+            truth=truth,
+            timings=timings,
+            backend=command.backend,
+        )
+        sys.stdout.write(f"report: {where}\n")
+
+
+def _labels(
+    command: Command,
+    scene: Scene,
+    evidence: Evidence,
+    views: tuple[View, ...],
+    timings: dict[str, float],
+) -> Labels:
+    """The layer of the method, reconsidered and completed as asked."""
+    begun = time.monotonic()
+    gaussians, backend = scene.gaussians, command.backend
+    classes = (evidence.classes or scene.classes) if evidence.kind != "masks" else None
+    with progress("segment") as step:
+        match command.method:
+            case "uplift":
+                options = command.uplift
+                if command.reconsider and options.candidates < 2:
+                    options = replace(
+                        options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES)
+                    )
+                named = classes if evidence.kind == "labels" else None
+                labels = uplift(
+                    gaussians,
+                    views,
+                    evidence,
+                    options=options,
+                    classes=named,
+                    backend=backend,
+                    progress=step,
+                )
+            case "vote":
+                named = classes if evidence.kind == "labels" else None
+                labels = vote(
+                    gaussians,
+                    views,
+                    evidence,
+                    options=command.vote,
+                    classes=named,
+                    backend=backend,
+                    progress=step,
+                )
+            case "associate":
+                labels = associate(
+                    gaussians,
+                    views,
+                    EvidenceSegments(evidence=evidence),
+                    options=command.associate,
+                    classes=_categories(evidence, scene),
+                    backend=backend,
+                    progress=step,
+                )
+    timings[command.method] = time.monotonic() - begun
+    if command.reconsider:
+        begun = time.monotonic()
+        labels = reconsider(labels, options=command.confusion)
+        if command.uplift.candidates < 2:
+            labels = replace(labels, candidates=None, shares=None)
+        timings["reconsider"] = time.monotonic() - begun
+    if command.complete and bool((labels.ids != UNLABELLED).any()):
+        begun = time.monotonic()
+        labels = complete(gaussians, labels, options=command.completion)
+        timings["complete"] = time.monotonic() - begun
+    return labels
+
+
+def _categories(evidence: Evidence, scene: Scene) -> ClassTable | None:
+    """Names of the categories of segments; a tracker's own table is of its tracks."""
+    if isinstance(evidence, TrackedEvidence):
+        return evidence.maps.table or scene.classes
+    return evidence.classes or scene.classes
 
 
 def _summary(labels: Labels, views: int, seconds: float) -> str:
@@ -109,8 +264,10 @@ def _summary(labels: Labels, views: int, seconds: float) -> str:
     background = labels.background
     names = labels.metadata["names"]
     behind = "none" if background == UNLABELLED else names.get(str(background), f"id {background}")
+    inferred = 0 if labels.inferred is None else int(labels.inferred.sum())
+    guessed = f", {inferred} of them inferred from neighbours" if inferred else ""
     return (
-        f"{labelled} of {len(labels)} Gaussians labelled ({share:.1f} %), {ids} ids, "
+        f"{labelled} of {len(labels)} Gaussians labelled ({share:.1f} %){guessed}, {ids} ids, "
         f"from {views} views in {seconds:.1f} s; behind all of them: {behind}\n"
     )
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from splatseg.lift._clustering import Agreement
 from splatseg.lift._segment_table import SegmentTable
 
+_MOST = 0.5
+
 _LEAST_SIGHT = 0.3
 """A view could have seen a group if it sees this share of what the group's best view does."""
 
@@ -39,35 +41,38 @@ def chosen_groups(
     )
     support = _support(table, agreement, group, joined)
     whole = np.asarray(mass.sum(axis=0)).ravel()
-    core = _cores(mass)
-    size = np.asarray(core.sum(axis=0)).ravel()
-    order = np.lexsort((-whole, -support))
+    cores = _Cores(table, group, mass)
     covered = np.zeros(table.gaussians, bool)
     taken = np.zeros(count, bool)
-    columns = core.tocsc()
-    for place in order.tolist():
-        if size[place] == 0:
-            continue
-        entries = slice(columns.indptr[place], columns.indptr[place + 1])
-        rows, weights = columns.indices[entries], columns.data[entries]
-        if weights[covered[rows]].sum() <= overlap * size[place]:
+    for place in np.lexsort((-whole, -support)).tolist():
+        rows, weights = cores.of(place)
+        size = weights.sum()
+        if size > 0 and weights[covered[rows]].sum() <= overlap * size:
             taken[place] = True
             covered[rows] = True
     return np.where(there & taken[group], group, -1)
 
 
-def _cores(mass: Any) -> Any:
-    """Of each group the Gaussians that it really holds, weighted by the square root of the mass.
+class _Cores:
+    """The Gaussians that a group really holds: most of what its own views see of them.
 
-    The edge of a group has a little of many Gaussians: those with less than a tenth of the mass
-    that the strongest group has on them do not count.
+    A single mask that spills over a neighbour does not make the neighbour a part of the group.
     """
-    rows = np.repeat(np.arange(mass.shape[0]), np.diff(mass.indptr))
-    strongest = np.asarray(mass.max(axis=1).todense()).ravel()
-    kept = mass.tocsr(copy=True)
-    kept.data = np.where(kept.data >= 0.1 * strongest[rows], np.sqrt(kept.data), 0)
-    kept.eliminate_zeros()
-    return kept
+
+    def __init__(self, table: SegmentTable, group: NDArray[np.int64], mass: Any) -> None:
+        self._mass = mass.tocsc()
+        self._seen = table.sights().power(2)
+        there = group >= 0
+        pairs = np.unique(np.stack((group[there], table.view[there])), axis=1)
+        self._views = np.split(pairs[1], np.searchsorted(pairs[0], np.arange(1, mass.shape[1])))
+
+    def of(self, place: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Rows of the Gaussians of a group, and the square roots of their masses."""
+        entries = slice(self._mass.indptr[place], self._mass.indptr[place + 1])
+        rows, mass = self._mass.indices[entries], self._mass.data[entries]
+        seen = np.asarray(self._seen[:, self._views[place]].sum(axis=1)).ravel()
+        holds = mass >= _MOST * seen[rows]
+        return rows[holds], np.sqrt(mass[holds])
 
 
 def _support(

@@ -215,9 +215,7 @@ def _instances(
     return rows
 
 
-def _account(
-    table: SegmentTable, group: NDArray[np.int64], *, tracked: bool
-) -> dict[str, Any]:
+def _account(table: SegmentTable, group: NDArray[np.int64], *, tracked: bool) -> dict[str, Any]:
     """What became of the segments; of tracks, which were joined and which were divided."""
     there = group >= 0
     pairs = np.stack((group[there], table.view[there]))
