@@ -72,7 +72,7 @@ def test_segment_views(small, splatseg) -> None:
     truth = small.capture / "semantic" / "test_2.png"
     (small.capture / "labels_semantic" / "test_2.png").write_bytes(truth.read_bytes())
     assert views("train") == ["train_0", "train_1", "train_3"]
-    assert views("all") == ["train_0", "train_1", "test_2", "train_3"]
+    assert views("all") == ["test_2", "train_0", "train_1", "train_3"]
     status, out, _ = splatseg(
         "evaluate", small.scene, "--layer", "labels_semantic", "--truth",
         small.capture / "semantic", "--backend", "cpu",

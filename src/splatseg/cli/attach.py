@@ -71,6 +71,7 @@ class Command:
     """Replace layers of the same name in a scene folder that FILE is."""
 
     options: AttachOptions = field(default_factory=AttachOptions)
+    """Limits of the search."""
 
 
 def run(command: Command) -> None:
