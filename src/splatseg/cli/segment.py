@@ -28,10 +28,12 @@ from splatseg.lift import (
     CompletionOptions,
     ConfusionOptions,
     EvidenceSegments,
+    IdentityOptions,
     UpliftOptions,
     VoteOptions,
     associate,
     complete,
+    identity,
     reconsider,
     uplift,
     vote,
@@ -49,11 +51,12 @@ class Command:
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """The scene folder."""
 
-    method: Literal["uplift", "vote", "associate"]
+    method: Literal["uplift", "vote", "associate", "identity"]
     """How. uplift: every pixel votes for its label on the Gaussians it shows. vote: views vote
-    for Gaussians by the pixels of their centres. Both need labels that mean the same in all
-    views. associate: segments of views, each with ids of its own (masks, panoptic maps, tracks),
-    become instances."""
+    for Gaussians by the pixels of their centres. identity: features of 16 channels and a
+    classifier are trained (Gaussian Grouping; slower, for comparison). These need labels that
+    mean the same in all views. associate: segments of views, each with ids of its own (masks,
+    panoptic maps, tracks), become instances."""
 
     evidence: str | None = None
     """Name of the evidence: a folder of SCENE/evidence or of the capture, such as
@@ -109,6 +112,9 @@ class Command:
     associate: AssociateOptions = field(default_factory=AssociateOptions)
     """Settings of the method associate."""
 
+    identity: IdentityOptions = field(default_factory=IdentityOptions)
+    """Settings of the method identity."""
+
     completion: CompletionOptions = field(default_factory=CompletionOptions)
     """How neighbours' labels spread."""
 
@@ -120,11 +126,14 @@ _KINDS: dict[str, tuple[EvidenceKind, ...]] = {
     "uplift": ("labels", "tracked"),
     "vote": ("labels", "tracked"),
     "associate": ("masks", "panoptic", "tracked"),
+    "identity": ("labels", "tracked"),
 }
+_SAME = "label maps whose ids mean the same in all views"
 _NEEDS = {
-    "uplift": "label maps whose ids mean the same in all views",
-    "vote": "label maps whose ids mean the same in all views",
+    "uplift": _SAME,
+    "vote": _SAME,
     "associate": "segments of objects",
+    "identity": _SAME,
 }
 _CANDIDATES = 8
 """Ids that `reconsider` chooses from."""
@@ -196,7 +205,7 @@ def _labels(
     """The layer of the method, reconsidered and completed as asked."""
     begun = time.monotonic()
     gaussians, backend = scene.gaussians, command.backend
-    classes = (evidence.classes or scene.classes) if evidence.kind != "masks" else None
+    named = (evidence.classes or scene.classes) if evidence.kind == "labels" else None
     with progress("segment") as step:
         match command.method:
             case "uplift":
@@ -205,7 +214,6 @@ def _labels(
                     options = replace(
                         options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES)
                     )
-                named = classes if evidence.kind == "labels" else None
                 labels = uplift(
                     gaussians,
                     views,
@@ -216,7 +224,6 @@ def _labels(
                     progress=step,
                 )
             case "vote":
-                named = classes if evidence.kind == "labels" else None
                 labels = vote(
                     gaussians,
                     views,
@@ -225,6 +232,17 @@ def _labels(
                     classes=named,
                     backend=backend,
                     progress=step,
+                )
+            case "identity":
+                labels = identity(
+                    gaussians,
+                    views,
+                    evidence,
+                    options=command.identity,
+                    classes=named,
+                    backend=backend,
+                    progress=step,
+                    seed=command.seed,
                 )
             case "associate":
                 labels = associate(

@@ -1,0 +1,261 @@
+"""Recorded evidence of the train views, lifted, scored on the test views by the independent scorer.
+
+    python benchmarks/labels.py SCENE ../shared/data/office [--rows truth semantic ...] [--work DIR]
+
+Rows, each a method on a folder of evidence (`splatseg segment` does the same):
+
+- `truth`: true class maps and true instance maps through `uplift`.
+- `semantic`: `labels_semantic` as they came (on the train views), voted for by centres, through
+  `uplift`, completed, smoothed, and reconsidered under how the evidence errs.
+- `tracked`: `labels_tracked` through `uplift`, repaired by `associate`, and through `identity`.
+- `panoptic`: `labels_panoptic` with every segment given its true instance (the ceiling of
+  association), and through `associate`.
+- `sam`: `masks_sam` through `associate`.
+
+Instances are scored without classes, matched one to one over the scene (`score.py instances`);
+classes by pooled mean IoU (`score.py semantic`).
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from splatseg.core import LabelMap, Labels, Scene
+from splatseg.io.evidence import Evidence, open_evidence
+from splatseg.io.scene import load_scene
+from splatseg.lift import (
+    AssociateOptions,
+    CompletionOptions,
+    EvidenceSegments,
+    UpliftOptions,
+    VoteOptions,
+    associate,
+    complete,
+    identity,
+    label_map,
+    reconsider,
+    uplift,
+    vote,
+)
+
+_SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
+
+
+class Bench:
+    """A scene, its capture, and a place for pictures."""
+
+    def __init__(self, scene: Scene, data: Path, work: Path) -> None:
+        self.scene = scene
+        self.data = data
+        self.work = work
+        self.train = scene.train_views
+
+    def evidence(self, name: str) -> Evidence:
+        """A folder of the capture."""
+        return open_evidence(self.data / name)
+
+    def row(self, title: str, truth: str, make: Callable[[], Labels]) -> Labels:
+        """Make a layer, draw the test views, score them, and print a line."""
+        begin = time.monotonic()
+        labels = make()
+        seconds = time.monotonic() - begin
+        folder = self.work / title.replace(" ", "_").replace("/", "_")
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for view in self.scene.test_views:
+            drawn = label_map(self.scene.gaussians, view.camera, labels).ids
+            ids = drawn.clamp_min(0).numpy().astype(np.uint16)
+            Image.fromarray(ids).save(folder / f"{view.name}.png")
+        command = "semantic" if truth == "semantic" else "instances"
+        said = self.score(command, folder, truth, "test_*")
+        print(f"{title:44s} mIoU {said['mIoU']:.4f}  {_more(said)}  {seconds:5.1f} s", flush=True)
+        return labels
+
+    def score(self, command: str, predicted: Path, truth: str, views: str) -> dict[str, float]:
+        """What the independent scorer says."""
+        said = subprocess.run(
+            [sys.executable, str(_SCORE), command, "--pred", str(predicted), "--truth",
+             str(self.data / truth), "--views", views],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return json.loads(said.stdout)
+
+
+def _more(said: dict[str, float]) -> str:
+    if "recall50" not in said:
+        return f"accuracy {said['accuracy']:.4f}"
+    return (
+        f"recall50 {said['recall50']:.3f} precision50 {said['precision50']:.3f} "
+        f"ids {said['predicted_instances']}/{said['truth_instances']}"
+    )
+
+
+def truth(bench: Bench) -> None:
+    """True maps through uplift."""
+    for name in ("semantic", "instance"):
+        found = bench.evidence(name)
+        lifted = bench.row(
+            f"true {name}, uplift",
+            name,
+            lambda found=found: uplift(bench.scene.gaussians, bench.train, found),
+        )
+        bench.row(
+            f"true {name}, completed",
+            name,
+            lambda lifted=lifted: complete(bench.scene.gaussians, lifted),
+        )
+
+
+def semantic(bench: Bench) -> None:
+    """Class maps of a model that errs."""
+    said = bench.score("semantic", bench.data / "labels_semantic", "semantic", "train_*")
+    print(f"{'labels_semantic as they came (train)':44s} mIoU {said['mIoU']:.4f}  {_more(said)}")
+    found, gaussians = bench.evidence("labels_semantic"), bench.scene.gaussians
+    for title, options in (
+        ("vote, no occlusion test", VoteOptions()),
+        ("vote, by depth", VoteOptions(vote_occlusion="depth")),
+        (
+            "vote, by transmittance",
+            VoteOptions(vote_occlusion="weight", vote_weight="transmittance"),
+        ),
+    ):
+        bench.row(
+            f"labels_semantic, {title}",
+            "semantic",
+            lambda options=options: vote(gaussians, bench.train, found, options=options),
+        )
+    soft = bench.row(
+        "labels_semantic, soft weights",
+        "semantic",
+        lambda: uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8)),
+    )
+    hard = replace(soft, candidates=None, shares=None)
+    bench.row("labels_semantic, uplift", "semantic", lambda: hard)
+    bench.row("labels_semantic, completed", "semantic", lambda: complete(gaussians, hard))
+    smooth = CompletionOptions(smoothing=50, completed_layer="hard")
+    bench.row(
+        "labels_semantic, smoothed",
+        "semantic",
+        lambda: complete(gaussians, soft, options=smooth),
+    )
+    again = reconsider(soft)
+    hard = replace(again, candidates=None, shares=None)
+    bench.row("labels_semantic, reconsidered", "semantic", lambda: complete(gaussians, hard))
+    bench.row(
+        "labels_semantic, reconsidered and smoothed",
+        "semantic",
+        lambda: complete(gaussians, again, options=smooth),
+    )
+
+
+def tracked(bench: Bench) -> None:
+    """Ids of a tracker that switches, splits and loses."""
+    found, gaussians = bench.evidence("labels_tracked"), bench.scene.gaussians
+    bench.row("labels_tracked, uplift", "instance", lambda: uplift(gaussians, bench.train, found))
+    _associated(bench, "labels_tracked", found)
+    bench.row(
+        "labels_tracked, identity", "instance", lambda: identity(gaussians, bench.train, found)
+    )
+
+
+def panoptic(bench: Bench) -> None:
+    """Segments with ids of each view's own."""
+    found = bench.evidence("labels_panoptic")
+    given = _TrueInstances(found, bench.data / "instance")
+    bench.row(
+        "labels_panoptic, true instances (ceiling)",
+        "instance",
+        lambda: uplift(bench.scene.gaussians, bench.train, given),
+    )
+    _associated(bench, "labels_panoptic", found)
+
+
+def sam(bench: Bench) -> None:
+    """Overlapping masks of objects, parts and groups."""
+    _associated(bench, "masks_sam", bench.evidence("masks_sam"))
+
+
+def _associated(bench: Bench, name: str, found: Evidence) -> None:
+    for title, options in (
+        ("associate", AssociateOptions()),
+        ("associate, all pixels alike", AssociateOptions(small_things=0)),
+    ):
+        bench.row(
+            f"{name}, {title}",
+            "instance",
+            lambda options=options: complete(
+                bench.scene.gaussians,
+                associate(
+                    bench.scene.gaussians,
+                    bench.train,
+                    EvidenceSegments(evidence=found),
+                    options=options,
+                ),
+            ),
+        )
+
+
+class _TrueInstances:
+    """Every segment of a view's map as the instance that most of its pixels really are."""
+
+    def __init__(self, found: Evidence, truth: Path) -> None:
+        self._found = found
+        self._truth = truth
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return self._found.view_names
+
+    def label_map(self, name: str) -> LabelMap:
+        ids = self._found.label_map(name).ids.numpy()
+        with Image.open(self._truth / f"{name}.png") as image:
+            true = np.asarray(image).astype(np.int64)
+        out = np.full(ids.shape, -1)
+        for segment in np.unique(ids[ids >= 0]):
+            inside = ids == segment
+            best = int(np.bincount(true[inside]).argmax())
+            out[inside] = best if best > 0 else -1
+        return LabelMap(ids=torch.from_numpy(out).int())
+
+
+ROWS = {
+    "truth": truth,
+    "semantic": semantic,
+    "tracked": tracked,
+    "panoptic": panoptic,
+    "sam": sam,
+}
+
+
+def main() -> None:
+    """Print one line a row."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--work", type=Path, help="keep label maps here")
+    arguments = parser.parse_args()
+    temporary = None if arguments.work else tempfile.mkdtemp()
+    work = arguments.work or Path(temporary or "")
+    try:
+        bench = Bench(load_scene(arguments.scene), arguments.data, work)
+        for name in arguments.rows:
+            ROWS[name](bench)
+    finally:
+        if temporary:
+            shutil.rmtree(temporary)
+
+
+if __name__ == "__main__":
+    main()
