@@ -142,8 +142,11 @@ class Engine:
             visible = found[1]
             if part:
                 say = self._say(visible)
-                table.add(part, found[0] if say is None else found[0] * say.unsqueeze(1))
-                caught = found[0].sum(dim=0, dtype=torch.float64)
+                # A view shows a small part of a scene: what it does not show need not be touched.
+                rows = torch.nonzero(visible > 0).squeeze(1)
+                sums = found[0][rows]
+                table.add(part, sums if say is None else sums * say[rows].unsqueeze(1), rows=rows)
+                caught = sums.sum(dim=0, dtype=torch.float64)
                 light.add(part, votes[start : start + len(part)], caught)
         say = self._say(visible)
         return visible if say is None else visible * say

@@ -75,16 +75,24 @@ class VoteTable:
             return self._summary.nbytes
         return sum(column.nbytes for column in self._columns.values())
 
-    def add(self, ids: Sequence[int], sums: Float[Tensor, "n ids"]) -> None:
-        """Take in the votes of a view, one column an id."""
+    def add(
+        self,
+        ids: Sequence[int],
+        sums: Float[Tensor, "m ids"],
+        *,
+        rows: Int64[Tensor, "m"] | None = None,
+    ) -> None:
+        """Take in the votes of a view, one column an id; of all Gaussians or of `rows` alone."""
         self._make_room(ids)
+        if rows is None:
+            rows = torch.arange(len(sums))
         if self._summary is None:
             for id, column in zip(ids, sums.T.contiguous(), strict=True):
-                self._columns[id] += column
+                self._columns[id].index_add_(0, rows, column)
             return
-        gaussian, place = torch.nonzero(sums > 0, as_tuple=True)
+        place, name = torch.nonzero(sums > 0, as_tuple=True)
         names = torch.tensor(list(ids), dtype=torch.int64)
-        self._summary.add(names[place], gaussian, sums[gaussian, place])
+        self._summary.add(names[name], rows[place], sums[place, name])
 
     def add_sparse(
         self, ids: Int64[Tensor, "m"], gaussians: Int64[Tensor, "m"], weights: Float[Tensor, "m"]
