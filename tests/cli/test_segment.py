@@ -113,6 +113,31 @@ def test_instances_have_classes_where_segments_do(panoptic, splatseg) -> None:
     assert layer.metadata["associate"]["instances"] == 2
 
 
+def test_instances_and_classes_merge(panoptic, splatseg) -> None:
+    classes = ("segment", panoptic.scene, "--method", "uplift", "--evidence", "labels_semantic")
+    assert splatseg(*classes, "--layer", "classes")[0] == 0
+    associate = ("segment", panoptic.scene, "--method", "associate", "--evidence")
+    status, _, err = splatseg(
+        *associate, "labels_panoptic", "--classes", "classes", "--layer", "whole", "--report"
+    )
+    assert (status, err.strip()) == (0, ""), err
+    layer = layer_of(panoptic.scene, "whole")
+    assert sorted(layer.metadata["class_of"].values()) == [LEFT, RIGHT]
+    assert layer.metadata["panoptic"]["things"] == 2
+    kinds = {int(i): kind for i, kind in layer.metadata["class_of"].items()}
+    expected = sides(panoptic.scene)
+    known = (expected >= 0) & (layer.ids >= 0)
+    found = torch.tensor([kinds.get(i, -1) for i in layer.ids.tolist()])
+    assert torch.equal(found[known], expected[known])
+    for arguments, word in (
+        ((*classes, "--classes", "classes"), "--classes: goes with evidence of instances"),
+        ((*associate, "labels_panoptic", "--classes", "other"), "other"),
+    ):
+        status, _, err = splatseg(*arguments)
+        assert status == 2
+        assert word in err
+
+
 def test_completion_marks_what_it_infers(small, splatseg) -> None:
     cut = ("segment", small.scene, "--method", "uplift", "--min-weight", 3)
     assert splatseg(*cut, "--no-complete", "--layer", "seen")[0] == 0

@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from splatseg.cli._segment_outputs import check_exports, write_exports, write_report
-from splatseg.cli._work import open_scene, progress
+from splatseg.cli._work import layer_of, open_scene, progress
 from splatseg.core import UNLABELLED, ClassTable, Labels, Scene, View
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -34,6 +34,7 @@ from splatseg.lift import (
     associate,
     complete,
     identity,
+    merge_panoptic,
     reconsider,
     uplift,
     vote,
@@ -83,6 +84,10 @@ class Command:
     """With uplift: decide anew under how often the evidence takes one id for another, which
     finds small things that most views miss. For class labels of a model that errs, not for
     truth."""
+
+    classes: str | None = None
+    """With instances: name of a layer of classes to merge them with. Instances take their class
+    from it, and what is no thing becomes one segment a class: the layer is panoptic."""
 
     export: bool = False
     """Also write SCENE/exports/LAYER: one splat file an object, a table of objects, all
@@ -151,6 +156,7 @@ def run(command: Command) -> None:
             f"{evidence.folder}: --method {command.method} needs {_NEEDS[command.method]} "
             f"({', '.join(kinds)}), got {evidence.kind}."
         )
+    merged = _classes_to_merge(command, scene, evidence)
     if command.reconsider and command.method != "uplift":
         raise InputError(f"--reconsider: goes with --method uplift, not {command.method}.")
     layer_name = command.layer or evidence_name
@@ -161,6 +167,8 @@ def run(command: Command) -> None:
     views = _voters(scene, evidence, command.views)
     timings["open"] = time.monotonic() - started
     labels = _labels(command, scene, evidence, views, timings)
+    if merged is not None:
+        labels = merge_panoptic(scene.gaussians, labels, *merged)
     metadata = dict(labels.metadata) | {
         "evidence": evidence_name,
         "views_asked": command.views,
@@ -193,6 +201,26 @@ def run(command: Command) -> None:
             backend=command.backend,
         )
         sys.stdout.write(f"report: {where}\n")
+
+
+def _classes_to_merge(
+    command: Command, scene: Scene, evidence: Evidence
+) -> tuple[Labels, ClassTable] | None:
+    """The layer of --classes and what its ids mean."""
+    if command.classes is None:
+        return None
+    if evidence.kind == "labels":
+        raise InputError(f"--classes: goes with evidence of instances, not of {evidence.kind}.")
+    layer = layer_of(scene, command.classes)
+    if not isinstance(layer, Labels):
+        raise InputError("--classes: expected labels, got the features or selection of a layer.")
+    table = _categories(evidence, scene)
+    if table is None:
+        raise InputError(
+            "--classes: expected a table that says which classes are things, and neither the "
+            "capture nor the evidence has one."
+        )
+    return layer, table
 
 
 def _labels(

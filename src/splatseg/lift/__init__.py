@@ -16,6 +16,7 @@ from splatseg.lift.identity import identity as identity
 from splatseg.lift.identity import identity_features as identity_features
 from splatseg.lift.identity import train_identity as train_identity
 from splatseg.lift.label_maps import label_map as label_map
+from splatseg.lift.panoptic import merge_panoptic as merge_panoptic
 from splatseg.lift.uplift import LabelSource as LabelSource
 from splatseg.lift.uplift import UpliftOptions as UpliftOptions
 from splatseg.lift.uplift import uplift as uplift
