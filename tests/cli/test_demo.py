@@ -10,13 +10,13 @@ import pytest
 import tyro
 from PIL import Image
 
-from splatseg.cli import demo, evaluate, export, fit, main, render, segment
+from splatseg.cli import demo, evaluate, export, fit, main, render, see, segment
 from splatseg.io.captures import read_capture
-from splatseg.io.scene import load_scene, scene_layer_names
+from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.splats import read_splats
 
 SMALL = ["--steps", "40", "--views", "6", "--width", "64", "--max-gaussians", "3000"]
-MODULES = {m.__name__.rsplit(".", 1)[1]: m for m in (fit, segment, render, evaluate, export)}
+MODULES = {m.__name__.rsplit(".", 1)[1]: m for m in (fit, see, segment, render, evaluate, export)}
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,12 @@ def test_everything_is_there_and_opens(finished: Path):
     capture = read_capture(finished / "capture")
     assert (len(capture.train_views), len(capture.test_views)) == (6, 1)
     scene = load_scene(finished / "scene")
-    assert scene_layer_names(finished / "scene") == ("semantic",)
+    assert scene_layer_names(finished / "scene") == ("objects", "semantic")
+    assert (finished / "scene" / "reports" / "objects.html").is_file()
+    objects = load_scene_layer(finished / "scene", "objects")
+    assert len(list((finished / "scene" / "exports" / "objects" / "objects").glob("*.ply"))) == len(
+        set(objects.ids.tolist()) - {-1}
+    )
     labelled = read_splats(finished / "labelled.ply")
     assert len(labelled) == len(scene.gaussians)
     assert set(labelled.extra["class_id"].unique().tolist()) <= set(range(17))
@@ -64,6 +69,7 @@ def test_the_record_holds_the_figures_that_the_report_shows(finished: Path):
     assert f"{record['miou_lifted_test']:.3f}" in page
     assert f"{record['miou_labels_as_they_came_train']:.3f}" in page
     assert 0 < record["miou_lifted_test"] < 1
+    assert f"{record['miou_objects_test']:.3f}" in page
     assert 3 < record["psnr_test"] < 50
     assert sum(record["seconds"].values()) == pytest.approx(record["seconds_total"], abs=1.0)
     assert page.count("data:image/") >= 10
@@ -77,7 +83,10 @@ def test_what_is_printed_is_what_runs(finished: Path):
     assert [name for name, _, _ in jobs] == [
         "fit",
         "segment",
+        "see",
+        "segment",
         "render",
+        "evaluate",
         "evaluate",
         "evaluate",
         "export",

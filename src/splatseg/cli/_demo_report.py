@@ -55,6 +55,9 @@ class DemoFigures:
     test: Mapping[str, Any]
     """The same of held-out views."""
 
+    objects: Mapping[str, Any]
+    """What evaluate says of the objects on held-out views."""
+
     steps: tuple[tuple[str, float], ...]
     """Names and seconds."""
 
@@ -78,13 +81,13 @@ def machine_score(capture: Path, evidence: str) -> SemanticScore:
 
 
 def write_report(
-    folder: Path, figures: DemoFigures, *, seed: int, layer: str, evidence: str
+    folder: Path, figures: DemoFigures, *, seed: int, layer: str, evidence: str, objects: str
 ) -> None:
     """Write contact_sheet.png and report.html of a demo's folder."""
     scene = load_scene(folder / "scene")
     truth = open_evidence(folder / "capture" / "semantic")
     classes = scene.classes or ClassTable(rows=())
-    held_out = _held_out_gallery(folder, scene, truth, layer=layer)
+    held_out = _held_out_gallery(folder, scene, truth, layer=layer, objects=objects)
     labels = load_scene_layer(folder / "scene", layer)
     if not isinstance(labels, Labels):
         raise InputError(f"{layer}: expected a layer of labels.")
@@ -135,6 +138,13 @@ def write_report(
                 note=f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points",
             ),
             Figure(
+                label="Objects, from masks without weights",
+                value=f"{figures.objects['mIoU']:.3f}",
+                note="instance mIoU on held-out views; "
+                f"{figures.objects['predicted_instances']} found, "
+                f"{figures.objects['truth_instances']} true ones",
+            ),
+            Figure(
                 label="Gaussians",
                 value=f"{len(scene.gaussians):,}".replace(",", "\N{THIN SPACE}"),
                 note=f"from {len(scene.train_views)} photographs",
@@ -159,8 +169,10 @@ def write_report(
         path.write_text(report_html(report), encoding="utf-8", newline="\n")
 
 
-def _held_out_gallery(folder: Path, scene: Scene, truth: Evidence, *, layer: str) -> Gallery:
-    """Photograph, rendering, depth, labels, truth and errors of some test views."""
+def _held_out_gallery(
+    folder: Path, scene: Scene, truth: Evidence, *, layer: str, objects: str
+) -> Gallery:
+    """Photograph, rendering, depth, labels, truth, errors and objects of some test views."""
     pictures = folder / "render"
     unit = read_json(pictures / "depth" / "depth.json")["unit"]
     views = _spread(scene.test_views, _HELD_OUT_ROWS)
@@ -170,8 +182,8 @@ def _held_out_gallery(folder: Path, scene: Scene, truth: Evidence, *, layer: str
     for view, depth in zip(views, depths, strict=True):
         photograph = load_image(view)
         drawn = _read(pictures / "rgb" / f"{view.name}.png").to(torch.uint8)
-        file_ids = _read(pictures / layer / f"{view.name}.png").int()
-        ids = torch.where(file_ids == 0, -1, file_ids)
+        ids = _ids(pictures / layer / f"{view.name}.png")
+        things = _ids(pictures / objects / f"{view.name}.png")
         true = truth.label_map(view.name).ids
         rows.append(
             (
@@ -186,14 +198,24 @@ def _held_out_gallery(folder: Path, scene: Scene, truth: Evidence, *, layer: str
                         image=mark_errors(photograph, ids, truth=true),
                         caption=f"{_right(ids, true):.1%} right",
                     ),
+                    _labels(things, None),
                 ),
             )
         )
     return Gallery(
         title="Held-out views",
-        columns=("photograph", "rendered", "depth", "labels, rendered", "truth", "errors in red"),
+        columns=(
+            "photograph",
+            "rendered",
+            "depth",
+            "labels, rendered",
+            "truth",
+            "errors in red",
+            "objects",
+        ),
         rows=tuple(rows),
-        note="No photograph and no label of these views was used before.",
+        note="No photograph and no label of these views was used before. Objects come from masks "
+        "that need no weights, joined in 3D; their colours are arbitrary.",
     )
 
 
@@ -289,6 +311,11 @@ def _labels(
 
 def _right(ids: Tensor, truth: Tensor) -> float:
     return float((ids == truth)[truth >= 0].float().mean())
+
+
+def _ids(path: Path) -> Tensor:
+    ids = _read(path).int()
+    return torch.where(ids == 0, -1, ids)
 
 
 def _read(path: Path) -> Tensor:

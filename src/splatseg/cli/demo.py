@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli import evaluate, export, fit, render, segment
+from splatseg.cli import evaluate, export, fit, render, see, segment
 from splatseg.cli._demo_report import DemoFigures, machine_score, write_report
 from splatseg.cli._work import progress
 from splatseg.errors import InputError, RangeError
@@ -32,6 +32,8 @@ _FILES = ("labelled.ply", "labelled.json", "contact_sheet.png", "report.html")
 _POINTS = 15_000
 _LAYER = "semantic"
 _EVIDENCE = "labels_semantic"
+_OBJECTS = "objects"
+_MASKS = "masks"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,8 +41,10 @@ class Command:
     """Show the main job on a generated room, of which the truth is known.
 
     Photographs of the room and class maps with a network's mistakes are generated; then the
-    commands fit, segment, render, evaluate and export run as you would run them. Takes about
-    three minutes on two cores. report.html and contact_sheet.png in DIR show what came of it.
+    commands fit, see, segment, render, evaluate and export run as you would run them: classes
+    from the maps, objects from masks that need no weights, pictures of held-out views, files and
+    reports. Takes about three minutes on two cores. report.html and contact_sheet.png in DIR
+    show what came of it.
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = Path("splatseg-demo")
@@ -101,14 +105,14 @@ def run(command: Command) -> None:
     steps.append(("generate", time.monotonic() - started))
 
     lines: list[str] = []
-    printed: dict[str, dict[str, Any]] = {}
+    printed: dict[tuple[str, str], dict[str, Any]] = {}
     for name, module, job in main_job(command):
         line = words_of(name, job)
         lines.append(" ".join(line))
         console.print(f"\n[bold]$[/bold] {' '.join(line)}", soft_wrap=True)
         begin = time.monotonic()
         if name == "evaluate":
-            printed[job.split] = _evaluated(job)
+            printed[job.layer, job.split] = _evaluated(job)
         else:
             module.run(job)
         if steps[-1][0] == name:
@@ -119,13 +123,16 @@ def run(command: Command) -> None:
     begin = time.monotonic()
     figures = DemoFigures(
         came=machine_score(capture, _EVIDENCE),
-        train=printed["train"],
-        test=printed["test"],
+        train=printed[_LAYER, "train"],
+        test=printed[_LAYER, "test"],
+        objects=printed[_OBJECTS, "test"],
         steps=tuple(steps),
         commands=tuple(lines),
         started=started,
     )
-    write_report(folder, figures, seed=command.seed, layer=_LAYER, evidence=_EVIDENCE)
+    write_report(
+        folder, figures, seed=command.seed, layer=_LAYER, evidence=_EVIDENCE, objects=_OBJECTS
+    )
     steps.append(("report", time.monotonic() - begin))
     total = time.monotonic() - started
     write_json(folder / _RECORD, _record(figures, steps, total, finished=True))
@@ -157,14 +164,36 @@ def main_job(command: Command) -> list[tuple[str, ModuleType, Any]]:
             "segment",
             segment,
             segment.Command(
-                scene=scene, method="uplift", evidence=_EVIDENCE, layer=_LAYER, backend=backend
+                scene=scene,
+                method="uplift",
+                evidence=_EVIDENCE,
+                layer=_LAYER,
+                reconsider=True,
+                backend=backend,
+            ),
+        ),
+        ("see", see, see.Command(scene=scene, model="classical", evidence=_MASKS)),
+        (
+            "segment",
+            segment,
+            segment.Command(
+                scene=scene,
+                method="associate",
+                evidence=_MASKS,
+                layer=_OBJECTS,
+                export=True,
+                report=True,
+                backend=backend,
             ),
         ),
         (
             "render",
             render,
             render.Command(
-                scene=scene, what=f"rgb,depth,{_LAYER}", output=pictures, backend=backend
+                scene=scene,
+                what=f"rgb,depth,{_LAYER},{_OBJECTS}",
+                output=pictures,
+                backend=backend,
             ),
         ),
         *(
@@ -183,9 +212,23 @@ def main_job(command: Command) -> list[tuple[str, ModuleType, Any]]:
             for split in ("train", "test")
         ),
         (
+            "evaluate",
+            evaluate,
+            evaluate.Command(
+                scene=scene,
+                layer=_OBJECTS,
+                metric="instances",
+                truth=capture / "instance",
+                json=True,
+                backend=backend,
+            ),
+        ),
+        (
             "export",
             export,
-            export.Command(scene=scene, layer=_LAYER, output=folder / "labelled.ply"),
+            export.Command(
+                scene=scene, layer=_LAYER, instances=_OBJECTS, output=folder / "labelled.ply"
+            ),
         ),
     ]
 
@@ -255,6 +298,7 @@ def _record(
         "miou_labels_as_they_came_train": figures.came.miou,
         "miou_lifted_train": figures.train["mIoU"],
         "miou_lifted_test": figures.test["mIoU"],
+        "miou_objects_test": figures.objects["mIoU"],
         "seconds": {name: round(seconds, 2) for name, seconds in steps},
         "seconds_total": round(total, 2),
         "commands": list(figures.commands),
@@ -279,6 +323,11 @@ def _print_tables(
     console.print(
         f"Pictures of held-out views: PSNR {figures.test['PSNR']:.2f} dB, "
         f"SSIM {figures.test['SSIM']:.3f}"
+    )
+    console.print(
+        f"Objects from masks without weights: {figures.objects['predicted_instances']} for "
+        f"{figures.objects['truth_instances']} true ones, mIoU {figures.objects['mIoU']:.3f} "
+        "held out"
     )
     times = Table("step", "seconds", title=f"{total:.0f} s in all")
     times.columns[1].justify = "right"

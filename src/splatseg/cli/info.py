@@ -112,7 +112,7 @@ def _describe_folder(path: Path, format: str) -> dict[str, Any]:
         return {"path": str(path), "kind": "folder", "holds": inside}
     files = [p for p in sorted(path.iterdir()) if p.suffix.lower() in _SPLAT_SUFFIXES]
     if (path / "evidence.json").is_file():
-        return _evidence_facts(open_evidence(path))
+        return _evidence_facts(open_evidence(path, unfinished="allow"))
     if not files and not bare_photographs(path):
         return _evidence_or_nothing(path)
     if files:
@@ -153,7 +153,7 @@ def _captures_inside(path: Path) -> list[str]:
 
 def _evidence_or_nothing(path: Path) -> dict[str, Any]:
     try:
-        evidence = open_evidence(path)
+        evidence = open_evidence(path, unfinished="allow")
     except InputError as error:
         if isinstance(error, FileFormatError):
             raise
@@ -168,7 +168,7 @@ def _as_label_maps(path: Path) -> dict[str, Any] | None:
     if {p.suffix.lower() for p in bare_photographs(path)} != {".png"}:
         return None
     try:
-        return _evidence_facts(open_evidence(path))
+        return _evidence_facts(open_evidence(path, unfinished="allow"))
     except FileFormatError:
         # Three channels: photographs that were saved as PNG.
         return None

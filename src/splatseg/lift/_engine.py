@@ -61,17 +61,18 @@ def camera_of_map(view: View, height: int, width: int) -> Camera:
     """The camera of a map's pixels: the view's own, or reduced in proportion.
 
     Raises:
-        ShapeError: If the map does not have the photograph's proportions.
+        ShapeError: If the map is larger than the photograph, or has not its proportions.
     """
     camera = view.camera
     if (height, width) == (camera.height, camera.width):
         return camera
     # A reduced side may be off by the rounding of one pixel.
     across, down = width / camera.width, height / camera.height
-    if abs(across - down) * max(camera.width, camera.height) > 1.0 + 1e-9:
+    out_of_proportion = abs(across - down) * max(camera.width, camera.height) > 1.0 + 1e-9
+    if across > 1 or down > 1 or out_of_proportion:
         raise ShapeError(
-            f"{view.name}: expected a map of {camera.width}x{camera.height} pixels or reduced in "
-            f"proportion, got {width}x{height}."
+            f"evidence: view {view.name!r}: expected {camera.width}x{camera.height} pixels as the "
+            f"photograph has, or fewer in proportion, got {width}x{height}."
         )
     return camera.resized(width, height)
 

@@ -72,7 +72,7 @@ def views_done(folder: Path, kind: EvidenceKind) -> frozenset[str]:
         # Panoptic evidence has no table before it is finished; its label maps tell.
         readable = [name for name, path in view_files(folder, ".png").items() if _is_map(path)]
         return frozenset(readable)
-    evidence = open_evidence(folder)
+    evidence = open_evidence(folder, unfinished="allow")
     return frozenset(name for name in evidence.view_names if _is_readable(evidence, name))
 
 

@@ -12,6 +12,10 @@ EvidenceKind = Literal["labels", "panoptic", "tracked", "masks", "features"]
 
 HEADER_FILE = "evidence.json"
 CONFIDENCE_FOLDER = "_confidence"
+
+MAX_FILE_ID = 65535
+"""Highest id that a label map of 16 bits holds."""
+
 # Files of a folder of evidence that are not of a view.
 _TABLES = frozenset({HEADER_FILE, "segments.json", "tracks.json", "legend.json"})
 _SHARED_ARRAYS = frozenset({"quant.npz", "basis.npz", "text_embeddings.npz"})
@@ -88,6 +92,11 @@ def view_files(folder: Path, suffix: str) -> dict[str, Path]:
         if path.is_file() and not shared and not hidden and below.parts[0] != CONFIDENCE_FOLDER:
             found[below.as_posix().removesuffix(suffix)] = path
     return dict(sorted(found.items()))
+
+
+def is_id(value: object) -> bool:
+    """Whether a value of a JSON table is an id that a label map can hold."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_FILE_ID
 
 
 def file_of(files: Mapping[str, Path], name: str, folder: Path) -> Path:

@@ -13,6 +13,8 @@ from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet,
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
+    HEADER_FILE,
+    MAX_FILE_ID,
     Evidence,
     EvidenceKind,
     file_of,
@@ -22,8 +24,6 @@ from splatseg.io.images import open_image
 
 CONFIDENCE_STEPS = 65535
 """A confidence of 1 in a file of confidences, 16 bit."""
-
-_MAX_FILE_ID = 65535
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,7 +56,7 @@ class IdRule:
         """Id in files by id in memory, where they differ."""
         if not self.zero_is_class:
             return None
-        return {id + 1: id for id in range(256) if id != self.void}
+        return {id + 1: id for id in range(MAX_FILE_ID + 1) if id != self.void}
 
 
 def read_id_map(path: Path) -> NDArray[np.int32]:
@@ -79,9 +79,9 @@ def read_id_map(path: Path) -> NDArray[np.int32]:
         except (OSError, SyntaxError, ValueError) as error:
             raise FileFormatError(f"{path}: cannot be decoded ({error}).") from error
     ids = array.astype(np.int64)
-    if ids.size and (ids.min() < 0 or ids.max() > _MAX_FILE_ID):
+    if ids.size and (ids.min() < 0 or ids.max() > MAX_FILE_ID):
         raise FileFormatError(
-            f"{path}: expected ids in [0, {_MAX_FILE_ID}], got [{ids.min()}, {ids.max()}]."
+            f"{path}: expected ids in [0, {MAX_FILE_ID}], got [{ids.min()}, {ids.max()}]."
         )
     return ids.astype(np.int32)
 
@@ -128,6 +128,7 @@ class LabelEvidence(Evidence):
     @override
     def label_map(self, name: str) -> LabelMap:
         ids = self.rule.to_memory(read_id_map(file_of(self.files, name, self.root)))
+        self._check_recorded(name, ids)
         return LabelMap(ids=torch.from_numpy(ids), confidence=self._confidence(name, ids.shape))
 
     @override
@@ -137,6 +138,17 @@ class LabelEvidence(Evidence):
     @override
     def features(self, name: str) -> FeatureMap:
         refuse(self, "features")
+
+    def _check_recorded(self, name: str, ids: NDArray[np.int32]) -> None:
+        """Refuse an id of which evidence.json does not tell what it was."""
+        if self.recorded is None:
+            return
+        unknown = {int(id) for id in np.unique(ids)} - {UNLABELLED} - self.recorded.keys()
+        if unknown:
+            raise FileFormatError(
+                f"{self.root / HEADER_FILE}: expected source_ids of all ids, got none of the id "
+                f"{min(unknown)}, which view {name!r} has."
+            )
 
     def _confidence(self, name: str, shape: tuple[int, ...]) -> torch.Tensor | None:
         path = self.root / CONFIDENCE_FOLDER / f"{name}.png"
@@ -178,8 +190,8 @@ def check_rule(zero_is_class: bool, void: int | None) -> IdRule:
     Raises:
         InputError: If void is not an id of files, or 0 is both void and a class.
     """
-    if void is not None and not 0 <= void <= _MAX_FILE_ID:
-        raise InputError(f"void: expected an id in [0, {_MAX_FILE_ID}], got {void}.")
+    if void is not None and not 0 <= void <= MAX_FILE_ID:
+        raise InputError(f"void: expected an id in [0, {MAX_FILE_ID}], got {void}.")
     if zero_is_class and void == 0:
         raise InputError("void: expected another id than 0, which zero_is_class makes a class.")
     return IdRule(zero_is_class=zero_is_class, void=void)

@@ -8,10 +8,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeGuard, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet, Rle
@@ -25,6 +26,8 @@ MASK_TABLE = "metadata.csv"
 """What SAM's tool writes beside the pictures of masks of one photograph."""
 
 _SCORES = ("score", "predicted_iou")
+_INT32 = np.iinfo(np.int32)
+_MOST_RUN = int(np.iinfo(np.uint32).max)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,17 +91,27 @@ def read_mask_arrays(path: Path) -> MaskSet:
     """
     arrays = read_npz(path, ["masks"], optional=["scores", "levels"])
     masks = arrays["masks"]
-    if masks.ndim != 3 or masks.dtype.kind not in "bui" or (masks.size and masks.min() < 0):
+    if (
+        masks.ndim != 3
+        or 0 in masks.shape[1:]
+        or masks.dtype.kind not in "bui"
+        or (masks.size and masks.min() < 0)
+    ):
         raise FileFormatError(
             f"{path}: expected masks of shape (masks, height, width) in booleans or 0 and 1, "
             f"got {masks.dtype} of {masks.shape}."
         )
     count = len(masks)
     scores, levels = arrays.get("scores", np.ones(count)), arrays.get("levels", np.zeros(count))
-    if scores.shape != (count,) or levels.shape != (count,) or not np.isfinite(scores).all():
+    if scores.shape != (count,) or scores.dtype.kind not in "biuf" or not _is_finite(scores):
         raise FileFormatError(
-            f"{path}: expected a finite score and a level for each of {count} masks, "
-            f"got {scores.shape} and {levels.shape}."
+            f"{path}: expected a finite score for each of {count} masks, "
+            f"got {scores.dtype} of {scores.shape}."
+        )
+    if levels.shape != (count,) or not _are_levels(levels):
+        raise FileFormatError(
+            f"{path}: expected a whole number as level for each of {count} masks, from "
+            f"{_INT32.min} to {_INT32.max}, got {levels.dtype} of {levels.shape}."
         )
     return MaskSet(
         height=int(masks.shape[1]),
@@ -107,6 +120,18 @@ def read_mask_arrays(path: Path) -> MaskSet:
         scores=torch.from_numpy(scores.astype(np.float32)).clamp(0, 1),
         levels=torch.from_numpy(levels.astype(np.int32)),
     )
+
+
+def _is_finite(values: NDArray[Any]) -> bool:
+    return bool(np.isfinite(values).all())
+
+
+def _are_levels(levels: NDArray[Any]) -> bool:
+    """Whether values are whole numbers that int32 holds, in whatever type they came."""
+    if levels.dtype.kind not in "biuf" or not _is_finite(levels):
+        return False
+    within = (levels >= _INT32.min) & (levels <= _INT32.max)
+    return bool(within.all() and (levels == np.trunc(levels)).all())
 
 
 def read_mask_pictures(folder: Path) -> MaskSet:
@@ -176,8 +201,11 @@ def read_masks(path: Path) -> MaskSet:
     content = read_json(path)
     rows = content.get("masks")
     height, width = content.get("height"), content.get("width")
-    if not isinstance(rows, list) or not isinstance(height, int) or not isinstance(width, int):
-        raise FileFormatError(f"{path}: expected masks with their height and width.")
+    if not isinstance(rows, list) or not _is_side(height) or not _is_side(width):
+        raise FileFormatError(
+            f"{path}: expected masks with their height and width, got {height!r:.40} and "
+            f"{width!r:.40}."
+        )
     masks: list[Rle] = []
     scores: list[float] = []
     levels: list[int] = []
@@ -187,13 +215,14 @@ def read_masks(path: Path) -> MaskSet:
         masks.append(_rle(fields.get("segmentation"), height, width, where=where))
         score = next((fields[key] for key in _SCORES if key in fields), 1.0)
         level = fields.get("level", 0)
-        if (
-            not isinstance(score, (int, float))
-            or not math.isfinite(score)
-            or not isinstance(level, int)
-        ):
-            raise FileFormatError(f"{where}: expected a score and a level, got {score}, {level}.")
-        scores.append(min(1.0, max(0.0, float(score))))
+        if not isinstance(score, (int, float)) or math.isnan(score) or abs(score) == math.inf:
+            raise FileFormatError(f"{where}: expected a finite score, got {score!r:.40}.")
+        if not isinstance(level, int) or not _INT32.min <= level <= _INT32.max:
+            raise FileFormatError(
+                f"{where}: expected a whole number from {_INT32.min} to {_INT32.max} as level, "
+                f"got {level!r:.40}."
+            )
+        scores.append(float(min(1, max(0, score))))
         levels.append(level)
     return MaskSet(
         height=height,
@@ -235,7 +264,16 @@ def _rle(segmentation: object, height: int, width: int, *, where: str) -> Rle:
     try:
         if isinstance(counts, str):
             return Rle.from_coco(counts, height=height, width=width)
-        runs = np.array(cast(list[int], counts), np.uint32)
-        return Rle(height=height, width=width, counts=runs)
-    except (InputError, ValueError, OverflowError, TypeError) as error:
+        runs = cast(list[object], counts)
+        wrong = [run for run in runs if type(run) is not int or not 0 <= run <= _MOST_RUN]
+        if wrong:
+            raise InputError(
+                f"counts: expected whole numbers from 0 to {_MOST_RUN}, got {wrong[0]!r:.40}."
+            )
+        return Rle(height=height, width=width, counts=np.array(runs, np.uint32))
+    except (InputError, OverflowError) as error:
         raise FileFormatError(f"{where}: {error}") from error
+
+
+def _is_side(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0

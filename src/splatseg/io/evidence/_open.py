@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from splatseg.core import ClassTable
 from splatseg.errors import FileFormatError, InputError, MissingFileError
@@ -43,6 +43,7 @@ def open_evidence(
     zero_is_class: bool = False,
     void: int | None = None,
     kind: EvidenceKind | None = None,
+    unfinished: Literal["refuse", "allow"] = "refuse",
 ) -> Evidence:
     """Open a folder of evidence, ours or recorded by others; no view is read yet.
 
@@ -56,10 +57,12 @@ def open_evidence(
         void: A further id of label maps that means none, such as 255.
         kind: What it holds, where its files could be two things; None looks at them. A folder
             of folders of PNGs is label maps unless SAM's metadata.csv or this says masks.
+        unfinished: Whether evidence may be opened whose views are not all there, because
+            `splatseg see` was stopped.
 
     Raises:
         MissingFileError: If there is no such folder.
-        InputError: If it holds no evidence.
+        InputError: If it holds no evidence, or unfinished evidence.
         FileFormatError: If a table in it is broken, or of a later version.
     """
     folder = Path(folder)
@@ -69,6 +72,12 @@ def open_evidence(
     rule = check_rule(zero_is_class, void)
     maps, arrays = view_files(folder, ".png"), view_files(folder, ".npz")
     objects = view_files(folder, ".json")
+    if unfinished == "refuse" and _is_unfinished(header):
+        count = max(len(maps), len(arrays), len(objects))
+        raise InputError(
+            f"{folder}: expected all its views, got {count} of work that was stopped; give the "
+            "same `splatseg see` again."
+        )
     if kind is not None and header.get("kind", kind) != kind:
         raise InputError(f"{folder}: expected evidence of {kind}, got {header['kind']}.")
     found: str | None = kind or header.get("kind") or _kind(folder, maps, objects, arrays)
@@ -159,6 +168,11 @@ def _header(folder: Path) -> dict[str, Any]:
             "a later splatseg wrote it."
         )
     return header
+
+
+def _is_unfinished(header: Mapping[str, Any]) -> bool:
+    metadata = header.get("metadata")
+    return isinstance(metadata, dict) and cast(dict[str, Any], metadata).get("complete") is False
 
 
 def _kind(

@@ -1,5 +1,6 @@
 """Panoptic and tracked evidence: label maps whose ids have a table beside them."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +19,12 @@ from splatseg.core import (
 )
 from splatseg.errors import FileFormatError
 from splatseg.io._json import read_json
-from splatseg.io.evidence._base import Evidence, EvidenceKind, refuse
+from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind, is_id, refuse
 from splatseg.io.evidence._labels import LabelEvidence, masks_of_ids
 
 SEGMENTS_FILE = "segments.json"
 TRACKS_FILE = "tracks.json"
+_DIGITS = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,17 +123,23 @@ class PanopticEvidence(Evidence):
         for row in cast(list[object], rows):
             fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
             id, category = fields.get("id"), fields.get("category_id")
-            if not isinstance(id, int) or not isinstance(category, int):
+            score = fields.get("score", 1.0)
+            if not is_id(id) or not isinstance(category, int) or category > MAX_FILE_ID:
                 raise FileFormatError(
-                    f"{path}: view {name!r}: expected segments with id and category_id, "
-                    f"got {row!r:.60}."
+                    f"{path}: view {name!r}: expected segments with id and category_id up to "
+                    f"{MAX_FILE_ID}, got {row!r:.60}."
+                )
+            if not isinstance(score, (int, float)) or math.isnan(score):
+                raise FileFormatError(
+                    f"{path}: view {name!r}: expected a number as score of segment {id}, "
+                    f"got {score!r:.40}."
                 )
             segments.append(
                 Segment(
                     id=id,
                     category=category if category > 0 else UNLABELLED,
                     isthing=bool(fields.get("isthing", True)),
-                    score=min(1.0, max(0.0, float(fields.get("score", 1.0)))),
+                    score=float(min(1, max(0, score))),
                 )
             )
         return tuple(sorted(segments, key=lambda segment: segment.id))
@@ -183,10 +191,21 @@ class TrackedEvidence(Evidence):
         for key, row in cast(dict[str, object], rows).items():
             fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
             votes = fields.get("category_votes", {})
-            if not key.isdecimal() or not isinstance(votes, dict):
-                raise FileFormatError(f"{path}: expected tracks by id, got {key!r}: {row!r:.60}.")
-            counts = cast(dict[str, int], votes)
-            found.append(Track(id=int(key), votes={n: int(v) for n, v in counts.items()}))
+            if not _is_key(key) or not isinstance(votes, dict):
+                raise FileFormatError(
+                    f"{path}: expected tracks by id up to {MAX_FILE_ID}, got "
+                    f"{key!r:.40}: {row!r:.60}."
+                )
+            counts = cast(dict[str, object], votes)
+            wrong = [v for v in counts.values() if not isinstance(v, (int, float)) or v != v // 1]
+            if wrong:
+                raise FileFormatError(
+                    f"{path}: expected whole numbers as category_votes of track {key}, "
+                    f"got {wrong[0]!r:.40}."
+                )
+            found.append(
+                Track(id=int(key), votes={n: int(cast(int, v)) for n, v in counts.items()})
+            )
         return tuple(sorted(found, key=lambda track: track.id))
 
     @property
@@ -232,6 +251,11 @@ def open_panoptic(maps: LabelEvidence) -> PanopticEvidence:
 def open_tracked(maps: LabelEvidence) -> TrackedEvidence:
     """Tracked evidence of a folder of label maps with tracks.json."""
     return TrackedEvidence(maps=maps, table=read_json(maps.folder / TRACKS_FILE))
+
+
+def _is_key(key: str) -> bool:
+    # Digits of other alphabets are decimal too, but no JSON of ours has them.
+    return key.isascii() and key.isdecimal() and len(key) <= _DIGITS and is_id(int(key))
 
 
 def _looked_up(
