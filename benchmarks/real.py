@@ -1,0 +1,239 @@
+"""Labels of real photographs, lifted and scored by the independent scorer.
+
+    python benchmarks/real.py camvid SCENE ../shared/data/real/camvid
+    python benchmarks/real.py dtu SCENE ../shared/data/real/dtu_scan37
+    python benchmarks/real.py replica SCENE ../shared/data/real/replica_office0 --masks masks
+
+`camvid`: a network's class maps of single frames, lifted from all frames and drawn into the same,
+and lifted from the train views and drawn into the held-out ones; pooled mean IoU over the eight
+static classes and over all eleven. `dtu`: the object masks of three views, lifted and drawn into
+all others; the scene must have been fitted without masks (`fit --masks off`). `replica`: masks
+that need no weights, as they come (painted smallest last, with ids of each view's own) and
+associated, against the reference's instances, which are predictions too.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from splatseg.core import LabelMap, Labels, Scene, View
+from splatseg.io.evidence import open_evidence
+from splatseg.io.scene import load_scene
+from splatseg.lift import (
+    AssociateOptions,
+    EvidenceSegments,
+    UpliftOptions,
+    associate,
+    complete,
+    label_map,
+    reconsider,
+    uplift,
+)
+
+_SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """What is scored and where pictures go."""
+
+    scene: Scene
+    data: Path
+    work: Path
+    masks: str
+
+    def draw(self, labels: Labels, views: Sequence[View], name: str, *, binary: int = 0) -> Path:
+        """Label maps of views as PNG; with `binary` masks of that id."""
+        folder = _fresh(self.work / name)
+        for view in views:
+            ids = label_map(self.scene.gaussians, view.camera, labels).ids
+            if binary:
+                image = Image.fromarray((ids == binary).numpy().astype(np.uint8) * 255)
+            else:
+                image = Image.fromarray(ids.clamp_min(0).numpy().astype(np.uint16))
+            image.save(folder / f"{view.name}.png")
+        return folder
+
+
+def camvid(job: Job) -> None:
+    """Class maps of single frames."""
+    found = open_evidence(job.data / "labels_semantic")
+    views, held = job.scene.views, job.scene.test_views
+    for title, train, scored in (
+        ("all frames", views, views),
+        ("held-out frames", job.scene.train_views, held),
+    ):
+        truth = _subset(job.data / "semantic", scored, job.work / "truth")
+        came = _subset(job.data / "labels_semantic", scored, job.work / "came")
+        _classes(f"{title}, as they came", _score("semantic", came, truth))
+        begin = time.monotonic()
+        soft = uplift(job.scene.gaussians, train, found, options=UpliftOptions(candidates=8))
+        seconds = time.monotonic() - begin
+        for name, labels in (("uplift", soft), ("reconsidered", reconsider(soft))):
+            hard = complete(job.scene.gaussians, replace(labels, candidates=None, shares=None))
+            drawn = job.draw(hard, scored, name)
+            _classes(f"{title}, {name}", _score("semantic", drawn, truth), seconds)
+
+
+def dtu(job: Job) -> None:
+    """The object of three views' masks in all others."""
+    views = sorted(job.scene.views, key=lambda view: view.name)
+    chosen = [views[len(views) * (2 * k + 1) // 6] for k in range(3)]
+    others = [view for view in views if view not in chosen]
+    truth = _subset(job.data / "masks", others, job.work / "truth")
+    for title, options in (
+        ("share", UpliftOptions()),
+        ("flashsplat", UpliftOptions(label_rule="flashsplat")),
+    ):
+        lifted = uplift(job.scene.gaussians, chosen, _Masks(job.data / "masks"), options=options)
+        for ending, labels in (
+            ("", lifted),
+            (", completed", complete(job.scene.gaussians, lifted)),
+        ):
+            drawn = job.draw(labels, others, "object", binary=_OBJECT)
+            said = _score("binary", drawn, truth)
+            print(
+                f"{title}{ending}, masks of {', '.join(v.name for v in chosen)}: "
+                f"IoU {said['IoU_mean_over_views']:.4f} mean of {said['views']} views, "
+                f"{said['IoU_pooled']:.4f} pooled",
+                flush=True,
+            )
+
+
+def replica(job: Job) -> None:
+    """Masks that need no weights against the reference's instances."""
+    found = open_evidence(job.scene.root / "evidence" / job.masks if job.scene.root else Path())
+    known = set(found.view_names)
+    train = [view for view in job.scene.views if view.name in known]
+    for title, scored in (("views seen", train), ("held-out views", job.scene.test_views)):
+        truth = _subset(job.data / "pano_reference", scored, job.work / "truth")
+        if title == "views seen":
+            came = _fresh(job.work / "came")
+            for view in scored:
+                _painted(found.masks(view.name)).save(came / f"{view.name}.png")
+            _instances(f"{title}, as they come", _score("instances", came, truth))
+        for overlap in (0.5, 0.7):
+            begin = time.monotonic()
+            labels = associate(
+                job.scene.gaussians,
+                train,
+                EvidenceSegments(evidence=found),
+                options=AssociateOptions(overlap=overlap),
+            )
+            labels = complete(job.scene.gaussians, labels)
+            seconds = time.monotonic() - begin
+            drawn = job.draw(labels, scored, f"associated-{overlap}")
+            said = _score("instances", drawn, truth)
+            _instances(f"{title}, associated (overlap {overlap})", said, seconds)
+
+
+_BACKGROUND, _OBJECT = 1, 2
+
+
+class _Masks:
+    """Masks of one object as label maps."""
+
+    def __init__(self, folder: Path) -> None:
+        self._files = {path.stem: path for path in sorted(folder.glob("*.png"))}
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return tuple(self._files)
+
+    def label_map(self, name: str) -> LabelMap:
+        with Image.open(self._files[name]) as image:
+            inside = np.asarray(image.convert("L")) > 127
+        return LabelMap(ids=torch.from_numpy(np.where(inside, _OBJECT, _BACKGROUND)).int())
+
+
+def _painted(masks: Any) -> Image.Image:
+    """Overlapping masks as one map: large ones first, small ones over them."""
+    ids = np.zeros((masks.height, masks.width), np.uint16)
+    order = sorted(range(len(masks.masks)), key=lambda place: -masks.masks[place].area)
+    for number, place in enumerate(order, start=1):
+        ids[masks.masks[place].decode().numpy()] = number
+    return Image.fromarray(ids)
+
+
+def _fresh(folder: Path) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def _subset(folder: Path, views: Sequence[View], target: Path) -> Path:
+    """Maps of some views alone: the scorer wants every view that the truth has."""
+    _fresh(target)
+    names = {view.name for view in views}
+    for path in sorted(folder.glob("*.png")):
+        if path.stem in names:
+            shutil.copy(path, target)
+    return target
+
+
+def _score(command: str, predicted: Path, truth: Path) -> dict[str, Any]:
+    said = subprocess.run(
+        [sys.executable, str(_SCORE), command, "--pred", str(predicted), "--truth", str(truth)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return json.loads(said.stdout)
+
+
+def _classes(title: str, said: Mapping[str, Any], seconds: float | None = None) -> None:
+    each = [said["per_class"][str(k)] for k in range(1, 9)]
+    spent = "" if seconds is None else f"  {seconds:.1f} s"
+    print(
+        f"{title:36s} static {np.mean(each):.4f}  all {said['mIoU']:.4f}  "
+        + " ".join(f"{v:.2f}" for v in said["per_class"].values())
+        + spent,
+        flush=True,
+    )
+
+
+def _instances(title: str, said: Mapping[str, Any], seconds: float | None = None) -> None:
+    spent = "" if seconds is None else f"  {seconds:.1f} s"
+    print(
+        f"{title:44s} mIoU {said['mIoU']:.4f} recall50 {said['recall50']:.3f} "
+        f"precision50 {said['precision50']:.3f} ids {said['predicted_instances']} for "
+        f"{said['truth_instances']}{spent}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print one line a row."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("camvid", "dtu", "replica"))
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--masks", default="masks", help="replica: evidence of the scene")
+    parser.add_argument("--work", type=Path, help="keep label maps here")
+    arguments = parser.parse_args()
+    temporary = None if arguments.work else tempfile.mkdtemp()
+    try:
+        job = Job(
+            scene=load_scene(arguments.scene),
+            data=arguments.data,
+            work=arguments.work or Path(temporary or ""),
+            masks=arguments.masks,
+        )
+        {"camvid": camvid, "dtu": dtu, "replica": replica}[arguments.what](job)
+    finally:
+        if temporary:
+            shutil.rmtree(temporary)
+
+
+if __name__ == "__main__":
+    main()
