@@ -267,3 +267,24 @@ def test_nothing_is_overwritten(room, capsys) -> None:
     assert main(words) == 2
     assert "expected a new folder, got one that is there" in capsys.readouterr().err
     assert (room / "gaussians.ply").read_bytes() == before
+
+
+def test_ctrl_c_leaves_nothing_half_written(room, tmp_path, monkeypatch, capsys) -> None:
+    """Neither during the cut nor between the files of the new scene."""
+    before = (room / "gaussians.ply").read_bytes()
+    out = tmp_path / "out"
+    words = ["edit", str(room), "-o", str(out), "--remove", "--layer", "objects", "--ids", "3"]
+
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    for where in ("splatseg.edit.cut.sides_of", "splatseg.io.scene.save_layer"):
+        with monkeypatch.context() as patch:
+            patch.setattr(where, stop)
+            assert main(words) == 1
+        assert "interrupted" in capsys.readouterr().err
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["room"]
+    assert (room / "gaussians.ply").read_bytes() == before
+    assert main(words) == 0, "it can be done again under the same name"
+    assert main(words) == 2, "and then it is there"
+    assert f"{out}: expected a new folder" in capsys.readouterr().err.replace("\n", "")

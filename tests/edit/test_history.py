@@ -398,3 +398,19 @@ def test_a_similarity_stays_exact_in_a_history() -> None:
     assert torch.equal(back.rotation, move.rotation)
     assert torch.equal(back.translation, move.translation)
     assert back.scale == move.scale
+
+
+def test_a_wrong_name_is_answered_with_those_most_like_it() -> None:
+    """Of more names than a sentence holds, those that share words come first."""
+    names = {str(i): f"book {i}" for i in range(1, 12)} | {"12": "navy train on the table"}
+    labels = Labels(
+        ids=torch.arange(1, 13).int(), confidence=torch.ones(12), metadata={"names": names}
+    )
+    with pytest.raises(InputError) as caught:
+        ids_named(labels, ["Train"])
+    told = str(caught.value)
+    assert told.startswith("names: expected names of the layer (navy train on the table, book 1, ")
+    assert told.endswith(", ...), got 'Train'.")
+    assert told.count("book") == 7
+    with pytest.raises(InputError, match=r"\(book 2, book 1, book 10"):
+        ids_named(labels, ["2"])

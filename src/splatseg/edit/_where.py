@@ -173,7 +173,20 @@ def ids_named(
     for name in names:
         ids = [i for i, own_name in known.items() if own_name == name and i in present]
         if not ids:
-            shown = ", ".join(sorted({n for i, n in known.items() if i in present})) or "none"
-            raise InputError(f"names: expected names of the layer ({shown:.200}), got {name!r}.")
+            own_names = {n for i, n in known.items() if i in present}
+            raise InputError(
+                f"names: expected names of the layer ({_shown(own_names, name)}), got {name!r}."
+            )
         found += ids
     return tuple(sorted(set(found)))
+
+
+_SHOWN = 8
+"""Most names that a message lists."""
+
+
+def _shown(names: set[str], asked: str) -> str:
+    """Names for a message, those first that share words with what was asked for."""
+    words = set(asked.lower().split())
+    order = sorted(names, key=lambda name: (-len(words & set(name.lower().split())), name))
+    return ", ".join([*order[:_SHOWN], *(["..."] if len(order) > _SHOWN else [])]) or "none"
