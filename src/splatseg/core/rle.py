@@ -77,8 +77,8 @@ class Rle:
         Raises:
             InputError: If a character is outside the alphabet or a number does not end.
         """
-        # What is not ASCII becomes "?" with the code 15 + 48, which is refused below.
-        data = text.encode("ascii", "backslashreplace") if isinstance(text, str) else text
+        # Bytes of what is not ASCII are above 127, which is refused below.
+        data = text.encode() if isinstance(text, str) else text
         codes = np.frombuffer(data, np.uint8).astype(np.int64) - 48
         if codes.size and (codes.min() < 0 or codes.max() > 63):
             raise InputError("counts: expected a compressed COCO mask, got other characters.")

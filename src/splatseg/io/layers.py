@@ -181,7 +181,7 @@ def _array(
     kind: str,
     shape: tuple[int | None, ...],
 ) -> NDArray[Any]:
-    """An array of a layer after checking its type (exact, or its kind letter) and shape."""
+    """An array of a layer after checking its type (exact, or its kind letter), shape, values."""
     array = arrays.get(name)
     if array is None:
         raise FileFormatError(f"{path}: expected an array {name!r}, which is not there.")
@@ -196,4 +196,13 @@ def _array(
             f"{path}: expected {name!r} of type {kind} and shape ({wanted}), "
             f"got {array.dtype} of {array.shape}."
         )
+    if kind.startswith("f"):
+        bad = int(array.size - np.isfinite(array).sum())
+        if bad:
+            raise FileFormatError(
+                f"{path}: expected finite {name!r}, got {bad} of {array.size} values that are NaN "
+                "or infinite."
+            )
+    elif kind.startswith("i") and array.size and array.min() < 0:
+        raise FileFormatError(f"{path}: expected {name!r} of 0 (none) or more, got {array.min()}.")
     return array

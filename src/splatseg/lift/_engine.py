@@ -71,7 +71,7 @@ def camera_of_map(view: View, height: int, width: int) -> Camera:
     out_of_proportion = abs(across - down) * max(camera.width, camera.height) > 1.0 + 1e-9
     if across > 1 or down > 1 or out_of_proportion:
         raise ShapeError(
-            f"evidence: view {view.name!r}: expected {camera.width}x{camera.height} pixels as the "
+            f"view {view.name}: expected a map of {camera.width}x{camera.height} pixels as its "
             f"photograph has, or fewer in proportion, got {width}x{height}."
         )
     return camera.resized(width, height)

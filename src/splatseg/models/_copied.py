@@ -20,11 +20,13 @@ from splatseg.io.evidence import (
     LabelEvidence,
     PanopticEvidence,
     TrackedEvidence,
+    read_id_map,
     save_features,
     save_label_map,
     save_masks,
     save_segments,
     save_tracks,
+    view_files,
 )
 from splatseg.models._sources import Source, some, without_empty
 from splatseg.models.recorded import AnyRecorded, check_grid, check_size
@@ -79,6 +81,9 @@ class _Copied(Source):
     bare: list[str] = field(default_factory=list[str])
     """Views without any mask or id."""
 
+    highest: list[int] = field(default_factory=lambda: [256])
+    """The highest id of the maps so far; those of 8 bits end at 255, plus 1."""
+
     unnamed: set[int] = field(default_factory=set[int])
     """Ids that the class table does not name."""
 
@@ -104,7 +109,11 @@ class _Copied(Source):
 
     @override
     def source_ids(self) -> Mapping[int, int] | None:
-        return self.evidence.source_ids
+        known = self.evidence.source_ids
+        if known is None:
+            return None
+        most = max(self.highest)
+        return {id: source for id, source in known.items() if id <= most}
 
     @override
     def details(self) -> Mapping[str, Any]:
@@ -122,6 +131,9 @@ class _Copied(Source):
     @override
     def start(self, folder: Path, views: Sequence[View]) -> None:
         evidence = self.evidence
+        if evidence.source_ids is not None:
+            there = view_files(folder, ".png").values()
+            self.highest.extend(int(read_id_map(path).max(initial=0)) for path in there)
         if isinstance(evidence, PanopticEvidence):
             save_segments(folder, {view.name: evidence.segments(view.name) for view in views})
         elif isinstance(evidence, TrackedEvidence):
@@ -156,6 +168,7 @@ class _Copied(Source):
         ids = maps.label_map(name)
         check_size(evidence, name, (ids.height, ids.width), size)
         self._note_ids(ids)
+        self.highest.append(int(ids.ids.max()))
         if not bool((ids.ids != UNLABELLED).any()):
             self.bare.append(name)
         save_label_map(folder, name, ids)

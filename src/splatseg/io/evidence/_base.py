@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal, NoReturn, TypeGuard
 
 from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
 from splatseg.errors import InputError
@@ -94,7 +94,7 @@ def view_files(folder: Path, suffix: str) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def is_id(value: object) -> bool:
+def is_id(value: object) -> TypeGuard[int]:
     """Whether a value of a JSON table is an id that a label map can hold."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_FILE_ID
 

@@ -215,7 +215,7 @@ def read_masks(path: Path) -> MaskSet:
         masks.append(_rle(fields.get("segmentation"), height, width, where=where))
         score = next((fields[key] for key in _SCORES if key in fields), 1.0)
         level = fields.get("level", 0)
-        if not isinstance(score, (int, float)) or math.isnan(score) or abs(score) == math.inf:
+        if not isinstance(score, (int, float)) or _is_infinite(score):
             raise FileFormatError(f"{where}: expected a finite score, got {score!r:.40}.")
         if not isinstance(level, int) or not _INT32.min <= level <= _INT32.max:
             raise FileFormatError(
@@ -273,6 +273,11 @@ def _rle(segmentation: object, height: int, width: int, *, where: str) -> Rle:
         return Rle(height=height, width=width, counts=np.array(runs, np.uint32))
     except (InputError, OverflowError) as error:
         raise FileFormatError(f"{where}: {error}") from error
+
+
+def _is_infinite(value: float) -> bool:
+    # A whole number may be too large for a float; it is finite.
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 def _is_side(value: object) -> TypeGuard[int]:

@@ -129,7 +129,9 @@ class PanopticEvidence(Evidence):
                     f"{path}: view {name!r}: expected segments with id and category_id up to "
                     f"{MAX_FILE_ID}, got {row!r:.60}."
                 )
-            if not isinstance(score, (int, float)) or math.isnan(score):
+            if not isinstance(score, (int, float)) or (
+                isinstance(score, float) and math.isnan(score)
+            ):
                 raise FileFormatError(
                     f"{path}: view {name!r}: expected a number as score of segment {id}, "
                     f"got {score!r:.40}."
