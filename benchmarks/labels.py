@@ -35,8 +35,8 @@ from splatseg.core import LabelMap, Labels, Scene
 from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import (
-    AssociateOptions,
     CompletionOptions,
+    ConfusionOptions,
     EvidenceSegments,
     UpliftOptions,
     VoteOptions,
@@ -162,7 +162,10 @@ def semantic(bench: Bench) -> None:
 def tracked(bench: Bench) -> None:
     """Ids of a tracker that switches, splits and loses."""
     found, gaussians = bench.evidence("labels_tracked"), bench.scene.gaussians
-    bench.row("labels_tracked, uplift", "instance", lambda: uplift(gaussians, bench.train, found))
+    soft = uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8))
+    for title, labels in (("uplift", soft), ("uplift, reconsidered", reconsider(soft))):
+        hard = replace(labels, candidates=None, shares=None)
+        bench.row(f"labels_tracked, {title}", "instance", lambda hard=hard: hard)
     _associated(bench, "labels_tracked", found)
     bench.row(
         "labels_tracked, identity", "instance", lambda: identity(gaussians, bench.train, found)
@@ -187,21 +190,16 @@ def sam(bench: Bench) -> None:
 
 
 def _associated(bench: Bench, name: str, found: Evidence) -> None:
-    for title, options in (
-        ("associate", AssociateOptions()),
-        ("associate, all pixels alike", AssociateOptions(small_things=0)),
+    gaussians, segments = bench.scene.gaussians, EvidenceSegments(evidence=found)
+    for title, confusion in (
+        ("associate", ConfusionOptions()),
+        ("associate, majority of votes", None),
     ):
         bench.row(
             f"{name}, {title}",
             "instance",
-            lambda options=options: complete(
-                bench.scene.gaussians,
-                associate(
-                    bench.scene.gaussians,
-                    bench.train,
-                    EvidenceSegments(evidence=found),
-                    options=options,
-                ),
+            lambda confusion=confusion: complete(
+                gaussians, associate(gaussians, bench.train, segments, confusion=confusion)
             ),
         )
 

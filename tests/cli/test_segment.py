@@ -1,7 +1,6 @@
 """segment: every method, completion, exports and the report, as the shell runs it."""
 
 import csv
-import json
 
 import numpy as np
 import pytest
@@ -155,18 +154,19 @@ def test_completion_marks_what_it_infers(small, splatseg) -> None:
 
 
 def test_reconsidering(small, splatseg) -> None:
-    command = ("segment", small.scene, "--method", "uplift", "--reconsider")
+    command = ("segment", small.scene, "--method", "uplift")
     assert splatseg(*command)[0] == 0
     layer = layer_of(small.scene, "labels_semantic")
-    assert "reconsidered" in json.dumps(layer.metadata) or "confusion" in json.dumps(layer.metadata)
+    assert layer.metadata["confusion"]["options"]["looks"] == 10
     assert layer.candidates is None
-    assert splatseg(*command, "--candidates", 3, "--layer", "soft")[0] == 0
+    assert splatseg(*command, "--candidates", 3, "--looks", 4, "--layer", "soft")[0] == 0
     soft = layer_of(small.scene, "soft")
+    assert soft.metadata["confusion"]["options"]["looks"] == 4
     assert soft.candidates is not None
     assert soft.candidates.shape[1] == 3
-    status, _, err = splatseg("segment", small.scene, "--method", "vote", "--reconsider")
-    assert status == 2
-    assert "--reconsider: goes with --method uplift, not vote." in err
+    for words in (("--no-reconsider",), ("--label-rule", "flashsplat")):
+        assert splatseg(*command, *words, "--layer", "plain")[0] == 0
+        assert "confusion" not in layer_of(small.scene, "plain").metadata
 
 
 def test_files_and_report_of_one_command(masks, splatseg) -> None:

@@ -1,5 +1,6 @@
 """Segments of unordered views become instances."""
 
+import importlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -10,8 +11,9 @@ import torch
 
 from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import AssociateOptions, associate
+from splatseg.lift import AssociateOptions, ConfusionOptions, associate
 from splatseg.lift._segment_table import segment_table
+from splatseg.lift.associate import DEFAULT_CONFUSION, _labels
 
 from .conftest import camera_at, gaussians_at
 
@@ -75,9 +77,9 @@ NAMES = {"v0": [7, 8, 9], "v1": [9, 7, 8], "v2": [1, 2, 3], "v3": [70000, 5, 1]}
 SAME = {name: [1, 2, 3] for name in NAMES}
 
 
-def run(source: Segments, views=VIEWS, **options):
+def run(source: Segments, views=VIEWS, confusion=DEFAULT_CONFUSION, **options):
     chosen = AssociateOptions(**options)
-    return associate(GAUSSIANS, views, source, options=chosen, backend=BACKEND)
+    return associate(GAUSSIANS, views, source, options=chosen, confusion=confusion, backend=BACKEND)
 
 
 def groups(ids: torch.Tensor) -> list[frozenset[int]]:
@@ -180,6 +182,48 @@ def test_small_things_speak_louder_than_what_swallows_them() -> None:
     # The outer things have one id in every view: one instance, and the larger one.
     assert labels[0.0].unique().tolist() == [1]
     assert labels[0.6].unique().tolist() == [2]
+
+
+def test_votes_become_a_soft_layer() -> None:
+    """Strongest first, the smaller id among equals; shares are of all votes."""
+    import scipy.sparse
+
+    votes = scipy.sparse.csr_matrix(np.array([[1.0, 3, 0, 0], [2, 0, 2, 0], [0, 0, 0, 0]]))
+    labels = _labels(votes)
+    assert labels.ids.tolist() == [2, 1, -1]
+    assert labels.candidates is not None
+    assert labels.candidates[:, :3].tolist() == [[2, 1, -1], [1, 3, -1], [-1, -1, -1]]
+    assert labels.shares is not None
+    assert labels.shares[:, :2].tolist() == [[0.75, 0.25], [0.5, 0.5], [0, 0]]
+    assert labels.confidence.tolist() == [0.75, 0.5, 0]
+    assert labels.evidence is not None
+    assert labels.evidence.tolist() == [4, 4, 0]
+    many = _labels(scipy.sparse.csr_matrix(np.arange(1.0, 11)[None]))
+    assert many.candidates is not None
+    assert many.candidates.tolist() == [[10, 9, 8, 7, 6, 5, 4, 3]]
+
+
+def test_votes_are_reconsidered_unless_told_otherwise(monkeypatch) -> None:
+    """The soft votes go to `reconsider` with the options given, and its word is the last."""
+    module = importlib.import_module("splatseg.lift.associate")
+    asked = []
+
+    def turned(labels, *, options):
+        asked.append((labels, options))
+        return replace(labels, ids=labels.ids.flip(0), metadata={"confusion": "said"})
+
+    monkeypatch.setattr(module, "reconsider", turned)
+    looks = ConfusionOptions(looks=3)
+    told = run(clean(NAMES), confusion=looks)
+    plain = run(clean(NAMES), confusion=None)
+    assert len(asked) == 1
+    assert asked[0][1] is looks
+    assert torch.equal(asked[0][0].ids, plain.ids)
+    assert asked[0][0].candidates is not None
+    assert torch.equal(told.ids, plain.ids.flip(0))
+    assert told.metadata["confusion"] == "said"
+    assert "confusion" not in plain.metadata
+    assert (told.candidates, plain.candidates) == (None, None)
 
 
 def test_accidents_are_left_out() -> None:

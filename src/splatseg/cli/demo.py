@@ -168,7 +168,6 @@ def main_job(command: Command) -> list[tuple[str, ModuleType, Any]]:
                 method="uplift",
                 evidence=_EVIDENCE,
                 layer=_LAYER,
-                reconsider=True,
                 backend=backend,
             ),
         ),

@@ -80,10 +80,9 @@ class Command:
     complete: bool = True
     """Label Gaussians that no view explains by their neighbours; they are marked as inferred."""
 
-    reconsider: bool = False
-    """With uplift: decide anew under how often the evidence takes one id for another, which
-    finds small things that most views miss. For class labels of a model that errs, not for
-    truth."""
+    reconsider: bool = True
+    """With uplift and associate: decide anew under how often the evidence takes one id for
+    another, which finds small things that most views miss. Not with FlashSplat's rules."""
 
     classes: str | None = None
     """With instances: name of a layer of classes to merge them with. Instances take their class
@@ -157,8 +156,6 @@ def run(command: Command) -> None:
             f"({', '.join(kinds)}), got {evidence.kind}."
         )
     merged = _classes_to_merge(command, scene, evidence)
-    if command.reconsider and command.method != "uplift":
-        raise InputError(f"--reconsider: goes with --method uplift, not {command.method}.")
     layer_name = command.layer or evidence_name
     check_name("--layer", layer_name)
     truth = None if command.truth is None else open_evidence(command.truth)
@@ -232,13 +229,14 @@ def _labels(
 ) -> Labels:
     """The layer of the method, reconsidered and completed as asked."""
     begun = time.monotonic()
-    gaussians, backend = scene.gaussians, command.backend
+    gaussians, backend, again = scene.gaussians, command.backend, False
     named = (evidence.classes or scene.classes) if evidence.kind == "labels" else None
     with progress("segment") as step:
         match command.method:
             case "uplift":
                 options = command.uplift
-                if command.reconsider and options.candidates < 2:
+                again = command.reconsider and options.label_rule == "share"
+                if again and options.candidates < 2:
                     options = replace(
                         options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES)
                     )
@@ -278,12 +276,13 @@ def _labels(
                     views,
                     EvidenceSegments(evidence=evidence),
                     options=command.associate,
+                    confusion=command.confusion if command.reconsider else None,
                     classes=_categories(evidence, scene),
                     backend=backend,
                     progress=step,
                 )
     timings[command.method] = time.monotonic() - begun
-    if command.reconsider:
+    if again:
         begun = time.monotonic()
         labels = reconsider(labels, options=command.confusion)
         if command.uplift.candidates < 2:

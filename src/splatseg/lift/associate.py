@@ -8,8 +8,9 @@ no order of views and no limit on their number or that of ids. Then the views vo
           q_k = \Bigl(\tfrac{1}{|k|} \sum_{s \in k} m_s\Bigr)^{-\gamma}
 
 with the mass :math:`m_s` of a segment over all Gaussians. The exponent :math:`\gamma` speaks for
-small things: a model that misses a cup calls its pixels table, far more often than one that sees
-a cup where there is only table. At 0 all pixels vote alike.
+small things where it is above 0. At 0 all pixels vote alike, and small things come to their right
+by `lift.confusion`: a model that misses a cup calls its pixels table, far more often than one that
+sees a cup where there is only table, and the votes themselves tell how often.
 
 Where masks overlap (levels of granularity), groups of masks are taken one after another, those
 that most of the views that could have seen them did see first; a group that mostly covers what
@@ -18,7 +19,7 @@ is taken already is left out.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,13 @@ from splatseg.errors import RangeError
 from splatseg.lift._clustering import cluster
 from splatseg.lift._flatten import chosen_groups
 from splatseg.lift._segment_table import SegmentSource, SegmentTable, segment_table
+from splatseg.lift.confusion import ConfusionOptions, reconsider
 from splatseg.render import RenderOptions
+
+DEFAULT_CONFUSION = ConfusionOptions()
+
+_CANDIDATES = 8
+"""Instances of a Gaussian that are reconsidered."""
 
 _SURE_SEGMENTS = 3
 """Groups of fewer segments are too few to speak for a small thing: they may be accidents."""
@@ -46,14 +53,14 @@ class AssociateOptions:
     over union on the Gaussians that the views of both see, averaged over all pairs of segments
     of the two groups. Lower joins more."""
 
-    small_things: float = 0.25
+    small_things: float = 0.0
     """Exponent with which small instances outweigh large ones where views contradict each other;
-    0 treats all alike."""
+    0 treats all alike. 0.25 does most of what reconsidering does, without it."""
 
     least_views: int = 2
     """An instance needs segments in so many views, or in all there are if they are fewer."""
 
-    overlap: float = 0.5
+    overlap: float = 0.7
     """Of overlapping masks: a group is left out if more than this share of it, in [0, 1], is
     covered by groups that were taken before."""
 
@@ -77,6 +84,7 @@ def associate(
     source: SegmentSource,
     *,
     options: AssociateOptions | None = None,
+    confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
     classes: ClassTable | None = None,
     render_options: RenderOptions | None = None,
     backend: str = "auto",
@@ -92,6 +100,7 @@ def associate(
         views: Those whose segments count.
         source: Their segments.
         options: How segments become instances.
+        confusion: How segments err, see `reconsider`. None takes the majority of the votes.
         classes: Names of the categories of segments; instances are named after theirs.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
@@ -123,13 +132,16 @@ def associate(
         group = chosen_groups(table, agreement, group, overlap=options.overlap)
     votes = table.votes(group, _say(table, group, options.small_things))
     group, votes = _by_mass(group, votes)
-    ids, confidence, evidence = _winners(votes)
     rows = _instances(table, group, classes)
-    return Labels(
-        ids=torch.from_numpy(ids),
-        confidence=torch.from_numpy(confidence),
-        evidence=torch.from_numpy(evidence),
-        metadata={
+    labels = _labels(votes)
+    if confusion is not None:
+        labels = reconsider(labels, options=confusion)
+    return replace(
+        labels,
+        candidates=None,
+        shares=None,
+        metadata=dict(labels.metadata)
+        | {
             "method": "associate",
             "options": asdict(options),
             "views": list(table.views),
@@ -170,22 +182,30 @@ def _by_mass(group: NDArray[np.int64], votes: Any) -> tuple[NDArray[np.int64], A
     return rank[group], votes.tocsc()[:, order].tocsr()
 
 
-def _winners(
-    votes: Any,
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-    """Of each Gaussian the id with most votes (the smaller among equals), its share, all votes."""
+def _labels(votes: Any) -> Labels:
+    """The strongest ids of each Gaussian (the smaller among equals), their shares, all votes."""
     count = votes.shape[0]
     votes.sort_indices()
     rows = np.repeat(np.arange(count), np.diff(votes.indptr))
     order = np.lexsort((votes.indices, -votes.data, rows))
-    named, first = np.unique(rows[order], return_index=True)
-    best = order[first]
+    rows = rows[order]
+    first = np.ones(len(rows), bool)
+    first[1:] = rows[1:] != rows[:-1]
+    rank = np.arange(len(rows)) - np.flatnonzero(first)[np.cumsum(first) - 1]
+    kept = rank < _CANDIDATES
     total = np.asarray(votes.sum(axis=1)).ravel()
-    ids = np.full(count, UNLABELLED, np.int32)
-    ids[named] = votes.indices[best] + 1
-    confidence = np.zeros(count, np.float32)
-    confidence[named] = votes.data[best] / total[named]
-    return ids, confidence.clip(0, 1), total.astype(np.float32)
+    ids = np.full((count, _CANDIDATES), UNLABELLED, np.int32)
+    shares = np.zeros((count, _CANDIDATES), np.float32)
+    place = rows[kept], rank[kept]
+    ids[place] = votes.indices[order][kept] + 1
+    shares[place] = (votes.data[order][kept] / total[place[0]]).clip(0, 1)
+    return Labels(
+        ids=torch.from_numpy(ids[:, 0].copy()),
+        confidence=torch.from_numpy(shares[:, 0].copy()),
+        candidates=torch.from_numpy(ids),
+        shares=torch.from_numpy(shares),
+        evidence=torch.from_numpy(total.astype(np.float32)),
+    )
 
 
 def _instances(

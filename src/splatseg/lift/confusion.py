@@ -45,7 +45,7 @@ _ROWS = 65536
 class ConfusionOptions:
     """How the evidence errs."""
 
-    looks: float = 7.0
+    looks: float = 10.0
     """k: independent looks that a Gaussian's evidence amounts to."""
 
     least_confusion: float = 3e-3
