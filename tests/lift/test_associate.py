@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, View
+from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import AssociateOptions, ConfusionOptions, associate
 from splatseg.lift._segment_table import segment_table
@@ -182,6 +182,37 @@ def test_small_things_speak_louder_than_what_swallows_them() -> None:
     # The outer things have one id in every view: one instance, and the larger one.
     assert labels[0.0].unique().tolist() == [1]
     assert labels[0.6].unique().tolist() == [2]
+
+
+@pytest.mark.parametrize("overlapping", [False, True])
+def test_large_segments_are_read_on_a_coarser_grid(overlapping) -> None:
+    """Four times the pixels: the same instances; the low-pass filter adds some evidence."""
+    large = [
+        replace(view, camera=view.camera.resized(4 * view.camera.width, 4 * view.camera.height))
+        for view in VIEWS
+    ]
+    of = {}
+    for view in large:
+        strips = columns(view, *BORDERS)
+        found = mapped(strips, NAMES[view.name])
+        if overlapping:
+            masks = tuple(Rle.encode(strips == i) for i in range(3))
+            height, width = strips.shape
+            found = MaskSet(
+                height=height,
+                width=width,
+                masks=masks,
+                scores=torch.ones(3),
+                levels=torch.zeros(3, dtype=torch.int64),
+            )
+        of[view.name] = found
+    source = Segments(of, overlapping=overlapping)
+    full = run(source, large, longest_side=10_000)
+    coarse = run(source, large, longest_side=64)
+    assert groups(full.ids) == groups(coarse.ids) == THINGS
+    assert full.evidence is not None
+    assert coarse.evidence is not None
+    torch.testing.assert_close(coarse.evidence, full.evidence, rtol=0.12, atol=0.5)
 
 
 def test_votes_become_a_soft_layer() -> None:

@@ -5,14 +5,15 @@ neither the order in which views come nor what their segments are called has any
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from splatseg.core import UNLABELLED, Gaussians, LabelMap, MaskSet, View
+from splatseg.core import UNLABELLED, Gaussians, LabelMap, MaskSet, Rle, View
 from splatseg.errors import InputError
 from splatseg.lift._clustering import Agreement
 from splatseg.lift._masses import view_masses
@@ -144,6 +145,7 @@ def segment_table(
     source: SegmentSource,
     *,
     most_views: int,
+    longest_side: int | None = None,
     render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
@@ -155,6 +157,8 @@ def segment_table(
         views: Those whose segments count.
         source: Their segments.
         most_views: Views kept of each Gaussian, those that see most of it: this bounds memory.
+        longest_side: Larger segments are read at so many pixels along their longest side; None
+            reads all pixels. Masses stay in pixels of the segments as they came.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and their number.
@@ -174,9 +178,14 @@ def segment_table(
         segments = source.segments_of(view.name)
         names, scores = _in_order(segments)
         categories = source.categories_of(view.name)
-        camera = camera_of_map(view, segments.height, segments.width)
+        camera_of_map(view, segments.height, segments.width)  # refuses other proportions
         if isinstance(segments, LabelMap):
             segments = LabelMap(ids=segments.ids)
+        worth = segments.height * segments.width
+        if longest_side is not None:
+            segments = _reduced(segments, longest_side)
+        worth /= segments.height * segments.width
+        camera = camera_of_map(view, segments.height, segments.width)
         found = view_masses(gaussians, camera, segments, options=render_options, backend=backend)
         row_of = {name: len(rows) + i for i, name in enumerate(names)}
         rows += [
@@ -186,12 +195,12 @@ def segment_table(
         kept = found.weight > _LEAST_MASS
         used, compact = torch.unique(found.segment[kept], return_inverse=True)
         segment = torch.tensor([row_of[int(i)] for i in used.tolist()])
-        gaussian, mass = found.gaussian[kept].numpy(), found.weight[kept].numpy()
+        gaussian, mass = found.gaussian[kept].numpy(), worth * found.weight[kept].numpy()
         if isinstance(segments, LabelMap):
             # Pixels without a label tell nothing; pixels outside all masks do.
             sight = np.bincount(gaussian, mass, minlength=len(gaussians))
         else:
-            sight = found.visible.numpy()
+            sight = worth * found.visible.numpy()
         number = segment[compact].numpy() if len(segment) else np.zeros(0, np.int64)
         entries.add(gaussian, number, mass, sight[gaussian], place)
         if progress is not None:
@@ -213,6 +222,25 @@ def segment_table(
         category=category.astype(np.int64),
         score=score.astype(np.float64),
     )
+
+
+def _reduced(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
+    """Segments on a coarser grid: each pixel takes what is at its middle."""
+    height, width = segments.height, segments.width
+    share = longest / max(height, width)
+    if share >= 1:
+        return segments
+    h, w = max(1, round(share * height)), max(1, round(share * width))
+    down = ((torch.arange(h) + 0.5) * height / h).long()
+    across = ((torch.arange(w) + 0.5) * width / w).long()
+
+    def taken(picture: Tensor) -> Tensor:
+        return picture[down.unsqueeze(1), across]
+
+    if isinstance(segments, LabelMap):
+        return LabelMap(ids=taken(segments.ids.cpu()))
+    masks = tuple(Rle.encode(taken(mask.decode())) for mask in segments.masks)
+    return replace(segments, height=h, width=w, masks=masks)
 
 
 class _Entries:

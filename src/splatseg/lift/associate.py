@@ -68,12 +68,16 @@ class AssociateOptions:
     """Views of each Gaussian that are compared, those that see most of it; bounds memory and
     time."""
 
+    longest_side: int = 640
+    """Segments of larger photographs are read at this many pixels along their longest side;
+    bounds time. What is thinner than a pixel there may be missed."""
+
     def __post_init__(self) -> None:
         check_range("agreement", self.agreement, 0.0, 1.0)
         if not (math.isfinite(self.small_things) and self.small_things >= 0):
             raise RangeError(f"small_things: expected 0 or more, got {self.small_things}.")
         check_range("overlap", self.overlap, 0.0, 1.0)
-        for name in ("least_views", "most_views"):
+        for name in ("least_views", "most_views", "longest_side"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
 
@@ -121,6 +125,7 @@ def associate(
         views,
         source,
         most_views=options.most_views,
+        longest_side=options.longest_side,
         render_options=render_options,
         backend=backend,
         progress=progress,
