@@ -9,7 +9,8 @@ and lifted from the train views and drawn into the held-out ones; pooled mean Io
 static classes and over all eleven. `dtu`: the object masks of three views, lifted and drawn into
 all others; the scene must have been fitted without masks (`fit --masks off`). `replica`: masks
 that need no weights, as they come (painted smallest last, with ids of each view's own) and
-associated, against the reference's instances, which are predictions too.
+associated (the layer that `segment --method associate` made), against the reference's instances,
+which are predictions too.
 """
 
 import argparse
@@ -30,12 +31,9 @@ from PIL import Image
 
 from splatseg.core import LabelMap, Labels, Scene, View
 from splatseg.io.evidence import open_evidence
-from splatseg.io.scene import load_scene
+from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import (
-    AssociateOptions,
-    EvidenceSegments,
     UpliftOptions,
-    associate,
     complete,
     label_map,
     reconsider,
@@ -113,8 +111,11 @@ def dtu(job: Job) -> None:
 
 
 def replica(job: Job) -> None:
-    """Masks that need no weights against the reference's instances."""
+    """Masks that need no weights, and the layer of them, against the reference's instances."""
     found = open_evidence(job.scene.root / "evidence" / job.masks if job.scene.root else Path())
+    labels = load_scene_layer(job.scene.root or Path(), job.masks)
+    if not isinstance(labels, Labels):
+        raise SystemExit(f"{job.masks}: expected a layer of labels")
     known = set(found.view_names)
     train = [view for view in job.scene.views if view.name in known]
     for title, scored in (("views seen", train), ("held-out views", job.scene.test_views)):
@@ -124,19 +125,8 @@ def replica(job: Job) -> None:
             for view in scored:
                 _painted(found.masks(view.name)).save(came / f"{view.name}.png")
             _instances(f"{title}, as they come", _score("instances", came, truth))
-        for overlap in (0.5, 0.7):
-            begin = time.monotonic()
-            labels = associate(
-                job.scene.gaussians,
-                train,
-                EvidenceSegments(evidence=found),
-                options=AssociateOptions(overlap=overlap),
-            )
-            labels = complete(job.scene.gaussians, labels)
-            seconds = time.monotonic() - begin
-            drawn = job.draw(labels, scored, f"associated-{overlap}")
-            said = _score("instances", drawn, truth)
-            _instances(f"{title}, associated (overlap {overlap})", said, seconds)
+        drawn = job.draw(labels, scored, "associated")
+        _instances(f"{title}, associated", _score("instances", drawn, truth))
 
 
 _BACKGROUND, _OBJECT = 1, 2
@@ -202,12 +192,11 @@ def _classes(title: str, said: Mapping[str, Any], seconds: float | None = None) 
     )
 
 
-def _instances(title: str, said: Mapping[str, Any], seconds: float | None = None) -> None:
-    spent = "" if seconds is None else f"  {seconds:.1f} s"
+def _instances(title: str, said: Mapping[str, Any]) -> None:
     print(
         f"{title:44s} mIoU {said['mIoU']:.4f} recall50 {said['recall50']:.3f} "
         f"precision50 {said['precision50']:.3f} ids {said['predicted_instances']} for "
-        f"{said['truth_instances']}{spent}",
+        f"{said['truth_instances']}",
         flush=True,
     )
 
@@ -218,7 +207,7 @@ def main() -> None:
     parser.add_argument("what", choices=("camvid", "dtu", "replica"))
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--masks", default="masks", help="replica: evidence of the scene")
+    parser.add_argument("--masks", default="masks", help="replica: evidence and layer of the scene")
     parser.add_argument("--work", type=Path, help="keep label maps here")
     arguments = parser.parse_args()
     temporary = None if arguments.work else tempfile.mkdtemp()

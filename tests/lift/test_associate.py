@@ -12,7 +12,7 @@ import torch
 from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import AssociateOptions, ConfusionOptions, associate
-from splatseg.lift._segment_table import segment_table
+from splatseg.lift._segment_table import SegmentTable, _shared, segment_table
 from splatseg.lift.associate import DEFAULT_CONFUSION, _labels
 
 from .conftest import camera_at, gaussians_at
@@ -213,6 +213,74 @@ def test_large_segments_are_read_on_a_coarser_grid(overlapping) -> None:
     assert full.evidence is not None
     assert coarse.evidence is not None
     torch.testing.assert_close(coarse.evidence, full.evidence, rtol=0.12, atol=0.5)
+
+
+def table_of(source: Segments, views=VIEWS) -> SegmentTable:
+    return segment_table(GAUSSIANS, views, source, most_views=100, backend=BACKEND)
+
+
+def test_pairs_that_share_next_to_nothing_are_left_out() -> None:
+    """Columns of 1, 400 and 401 Gaussians: the first is a 400th of the others."""
+    import scipy.sparse
+
+    dense = np.zeros((402, 4))
+    dense[0, 0] = dense[:400, 1] = dense[:401, 2] = dense[401, 3] = 1
+    found = _shared(scipy.sparse.csr_matrix(dense)).toarray()
+    whole = dense.T @ dense
+    assert whole[0, 1] == 1
+    assert whole[0, 2] == 1
+    whole[0, 1:3] = whole[1:3, 0] = 0  # cosines of 0.05 and below
+    assert np.array_equal(found, whole)
+
+
+def test_a_sample_of_gaussians_keeps_the_sums(monkeypatch) -> None:
+    """Few pairs: all count 1. Many: fewer Gaussians, which count for the others."""
+    table = table_of(clean(NAMES))
+    module = importlib.import_module("splatseg.lift._segment_table")
+    entries = np.bincount(table.gaussian, minlength=table.gaussians)
+    assert table._sample(entries).tolist() == [1.0] * table.gaussians
+    rng = np.random.default_rng(0)
+    n = 5000
+    size = rng.gamma(0.7, size=n).astype(np.float32)
+    many = replace(
+        table,
+        gaussians=n,
+        gaussian=np.arange(n, dtype=np.int32),
+        segment=np.zeros(n, np.int32),
+        mass=size,
+        seen=size,
+    )
+    monkeypatch.setattr(module, "_PAIRS", 1e4)
+    worth = many._sample(np.full(n, 5))
+    taken = worth > 0
+    assert 380 < taken.sum() < 402, "25 pairs a Gaussian"
+    assert float((worth * size).sum()) == pytest.approx(float(size.sum()), rel=0.01)
+    assert worth[taken].min() >= 1 - 1e-9
+    # Those that are seen most are taken most.
+    assert size[taken].mean() > 1.5 * size.mean()
+    sampled = replace(table)
+    monkeypatch.setattr(module, "_PAIRS", 100)
+    assert 0 < (sampled._sample(entries) > 0).sum() < table.gaussians
+    assert groups(run(clean(NAMES)).ids) == THINGS
+
+
+@pytest.mark.parametrize("count", [3, 700])
+def test_unions_dense_and_sparse_are_the_same(rng, monkeypatch, count) -> None:
+    import scipy.sparse
+
+    module = importlib.import_module("splatseg.lift._clustering")
+    seen = scipy.sparse.random(count, 9, 0.4, random_state=1, format="csr")
+    members = scipy.sparse.csr_matrix(rng.integers(0, 3, (count, 9)).astype(float))
+    row = np.sort(rng.integers(0, count, 50))
+    column = rng.integers(0, count, 50)
+    monkeypatch.setattr(module, "_DENSE", 2.0 * 50)
+    one = module._unions(seen, members, row, column)
+    monkeypatch.setattr(module, "_DENSE", 0.0)
+    other = module._unions(seen, members, row, column)
+    a, b = seen.toarray(), members.toarray()
+    expected = (a[row] * b[column] + b[row] * a[column]).sum(axis=1)
+    np.testing.assert_allclose(one, expected)
+    np.testing.assert_allclose(other, expected)
 
 
 def test_votes_become_a_soft_layer() -> None:

@@ -26,6 +26,12 @@ _ROUNDS = 1000
 _PAIRS = 1 << 17
 """Pairs of groups whose unions are computed at a time."""
 
+_DENSE = 0.002
+"""Share of all pairs above which the unions of all are computed, as products of dense blocks."""
+
+_BLOCK = 512
+"""Rows of such a block."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Agreement:
@@ -77,13 +83,9 @@ def _mutual_best(shared: Any, seen: Any, members: Any, threshold: float) -> NDAr
     pairs = shared.tocoo()
     apart = (pairs.row < pairs.col) & (pairs.data > 0)
     row, column, both = pairs.row[apart], pairs.col[apart], pairs.data[apart]
-    ratio = np.empty(len(row))
-    for start in range(0, len(row), _PAIRS):
-        part = slice(start, start + _PAIRS)
-        r, c = row[part], column[part]
-        union = np.asarray(seen[r].multiply(members[c]).sum(axis=1)).ravel()
-        union += np.asarray(members[r].multiply(seen[c]).sum(axis=1)).ravel()
-        ratio[part] = both[part] / np.maximum(union - both[part], 1e-12)
+    order = np.argsort(row, kind="stable")
+    row, column, both = row[order], column[order], both[order]
+    ratio = both / np.maximum(_unions(seen, members, row, column) - both, 1e-12)
     enough = ratio >= threshold
     if not enough.any():
         return None
@@ -100,3 +102,25 @@ def _mutual_best(shared: Any, seen: Any, members: Any, threshold: float) -> NDAr
     mutual = has[best[best[has]] == has]
     target[mutual] = np.minimum(mutual, best[mutual])
     return target
+
+
+def _unions(
+    seen: Any, members: Any, row: NDArray[Any], column: NDArray[Any]
+) -> NDArray[np.float64]:
+    """What views of either group see of the other, for pairs (row, column) with rows ascending."""
+    union = np.empty(len(row))
+    count = seen.shape[0]
+    if len(row) <= _DENSE * count**2:
+        for start in range(0, len(row), _PAIRS):
+            part = slice(start, start + _PAIRS)
+            r, c = row[part], column[part]
+            union[part] = np.asarray(seen[r].multiply(members[c]).sum(axis=1)).ravel()
+            union[part] += np.asarray(members[r].multiply(seen[c]).sum(axis=1)).ravel()
+        return union
+    whole_seen, whole_members = seen.toarray(), members.toarray()
+    for start in range(0, count, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        first, last = np.searchsorted(row, [start, start + _BLOCK])
+        sums = whole_seen[block] @ whole_members.T + whole_members[block] @ whole_seen.T
+        union[first:last] = sums[row[first:last] - start, column[first:last]]
+    return union

@@ -56,6 +56,16 @@ class SegmentSource(Protocol):
         ...
 
 
+_PAIRS = 4e9
+"""Products of pairs of entries at most: about a minute. A sample of Gaussians does beyond it."""
+
+_LEAST_ALIKE = 0.05
+"""Least cosine of two segments' masses: of two sets one a 400th of the other's size reaches it."""
+
+_BLOCK = 512
+"""Segments that are compared with all others at a time."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SegmentTable:
     """Nonzero masses of all segments, sorted by view, segment and Gaussian."""
@@ -120,7 +130,9 @@ class SegmentTable:
     def agreement(self) -> Agreement:
         """What the segments share on the Gaussians that their views both see.
 
-        A Gaussian counts with the geometric mean of what the two views see of it.
+        A Gaussian counts with the geometric mean of what the two views see of it. Where many
+        segments share many Gaussians, a sample of them speaks for all (`_sample`). Pairs that
+        share next to nothing are left out.
         """
         import scipy.sparse
 
@@ -128,15 +140,60 @@ class SegmentTable:
         share = self.mass / np.maximum(self.seen, _LEAST_MASS)
         root = np.sqrt(self.seen, dtype=np.float32)
         holds = told & (share > _LEAST_SHARE)
+        worth = self._sample(np.bincount(self.gaussian[holds], minlength=self.gaussians))
+        root *= np.sqrt(worth, dtype=np.float32)[self.gaussian]
+        holds &= worth[self.gaussian] > 0
         count = len(self.view)
         masses: Any = scipy.sparse.csr_matrix(
             ((root * share)[holds], (self.gaussian[holds], self.segment[holds])),
             shape=(self.gaussians, count),
         )
-        sights = self.sights()
-        return Agreement(
-            shared=(masses.T @ masses).tocsr(), seen=(masses.T @ sights).tocsr(), view=self.view
+        sights = scipy.sparse.diags(np.sqrt(worth)) @ self.sights()
+        seen = (masses.T @ sights).tocsr()
+        return Agreement(shared=_shared(masses), seen=seen, view=self.view)
+
+    def _sample(self, entries: NDArray[np.int64]) -> NDArray[np.float64]:
+        """What each Gaussian counts, 0 for those left out, so that the pairs are affordable.
+
+        All count 1 as long as there are few pairs. Beyond that Gaussians are taken with a
+        probability that goes with what is seen of them, in even steps through their order, and
+        count for what they stand for (Horvitz and Thompson 1952): sums stay what they were in
+        expectation, and nothing is random.
+        """
+        pairs = entries.astype(np.float64) ** 2
+        worth = np.ones(self.gaussians)
+        if pairs.sum() <= _PAIRS:
+            return worth
+        size = np.bincount(self.gaussian, self.seen, minlength=self.gaussians)
+        low, high = 0.0, float(1 / max(size[size > 0].min(), 1e-9))
+        for _ in range(60):
+            middle = (low + high) / 2
+            if (np.minimum(1, middle * size) * pairs).sum() > _PAIRS:
+                high = middle
+            else:
+                low = middle
+        chance = np.minimum(1, low * size)
+        steps = np.floor(np.cumsum(chance) + 0.5)
+        taken = np.diff(steps, prepend=0.0) > 0
+        return np.where(taken, 1 / np.maximum(chance, 1e-12), 0.0)
+
+
+def _shared(masses: Any) -> Any:
+    """Products of the columns with each other, without those of nearly nothing, sparse."""
+    import scipy.sparse
+
+    turned = masses.T.tocsr()
+    length = np.sqrt(np.asarray(turned.multiply(turned).sum(axis=1)).ravel())
+    blocks: list[Any] = []
+    for start in range(0, turned.shape[0], _BLOCK):
+        block = (turned[start : start + _BLOCK] @ masses).tocoo()
+        kept = block.data > _LEAST_ALIKE * length[start + block.row] * length[block.col]
+        blocks.append(
+            scipy.sparse.csr_matrix(
+                (block.data[kept], (block.row[kept], block.col[kept])), shape=block.shape
+            )
         )
+    return scipy.sparse.vstack(blocks).tocsr()
 
 
 def segment_table(
