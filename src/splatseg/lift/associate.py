@@ -64,7 +64,7 @@ class AssociateOptions:
     """Of overlapping masks: a group is left out if more than this share of it, in [0, 1], is
     covered by groups that were taken before."""
 
-    most_views: int = 100
+    most_views: int = 50
     """Views of each Gaussian that are compared, those that see most of it; bounds memory and
     time."""
 
