@@ -74,6 +74,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.edit",
         summary="things removed, kept alone, copied, moved, coloured, joined -> a new scene",
     ),
+    "sharpen": CommandEntry(
+        module="splatseg.cli.sharpen",
+        summary="Gaussians that take sides at the boundaries of a layer -> a new scene",
+    ),
     "export": CommandEntry(
         module="splatseg.cli.export",
         summary="a scene and its labels as files that other tools read",

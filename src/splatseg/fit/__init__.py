@@ -1,6 +1,7 @@
 """Photographs with cameras and start points become Gaussians.
 
-`fit` is the whole of it; `FitOptions` are its switches.
+`fit` is the whole of it; `FitOptions` are its switches. `refine` lets Gaussians that are there
+go on learning, from photographs and from anything else that can be drawn of them.
 """
 
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
@@ -15,5 +16,8 @@ from splatseg.fit._photographs import reduction_note as reduction_note
 from splatseg.fit._records import FitProgress as FitProgress
 from splatseg.fit._records import FitRecord as FitRecord
 from splatseg.fit._records import FitResult as FitResult
+from splatseg.fit._refine import Refinement as Refinement
+from splatseg.fit._refine import Term as Term
+from splatseg.fit._refine import refine as refine
 from splatseg.fit._resume import Checkpoints as Checkpoints
 from splatseg.fit._start import random_start_count as random_start_count

@@ -23,7 +23,7 @@ from splatseg.fit._records import FitProgress, FitRecord
 from splatseg.fit._schedule import degree_at, rates_at, reduction_at
 from splatseg.fit._start import with_start_points
 from splatseg.fit._state import FitState, Part, named, parameters_of
-from splatseg.fit._update import UpdateSettings, update_rows
+from splatseg.fit._update import UpdateSettings, gradients_of, update_rows
 from splatseg.fit._view_parts import ViewParts
 from splatseg.render import Backend, Rendered, default_options
 
@@ -273,7 +273,7 @@ class FitRun:
             noise=self._options.noise * rates.means * unit**2,
             seed=self._options.seed,
         )
-        update_rows(*self._state, _gradients(gaussians), rows=rows, settings=settings)
+        update_rows(*self._state, gradients_of(gaussians), rows=rows, settings=settings)
 
     def _report(self, loss: Loss) -> FitProgress:
         seconds, done = self.seconds, self.progress
@@ -308,18 +308,3 @@ class FitRun:
             yield
         finally:
             self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin
-
-
-def _gradients(leaves: Gaussians) -> Gaussians:
-    """Slopes of the loss where the values were; 0 where nothing depends on them."""
-
-    def slope(leaf: Tensor) -> Tensor:
-        return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-
-    return Gaussians(
-        means=slope(leaves.means),
-        rotations=slope(leaves.rotations),
-        scales=slope(leaves.scales),
-        opacities=slope(leaves.opacities),
-        sh=slope(leaves.sh),
-    )

@@ -204,3 +204,18 @@ def _mixed(x: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
     x = (x ^ shifted(x, 30)) * (0xBF58476D1CE4E5B9 - (1 << 64))
     x = (x ^ shifted(x, 27)) * (0x94D049BB133111EB - (1 << 64))
     return x ^ shifted(x, 31)
+
+
+def gradients_of(leaves: Gaussians) -> Gaussians:
+    """Slopes of the loss where the values were; 0 where nothing depends on them."""
+
+    def slope(leaf: Tensor) -> Tensor:
+        return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+    return Gaussians(
+        means=slope(leaves.means),
+        rotations=slope(leaves.rotations),
+        scales=slope(leaves.scales),
+        opacities=slope(leaves.opacities),
+        sh=slope(leaves.sh),
+    )

@@ -16,7 +16,11 @@ from splatseg.lift.identity import identity as identity
 from splatseg.lift.identity import identity_features as identity_features
 from splatseg.lift.identity import train_identity as train_identity
 from splatseg.lift.label_maps import label_map as label_map
+from splatseg.lift.matching import MatchedMaps as MatchedMaps
 from splatseg.lift.panoptic import merge_panoptic as merge_panoptic
+from splatseg.lift.sharpen import Sharpened as Sharpened
+from splatseg.lift.sharpen import SharpenOptions as SharpenOptions
+from splatseg.lift.sharpen import sharpen as sharpen
 from splatseg.lift.uplift import LabelSource as LabelSource
 from splatseg.lift.uplift import UpliftOptions as UpliftOptions
 from splatseg.lift.uplift import uplift as uplift

@@ -240,7 +240,7 @@ def segment_table(
             segments = LabelMap(ids=segments.ids)
         worth = segments.height * segments.width
         if longest_side is not None:
-            segments = _reduced(segments, longest_side)
+            segments = reduced_segments(segments, longest_side)
         worth /= segments.height * segments.width
         camera = camera_of_map(view, segments.height, segments.width)
         found = view_masses(gaussians, camera, segments, options=render_options, backend=backend)
@@ -281,7 +281,7 @@ def segment_table(
     )
 
 
-def _reduced(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
+def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
     """Segments on a coarser grid: each pixel takes what is at its middle."""
     height, width = segments.height, segments.width
     share = longest / max(height, width)
