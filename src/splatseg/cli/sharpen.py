@@ -175,16 +175,17 @@ def _source(command: Command, scene: Scene, layer: Labels) -> tuple[LabelSource,
             "made from; got none."
         )
     places = [place for place in (scene.root, scene.source) if place is not None]
-    zero = "source_ids" in layer.metadata and name == layer.metadata.get("evidence")
+    own = name == layer.metadata.get("evidence")
+    zero = own and "source_ids" in layer.metadata
     evidence = open_evidence(find_evidence(places, name), zero_is_class=zero)
     views = _views(scene, layer, evidence)
-    if evidence.kind in ("labels", "tracked") and layer.metadata.get("method") in _SAME_IDS:
+    same = own and layer.metadata.get("method") in _SAME_IDS
+    if same and evidence.kind in ("labels", "tracked"):
         return evidence, views
-    if evidence.kind == "labels":
+    if evidence.kind not in ("masks", "panoptic", "tracked"):
         raise InputError(
-            f"--evidence: expected segments of objects, or a layer whose ids are those of label "
-            f"maps; {name} has label maps, and layer {command.layer} is of method "
-            f"{layer.metadata.get('method', 'unknown')}."
+            f"--evidence: expected the label maps that layer {command.layer} was made from, or "
+            f"segments of objects; {name} is {evidence.kind}."
         )
     segments = EvidenceSegments(evidence=evidence)
     matched = MatchedMaps(

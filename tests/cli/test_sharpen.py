@@ -1,0 +1,182 @@
+"""`splatseg sharpen` as a person types it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from splatseg.core import Labels, Selection
+from splatseg.io.evidence import open_evidence
+from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
+
+QUICK = ("--sharpen-steps", 60, "--decide-every", 30, "--rates-from", 0, "--no-reconsider")
+
+
+@pytest.fixture
+def labelled(small, splatseg):
+    """The small scene with a layer of its recorded classes, and a selection beside it."""
+    status, _, said = splatseg(
+        "segment", small.scene, "--method", "uplift", "--evidence", "labels_semantic", "--data",
+        small.capture, "--layer", "classes",
+    )  # fmt: skip
+    assert status == 0, said
+    count = len(load_scene(small.scene).gaussians)
+    save_scene_layer(small.scene, "picked", Selection(mask=torch.arange(count) < 5))
+    return small
+
+
+def sharpened(splatseg, labelled, out, *more):
+    return splatseg(
+        "sharpen", labelled.scene, "-o", out, "--layer", "classes", "--data", labelled.capture,
+        *QUICK, *more,
+    )  # fmt: skip
+
+
+def test_a_new_scene_with_all_layers_and_what_was_done(labelled, splatseg, tmp_path) -> None:
+    status, out, said = sharpened(splatseg, labelled, tmp_path / "new", "--label-weight", 1)
+    assert status == 0, said
+    assert "light of labelled pixels that comes from Gaussians of their label" in out
+    assert "PSNR in 1 views" in out
+    before, after = load_scene(labelled.scene), load_scene(tmp_path / "new")
+    assert len(before.gaussians) == len(after.gaussians)
+    assert not torch.equal(before.gaussians.means, after.gaussians.means)
+    assert [view.name for view in after.views] == [view.name for view in before.views]
+    facts = after.provenance["sharpened"]
+    assert facts["layer"] == "classes"
+    first, last = facts["agreement"]
+    assert last > first
+    assert facts["psnr"][0] > 20
+    assert facts["psnr"][1] > 20
+    old, new = (load_scene_layer(root, "classes") for root in (labelled.scene, tmp_path / "new"))
+    assert isinstance(old, Labels)
+    assert isinstance(new, Labels)
+    assert dict(new.metadata["names"]) == dict(old.metadata["names"])
+    assert new.metadata["evidence"] == "labels_semantic"
+    assert new.metadata["sharpened"]["agreement"] == [first, last]
+    assert float((new.ids == old.ids).float().mean()) > 0.9
+    picked = load_scene_layer(tmp_path / "new", "picked")
+    assert isinstance(picked, Selection)
+    assert picked.count == 5
+
+
+def test_the_same_again_and_never_over_what_is_there(labelled, splatseg, tmp_path) -> None:
+    for name in ("one", "two"):
+        assert sharpened(splatseg, labelled, tmp_path / name)[0] == 0
+    one, two = (load_scene(tmp_path / name).gaussians for name in ("one", "two"))
+    assert torch.equal(one.means, two.means)
+    assert torch.equal(one.opacities, two.opacities)
+    status, _, said = sharpened(splatseg, labelled, tmp_path / "one")
+    assert status == 2
+    assert "expected a new folder" in said
+
+
+def test_segments_of_views_take_the_ids_of_the_layer(labelled, splatseg, tmp_path) -> None:
+    """Panoptic segments whose own ids differ from view to view."""
+    scene = load_scene(labelled.scene, data=labelled.capture)
+    found = open_evidence(labelled.capture / "labels_semantic")
+    folder = labelled.capture / "labels_panoptic"
+    folder.mkdir()
+    tables = {}
+    for place, view in enumerate(scene.train_views):
+        ids = found.label_map(view.name).ids.numpy()
+        own = np.where(ids > 0, (ids * 7 + 31 * place) % 251 + 1, 0)
+        rows = [{"id": int(i), "category_id": 0} for i in np.unique(own) if i]
+        tables[view.name] = {"segments_info": rows}
+        Image.fromarray(own.astype(np.uint16)).save(folder / f"{view.name}.png")
+    (folder / "segments.json").write_text(json.dumps(tables))
+    segments, wide = ("--evidence", "labels_panoptic"), ("--label-weight", 1)
+    status, out, said = sharpened(splatseg, labelled, tmp_path / "new", *segments, *wide)
+    assert status == 0, said + out
+    assert sharpened(splatseg, labelled, tmp_path / "maps", *wide)[0] == 0
+    first, second = (load_scene(tmp_path / name) for name in ("new", "maps"))
+    # Segments that were once these maps say what the maps say.
+    agreement = first.provenance["sharpened"]["agreement"]
+    assert agreement == pytest.approx(second.provenance["sharpened"]["agreement"], abs=0.02)
+    layer = load_scene_layer(tmp_path / "new", "classes")
+    assert isinstance(layer, Labels)
+    assert set(layer.present.tolist()) <= {1, 2, 7}
+
+
+def test_nothing_is_measured_if_not_asked(labelled, splatseg, tmp_path) -> None:
+    status, out, _ = sharpened(splatseg, labelled, tmp_path / "new", "--measure", 0)
+    assert status == 0
+    assert "PSNR" not in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--layer", "none"), "expected a layer of the scene (classes, picked), got 'none'"),
+        (("--layer", "picked"), "expected labels"),
+        (("--evidence", "nowhere"), "nowhere"),
+        (("--measure", -1), "--measure"),
+        (("-o", "{tmp}/no/such/place"), "expected a place in a folder that is there"),
+    ],
+)
+def test_refused_in_one_sentence(labelled, splatseg, tmp_path, arguments, says) -> None:
+    given = {"--layer": "classes", "-o": f"{tmp_path}/new"}
+    given |= {str(arguments[0]): str(arguments[1]).format(tmp=tmp_path)}
+    flat = [part for pair in given.items() for part in pair]
+    status, _, said = splatseg("sharpen", labelled.scene, "--data", labelled.capture, *QUICK, *flat)
+    assert status == 2
+    assert says in said
+    assert len(said.strip().splitlines()) <= 2
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_layer_of_unknown_origin_needs_evidence(labelled, splatseg, tmp_path) -> None:
+    count = len(load_scene(labelled.scene).gaussians)
+    ids = torch.ones(count, dtype=torch.int32)
+    save_scene_layer(labelled.scene, "hand", Labels(ids=ids, confidence=torch.ones(count)))
+    arguments = ("sharpen", labelled.scene, "-o", tmp_path / "new", "--layer", "hand")
+    status, _, said = splatseg(*arguments, "--data", labelled.capture)
+    assert status == 2
+    assert "does not say what it was made from" in said
+    status, _, said = splatseg(
+        *arguments, "--data", labelled.capture, "--evidence", "labels_semantic"
+    )
+    assert status == 2
+    assert "expected the label maps that layer hand was made from" in said
+
+
+def test_an_interruption_leaves_nothing(labelled, splatseg, tmp_path, monkeypatch) -> None:
+    import splatseg.cli.sharpen as command
+
+    def stopped(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "sharpen", stopped)
+    status, _, _ = sharpened(splatseg, labelled, tmp_path / "new")
+    assert status == 1
+    assert not (tmp_path / "new").exists()
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_what_no_pixel_shows_keeps_its_label(labelled) -> None:
+    from splatseg.cli.sharpen import merged
+    from splatseg.lift import Sharpened
+
+    old = Labels(
+        ids=torch.tensor([2, 7, 7], dtype=torch.int32),
+        confidence=torch.tensor([0.9, 0.8, 0.3]),
+        evidence=torch.tensor([5.0, 4.0, 0.0]),
+        inferred=torch.tensor([False, True, True]),
+        metadata={"names": {"2": "wall"}},
+    )
+    new = Labels(
+        ids=torch.tensor([2, 2, -1], dtype=torch.int32),
+        confidence=torch.tensor([1.0, 0.7, 0.0]),
+        evidence=torch.tensor([6.0, 3.0, 0.0]),
+        metadata={"sharpened": {}},
+    )
+    scene = load_scene(labelled.scene).gaussians
+    found = merged(old, Sharpened(gaussians=scene, labels=new, agreement=(0.5, 0.6)))
+    assert found.ids.tolist() == [2, 2, 7]
+    torch.testing.assert_close(found.confidence, torch.tensor([1.0, 0.7, 0.3]))
+    assert found.evidence is not None
+    assert found.evidence.tolist() == [6.0, 3.0, 0.0]
+    assert found.inferred is not None
+    assert found.inferred.tolist() == [False, False, True]
+    assert found.metadata["names"] == {"2": "wall"}

@@ -1,0 +1,155 @@
+"""Gaussians that are there go on learning: what stays, what changes, what is refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splatseg.core import Gaussians
+from splatseg.errors import InputError, RangeError, SplatsegError
+from splatseg.evaluate import picture_and_photograph, psnr
+from splatseg.fit import FitOptions, Refinement, refine
+from splatseg.render.cpu import set_threads, threads
+
+from .conftest import tiny_scene
+
+QUICK = FitOptions(background="black")
+
+
+@pytest.fixture
+def tiny() -> Gaussians:
+    """What was photographed."""
+    return tiny_scene()
+
+
+def worse(scene):
+    """The scene with wrong colours and opacities."""
+    generator = torch.Generator().manual_seed(3)
+    return scene.replace(
+        sh=scene.sh + 0.3 * torch.randn(scene.sh.shape, generator=generator),
+        opacities=(scene.opacities * 0.7),
+    )
+
+
+def mean_psnr(gaussians, views) -> float:
+    return sum(psnr(*picture_and_photograph(gaussians, view)) for view in views) / len(views)
+
+
+def same(one, other) -> bool:
+    names = ("means", "rotations", "scales", "opacities", "sh")
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+def test_it_comes_nearer_to_the_photographs_row_by_row(make_capture, tiny) -> None:
+    capture = make_capture()
+    start = worse(tiny)
+    before = mean_psnr(start, capture.test_views)
+    found = refine(start, capture.train_views, steps=60, start=0.0, options=QUICK, backend="cpu")
+    assert len(found) == len(start)
+    assert mean_psnr(found, capture.test_views) > before + 2
+    # Row i is still the Gaussian that row i was.
+    moved = (found.means - start.means).norm(dim=1)
+    apart = torch.cdist(start.means, start.means).fill_diagonal_(9).min(dim=1).values
+    assert float((moved < apart).float().mean()) > 0.9
+
+
+def test_no_steps_change_nothing_but_rounding(make_capture, tiny) -> None:
+    start = tiny.replace(opacities=tiny.opacities.clone().index_fill_(0, torch.tensor([0]), 1.0))
+    found = refine(start, make_capture().train_views, steps=0, options=QUICK, backend="cpu")
+    for name in ("means", "rotations", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(found, name), getattr(start, name), atol=2e-6, rtol=1e-5)
+
+
+def test_the_filter_of_the_gaussians_stays(make_capture, tiny) -> None:
+    start = tiny.replace(antialiased=True, low_pass=0.1)
+    found = refine(start, make_capture().train_views, steps=2, options=QUICK, backend="cpu")
+    assert found.antialiased
+    assert found.low_pass == 0.1
+
+
+def test_seed_decides_and_threads_do_not(make_capture, tiny) -> None:
+    views = make_capture().train_views
+
+    def run(seed: int):
+        options = replace(QUICK, background="random", seed=seed)
+        return refine(worse(tiny), views, steps=6, options=options, backend="cpu")
+
+    first = run(4)
+    before = threads()
+    try:
+        set_threads(3)
+        assert same(first, run(4))
+    finally:
+        set_threads(before)
+    assert not same(first, run(5))
+
+
+def test_rates_fall_from_those_of_the_start_to_those_of_the_end(make_capture, tiny) -> None:
+    """One step of Adam moves a value by its rate: later in a fit, by less."""
+    views = make_capture().train_views
+
+    def moved(start: float) -> float:
+        found = refine(worse(tiny), views, steps=1, start=start, options=QUICK, backend="cpu")
+        return float((found.sh[:, 0] - worse(tiny).sh[:, 0]).abs().max())
+
+    assert moved(0.0) == pytest.approx(QUICK.colour_rate, rel=0.02)
+    assert moved(1.0) == pytest.approx(QUICK.colour_rate * QUICK.final_rate, rel=0.02)
+
+
+def test_a_further_term_is_learned_from(make_capture, tiny) -> None:
+    """A term that wants Gaussians transparent, much stronger than the photographs."""
+    views = make_capture().train_views
+    asked: list[str] = []
+
+    def term(view, gaussians, rows):
+        asked.append(view.name)
+        assert len(gaussians) == len(rows)
+        assert gaussians.opacities.requires_grad
+        return 100 * gaussians.opacities.sum()
+
+    found = refine(tiny, views, steps=len(views), term=term, options=QUICK, backend="cpu")
+    assert bool((found.opacities < tiny.opacities).all())
+    assert sorted(asked) == sorted(view.name for view in views)
+
+
+def test_pixels_outside_a_mask_teach_nothing(make_capture, tiny, tmp_path) -> None:
+    """With masks of nothing at all there is nothing to learn."""
+    import numpy as np
+    from PIL import Image
+
+    views = []
+    for view in make_capture().train_views:
+        path = tmp_path / f"{view.name}.png"
+        shape = (view.camera.height, view.camera.width)
+        Image.fromarray(np.zeros(shape, np.uint8)).save(path)
+        views.append(replace(view, mask=path))
+    found = refine(worse(tiny), views, steps=4, options=QUICK, backend="cpu")
+    torch.testing.assert_close(found.sh, worse(tiny).sh, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        ({"views": ()}, InputError, "views: expected at least one"),
+        ({"start": 1.5}, RangeError, "start"),
+    ],
+)
+def test_refused(make_capture, tiny, change, error, says) -> None:
+    arguments = {"views": make_capture().train_views, "steps": 1, "start": 0.5} | change
+    views = arguments.pop("views")
+    with pytest.raises(error, match=says):
+        Refinement(tiny, views, options=QUICK, backend="cpu", **arguments)
+
+
+def test_no_gaussians_are_refused(make_capture, tiny) -> None:
+    none = tiny[torch.zeros(len(tiny), dtype=torch.bool)]
+    with pytest.raises(InputError, match="gaussians: expected at least one"):
+        refine(none, make_capture().train_views, steps=1, options=QUICK, backend="cpu")
+
+
+def test_a_term_that_is_no_number_stops_it(make_capture, tiny) -> None:
+    def term(view, gaussians, rows):
+        return gaussians.opacities.sum() * float("nan")
+
+    with pytest.raises(SplatsegError, match="expected a finite loss"):
+        refine(tiny, make_capture().train_views, steps=1, term=term, options=QUICK, backend="cpu")
