@@ -1,6 +1,8 @@
 """`splatseg sharpen` as a person types it."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import Labels, Selection
+from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 
@@ -97,6 +100,59 @@ def test_segments_of_views_take_the_ids_of_the_layer(labelled, splatseg, tmp_pat
     layer = load_scene_layer(tmp_path / "new", "classes")
     assert isinstance(layer, Labels)
     assert set(layer.present.tolist()) <= {1, 2, 7}
+
+
+def test_an_edited_scene_begins_anew(labelled, splatseg, tmp_path) -> None:
+    """Edits are done again on the scene that was edited first, which is not the sharpened one."""
+    edit = ("edit", labelled.scene, "-o", tmp_path / "red", "--colour-scale", 1.1, 1, 1)
+    assert splatseg(*edit, "--data", labelled.capture)[0] == 0
+    status, _, said = splatseg(
+        "sharpen", tmp_path / "red", "-o", tmp_path / "new", "--layer", "classes", "--data",
+        labelled.capture, *QUICK,
+    )  # fmt: skip
+    assert status == 0, said
+    assert "edits" in load_scene(tmp_path / "red").provenance
+    assert "edits" not in load_scene(tmp_path / "new").provenance
+    assert "edited_from" not in load_scene(tmp_path / "new").provenance
+
+
+def test_views_are_those_of_the_layer(labelled) -> None:
+    from splatseg.cli.sharpen import _views
+
+    scene = load_scene(labelled.scene, data=labelled.capture)
+    every = open_evidence(labelled.capture / "semantic")
+    layer = load_scene_layer(labelled.scene, "classes")
+    assert isinstance(layer, Labels)
+    train = [view.name for view in scene.train_views]
+    assert [view.name for view in _views(scene, layer, every)] == train
+    assert len(train) < len(scene.views)
+    test = replace(layer, metadata={"views": ["test_2", "train_0"]})
+    assert [view.name for view in _views(scene, test, every)] == ["train_0", "test_2"]
+    unknown = replace(layer, metadata={})
+    assert [view.name for view in _views(scene, unknown, every)] == train
+    with pytest.raises(InputError, match="expected evidence of a view"):
+        _views(scene, replace(layer, metadata={"views": ["nobody"]}), every)
+
+
+def test_label_maps_of_something_else_are_refused(labelled, splatseg, tmp_path) -> None:
+    """Whether their ids mean what the layer's do is not known."""
+    shutil.copytree(labelled.capture / "labels_semantic", labelled.capture / "labels_other")
+    status, _, said = sharpened(splatseg, labelled, tmp_path / "new", "--evidence", "labels_other")
+    assert status == 2
+    assert "labels_other is labels" in said
+
+
+def test_the_fit_goes_on_as_it_was(labelled) -> None:
+    from splatseg.cli.sharpen import _fit_options
+
+    scene = load_scene(labelled.scene, data=labelled.capture)
+    unknown = _fit_options(scene)
+    assert (unknown.background, unknown.masks) == ("black", "off")
+    said = {"options": {"masks": "ignore", "background": [0, 0.5, 1], "longest": 700}}
+    known = _fit_options(replace(scene, provenance=said))
+    assert (known.background, known.masks, known.longest) == ((0, 0.5, 1), "ignore", 700)
+    plain = _fit_options(replace(scene, provenance={"options": {"masks": "alpha"}}))
+    assert (plain.background, plain.masks) == ("random", "alpha")
 
 
 def test_nothing_is_measured_if_not_asked(labelled, splatseg, tmp_path) -> None:

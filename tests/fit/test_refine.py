@@ -96,6 +96,33 @@ def test_rates_fall_from_those_of_the_start_to_those_of_the_end(make_capture, ti
     assert moved(1.0) == pytest.approx(QUICK.colour_rate * QUICK.final_rate, rel=0.02)
 
 
+def test_every_step_has_the_rates_of_its_progress(make_capture, tiny, monkeypatch) -> None:
+    import splatseg.fit._refine as module
+
+    asked: list[float] = []
+    real = module.rates_at
+
+    def rates(progress, **more):
+        asked.append(progress)
+        return real(progress, **more)
+
+    monkeypatch.setattr(module, "rates_at", rates)
+    views = make_capture().train_views
+    refine(tiny, views, steps=4, start=0.6, options=QUICK, backend="cpu")
+    assert asked == pytest.approx([0.6, 0.7, 0.8, 0.9])
+
+
+def test_gaussians_cover_a_background_that_the_photographs_do_not_have(make_capture, tiny) -> None:
+    views = make_capture().train_views
+
+    def light(background: str) -> float:
+        options = replace(QUICK, background=background)
+        found = refine(tiny, views, steps=30, start=0.0, options=options, backend="cpu")
+        return float(found.opacities.mean())
+
+    assert light("white") > light("black") + 0.01
+
+
 def test_a_further_term_is_learned_from(make_capture, tiny) -> None:
     """A term that wants Gaussians transparent, much stronger than the photographs."""
     views = make_capture().train_views

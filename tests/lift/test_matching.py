@@ -102,6 +102,16 @@ def test_of_masks_that_overlap_the_better_one_tells(drawn) -> None:
     assert torch.equal(alone, torch.where(a, A, -1).int())
 
 
+def test_where_two_masks_disagree_the_better_one_tells(drawn) -> None:
+    """A alone, and B with half of A, whose overlap with B is 2/3."""
+    a, b = drawn == A, drawn == B
+    half = a.clone()
+    half[: half.shape[0] // 2] = False
+    wanted = torch.where(a, A, torch.where(b, B, -1)).int()
+    for order in ((a, b | half), (b | half, a)):
+        assert torch.equal(matched(MaskSet.from_dense(torch.stack(order))), wanted)
+
+
 def test_empty_masks_are_harmless(drawn) -> None:
     masks = MaskSet.from_dense(torch.stack((drawn == -2, drawn == B)))
     assert torch.equal(matched(masks), torch.where(drawn == B, B, -1).int())

@@ -9,7 +9,7 @@ from splatseg.core import Gaussians, LabelMap, Labels, View
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
 from splatseg.io.images import save_png
-from splatseg.lift import SharpenOptions, UpliftOptions, sharpen, uplift
+from splatseg.lift import SharpenOptions, UpliftOptions, reconsider, sharpen, uplift
 from splatseg.lift.sharpen import _LabelTerm, _Papers
 from splatseg.render import back_project, render
 from splatseg.render.cpu import set_threads, threads
@@ -226,6 +226,26 @@ def test_steps_are_reported_and_none_leaves_everything(scene) -> None:
     wanted = uplift(gaussians, views, maps, options=UpliftOptions(candidates=2), backend="cpu")
     assert torch.equal(found.labels.ids, wanted.ids)
     assert found.agreement[0] == found.agreement[1]
+
+
+def test_steps_behind_the_last_decision_count_too(scene) -> None:
+    gaussians, views, maps = scene
+    options = replace(OPTIONS, sharpen_steps=3, decide_every=50)
+    found = sharpen(gaussians, views, maps, options=options, backend="cpu")
+    assert not torch.equal(found.gaussians.means, gaussians.means)
+    assert found.agreement[0] != found.agreement[1]
+
+
+def test_labels_are_reconsidered_unless_told_not_to(scene) -> None:
+    gaussians, views, maps = scene
+    none = replace(OPTIONS, sharpen_steps=0)
+    votes = uplift(
+        gaussians, views, maps, options=UpliftOptions(candidates=8, slots=8), backend="cpu"
+    )
+    again = sharpen(gaussians, views, maps, options=none, backend="cpu").labels
+    assert again.shares is not None
+    assert torch.equal(again.shares, reconsider(votes).shares)
+    assert not torch.equal(again.shares[:, 0], votes.shares[:, 0])
 
 
 def test_agreement_of_the_label_and_not_of_the_majority() -> None:

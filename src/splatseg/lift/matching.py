@@ -112,7 +112,7 @@ def _of_masks(masks: MaskSet, drawn: Int64[Tensor, "height width"], least: float
         mask = masks.dense(index)
         meets = torch.bincount(column[mask], minlength=len(ids)).double()
         best, overlap = _best(meets[None], meets.sum()[None], whole, ids)
-        if float(overlap) < least or int(best) == UNLABELLED:
+        if float(overlap) < least:
             continue
         better = mask & (overlap > strength)
         found[better], strength[better] = best, overlap
