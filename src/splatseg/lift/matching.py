@@ -13,6 +13,7 @@ what the model got wrong in this view, or what the layer does not have, is left 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -48,8 +49,9 @@ class MatchedMaps:
     """Intersection over union, in [0, 1], that a segment must have with what the layer shows,
     the same that joins segments (`AssociateOptions.agreement`)."""
 
-    longest_side: int = 1600
-    """Segments of larger photographs are read at this many pixels along their longest side."""
+    longest_side: int = 1000
+    """Segments of larger photographs are read at this many pixels along their longest side;
+    bounds time."""
 
     backend: str = "auto"
 
@@ -104,19 +106,22 @@ def _of_map(segments: LabelMap, drawn: Int64[Tensor, "height width"], least: flo
 
 def _of_masks(masks: MaskSet, drawn: Int64[Tensor, "height width"], least: float) -> LabelMap:
     """Masks that overlap: each pixel takes the id of the best of those over it."""
-    ids, column = torch.unique(drawn, return_inverse=True)
-    whole = torch.bincount(column.reshape(-1), minlength=len(ids)).double()
-    found = torch.full(drawn.shape, UNLABELLED)
-    strength = torch.zeros(drawn.shape, dtype=torch.float64)
-    for index in range(len(masks)):
-        mask = masks.dense(index)
-        meets = torch.bincount(column[mask], minlength=len(ids)).double()
+    # Down one column after another, as the runs of masks go.
+    flat = drawn.T.reshape(-1)
+    ids, column = torch.unique(flat, return_inverse=True)
+    whole = torch.bincount(column, minlength=len(ids)).double()
+    column = column.int().numpy()
+    found = np.full(len(flat), UNLABELLED, np.int32)
+    strength = np.zeros(len(flat))
+    for mask in masks.masks:
+        inside = np.repeat(np.arange(len(mask.counts)) % 2 == 1, mask.counts)
+        meets = torch.from_numpy(np.bincount(column[inside], minlength=len(ids))).double()
         best, overlap = _best(meets[None], meets.sum()[None], whole, ids)
         if float(overlap) < least:
             continue
-        better = mask & (overlap > strength)
-        found[better], strength[better] = best, overlap
-    return LabelMap(ids=found.int())
+        better = inside & (float(overlap) > strength)
+        found[better], strength[better] = int(best), float(overlap)
+    return LabelMap(ids=torch.from_numpy(found).view(drawn.T.shape).T.contiguous())
 
 
 def _best(

@@ -196,6 +196,8 @@ class _Papers:
 
     source: LabelSource
     kept: dict[str, tuple[tuple[int, ...], bytes, bytes | None]] = field(default_factory=dict)
+    ids: set[int] = field(default_factory=set[int])
+    """All ids of the maps that are kept."""
 
     @property
     def view_names(self) -> Sequence[str]:
@@ -204,6 +206,7 @@ class _Papers:
     def label_map(self, name: str) -> LabelMap:
         if name not in self.kept:
             paper = self.source.label_map(name)
+            self.ids.update(torch.unique(paper.ids).tolist())
             shape = (paper.height, paper.width)
             sure = None if paper.confidence is None else _packed(paper.confidence.float())
             self.kept[name] = (shape, _packed(paper.ids), sure)
@@ -232,9 +235,9 @@ class _LabelTerm:
 
     def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
         paper = self.papers.label_map(view.name)
-        own = self.labels[rows.cpu()].long()
-        ids = paper.ids.long()
-        names = torch.unique(torch.cat((own, ids.reshape(-1))))
+        own = self.labels[rows.cpu()]
+        known = self.papers.ids | {UNLABELLED, *torch.unique(own).tolist()}
+        names = torch.tensor(sorted(known), dtype=torch.int32)
         codes = 2.0 * torch.randint(
             0, 2, (len(names), self.options.codes), generator=self.generator
         )
@@ -248,10 +251,10 @@ class _LabelTerm:
             signal,
             backend=self.backend,
         ).image
-        say = (ids != UNLABELLED).float()
+        say = (paper.ids != UNLABELLED).float()
         if paper.confidence is not None:
             say = say * paper.confidence
-        wanted = codes[torch.searchsorted(names, ids)] * say.unsqueeze(-1)
+        wanted = codes[torch.searchsorted(names, paper.ids)] * say.unsqueeze(-1)
         same = (drawn * wanted.to(drawn)).sum() / self.options.codes
         worth = float(say.sum())
         return self.options.label_weight * (1 - same / max(worth, 1.0))
