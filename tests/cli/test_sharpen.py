@@ -116,6 +116,22 @@ def test_an_edited_scene_begins_anew(labelled, splatseg, tmp_path) -> None:
     assert "edited_from" not in load_scene(tmp_path / "new").provenance
 
 
+def test_evidence_of_the_scene_itself_comes_along(labelled, splatseg, tmp_path) -> None:
+    """So that the new scene can be segmented again; evidence of the capture is there anyway."""
+    assert sharpened(splatseg, labelled, tmp_path / "first")[0] == 0
+    assert not (tmp_path / "first" / "evidence" / "labels_semantic").exists()
+    own = labelled.scene / "evidence" / "labels_semantic"
+    shutil.move(labelled.capture / "labels_semantic", own)
+    assert sharpened(splatseg, labelled, tmp_path / "second")[0] == 0
+    copied = tmp_path / "second" / "evidence" / "labels_semantic"
+    names = sorted(path.name for path in own.iterdir())
+    assert sorted(path.name for path in copied.iterdir()) == names
+    assert all((copied / name).read_bytes() == (own / name).read_bytes() for name in names)
+    again = ("segment", tmp_path / "second", "--method", "uplift", "--data", labelled.capture)
+    status, _, said = splatseg(*again, "--evidence", "labels_semantic", "--layer", "again")
+    assert status == 0, said
+
+
 def test_views_are_those_of_the_layer(labelled) -> None:
     from splatseg.cli.sharpen import _views
 

@@ -17,7 +17,7 @@ from splatseg.edit._document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.evaluate import picture_and_photograph, psnr
 from splatseg.fit import FitOptions
-from splatseg.io.evidence import Evidence, find_evidence, open_evidence
+from splatseg.io.evidence import Evidence, copy_evidence, find_evidence, open_evidence
 from splatseg.lift import (
     ConfusionOptions,
     EvidenceSegments,
@@ -42,8 +42,8 @@ class Command:
     Gaussians of the pixel's label. Things then come out cleaner when they are removed or
     exported, and label maps are sharper. It costs a little of the picture, which is printed.
 
-    The result is a new scene with as many Gaussians in the same order. LAYER is decided anew,
-    and all other layers come along as they are. SCENE stays as it is.
+    The result is a new scene with as many Gaussians in the same order. LAYER is decided anew;
+    all other layers, and the evidence if it is SCENE's own, come along. SCENE stays as it is.
 
     For example:
 
@@ -99,7 +99,7 @@ def run(command: Command) -> None:
     document = load_document(command.scene, data=command.data)
     scene = document.scene
     layer = _layer(document, command.layer)
-    source, views = _source(command, scene, layer)
+    evidence, source, views = _source(command, scene, layer)
     spaced = _spaced(scene, command.measure)
     before = _psnr(scene, scene.gaussians, spaced, command.backend)
     with progress("sharpen") as step:
@@ -129,6 +129,9 @@ def run(command: Command) -> None:
     layers = {**document.layers, command.layer: merged(layer, found)}
     scene = replace(scene, gaussians=found.gaussians, provenance=provenance)
     save_document(Document(scene=scene, layers=layers), out)
+    # What lies in the scene's own folder would be out of reach from the new one.
+    if evidence.folder.resolve().parent == (command.scene / "evidence").resolve():
+        copy_evidence(evidence.folder, out)
     sys.stdout.write(_told(command, found, before, after, len(spaced)))
     seconds = time.monotonic() - started
     sys.stdout.write(f"{out}: {len(found.gaussians)} Gaussians, in {seconds:.0f} s\n")
@@ -166,8 +169,10 @@ def _layer(document: Document, name: str) -> Labels:
     return layer
 
 
-def _source(command: Command, scene: Scene, layer: Labels) -> tuple[LabelSource, tuple[View, ...]]:
-    """Label maps with the layer's ids, and the views that may be learned from."""
+def _source(
+    command: Command, scene: Scene, layer: Labels
+) -> tuple[Evidence, LabelSource, tuple[View, ...]]:
+    """The evidence, label maps of it with the layer's ids, and the views to learn from."""
     name = command.evidence or layer.metadata.get("evidence")
     if not isinstance(name, str):
         raise InputError(
@@ -181,7 +186,7 @@ def _source(command: Command, scene: Scene, layer: Labels) -> tuple[LabelSource,
     views = _views(scene, layer, evidence)
     same = own and layer.metadata.get("method") in _SAME_IDS
     if same and evidence.kind in ("labels", "tracked"):
-        return evidence, views
+        return evidence, evidence, views
     if evidence.kind not in ("masks", "panoptic", "tracked"):
         raise InputError(
             f"--evidence: expected the label maps that layer {command.layer} was made from, or "
@@ -195,7 +200,7 @@ def _source(command: Command, scene: Scene, layer: Labels) -> tuple[LabelSource,
         labels=layer,
         backend=command.backend,
     )
-    return matched, views
+    return evidence, matched, views
 
 
 def _views(scene: Scene, layer: Labels, evidence: Evidence) -> tuple[View, ...]:

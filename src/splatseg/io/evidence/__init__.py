@@ -30,6 +30,7 @@ from splatseg.io.evidence._segments import PanopticEvidence as PanopticEvidence
 from splatseg.io.evidence._segments import Segment as Segment
 from splatseg.io.evidence._segments import Track as Track
 from splatseg.io.evidence._segments import TrackedEvidence as TrackedEvidence
+from splatseg.io.evidence._write import copy_evidence as copy_evidence
 from splatseg.io.evidence._write import create_evidence as create_evidence
 from splatseg.io.evidence._write import save_features as save_features
 from splatseg.io.evidence._write import save_label_map as save_label_map

@@ -1,5 +1,6 @@
 """Writes evidence: a folder with evidence.json and one file a view, each whole or not there."""
 
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from splatseg._check import check_choice, check_finite, check_values
 from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet
 from splatseg.errors import InputError, RangeError
-from splatseg.io._atomic import atomic_file
+from splatseg.io._atomic import atomic_file, atomic_folder
 from splatseg.io._class_rows import class_rows
 from splatseg.io._json import json_text, write_json
 from splatseg.io.evidence._base import CONFIDENCE_FOLDER, HEADER_FILE, EvidenceKind
@@ -172,3 +173,23 @@ def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Pa
     if make:
         path.parent.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def copy_evidence(folder: Path | str, scene: Path | str) -> Path:
+    """Give a scene the evidence of another one of the same photographs, whole or not at all.
+
+    Args:
+        folder: The evidence.
+        scene: The scene folder; evidence of this name that it has is replaced.
+
+    Raises:
+        InputError: If there is no such folder.
+        MissingFileError: If there is no scene folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of evidence, got none.")
+    target = Path(scene) / "evidence" / folder.name
+    with atomic_folder(target) as temporary:
+        shutil.copytree(folder, temporary, dirs_exist_ok=True)
+    return target
