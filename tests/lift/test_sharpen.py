@@ -248,6 +248,40 @@ def test_labels_are_reconsidered_unless_told_not_to(scene) -> None:
     assert not torch.equal(again.shares[:, 0], votes.shares[:, 0])
 
 
+def test_ids_near_by_are_trusted() -> None:
+    from splatseg.lift.sharpen import shown_near
+
+    drawn = torch.full((4, 6), 1, dtype=torch.int32)
+    drawn[:, 3:] = 2
+    ids = torch.full((4, 6), 2, dtype=torch.int32)
+    for pixels, first in ((0, 3), (1, 2), (2, 1), (9, 0)):
+        near = shown_near(ids, drawn, pixels)
+        assert bool(near[:, first:].all())
+        assert not bool(near[:, :first].any())
+    corner = torch.full((4, 6), 1, dtype=torch.int32)
+    corner[0, 0] = 2
+    assert shown_near(ids, corner, 1).nonzero().tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+
+
+def test_what_contradicts_all_other_views_does_not_bend_the_geometry(scene) -> None:
+    """One view takes the left of the wall for a third thing."""
+    gaussians, views, maps = scene
+    wrong = maps.maps["v1"].ids.clone()
+    wrong[:, :8] = 9
+    bad = Maps(maps.maps | {"v1": LabelMap(ids=wrong)})
+
+    def opacity(source, **change) -> torch.Tensor:
+        options = replace(OPTIONS, sharpen_steps=60, **change)
+        found = sharpen(
+            gaussians, views, source, options=options, fit_options=BLACK, confusion=None,
+            backend="cpu",
+        )  # fmt: skip
+        return found.gaussians.opacities[:5].mean()
+
+    trusting, careful = opacity(bad, trust_pixels=-1), opacity(bad)
+    assert float(careful) > float(trusting) + 0.005
+
+
 def test_agreement_of_the_label_and_not_of_the_majority() -> None:
     from splatseg.lift.sharpen import _agreement
 
@@ -271,6 +305,7 @@ def test_agreement_of_the_label_and_not_of_the_majority() -> None:
         ({"label_weight": float("nan")}, "label_weight"),
         ({"label_weight": -0.1}, "label_weight"),
         ({"decide_every": 0}, "decide_every"),
+        ({"trust_pixels": -2}, "trust_pixels"),
         ({"codes": 0}, "codes"),
         ({"codes": 65}, "codes"),
         ({"rates_from": 1.1}, "rates_from"),

@@ -22,6 +22,9 @@ code c of +1 and -1 in K channels and draws the codes of the Gaussians' labels; 
 
 so that K channels have the right gradient on average, whatever the number of ids.
 
+Pixels whose id the layer does not show anywhere near say nothing: a model that errs alike in many
+views would bend the geometry to its errors.
+
 References:
     Zhang et al., COB-GS: Clear Object Boundaries in 3DGS Segmentation Based on Boundary-Adaptive
     Gaussian Splitting, CVPR 2025.
@@ -29,12 +32,12 @@ References:
 
 import math
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Int32, Int64
+from jaxtyping import Bool, Int32, Int64
 from torch import Tensor
 
 from splatseg._check import check_range
@@ -44,6 +47,7 @@ from splatseg.fit import FitOptions, Refinement
 from splatseg.lift._engine import camera_of_map, voting_views
 from splatseg.lift.associate import DEFAULT_CONFUSION
 from splatseg.lift.confusion import ConfusionOptions, reconsider
+from splatseg.lift.label_maps import label_map
 from splatseg.lift.uplift import LabelSource, UpliftOptions, uplift
 from splatseg.render import render
 
@@ -65,6 +69,11 @@ class SharpenOptions:
     decide_every: int = 200
     """Steps after which labels are decided anew."""
 
+    trust_pixels: int = 2
+    """Pixels of the label maps count if the layer, as it was, shows their id at most so many
+    pixels away along each axis: they move a boundary, and what contradicts all other views says
+    nothing. -1 lets all count."""
+
     codes: int = 4
     """K: channels of the random codes. More is less noise for more time."""
 
@@ -79,6 +88,8 @@ class SharpenOptions:
             raise RangeError(f"label_weight: expected 0 or more, got {self.label_weight}.")
         if self.decide_every < 1:
             raise RangeError(f"decide_every: expected at least 1, got {self.decide_every}.")
+        if self.trust_pixels < -1:
+            raise RangeError(f"trust_pixels: expected -1 or more, got {self.trust_pixels}.")
         if not 1 <= self.codes <= 64:
             raise RangeError(f"codes: expected 1 to 64, got {self.codes}.")
         check_range("rates_from", self.rates_from, 0.0, 1.0)
@@ -152,6 +163,13 @@ def sharpen(
 
     labels, before = decided(gaussians)
     after = before
+    trusted = papers
+    if options.trust_pixels >= 0:
+        drawn = replace(labels, candidates=None, shares=None)
+        by_name = {view.name: view for view in ordered}
+        trusted = _Papers(
+            _Trusted(papers, gaussians, by_name, drawn, options.trust_pixels, backend)
+        )
     base = fit_options or FitOptions()
     run = Refinement(
         gaussians,
@@ -162,7 +180,7 @@ def sharpen(
         backend=backend,
     )
     for done in range(options.sharpen_steps):
-        term = _LabelTerm(papers, labels.ids.cpu(), options, run.generator, backend)
+        term = _LabelTerm(trusted, labels.ids.cpu(), options, run.generator, backend)
         run.step(term)
         last = done + 1 == options.sharpen_steps
         if last or (done + 1) % options.decide_every == 0:
@@ -213,6 +231,43 @@ class _Papers:
         shape, ids, sure = self.kept[name]
         confidence = None if sure is None else _unpacked(sure, np.float32, shape)
         return LabelMap(ids=_unpacked(ids, np.int32, shape), confidence=confidence)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trusted:
+    """Label maps without the pixels that contradict what a layer shows around them."""
+
+    papers: _Papers
+    gaussians: Gaussians
+    views: Mapping[str, View]
+    labels: Labels
+    pixels: int
+    backend: str
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return self.papers.view_names
+
+    def label_map(self, name: str) -> LabelMap:
+        paper = self.papers.label_map(name)
+        camera = camera_of_map(self.views[name], paper.height, paper.width)
+        drawn = label_map(self.gaussians, camera, self.labels, backend=self.backend).ids
+        near = shown_near(paper.ids, drawn, self.pixels)
+        return LabelMap(ids=torch.where(near, paper.ids, UNLABELLED), confidence=paper.confidence)
+
+
+def shown_near(
+    ids: Int32[Tensor, "height width"], drawn: Int32[Tensor, "height width"], pixels: int
+) -> Bool[Tensor, "height width"]:
+    """Where `drawn` has the pixel's own id at most so many pixels away along each axis."""
+    height, width = ids.shape
+    # No pixel has the id -2.
+    around = torch.nn.functional.pad(drawn, (pixels,) * 4, value=-2)
+    found = torch.zeros(ids.shape, dtype=torch.bool)
+    for down in range(2 * pixels + 1):
+        for across in range(2 * pixels + 1):
+            found |= around[down : down + height, across : across + width] == ids
+    return found
 
 
 def _packed(values: Tensor) -> bytes:
