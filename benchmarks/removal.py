@@ -1,7 +1,7 @@
 """What removing a thing leaves of it, and what it does to the rest of the picture.
 
-    splatseg fit ../shared/data/toys -o /tmp/toys
-    python benchmarks/removal.py /tmp/toys ../shared/data/toys [--split once|each|off]
+    splatseg fit ../shared/data/toys -o SCENE
+    python benchmarks/removal.py SCENE ../shared/data/toys [--split once|each|off]
 
 A layer `things` that SCENE holds is taken as it is, made for instance by ``splatseg segment SCENE
 --method uplift --evidence instance --layer things``.

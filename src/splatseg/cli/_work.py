@@ -3,6 +3,7 @@
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -10,7 +11,33 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from splatseg.core import Features, Labels, Scene, Selection, View
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import MaskUse
+from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene, load_scene_layer
+
+SAME_IDS = ("uplift", "vote", "identity")
+"""Methods whose layers have the ids of the evidence that they were made from."""
+
+
+def check_new_scene(out: Path) -> None:
+    """Refuse before the work a place that a new scene could not be written to after it."""
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise InputError(f"{out}: expected a new folder, got one that is there.")
+    if not out.resolve().parent.is_dir():
+        raise InputError(f"{out}: expected a place in a folder that is there, got none.")
+
+
+def views_that_made(
+    scene: Scene, metadata: Mapping[str, Any], evidence: Evidence
+) -> tuple[View, ...]:
+    """Views with evidence that made a layer, where it says which; else the training views."""
+    known = set(evidence.view_names)
+    used = metadata.get("views")
+    names = set(cast("list[str]", used)) if isinstance(used, list) else None
+    return tuple(
+        view
+        for view in scene.views
+        if view.name in known and (view.split == "train" if names is None else view.name in names)
+    )
 
 
 @contextmanager

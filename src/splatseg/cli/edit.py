@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, cast
 import torch
 import tyro
 
-from splatseg.cli._work import progress
+from splatseg.cli._work import SAME_IDS, check_new_scene, progress, views_that_made
 from splatseg.core import Gaussians, Labels, Similarity, View
 from splatseg.edit import (
     CutBy,
@@ -36,9 +36,6 @@ from splatseg.io.scene import is_scene
 from splatseg.render import BackendName, render
 
 Triple = tuple[float, float, float]
-_SAME_IDS = ("uplift", "vote", "identity")
-"""Methods whose layers have the ids of the evidence that they were made from."""
-
 _DRAWN_VIEWS = 40
 """Most views in which a layer draws its own boundary."""
 
@@ -165,11 +162,7 @@ def run(command: Command) -> None:
 
 def _check(command: Command) -> None:
     """Refuse before the work what makes no sense or could not be written after it."""
-    out = command.output
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise InputError(f"{out}: expected a new folder, got one that is there.")
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"{out}: expected a place in a folder that is there, got none.")
+    check_new_scene(command.output)
     actions = {
         "--extract": command.extract,
         "--remove": command.remove,
@@ -347,7 +340,7 @@ def _masks(command: Command, document: Document, where: Where) -> CutBy | None:
         if asked:
             raise InputError("--split masks: expected a layer made from label maps, got none.")
         return None
-    if not asked and (document.history or metadata.get("method") not in _SAME_IDS):
+    if not asked and (document.history or metadata.get("method") not in SAME_IDS):
         return None
     places = [place for place in (scene.root, scene.source) if place is not None]
     zero_is_class = "source_ids" in metadata
@@ -361,14 +354,7 @@ def _masks(command: Command, document: Document, where: Where) -> CutBy | None:
         if asked:
             raise InputError(f"--split masks: expected label maps, {name} is {evidence.kind}.")
         return None
-    known = set(evidence.view_names)
-    used = metadata.get("views")
-    voters = set(cast("list[str]", used)) if isinstance(used, list) else None
-    views = tuple(
-        view.name
-        for view in scene.views
-        if view.name in known and (view.split == "train" if voters is None else view.name in voters)
-    )
+    views = tuple(view.name for view in views_that_made(scene, metadata, evidence))
     if not views:
         if asked:
             raise InputError(f"--split masks: {name} has no label map of a view that may be used.")

@@ -10,7 +10,7 @@ from typing import Annotated, Any, cast
 import torch
 import tyro
 
-from splatseg.cli._work import mask_use, progress
+from splatseg.cli._work import SAME_IDS, check_new_scene, mask_use, progress, views_that_made
 from splatseg.core import UNLABELLED, Gaussians, Labels, Scene, View
 from splatseg.edit import Document, load_document, save_document
 from splatseg.edit._document import BASE, HISTORY
@@ -28,9 +28,6 @@ from splatseg.lift import (
     sharpen,
 )
 from splatseg.render import BackendName
-
-_SAME_IDS = ("uplift", "vote", "identity")
-"""Methods whose layers have the ids of the evidence that they were made from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,10 +86,7 @@ class Command:
 def run(command: Command) -> None:
     """Sharpen a scene."""
     out = command.output
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise InputError(f"{out}: expected a new folder, got one that is there.")
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"{out}: expected a place in a folder that is there, got none.")
+    check_new_scene(out)
     if command.measure < 0:
         raise InputError(f"--measure: expected 0 or more, got {command.measure}.")
     started = time.monotonic()
@@ -184,7 +178,7 @@ def _source(
     zero = own and "source_ids" in layer.metadata
     evidence = open_evidence(find_evidence(places, name), zero_is_class=zero)
     views = _views(scene, layer, evidence)
-    same = own and layer.metadata.get("method") in _SAME_IDS
+    same = own and layer.metadata.get("method") in SAME_IDS
     if same and evidence.kind in ("labels", "tracked"):
         return evidence, evidence, views
     if evidence.kind not in ("masks", "panoptic", "tracked"):
@@ -204,15 +198,8 @@ def _source(
 
 
 def _views(scene: Scene, layer: Labels, evidence: Evidence) -> tuple[View, ...]:
-    """Those that made the layer, where they are known; else the training views."""
-    known = set(evidence.view_names)
-    used = layer.metadata.get("views")
-    names = set(cast("list[str]", used)) if isinstance(used, list) else None
-    views = tuple(
-        view
-        for view in scene.views
-        if view.name in known and (view.split == "train" if names is None else view.name in names)
-    )
+    """Those that made the layer and have a photograph."""
+    views = views_that_made(scene, layer.metadata, evidence)
     views = tuple(view for view in views if view.image is not None)
     if not views:
         raise InputError(

@@ -3,6 +3,7 @@
 None is added, moved to another place or left out: row i stays row i, so that layers stay in step.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -143,7 +144,7 @@ class Refinement:
                 roots.append(further)
                 slopes.append(torch.ones_like(further))
             value += float(further.detach())
-        if not torch.isfinite(torch.tensor(value)):
+        if not math.isfinite(value):
             raise SplatsegError(f"refine: expected a finite loss, got {value} at {self._done}.")
         torch.autograd.backward(roots, slopes)
         progress = self._start + (1 - self._start) * self._done / max(1, self._steps)
