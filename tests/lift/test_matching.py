@@ -134,6 +134,20 @@ def test_large_photographs_are_read_smaller() -> None:
     assert set(found.ids.unique().tolist()) == {-1, A, B}
 
 
+def test_a_coarser_pixel_takes_what_is_at_its_middle() -> None:
+    from splatseg.lift._segment_table import reduced_segments
+
+    ids = torch.arange(12, dtype=torch.int32).view(2, 6)
+    found = reduced_segments(LabelMap(ids=ids), 3)
+    assert isinstance(found, LabelMap)
+    assert found.ids.tolist() == [[7, 9, 11]]
+    masks = MaskSet.from_dense(torch.stack((ids == 9, ids == 8)))
+    coarse = reduced_segments(masks, 3)
+    assert isinstance(coarse, MaskSet)
+    assert coarse.dense(0).tolist() == [[False, True, False]]
+    assert not bool(coarse.dense(1).any())
+
+
 def test_views_without_segments_are_not_named_and_not_there() -> None:
     other = View(name="w", camera=camera_at(0.2))
     source = Segments({"v": LabelMap(ids=torch.zeros(12, 16, dtype=torch.int32))})

@@ -261,6 +261,9 @@ def test_ids_near_by_are_trusted() -> None:
     corner = torch.full((4, 6), 1, dtype=torch.int32)
     corner[0, 0] = 2
     assert shown_near(ids, corner, 1).nonzero().tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+    # Beyond the border there is nothing, whatever the id.
+    for id in (0, 1, 2):
+        assert not bool(shown_near(torch.full_like(ids, id), torch.full_like(ids, 3), 1).any())
 
 
 def test_what_contradicts_all_other_views_does_not_bend_the_geometry(scene) -> None:
