@@ -39,15 +39,14 @@ from splatseg.lift import (
     ConfusionOptions,
     EvidenceSegments,
     UpliftOptions,
-    VoteOptions,
-    associate,
     complete,
-    identity,
     label_map,
     reconsider,
     uplift,
-    vote,
 )
+from splatseg.methods.associate import associate
+from splatseg.methods.identity import identity
+from splatseg.methods.vote import VoteOptions, vote
 
 _SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 

@@ -26,8 +26,8 @@ from memory import room
 
 from splatseg.core import Camera, FeatureMap, LabelMap, MaskSet, Rle, View
 from splatseg.lift import UpliftOptions, uplift
-from splatseg.lift._masses import view_masses
-from splatseg.lift.features import uplift_features
+from splatseg.lift.mass.features import uplift_features
+from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.render.cpu import threads
 
 WIDTH, HEIGHT = 512, 384

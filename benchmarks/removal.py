@@ -35,20 +35,10 @@ import torch
 from torch import Tensor
 
 from splatseg.core import Gaussians, LabelMap, Labels, Scene, Selection, View
-from splatseg.edit import (
-    CutBy,
-    CutOptions,
-    Document,
-    Operation,
-    Where,
-    cut_labels,
-    load_document,
-    prepare,
-    remove,
-)
+from splatseg.edit import CutBy, Document, Operation, Where, load_document, prepare, remove
 from splatseg.evaluate import picture_and_photograph, psnr
 from splatseg.io.evidence import Evidence, open_evidence
-from splatseg.lift import UpliftOptions, uplift
+from splatseg.lift import CutOptions, UpliftOptions, cut_labels, uplift
 from splatseg.render import back_project
 
 LAYER, FOLDER = "things", "instance"

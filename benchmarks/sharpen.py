@@ -27,12 +27,12 @@ from splatseg.lift import (
     MatchedMaps,
     SharpenOptions,
     UpliftOptions,
-    associate,
     complete,
     reconsider,
     sharpen,
     uplift,
 )
+from splatseg.methods.associate import associate
 
 
 def layer(bench: Bench, found: Evidence) -> Labels:

@@ -42,16 +42,18 @@ SURFACE = {
 }
 
 PACKAGES = {
-    "adopt",
     "core",
     "edit",
     "evaluate",
     "fit",
+    "importing",
     "io",
     "lift",
+    "methods",
     "models",
     "pose",
     "render",
+    "report",
     "synthetic",
 }
 

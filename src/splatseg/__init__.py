@@ -19,16 +19,18 @@ from splatseg.errors import InputError as InputError
 from splatseg.errors import SplatsegError as SplatsegError
 
 if TYPE_CHECKING:
-    from splatseg import adopt as adopt
     from splatseg import core as core
     from splatseg import edit as edit
     from splatseg import evaluate as evaluate
     from splatseg import fit as fit
+    from splatseg import importing as importing
     from splatseg import io as io
     from splatseg import lift as lift
+    from splatseg import methods as methods
     from splatseg import models as models
     from splatseg import pose as pose
     from splatseg import render as render
+    from splatseg import report as report
     from splatseg import synthetic as synthetic
     from splatseg.core import Camera as Camera
     from splatseg.core import Capture as Capture
@@ -73,16 +75,18 @@ _HOMES = {
 }
 _PACKAGES = frozenset(
     {
-        "adopt",
         "core",
         "edit",
         "evaluate",
         "fit",
+        "importing",
         "io",
         "lift",
+        "methods",
         "models",
         "pose",
         "render",
+        "report",
         "synthetic",
     }
 )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.adopt import align
 from splatseg.core import Similarity
 from splatseg.errors import InputError
+from splatseg.importing import align
 
 Z_UP = [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.adopt import place_cameras
 from splatseg.core import Gaussians
 from splatseg.errors import InputError
+from splatseg.importing import place_cameras
 from splatseg.render import render
 
 UP = (0.0, -1.0, 0.0)

@@ -14,10 +14,8 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import FeatureMap, MaskSet
+from splatseg.core import FeatureMap, MaskSet, Segment, Track
 from splatseg.io.evidence import (
-    Segment,
-    Track,
     open_evidence,
     save_features,
     save_masks,

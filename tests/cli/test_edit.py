@@ -278,7 +278,7 @@ def test_ctrl_c_leaves_nothing_half_written(room, tmp_path, monkeypatch, capsys)
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    for where in ("splatseg.edit.cut.sides_of", "splatseg.io.scene.save_layer"):
+    for where in ("splatseg.lift.boundaries.cut.sides_of", "splatseg.io.scene.save_layer"):
         with monkeypatch.context() as patch:
             patch.setattr(where, stop)
             assert main(words) == 1

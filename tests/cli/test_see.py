@@ -9,10 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import FeatureMap, LabelMap, MaskSet
+from splatseg.core import FeatureMap, LabelMap, MaskSet, Panoptic, Segment
 from splatseg.io.evidence import (
     PanopticEvidence,
-    Segment,
     TrackedEvidence,
     evidence_header,
     open_evidence,
@@ -20,7 +19,7 @@ from splatseg.io.evidence import (
     save_masks,
 )
 from splatseg.io.scene import load_scene
-from splatseg.models import Panoptic, record_evidence
+from splatseg.models import record_evidence
 
 WIDTH, HEIGHT = 28, 20
 TRAIN = ("train_0", "train_1", "train_3")
@@ -363,7 +362,8 @@ def test_recorded_panoptic_tracked_and_features_of_the_shared_scenes(
         status, out, _ = splatseg(*words)
         assert status == 0
         assert "2 of them were there" in out
-    from splatseg.models import TextFeatures, find_model
+    from splatseg.core import TextFeatures
+    from splatseg.models import find_model
 
     assert isinstance(find_model(tmp_path / "S" / "evidence" / "features_text"), TextFeatures)
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Labels, MaskSet, Rle
-from splatseg.io.evidence import Segment, save_masks, save_segments
+from splatseg.core import Labels, MaskSet, Rle, Segment
+from splatseg.io.evidence import save_masks, save_segments
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.io.splats import read_splats
 

@@ -8,10 +8,9 @@ import torch
 
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, View
 from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.edit import CutOptions, cut_box, cut_labels, cut_masks
-from splatseg.edit._sides import on_border, sides_of
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import UpliftOptions, uplift
+from splatseg.lift import CutOptions, UpliftOptions, cut_box, cut_labels, cut_masks, uplift
+from splatseg.lift.boundaries.sides import on_border, sides_of
 from splatseg.render import RenderOptions, render
 
 from .conftest import BACKEND, camera

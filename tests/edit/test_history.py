@@ -9,7 +9,6 @@ import torch
 from splatseg.core import Features, Labels, Scene, Selection, Similarity, View
 from splatseg.edit import (
     CutBy,
-    CutOptions,
     Document,
     Operation,
     Recolour,
@@ -27,6 +26,7 @@ from splatseg.edit import (
 )
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.scene import load_scene
+from splatseg.lift import CutOptions
 from splatseg.render import render
 
 from .conftest import BACKEND, camera, layers_of, random_gaussians

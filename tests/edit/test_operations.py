@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Gaussians, Selection, Similarity
-from splatseg.edit import (
-    Edited,
-    apply_rows,
-    duplicate,
-    extract,
-    merge,
-    recolour,
-    remove,
-    transform,
-)
+from splatseg.core import Edited, Gaussians, Selection, Similarity, apply_rows
+from splatseg.edit import duplicate, extract, merge, recolour, remove, transform
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render import render
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Gaussians, Selection
+from splatseg.core import Gaussians, Selection, apply_rows
 from splatseg.core.rigid import rotation_from_quaternion
-from splatseg.edit import apply_rows, split
-from splatseg.edit._geometry import seen_along
-from splatseg.edit._mixture import MIXTURES, opacities_of_parts
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift import split
+from splatseg.lift.boundaries.geometry import seen_along
+from splatseg.lift.boundaries.mixture import MIXTURES, opacities_of_parts
 from splatseg.render import render
 
 from .conftest import BACKEND, camera, layers_of, random_gaussians

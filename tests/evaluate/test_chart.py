@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 from splatseg.errors import InputError, RangeError
-from splatseg.evaluate._chart import (
+from splatseg.report.chart import (
     _BOTTOM,
     _HEIGHT,
     _LEFT,

@@ -6,7 +6,7 @@ import torch
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import InputError, ShapeError
-from splatseg.evaluate.pictures import (
+from splatseg.report.pictures import (
     Gallery,
     Picture,
     colour_depth,

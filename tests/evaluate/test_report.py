@@ -12,8 +12,7 @@ from PIL import Image
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import InputError
-from splatseg.evaluate.pictures import Gallery, Picture
-from splatseg.evaluate.report import (
+from splatseg.report.html import (
     Bars,
     Commands,
     Figure,
@@ -23,6 +22,7 @@ from splatseg.evaluate.report import (
     data_uri,
     report_html,
 )
+from splatseg.report.pictures import Gallery, Picture
 
 VOID_ELEMENTS = {"meta", "img", "br"}
 NASTY = "<script>alert('x')</script> & \"y\""

@@ -22,8 +22,6 @@ from splatseg.core import (
     View,
 )
 from splatseg.errors import MissingFileError, ShapeError
-from splatseg.evaluate import _segment_ids, _segment_pictures, _segment_tables, segment_report
-from splatseg.evaluate.segment_report import write_segmentation_report
 from splatseg.io.evidence import (
     MaskEvidence,
     create_evidence,
@@ -32,6 +30,8 @@ from splatseg.io.evidence import (
     save_masks,
 )
 from splatseg.io.images import save_png
+from splatseg.report import _segment_ids, _segment_pictures, _segment_tables, segment_report
+from splatseg.report.segment_report import write_segmentation_report
 
 WIDTH, HEIGHT = 40, 30
 CLASSES = ClassTable(

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io._atomic import atomic_file, atomic_folder
+from splatseg.io.atomic import atomic_file, atomic_folder
 
 
 def names(folder: Path) -> list[str]:

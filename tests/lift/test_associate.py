@@ -11,9 +11,9 @@ import torch
 
 from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import AssociateOptions, ConfusionOptions, associate
-from splatseg.lift._segment_table import SegmentTable, _shared, segment_table
-from splatseg.lift.associate import DEFAULT_CONFUSION, _labels
+from splatseg.lift import ConfusionOptions
+from splatseg.lift.segments.table import SegmentTable, _shared, segment_table
+from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, _labels, associate
 
 from .conftest import camera_at, gaussians_at
 
@@ -236,7 +236,7 @@ def test_pairs_that_share_next_to_nothing_are_left_out() -> None:
 def test_a_sample_of_gaussians_keeps_the_sums(monkeypatch) -> None:
     """Few pairs: all count 1. Many: fewer Gaussians, which count for the others."""
     table = table_of(clean(NAMES))
-    module = importlib.import_module("splatseg.lift._segment_table")
+    module = importlib.import_module("splatseg.lift.segments.table")
     entries = np.bincount(table.gaussian, minlength=table.gaussians)
     assert table._sample(entries).tolist() == [1.0] * table.gaussians
     rng = np.random.default_rng(0)
@@ -268,7 +268,7 @@ def test_a_sample_of_gaussians_keeps_the_sums(monkeypatch) -> None:
 def test_unions_dense_and_sparse_are_the_same(rng, monkeypatch, count) -> None:
     import scipy.sparse
 
-    module = importlib.import_module("splatseg.lift._clustering")
+    module = importlib.import_module("splatseg.lift.segments.clustering")
     seen = scipy.sparse.random(count, 9, 0.4, random_state=1, format="csr")
     members = scipy.sparse.csr_matrix(rng.integers(0, 3, (count, 9)).astype(float))
     row = np.sort(rng.integers(0, count, 50))
@@ -304,7 +304,7 @@ def test_votes_become_a_soft_layer() -> None:
 
 def test_votes_are_reconsidered_unless_told_otherwise(monkeypatch) -> None:
     """The soft votes go to `reconsider` with the options given, and its word is the last."""
-    module = importlib.import_module("splatseg.lift.associate")
+    module = importlib.import_module("splatseg.methods.associate")
     asked = []
 
     def turned(labels, *, options):

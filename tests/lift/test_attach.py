@@ -10,7 +10,7 @@ from splatseg.core import Features, Gaussians, Labels, Selection, Similarity
 from splatseg.core.rigid import normalised, rotation_from_quaternion
 from splatseg.errors import RangeError, ShapeError
 from splatseg.io.splats import read_splats, write_splats
-from splatseg.lift.attach import AttachOptions, attach
+from splatseg.lift.attachment.attach import AttachOptions, attach
 
 COUNT = 3000
 

@@ -11,7 +11,7 @@ import torch
 from splatseg.core import Features, Gaussians, Labels
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import CompletionOptions, complete
-from splatseg.lift._graph import NodeAttributes, diffuse, neighbour_graph, ranked, walk
+from splatseg.lift.completion.graph import NodeAttributes, diffuse, neighbour_graph, ranked, walk
 
 from .conftest import gaussians_at
 

@@ -9,7 +9,7 @@ import torch
 
 from splatseg.core import FeatureMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.features import FeatureUpliftOptions, read_grid, uplift_features
+from splatseg.lift.mass.features import FeatureUpliftOptions, read_grid, uplift_features
 from splatseg.render.warp import warp_into_photograph
 
 from .conftest import BACKEND, BARREL, camera_at, gaussians_at, matrix_of, random_gaussians

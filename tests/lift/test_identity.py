@@ -9,16 +9,16 @@ import torch
 
 from splatseg.core import ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import (
+from splatseg.methods._identity_loss import NeighbourLoss, pixel_loss
+from splatseg.methods._identity_rows import Batch, Rows, Sampler, batches_of
+from splatseg.methods.identity import (
     IdentityField,
     IdentityOptions,
+    _Trainer,
     identity,
     identity_features,
     train_identity,
 )
-from splatseg.lift._identity_loss import NeighbourLoss, pixel_loss
-from splatseg.lift._identity_rows import Batch, Rows, Sampler, batches_of
-from splatseg.lift.identity import _Trainer
 from splatseg.render import RenderOptions
 
 from .conftest import (

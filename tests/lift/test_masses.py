@@ -6,7 +6,7 @@ import torch
 from splatseg.core import LabelMap, MaskSet
 from splatseg.errors import ShapeError
 from splatseg.lift import _masses
-from splatseg.lift._masses import view_masses
+from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.render.warp import warp_into_photograph
 
 from .conftest import BACKEND, BARREL, camera_at, gaussians_at, matrix_of, random_gaussians

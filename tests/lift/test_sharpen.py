@@ -10,7 +10,7 @@ from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
 from splatseg.io.images import save_png
 from splatseg.lift import SharpenOptions, UpliftOptions, reconsider, sharpen, uplift
-from splatseg.lift.sharpen import _LabelTerm, _Papers
+from splatseg.lift.boundaries.sharpen import _LabelTerm, _Papers
 from splatseg.render import back_project, render
 from splatseg.render.cpu import set_threads, threads
 
@@ -249,7 +249,7 @@ def test_labels_are_reconsidered_unless_told_not_to(scene) -> None:
 
 
 def test_ids_near_by_are_trusted() -> None:
-    from splatseg.lift.sharpen import shown_near
+    from splatseg.lift.boundaries.sharpen import shown_near
 
     drawn = torch.full((4, 6), 1, dtype=torch.int32)
     drawn[:, 3:] = 2
@@ -286,7 +286,7 @@ def test_what_contradicts_all_other_views_does_not_bend_the_geometry(scene) -> N
 
 
 def test_agreement_of_the_label_and_not_of_the_majority() -> None:
-    from splatseg.lift.sharpen import _agreement
+    from splatseg.lift.boundaries.sharpen import _agreement
 
     ids = torch.tensor([[1, 2], [2, 1], [-1, -1]], dtype=torch.int32)
     votes = Labels(

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from splatseg.lift._rules import decide
-from splatseg.lift._votes import Ranking
+from splatseg.lift.mass.decision import decide
+from splatseg.lift.mass.vote_table import Ranking
 
 SHARE = {"slackness": 0.0, "min_weight": 0.0, "min_share": 0.0}
 

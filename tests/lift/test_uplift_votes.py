@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.lift._votes import SlotTable, VoteTable
+from splatseg.lift.mass.vote_table import SlotTable, VoteTable
 
 COUNT = 9
 

@@ -9,8 +9,8 @@ import torch
 
 from splatseg.core import Camera, ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift import VoteOptions, vote
-from splatseg.lift._centres import centres_in, majority_map, own_weights
+from splatseg.lift.mass.centres import centres_in, majority_map, own_weights
+from splatseg.methods.vote import VoteOptions, vote
 from splatseg.render import RenderOptions, weights
 
 from .conftest import (

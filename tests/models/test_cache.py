@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import FeatureMap, LabelMap, MaskSet
+from splatseg.core import DeepFeatures, Embedding, FeatureMap, LabelMap, MaskSet, Panoptic, Segment
 from splatseg.errors import InputError, RangeError
-from splatseg.io.evidence import Segment
-from splatseg.models import (
-    DeepFeatures,
-    Embedding,
-    ModelCache,
-    Panoptic,
-)
+from splatseg.models import ModelCache
 
 
 @dataclass

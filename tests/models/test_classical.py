@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import MaskSet
-from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.models import (
+from splatseg.core import (
     AutomaticMasks,
     DenseFeatures,
     GroundedBoxes,
+    MaskSet,
     MaskTracker,
     PanopticSegments,
     Prompt,
     PromptableMasks,
     SemanticLabels,
     TextFeatures,
-    find_model,
 )
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.models import find_model
 from splatseg.models.classical import (
     Classical,
     DescriptorOptions,

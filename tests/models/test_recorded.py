@@ -7,12 +7,25 @@ import pytest
 import torch
 from PIL import Image as Picture
 
-from splatseg.core import FeatureMap, LabelMap, MaskSet
+from splatseg.core import (
+    AutomaticMasks,
+    DenseFeatures,
+    FeatureMap,
+    LabelMap,
+    MaskSet,
+    MaskTracker,
+    Model,
+    PanopticSegments,
+    Prompt,
+    PromptableMasks,
+    Segment,
+    SemanticLabels,
+    TextFeatures,
+    Track,
+)
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import (
-    Segment,
-    Track,
     create_evidence,
     open_evidence,
     save_features,
@@ -22,19 +35,7 @@ from splatseg.io.evidence import (
     save_tracks,
 )
 from splatseg.io.images import load_image
-from splatseg.models import (
-    AutomaticMasks,
-    DenseFeatures,
-    MaskTracker,
-    Model,
-    PanopticSegments,
-    Prompt,
-    PromptableMasks,
-    SemanticLabels,
-    TextFeatures,
-    find_model,
-    recorded_model,
-)
+from splatseg.models import find_model, recorded_model
 
 H, W = 48, 64
 

@@ -8,15 +8,17 @@ from typing import ClassVar
 import pytest
 import torch
 
-from splatseg.core import MaskSet
-from splatseg.errors import InputError, MissingPackageError
-from splatseg.models import (
-    ENTRY_POINT_GROUP,
+from splatseg.core import (
     AutomaticMasks,
     DeepFeatures,
     DenseFeatures,
+    MaskSet,
     Model,
     PromptableMasks,
+)
+from splatseg.errors import InputError, MissingPackageError
+from splatseg.models import (
+    ENTRY_POINT_GROUP,
     _registry,
     find_model,
     model_names,

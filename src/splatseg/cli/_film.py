@@ -12,12 +12,12 @@ from torch import Tensor
 from splatseg.cli._legend import coloured
 from splatseg.core import ClassTable, Labels, Scene, View
 from splatseg.errors import InputError, RangeError
-from splatseg.evaluate.pictures import colour_depth
-from splatseg.io._cameras import cameras_content
-from splatseg.io._json import read_json, write_json
+from splatseg.io.cameras import cameras_content
+from splatseg.io.json_files import read_json, write_json
 from splatseg.io.video import check_encoder, write_video
 from splatseg.render import BackendName, render
 from splatseg.render.paths import camera_path, is_forward_facing
+from splatseg.report.pictures import colour_depth
 
 # Depths beyond these shares of all are shown in the end colours.
 _NEAR, _FAR = 0.01, 0.99

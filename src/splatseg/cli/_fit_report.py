@@ -8,15 +8,15 @@ from typing import Any
 
 from splatseg.core import Capture, View
 from splatseg.evaluate import PhotographReport, evaluate_photographs, picture_and_photograph
-from splatseg.evaluate.fit_report import FitStory, fit_record, fit_report
 from splatseg.evaluate.held_out import MaskUse
-from splatseg.evaluate.pictures import Gallery, Picture, colour_difference
-from splatseg.evaluate.report import report_html
 from splatseg.fit import FitOptions, FitResult
-from splatseg.io._atomic import atomic_file
-from splatseg.io._json import read_json, write_json
+from splatseg.io.atomic import atomic_file
+from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import GAUSSIANS_FILE, POSES_FOLDER
 from splatseg.render import BackendName
+from splatseg.report.fit_report import FitStory, fit_record, fit_report
+from splatseg.report.html import report_html
+from splatseg.report.pictures import Gallery, Picture, colour_difference
 
 # Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
 _SCORING = 20.0

@@ -9,9 +9,9 @@ from splatseg.cli import export as export_command
 from splatseg.cli import render as render_command
 from splatseg.core import Labels, Scene, View
 from splatseg.errors import InputError
-from splatseg.evaluate.segment_report import write_segmentation_report
 from splatseg.io.evidence import Evidence
 from splatseg.render import BackendName
+from splatseg.report.segment_report import write_segmentation_report
 
 EXPORTS_FOLDER = "exports"
 REPORTS_FOLDER = "reports"

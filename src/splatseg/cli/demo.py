@@ -17,11 +17,11 @@ from rich.console import Console
 from rich.table import Table
 
 from splatseg.cli import evaluate, export, fit, render, see, segment
-from splatseg.cli._demo_report import DemoFigures, machine_score, write_report
 from splatseg.cli._work import progress
 from splatseg.errors import InputError, RangeError
-from splatseg.io._json import read_json, write_json
+from splatseg.io.json_files import read_json, write_json
 from splatseg.render import BackendName
+from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.synthetic import cameras, room, write_capture
 
 _RECORD = "demo.json"

@@ -15,7 +15,6 @@ from splatseg.cli._work import SAME_IDS, check_new_scene, progress, views_that_m
 from splatseg.core import Gaussians, Labels, Similarity, View
 from splatseg.edit import (
     CutBy,
-    CutOptions,
     Document,
     Operation,
     Recolour,
@@ -33,6 +32,7 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import picture_and_photograph, psnr
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.io.scene import is_scene
+from splatseg.lift import CutOptions
 from splatseg.render import BackendName, render
 
 Triple = tuple[float, float, float]

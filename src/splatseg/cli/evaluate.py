@@ -21,7 +21,7 @@ from splatseg.cli._figures import (
     semantic_figures,
 )
 from splatseg.cli._work import layer_of, mask_use, open_scene, progress, views_of_split
-from splatseg.core import ClassTable, Features, Labels, Scene, View
+from splatseg.core import ClassTable, Features, Labels, Layer, Scene, View
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     SemanticReport,
@@ -34,10 +34,9 @@ from splatseg.evaluate import (
 )
 from splatseg.evaluate.lpips import Lpips, load_lpips
 from splatseg.evaluate.solid import PointRule
-from splatseg.io._class_rows import class_table
-from splatseg.io._json import read_json, write_json
+from splatseg.io.class_tables import class_table
 from splatseg.io.evidence import Evidence, open_evidence
-from splatseg.io.layers import Layer
+from splatseg.io.json_files import read_json, write_json
 from splatseg.render import BackendName
 
 Metric = Literal["semantic", "instances", "panoptic", "binary"]

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseg.adopt import Alignment, SceneKind, VirtualViews, align, place_cameras
 from splatseg.cli._work import progress
 from splatseg.core import Capture, Gaussians, Scene
 from splatseg.errors import InputError
+from splatseg.importing import Alignment, SceneKind, VirtualViews, align, place_cameras
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import is_scene, save_scene, scene_layer_names
 from splatseg.io.splats import SplatWarning, read_splats, splat_format

@@ -12,13 +12,13 @@ from typing import Annotated, Any
 import tyro
 
 from splatseg.cli._output import where_it_stopped
-from splatseg.core import Capture, Features, Gaussians, Labels, Scene, View
+from splatseg.core import Capture, Features, Gaussians, Labels, Layer, Scene, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import CheckpointSummary, checkpoint_summary
 from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_capture
 from splatseg.io.evidence import Evidence, evidence_names, open_evidence
 from splatseg.io.images import DEFAULT_LONGEST, image_size
-from splatseg.io.layers import Layer, load_layer
+from splatseg.io.layers import load_layer
 from splatseg.io.scene import (
     CHECKPOINT_FILE,
     is_scene,

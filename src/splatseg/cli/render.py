@@ -20,9 +20,9 @@ from splatseg.cli._work import layer_of, open_scene, progress, views_of_split
 from splatseg.core import UNLABELLED, Labels, Scene, Selection, View
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import labels_of
-from splatseg.io._atomic import atomic_folder
-from splatseg.io._json import read_json, write_json
+from splatseg.io.atomic import atomic_folder
 from splatseg.io.images import save_png
+from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift import label_map
 from splatseg.render import BackendName, Rendered, render

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import tyro
 
 from splatseg.cli._work import open_scene, progress
-from splatseg.core import Scene, View
+from splatseg.core import Model, Scene, View
 from splatseg.errors import InputError
 from splatseg.io.scene import check_name
-from splatseg.models import Model, ModelCache, SeenEvidence, find_model, record_evidence
+from splatseg.models import ModelCache, SeenEvidence, find_model, record_evidence
 from splatseg.models.classical import Classical, RegionOptions
 from splatseg.models.recorded import AnyRecorded, recorded_model
 

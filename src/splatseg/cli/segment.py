@@ -24,21 +24,18 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.lift import (
-    AssociateOptions,
     CompletionOptions,
     ConfusionOptions,
     EvidenceSegments,
-    IdentityOptions,
     UpliftOptions,
-    VoteOptions,
-    associate,
     complete,
-    identity,
     merge_panoptic,
     reconsider,
     uplift,
-    vote,
 )
+from splatseg.methods.associate import AssociateOptions, associate
+from splatseg.methods.identity import IdentityOptions, identity
+from splatseg.methods.vote import VoteOptions, vote
 from splatseg.render import BackendName
 
 

@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from splatseg.cli._work import SAME_IDS, check_new_scene, mask_use, progress, views_that_made
-from splatseg.core import UNLABELLED, Gaussians, Labels, Scene, View
+from splatseg.core import UNLABELLED, Gaussians, Labels, LabelSource, Scene, View
 from splatseg.edit import Document, load_document, save_document
 from splatseg.edit._document import BASE, HISTORY
 from splatseg.errors import InputError
@@ -21,7 +21,6 @@ from splatseg.io.evidence import Evidence, copy_evidence, find_evidence, open_ev
 from splatseg.lift import (
     ConfusionOptions,
     EvidenceSegments,
-    LabelSource,
     MatchedMaps,
     Sharpened,
     SharpenOptions,

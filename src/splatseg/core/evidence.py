@@ -1,6 +1,6 @@
 """What 2D models see in one view: masks, label maps, feature maps."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -124,3 +124,28 @@ class FeatureMap:
     def channels(self) -> int:
         """Width of a feature."""
         return int(self.features.shape[2])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Segment:
+    """One segment of one view."""
+
+    id: int
+    category: int
+    isthing: bool
+    score: float
+    """How sure the model is of it, in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """One object followed through the views."""
+
+    id: int
+    votes: Mapping[str, int]
+    """Pixels under the track by the name of the class that a segmenter gave them."""
+
+    @property
+    def category(self) -> str | None:
+        """The class name with most votes; the first by name among equals."""
+        return min(self.votes, key=lambda name: (-self.votes[name], name)) if self.votes else None

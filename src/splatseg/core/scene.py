@@ -11,7 +11,7 @@ from torch import Tensor
 from splatseg._check import check_shape
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
-from splatseg.errors import InputError
+from splatseg.errors import InputError, ShapeError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,3 +201,23 @@ class Scene:
             InputError: If there is none.
         """
         return _find(self.views, name)
+
+
+def camera_of_map(view: View, height: int, width: int) -> Camera:
+    """The camera of a map's pixels: the view's own, or reduced in proportion.
+
+    Raises:
+        ShapeError: If the map is larger than the photograph, or has not its proportions.
+    """
+    camera = view.camera
+    if (height, width) == (camera.height, camera.width):
+        return camera
+    # A reduced side may be off by the rounding of one pixel.
+    across, down = width / camera.width, height / camera.height
+    out_of_proportion = abs(across - down) * max(camera.width, camera.height) > 1.0 + 1e-9
+    if across > 1 or down > 1 or out_of_proportion:
+        raise ShapeError(
+            f"view {view.name}: expected a map of {camera.width}x{camera.height} pixels as its "
+            f"photograph has, or fewer in proportion, got {width}x{height}."
+        )
+    return camera.resized(width, height)

@@ -3,8 +3,6 @@
 from splatseg.edit._document import Document as Document
 from splatseg.edit._document import load_document as load_document
 from splatseg.edit._document import save_document as save_document
-from splatseg.edit._edited import Edited as Edited
-from splatseg.edit._edited import apply_rows as apply_rows
 from splatseg.edit._merge import merged_layers as merged_layers
 from splatseg.edit._operation import CutBy as CutBy
 from splatseg.edit._operation import Operation as Operation
@@ -12,11 +10,6 @@ from splatseg.edit._operation import Recolour as Recolour
 from splatseg.edit._where import Where as Where
 from splatseg.edit._where import ids_named as ids_named
 from splatseg.edit._where import select as select
-from splatseg.edit.cut import Cut as Cut
-from splatseg.edit.cut import CutOptions as CutOptions
-from splatseg.edit.cut import cut_box as cut_box
-from splatseg.edit.cut import cut_labels as cut_labels
-from splatseg.edit.cut import cut_masks as cut_masks
 from splatseg.edit.history import Prepared as Prepared
 from splatseg.edit.history import apply as apply
 from splatseg.edit.history import prepare as prepare
@@ -28,4 +21,3 @@ from splatseg.edit.operations import merge as merge
 from splatseg.edit.operations import recolour as recolour
 from splatseg.edit.operations import remove as remove
 from splatseg.edit.operations import transform as transform
-from splatseg.edit.split import split as split

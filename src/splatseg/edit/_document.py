@@ -5,10 +5,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Scene
-from splatseg.edit._edited import Edited, apply_rows
+from splatseg.core import Edited, Layer, Scene, apply_rows
 from splatseg.errors import InputError, ShapeError
-from splatseg.io.layers import Layer
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene, scene_layer_names
 
 HISTORY = "edits"

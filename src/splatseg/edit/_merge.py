@@ -7,10 +7,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Features, Labels, Selection
-from splatseg.edit._edited import Edited, apply_rows
+from splatseg.core import UNLABELLED, Edited, Features, Labels, Layer, Selection, apply_rows
 from splatseg.errors import InputError
-from splatseg.io.layers import Layer
 
 
 def merged_layers(

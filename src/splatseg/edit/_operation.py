@@ -9,8 +9,8 @@ import torch
 
 from splatseg.core import Similarity
 from splatseg.edit._where import Where
-from splatseg.edit.cut import CutOptions
 from splatseg.errors import InputError, RangeError
+from splatseg.lift.boundaries.cut import CutOptions
 
 Kind = Literal["extract", "remove", "duplicate", "transform", "recolour", "merge", "split"]
 

@@ -7,10 +7,9 @@ from typing import Any, cast
 
 import torch
 
-from splatseg.core import ClassTable, Gaussians, Labels, Selection
-from splatseg.edit.cut import box_corners
+from splatseg.core import ClassTable, Gaussians, Labels, Layer, Selection
 from splatseg.errors import InputError, ShapeError
-from splatseg.io.layers import Layer
+from splatseg.lift.boundaries.cut import box_corners
 
 _BOX = 6
 

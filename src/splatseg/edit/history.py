@@ -13,25 +13,26 @@ import torch
 
 from splatseg.core import (
     UNLABELLED,
+    Edited,
     Gaussians,
     LabelMap,
     Labels,
+    LabelSource,
+    Layer,
     Scene,
     Selection,
     Similarity,
     View,
 )
 from splatseg.edit._document import HISTORY, Document, load_document
-from splatseg.edit._edited import Edited
 from splatseg.edit._merge import merged_layers
 from splatseg.edit._operation import CutBy, Operation
 from splatseg.edit._where import Where, layer_called, select
-from splatseg.edit.cut import cut_box, cut_masks
 from splatseg.edit.operations import duplicate, extract, merge, recolour, remove, transform
 from splatseg.errors import InputError
 from splatseg.io.evidence import find_evidence, open_evidence
-from splatseg.io.layers import Layer
-from splatseg.lift import LabelSource, label_map
+from splatseg.lift import label_map
+from splatseg.lift.boundaries.cut import cut_box, cut_masks
 
 Progress = Callable[[int, int], None]
 MOVES = ("duplicate", "transform", "merge", "remove", "extract")

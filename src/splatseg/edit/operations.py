@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg._check import check_finite
-from splatseg.core import Gaussians, Selection, Similarity
+from splatseg.core import Edited, Gaussians, Selection, Similarity
+from splatseg.core.edited import NEW
 from splatseg.core.sh import SH_C0, degree_of
-from splatseg.edit._edited import NEW, Edited
 from splatseg.errors import InputError, RangeError, ShapeError
 
 

@@ -37,9 +37,6 @@ from splatseg.evaluate.panoptic import PrecisionScore as PrecisionScore
 from splatseg.evaluate.panoptic import average_precision as average_precision
 from splatseg.evaluate.panoptic import panoptic_score as panoptic_score
 from splatseg.evaluate.panoptic import segment_keys as segment_keys
-from splatseg.evaluate.segment_report import (
-    write_segmentation_report as write_segmentation_report,
-)
 from splatseg.evaluate.solid import gaussian_score as gaussian_score
 from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
 from splatseg.evaluate.solid import labels_from_points as labels_from_points

@@ -14,7 +14,16 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, Selection, View
+from splatseg.core import (
+    UNLABELLED,
+    Gaussians,
+    LabelMap,
+    Labels,
+    LabelSource,
+    Selection,
+    View,
+    camera_of_map,
+)
 from splatseg.errors import InputError
 from splatseg.evaluate.boundary import (
     BoundaryCounts,
@@ -34,8 +43,7 @@ from splatseg.evaluate.metrics import (
     ssim,
 )
 from splatseg.io.images import load_alpha, load_image, load_mask
-from splatseg.lift import LabelSource, label_map
-from splatseg.lift.uplift import camera_of_map
+from splatseg.lift import label_map
 from splatseg.render import RenderOptions, render
 
 Progress = Callable[[int, int], None]

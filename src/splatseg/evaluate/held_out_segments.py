@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, View
+from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, LabelSource, View
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.held_out import Progress, drawn_like, learned_from, with_truth
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
@@ -28,7 +28,6 @@ from splatseg.evaluate.panoptic import (
     segment_keys,
 )
 from splatseg.evaluate.solid import MIN_OPACITY, NEIGHBOURS, PointRule, labels_of_points
-from splatseg.lift import LabelSource
 from splatseg.render import RenderOptions
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
 from splatseg.fit._state import FitState
-from splatseg.io._json import json_text, parse_object
+from splatseg.io.json_files import json_text, parse_object
 
 FORMAT = "splatseg-fit"
 VERSION = 1

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError, ShapeError
-from splatseg.io._atomic import atomic_file
+from splatseg.io.atomic import atomic_file
 
 DEFAULT_LONGEST = 1600
 """Longest side, in pixels, that commands which read photographs work at unless told otherwise."""

@@ -13,16 +13,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import UNLABELLED, Features, Labels, Selection
+from splatseg.core import UNLABELLED, Features, Labels, Layer, Selection
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io._atomic import atomic_file
-from splatseg.io._json import json_text, parse_object
+from splatseg.io.atomic import atomic_file
+from splatseg.io.json_files import json_text, parse_object
 
 FORMAT = "splatseg-layer"
 VERSION = 1
 """Version of the files written; all versions up to it are read."""
 
-Layer = Labels | Features | Selection
 _HEADER = "header"
 _VOID = 0
 

@@ -21,18 +21,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from splatseg.core import Scene, View
+from splatseg.core import Layer, Scene, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io._atomic import TEMPORARY, atomic_folder
-from splatseg.io._cameras import (
+from splatseg.io.atomic import TEMPORARY, atomic_folder
+from splatseg.io.cameras import (
     cameras_content,
     relative_path,
     source_paths,
     views_from_content,
 )
-from splatseg.io._class_rows import class_rows, class_table
-from splatseg.io._json import read_json, write_json
-from splatseg.io.layers import Layer, load_layer, save_layer
+from splatseg.io.class_tables import class_rows, class_table
+from splatseg.io.json_files import read_json, write_json
+from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.splats import read_splats, write_splats
 
 FORMAT = "splatseg-scene"

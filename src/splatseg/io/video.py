@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.errors import BackendError, InputError, MissingPackageError, RangeError
-from splatseg.io._atomic import atomic_file
+from splatseg.io.atomic import atomic_file
 
 # Constant rate factor: 18 is hardly told from the original.
 _CRF = 18

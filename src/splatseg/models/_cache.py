@@ -19,12 +19,7 @@ import numpy as np
 
 from splatseg._check import check_choice
 from splatseg.core import FeatureMap, LabelMap, MaskSet
-from splatseg.errors import InputError
-from splatseg.io._atomic import atomic_file
-from splatseg.io._json import json_text
-from splatseg.models._content import image_digest
-from splatseg.models._packing import Answer, Precision, pack, unpack
-from splatseg.models._protocols import (
+from splatseg.core.models import (
     AutomaticMasks,
     DeepFeatures,
     DenseFeatures,
@@ -37,6 +32,11 @@ from splatseg.models._protocols import (
     SemanticLabels,
     TextFeatures,
 )
+from splatseg.errors import InputError
+from splatseg.io.atomic import atomic_file
+from splatseg.io.json_files import json_text
+from splatseg.models._content import image_digest
+from splatseg.models._packing import Answer, Precision, pack, unpack
 
 _MAGIC = b"splatseg-cache 1\n"
 _SUFFIX = ".entry"

@@ -10,8 +10,16 @@ from typing_extensions import override
 
 from splatseg._check import check_choice
 from splatseg.core import ClassTable, FeatureMap, LabelMap, View
+from splatseg.core.models import (
+    AutomaticMasks,
+    DenseFeatures,
+    Image,
+    Model,
+    PanopticSegments,
+    SemanticLabels,
+    TextFeatures,
+)
 from splatseg.errors import InputError, ShapeError
-from splatseg.io._json import read_json, write_json
 from splatseg.io.evidence import (
     SEGMENTS_FILE,
     EvidenceKind,
@@ -21,16 +29,8 @@ from splatseg.io.evidence import (
     save_segments,
 )
 from splatseg.io.images import load_image
+from splatseg.io.json_files import read_json, write_json
 from splatseg.models._cache import ModelCache
-from splatseg.models._protocols import (
-    AutomaticMasks,
-    DenseFeatures,
-    Image,
-    Model,
-    PanopticSegments,
-    SemanticLabels,
-    TextFeatures,
-)
 from splatseg.models._sources import SEGMENT_PARTS, Source, What, some, without_empty
 
 _PROTOCOLS: dict[What, type[Any]] = {

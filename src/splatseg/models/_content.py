@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from splatseg.core import View
+from splatseg.core.models import Image
 from splatseg.errors import InputError
 from splatseg.io.images import load_image
-from splatseg.models._protocols import Image
 
 
 def image_digest(image: Image) -> str:

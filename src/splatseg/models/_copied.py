@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from splatseg.core import UNLABELLED, ClassTable, LabelMap, View
 from splatseg.errors import InputError
-from splatseg.io._atomic import atomic_file
+from splatseg.io.atomic import atomic_file
 from splatseg.io.evidence import (
     TEXT_FILE,
     Evidence,

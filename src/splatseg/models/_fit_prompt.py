@@ -3,7 +3,7 @@
 import torch
 
 from splatseg.core import MaskSet
-from splatseg.models._protocols import Prompt
+from splatseg.core.models import Prompt
 
 LEAST_FIT = 0.05
 """Masks that fit less are no answer."""

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_finite
-from splatseg.core import FeatureMap, LabelMap, MaskSet, Rle
+from splatseg.core import FeatureMap, LabelMap, MaskSet, Rle, Segment
+from splatseg.core.models import DeepFeatures, Embedding, Panoptic
 from splatseg.errors import FileFormatError
-from splatseg.io.evidence import Segment
-from splatseg.models._protocols import DeepFeatures, Embedding, Panoptic
 
 Precision = Literal["float16", "int8"]
 Answer = MaskSet | LabelMap | Panoptic | FeatureMap | DeepFeatures | Embedding

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatseg.core import View
+from splatseg.core.models import Model
 from splatseg.errors import InputError
-from splatseg.io._json import json_text, parse_object
 from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header
+from splatseg.io.json_files import json_text, parse_object
 from splatseg.models._cache import ModelCache
 from splatseg.models._computed import computed
 from splatseg.models._copied import copied
-from splatseg.models._protocols import Model
 from splatseg.models._sources import Source, What, some, views_done
 from splatseg.models.recorded import AnyRecorded
 

@@ -10,8 +10,8 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, cast
 
+from splatseg.core.models import Model
 from splatseg.errors import InputError, MissingPackageError
-from splatseg.models._protocols import Model
 
 ENTRY_POINT_GROUP = "splatseg.models"
 

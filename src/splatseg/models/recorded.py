@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet, View
+from splatseg.core.models import DeepFeatures, Embedding, Image, Panoptic, Prompt
 from splatseg.errors import FileFormatError, InputError, ShapeError
 from splatseg.io.evidence import (
     TEXT_FILE,
@@ -29,7 +30,6 @@ from splatseg.io.evidence import (
 )
 from splatseg.models._content import ViewsByContent
 from splatseg.models._fit_prompt import best_masks
-from splatseg.models._protocols import DeepFeatures, Embedding, Image, Panoptic, Prompt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

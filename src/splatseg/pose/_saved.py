@@ -20,10 +20,10 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import Capture
-from splatseg.io._json import read_json, write_json
 from splatseg.io.captures._build import RawView, build_capture
 from splatseg.io.captures._colmap_model import intrinsics_of, poses_of
 from splatseg.io.captures.colmap import read_colmap_model
+from splatseg.io.json_files import read_json, write_json
 from splatseg.pose._options import PoseOptions
 from splatseg.pose._report import PoseReport
 

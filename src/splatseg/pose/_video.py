@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatseg.errors import FileFormatError, MissingFileError, MissingPackageError
-from splatseg.io._atomic import atomic_folder
+from splatseg.io.atomic import atomic_folder
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 """Suffixes, in lower case, of the files that are taken for videos."""

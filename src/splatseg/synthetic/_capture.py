@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, PointCloud, View
 from splatseg.errors import InputError
-from splatseg.io._atomic import atomic_folder
+from splatseg.io.atomic import atomic_folder
 from splatseg.synthetic._labels import machine_labels
 from splatseg.synthetic._raycast import Truth, render_truth
 from splatseg.synthetic._scene import SyntheticScene

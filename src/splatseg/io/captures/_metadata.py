@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatseg.core import ClassTable
-from splatseg.io._class_rows import class_table
-from splatseg.io._json import read_json
+from splatseg.io.class_tables import class_table
+from splatseg.io.json_files import read_json
 
 _UP_AXES = {
     f"{sign}{axis}": (

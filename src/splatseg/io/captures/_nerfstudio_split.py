@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatseg.io._json import read_json
+from splatseg.io.json_files import read_json
 
 _LISTS = ("train", "val", "test")
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, Capture, PointCloud
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io._json import read_json
 from splatseg.io.captures._build import (
     Intrinsics,
     RawView,
@@ -20,6 +19,7 @@ from splatseg.io.captures._build import (
 from splatseg.io.captures._nerfstudio_split import frame_splits
 from splatseg.io.captures._points import ply_holds_splats, read_ply_points
 from splatseg.io.captures._points_beside import points_beside
+from splatseg.io.json_files import read_json
 
 FILE = "transforms.json"
 MILLIMETRE = 0.001

@@ -27,8 +27,6 @@ from splatseg.io.evidence._open import find_evidence as find_evidence
 from splatseg.io.evidence._open import open_evidence as open_evidence
 from splatseg.io.evidence._segments import SEGMENTS_FILE as SEGMENTS_FILE
 from splatseg.io.evidence._segments import PanopticEvidence as PanopticEvidence
-from splatseg.io.evidence._segments import Segment as Segment
-from splatseg.io.evidence._segments import Track as Track
 from splatseg.io.evidence._segments import TrackedEvidence as TrackedEvidence
 from splatseg.io.evidence._write import copy_evidence as copy_evidence
 from splatseg.io.evidence._write import create_evidence as create_evidence

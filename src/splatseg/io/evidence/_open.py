@@ -6,9 +6,8 @@ from typing import Any, Literal, cast
 
 from splatseg.core import ClassTable
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io._class_rows import class_table
-from splatseg.io._json import read_json
 from splatseg.io.captures import read_metadata
+from splatseg.io.class_tables import class_table
 from splatseg.io.evidence._base import HEADER_FILE, Evidence, EvidenceKind, view_files
 from splatseg.io.evidence._features import (
     BASIS_FILE,
@@ -25,6 +24,7 @@ from splatseg.io.evidence._segments import (
     open_panoptic,
     open_tracked,
 )
+from splatseg.io.json_files import read_json
 
 FORMAT = "splatseg-evidence"
 VERSION = 1

@@ -16,40 +16,17 @@ from splatseg.core import (
     FeatureMap,
     LabelMap,
     MaskSet,
+    Segment,
+    Track,
 )
 from splatseg.errors import FileFormatError
-from splatseg.io._json import read_json
 from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind, is_id, refuse
 from splatseg.io.evidence._labels import LabelEvidence, masks_of_ids
+from splatseg.io.json_files import read_json
 
 SEGMENTS_FILE = "segments.json"
 TRACKS_FILE = "tracks.json"
 _DIGITS = 5
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Segment:
-    """One segment of one view."""
-
-    id: int
-    category: int
-    isthing: bool
-    score: float
-    """How sure the model is of it, in [0, 1]."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
-    """One object followed through the views."""
-
-    id: int
-    votes: Mapping[str, int]
-    """Pixels under the track by the name of the class that a segmenter gave them."""
-
-    @property
-    def category(self) -> str | None:
-        """The class name with most votes; the first by name among equals."""
-        return min(self.votes, key=lambda name: (-self.votes[name], name)) if self.votes else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

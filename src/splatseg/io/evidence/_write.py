@@ -10,17 +10,17 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg._check import check_choice, check_finite, check_values
-from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Segment, Track
 from splatseg.errors import InputError, RangeError
-from splatseg.io._atomic import atomic_file, atomic_folder
-from splatseg.io._class_rows import class_rows
-from splatseg.io._json import json_text, write_json
+from splatseg.io.atomic import atomic_file, atomic_folder
+from splatseg.io.class_tables import class_rows
 from splatseg.io.evidence._base import CONFIDENCE_FOLDER, HEADER_FILE, EvidenceKind
 from splatseg.io.evidence._labels import CONFIDENCE_STEPS
 from splatseg.io.evidence._masks import masks_content
 from splatseg.io.evidence._open import FORMAT, VERSION
-from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE, Segment, Track
+from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE
 from splatseg.io.images import write_png
+from splatseg.io.json_files import json_text, write_json
 
 _WRITTEN = ("labels", "panoptic", "tracked", "masks", "features")
 _MAX_ID = 65535

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED
 from splatseg.errors import InputError
-from splatseg.io._atomic import atomic_folder
-from splatseg.io._json import write_json
+from splatseg.io.atomic import atomic_folder
 from splatseg.io.export._folders import check_replaceable
 from splatseg.io.export._tables import MADE_BY
 from splatseg.io.images import write_png
+from splatseg.io.json_files import write_json
 
 PANOPTIC_FILE = "panoptic.json"
 PANOPTIC_FOLDER = "panoptic"

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Gaussians, Labels, Selection
 from splatseg.errors import InputError
-from splatseg.io._atomic import atomic_file
-from splatseg.io._json import read_json, write_json
+from splatseg.io.atomic import atomic_file
 from splatseg.io.export._folders import check_parent, is_ours
 from splatseg.io.export._tables import MADE_BY
 from splatseg.io.export._warnings import retold
+from splatseg.io.json_files import read_json, write_json
 from splatseg.io.splats import WritableFormat, write_splats
 
 NONE = 0

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io._json import read_json
 from splatseg.io.export._tables import MADE_BY
+from splatseg.io.json_files import read_json
 
 
 def check_replaceable(path: Path, record: str) -> None:

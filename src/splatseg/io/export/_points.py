@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splatseg.core import Gaussians
 from splatseg.errors import InputError, MissingPackageError, RangeError
-from splatseg.io._atomic import atomic_file
+from splatseg.io.atomic import atomic_file
 
 FIRST_USER_CLASS = 64
 """LAS 1.4 gives the classifications 0 to 63 a meaning of their own (2 ground, 7 noise, which

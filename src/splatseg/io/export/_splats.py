@@ -12,13 +12,13 @@ from torch import Tensor
 from splatseg._check import check_choice
 from splatseg.core import UNLABELLED, Gaussians, Labels
 from splatseg.errors import InputError, ShapeError
-from splatseg.io._atomic import atomic_folder
-from splatseg.io._json import write_json
+from splatseg.io.atomic import atomic_folder
 from splatseg.io.export._columns import holds_columns
 from splatseg.io.export._folders import check_replaceable
 from splatseg.io.export._objects import ObjectRow
 from splatseg.io.export._tables import MADE_BY, object_content
 from splatseg.io.export._warnings import retold
+from splatseg.io.json_files import write_json
 from splatseg.io.splats import WritableFormat, write_splats
 
 OBJECTS_FILE = "objects.json"

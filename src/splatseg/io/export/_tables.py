@@ -8,9 +8,9 @@ from typing import Any
 from splatseg.core import UNLABELLED
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import InputError
-from splatseg.io._atomic import atomic_file
-from splatseg.io._json import write_json
+from splatseg.io.atomic import atomic_file
 from splatseg.io.export._objects import ObjectRow
+from splatseg.io.json_files import write_json
 
 MADE_BY = "splatseg export"
 _DIGITS = 6

@@ -12,7 +12,7 @@ from typing import Literal
 from splatseg._check import check_choice
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io._atomic import atomic_file
+from splatseg.io.atomic import atomic_file
 from splatseg.io.splats._common import Losses, StrPath, check_file
 from splatseg.io.splats._common import SplatWarning as SplatWarning
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from splatseg.core import MaskSet
-from splatseg.models._protocols import DeepFeatures, Embedding, Image, Prompt
+from splatseg.core.models import DeepFeatures, Embedding, Image, Prompt
 from splatseg.models.classical._descriptor import DescriptorOptions as DescriptorOptions
 from splatseg.models.classical._descriptor import (
     colour_gradient_features as colour_gradient_features,

@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import FeatureMap
+from splatseg.core.models import DeepFeatures, Image
 from splatseg.errors import InputError
-from splatseg.models._protocols import DeepFeatures, Image
 from splatseg.models.classical._boundary import one_thread
 
 _LIGHTNESS_WEIGHT = 0.5

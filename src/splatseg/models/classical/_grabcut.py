@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import MaskSet
+from splatseg.core.models import Prompt
 from splatseg.errors import InputError
-from splatseg.models._protocols import Prompt
 from splatseg.models.classical._boundary import one_thread
 
 _SEED = 20240817

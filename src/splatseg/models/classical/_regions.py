@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, LabelMap, MaskSet, Rle
+from splatseg.core.models import Image
 from splatseg.errors import InputError
 from splatseg.io.images import reduced_size
-from splatseg.models._protocols import Image
 from splatseg.models.classical._boundary import one_thread, pixel_features
 from splatseg.models.classical._merge_tree import MergeTree, merge_tree
 

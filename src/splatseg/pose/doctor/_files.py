@@ -11,11 +11,11 @@ import numpy as np
 
 from splatseg.core import Capture, PointCloud
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io._atomic import atomic_folder
-from splatseg.io._cameras import cameras_content
-from splatseg.io._json import read_json, write_json
+from splatseg.io.atomic import atomic_folder
+from splatseg.io.cameras import cameras_content
 from splatseg.io.captures import find_formats, read_capture
 from splatseg.io.images import image_size
+from splatseg.io.json_files import read_json, write_json
 from splatseg.pose.doctor._corrections import PointCorrection
 from splatseg.pose.doctor._diagnosis import Diagnosis, Fault
 from splatseg.pose.doctor._up import nearest_axis

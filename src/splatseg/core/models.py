@@ -1,0 +1,284 @@
+"""What a 2D model can be asked. An adapter has the methods of one or several of these protocols.
+
+An image is uint8 (H, W, 3), upright sRGB; what comes back is in the pixels of that image. A model
+is a value: it keeps nothing of one image that changes the answer to the next. `splatseg see` asks
+which protocols a model has by its methods, so an adapter inherits from nothing.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from splatseg._check import check_finite, check_shape
+from splatseg.core.evidence import FeatureMap, LabelMap, MaskSet, Segment
+from splatseg.core.scene import ClassTable
+from splatseg.errors import InputError, RangeError
+
+Image = UInt8[Tensor, "height width 3"]
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What every model says of itself."""
+
+    @property
+    def name(self) -> str:
+        """How it is asked for, such as ``classical``; recorded with what it gives."""
+        ...
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All that changes its answers besides the image, in values that JSON holds.
+
+        Weights belong here too, by a revision or a digest. Cached answers are found by it.
+        """
+        ...
+
+    @property
+    def note(self) -> str:
+        """What people who use it should know, such as that it is a stand-in; may be empty."""
+        ...
+
+
+@runtime_checkable
+class AutomaticMasks(Model, Protocol):
+    """Finds the things in an image by itself."""
+
+    def masks(self, image: Image) -> MaskSet:
+        """Masks of the image; they may overlap."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prompt:
+    """What a person points at in an image: points, a box, a rough mask, or several of them."""
+
+    points: Float[Tensor, "p 2"] = field(default_factory=lambda: torch.zeros(0, 2))
+    """x to the right and y down, in pixels; the centre of the top-left pixel is (0.5, 0.5)."""
+
+    positive: Bool[Tensor, "p"] | None = None
+    """Whether each point is on the thing (True) or not; None means that all are."""
+
+    box: Float[Tensor, "4"] | None = None
+    """x0, y0, x1, y1 in pixels: the thing lies inside."""
+
+    mask: Bool[Tensor, "height width"] | None = None
+    """A rough mask of the thing, of the image's size."""
+
+    def __post_init__(self) -> None:
+        check_shape("points", self.points, (None, 2))
+        check_finite("points", self.points)
+        count = len(self.points)
+        if self.positive is None:
+            object.__setattr__(self, "positive", torch.ones(count, dtype=torch.bool))
+        else:
+            check_shape("positive", self.positive, (count,))
+            object.__setattr__(self, "positive", self.positive.to(torch.bool))
+        if self.box is not None:
+            check_shape("box", self.box, (4,))
+            check_finite("box", self.box)
+            x0, y0, x1, y1 = self.box.tolist()
+            if not (x0 < x1 and y0 < y1):
+                raise RangeError(
+                    f"box: expected x0 < x1 and y0 < y1, got ({x0:g}, {y0:g}, {x1:g}, {y1:g})."
+                )
+        if self.box is None and self.mask is None and not bool(self.signs.any()):
+            raise InputError("prompt: expected a positive point, a box or a mask, got none.")
+
+    @property
+    def signs(self) -> Bool[Tensor, "p"]:
+        """`positive`, never None."""
+        return (
+            torch.ones(len(self.points), dtype=torch.bool)
+            if self.positive is None
+            else (self.positive)
+        )
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raise `InputError` unless the prompt lies in an image of this size.
+
+        Raises:
+            RangeError: If a point lies outside, or the box does not meet the image.
+            ShapeError: If the mask has another size.
+        """
+        limits = torch.tensor([width, height])
+        outside = ((self.points < 0) | (self.points > limits)).any(1)
+        if bool(outside.any()):
+            x, y = self.points[outside][0].tolist()
+            raise RangeError(
+                f"points: expected pixels of an image of {width}x{height}, got ({x:g}, {y:g})."
+            )
+        if self.box is not None:
+            x0, y0, x1, y1 = self.box.tolist()
+            if x0 >= width or y0 >= height or x1 <= 0 or y1 <= 0:
+                raise RangeError(
+                    f"box: expected one that meets the image of {width}x{height}, "
+                    f"got ({x0:g}, {y0:g}, {x1:g}, {y1:g})."
+                )
+        if self.mask is not None:
+            check_shape("mask", self.mask, (height, width))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Embedding:
+    """What a promptable model keeps of an image. A value: it can be cached and sent elsewhere."""
+
+    model: str
+    """Name of the model that made it; no other can use it."""
+
+    height: int
+    """Rows of the image."""
+
+    width: int
+    """Columns of the image."""
+
+    arrays: Mapping[str, Tensor]
+    """What the model needs to answer prompts."""
+
+    view: str | None = None
+    """Name of the view, for models that go by it."""
+
+    def check_model(self, name: str) -> None:
+        """Raise `InputError` unless the model of this name made it."""
+        if self.model != name:
+            raise InputError(f"embedding: expected one of model {name!r}, got {self.model!r}.")
+
+
+@runtime_checkable
+class PromptableMasks(Model, Protocol):
+    """Answers a prompt with masks: the image is looked at once, prompts are cheap."""
+
+    def embed(self, image: Image) -> Embedding:
+        """Look at an image."""
+        ...
+
+    def prompted_masks(self, embedding: Embedding, prompt: Prompt) -> MaskSet:
+        """Masks of what the prompt means, the best first; none where nothing fits."""
+        ...
+
+
+@runtime_checkable
+class SemanticLabels(Model, Protocol):
+    """Names the class of every pixel, out of a closed set."""
+
+    @property
+    def classes(self) -> ClassTable | None:
+        """Names of the ids."""
+        ...
+
+    def label_map(self, image: Image) -> LabelMap:
+        """The class of every pixel, -1 where there is none."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Panoptic:
+    """The segments of one image; ids mean something in this image only."""
+
+    ids: LabelMap
+    segments: tuple[Segment, ...]
+    """One for each id: its class, whether it is a thing, how sure it is."""
+
+
+@runtime_checkable
+class PanopticSegments(Model, Protocol):
+    """Divides an image into segments, each with a class out of a closed set."""
+
+    @property
+    def categories(self) -> ClassTable | None:
+        """Names of the segments' classes."""
+        ...
+
+    def panoptic(self, image: Image) -> Panoptic:
+        """The segments of an image."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DeepFeatures:
+    """Features of one image at several depths of a network."""
+
+    maps: tuple[FeatureMap, ...]
+    """From the shallowest to the deepest; at least one."""
+
+    depths: tuple[str, ...]
+    """Names of the depths, such as ``block9``."""
+
+    class_token: Float[Tensor, "width"] | None = None
+    """One vector of the whole image, where the network has one."""
+
+    def __post_init__(self) -> None:
+        if not self.maps or len(self.maps) != len(self.depths):
+            raise InputError(
+                f"depths: expected one name a map, at least one, got {len(self.depths)} names of "
+                f"{len(self.maps)} maps."
+            )
+
+
+@runtime_checkable
+class DenseFeatures(Model, Protocol):
+    """Describes every place of an image by a vector; like places have like vectors."""
+
+    def features(self, image: Image) -> DeepFeatures:
+        """Features of an image."""
+        ...
+
+
+@runtime_checkable
+class TextFeatures(Model, Protocol):
+    """Describes places of images and words in one space; compare by cosine."""
+
+    def text_features(self, image: Image) -> FeatureMap:
+        """Unit vectors of the places of an image."""
+        ...
+
+    def encode_text(self, words: Sequence[str]) -> Float[Tensor, "n width"]:
+        """Unit vectors of words or phrases."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Boxes:
+    """Boxes found for words."""
+
+    boxes: Float[Tensor, "n 4"]
+    """x0, y0, x1, y1 in pixels, the surest first."""
+
+    scores: Float[Tensor, "n"]
+    """How sure each is, in [0, 1]."""
+
+    words: tuple[int, ...]
+    """Which of the words asked for each box is, by place."""
+
+    def __post_init__(self) -> None:
+        check_shape("boxes", self.boxes, (len(self.words), 4))
+        check_shape("scores", self.scores, (len(self.words),))
+
+
+@runtime_checkable
+class GroundedBoxes(Model, Protocol):
+    """Finds what words mean."""
+
+    def boxes(self, image: Image, words: Sequence[str]) -> Boxes:
+        """Boxes of what the words mean, none where they mean nothing here."""
+        ...
+
+
+@runtime_checkable
+class MaskTracker(Model, Protocol):
+    """Follows objects through views that come in the order of a path."""
+
+    def track(
+        self, frames: Iterable[tuple[str, Image]], seeds: Mapping[str, LabelMap]
+    ) -> Iterator[tuple[str, LabelMap]]:
+        """Follow what the seeds mark; one label map a frame, as frames are taken in.
+
+        Args:
+            frames: Names and images of views, in order. They are taken one at a time.
+            seeds: Label maps by name of the view that they mark. Ids are those of the result.
+        """
+        ...

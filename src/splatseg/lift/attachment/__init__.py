@@ -1,0 +1,1 @@
+"""Labels put back on splats that an editor changed."""

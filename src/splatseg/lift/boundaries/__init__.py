@@ -1,0 +1,1 @@
+"""Gaussians at the boundaries of labels: split, cut and refitted."""

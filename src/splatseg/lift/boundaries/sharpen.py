@@ -1,0 +1,314 @@
+r"""Gaussians that take sides: labels sharpen the geometry.
+
+A fit on photographs alone does not care whether a Gaussian reaches from one thing over another
+of the same colour, or whether a thing lets a little of what is behind it through. Labels do. So
+Gaussians go on learning from the photographs and, beside them, from the label maps: of the light
+of a pixel as much as possible shall come from Gaussians of the pixel's id,
+
+.. math:: L = L_{\mathrm{photo}} + \lambda \, \frac{1}{|P|} \sum_{p \in P}
+          \Bigl(1 - \sum_{i:\, l_i = y(p)} w_{pi}\Bigr)
+
+over the pixels P that have an id y. COB-GS (Zhang et al. 2025) learns a mask value of each
+Gaussian by this loss for one mask, splits those that both sides pull at, and fits colours again.
+Here the labels are decided in closed form (`uplift`), all of them at once, and the loss is one
+of positions, shapes and opacities: what two sides pull at moves, shrinks or becomes opaque.
+
+With more than a few ids the sum is not drawn for each of them. Every step gives each id a random
+code c of +1 and -1 in K channels and draws the codes of the Gaussians' labels; as
+:math:`E[c_a \cdot c_b] = K [a = b]`,
+
+.. math:: \sum_{i:\, l_i = y} w_{pi} =
+          E\Bigl[\tfrac{1}{K}\, c_{y} \cdot \sum_i w_{pi} c_{l_i}\Bigr],
+
+so that K channels have the right gradient on average, whatever the number of ids.
+
+Pixels whose id the layer does not show anywhere near say nothing: a model that errs alike in many
+views would bend the geometry to its errors.
+
+References:
+    Zhang et al., COB-GS: Clear Object Boundaries in 3DGS Segmentation Based on Boundary-Adaptive
+    Gaussian Splitting, CVPR 2025.
+"""
+
+import math
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int32, Int64
+from torch import Tensor
+
+from splatseg._check import check_range
+from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, LabelSource, View, camera_of_map
+from splatseg.errors import InputError, RangeError
+from splatseg.fit import FitOptions, Refinement
+from splatseg.lift.label_maps import label_map
+from splatseg.lift.mass.adjoint import voting_views
+from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
+from splatseg.lift.mass.uplift import UpliftOptions, uplift
+from splatseg.render import render
+
+_CANDIDATES = 8
+"""Ids of a Gaussian that are reconsidered."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharpenOptions:
+    """How labels sharpen the geometry."""
+
+    sharpen_steps: int = 400
+    """Steps, each from one photograph and its label map; 0 leaves the Gaussians as they are."""
+
+    label_weight: float = 0.1
+    """Lambda: weight of the label maps beside the photographs. 1 is cleanest, and costs most of
+    the picture."""
+
+    decide_every: int = 200
+    """Steps after which labels are decided anew."""
+
+    trust_pixels: int = 2
+    """Pixels of the label maps count if the layer, as it was, shows their id at most so many
+    pixels away along each axis: they move a boundary, and what contradicts all other views says
+    nothing. -1 lets all count."""
+
+    codes: int = 4
+    """K: channels of the random codes. More is less noise for more time."""
+
+    rates_from: float = 0.6
+    """Progress, in [0, 1], of a fit whose learning rates the first step has; the last has those
+    of a fit's end."""
+
+    def __post_init__(self) -> None:
+        if self.sharpen_steps < 0:
+            raise RangeError(f"sharpen_steps: expected 0 or more, got {self.sharpen_steps}.")
+        if not (math.isfinite(self.label_weight) and self.label_weight >= 0):
+            raise RangeError(f"label_weight: expected 0 or more, got {self.label_weight}.")
+        if self.decide_every < 1:
+            raise RangeError(f"decide_every: expected at least 1, got {self.decide_every}.")
+        if self.trust_pixels < -1:
+            raise RangeError(f"trust_pixels: expected -1 or more, got {self.trust_pixels}.")
+        if not 1 <= self.codes <= 64:
+            raise RangeError(f"codes: expected 1 to 64, got {self.codes}.")
+        check_range("rates_from", self.rates_from, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sharpened:
+    """Gaussians that took sides, row by row those of before."""
+
+    gaussians: Gaussians
+
+    labels: Labels
+    """Their labels, soft, decided from the same label maps."""
+
+    agreement: tuple[float, float]
+    """Before and after: share of the light of labelled pixels, in [0, 1], that comes from
+    Gaussians of the pixel's id."""
+
+
+def sharpen(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: LabelSource,
+    *,
+    options: SharpenOptions | None = None,
+    uplift_options: UpliftOptions | None = None,
+    confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
+    fit_options: FitOptions | None = None,
+    seed: int = 0,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> Sharpened:
+    """Fit Gaussians to photographs and label maps together, so that each is of one thing.
+
+    Their number and order stay: layers stay in step. The result depends on the seed and not on
+    the order of the views or the number of threads.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Views with photographs and label maps. Only these are looked at.
+        evidence: Their label maps, with ids that mean the same in all views (`MatchedMaps` for
+            segments); pixels at -1 say nothing.
+        options: How long, and how much labels count.
+        uplift_options: How Gaussians get labels; candidates are at least 8 where labels are
+            reconsidered.
+        confusion: How the evidence errs, see `reconsider`; None takes the majority.
+        fit_options: Rates, loss, background and masks of the fit; its seed is not used.
+        seed: Order of views and codes.
+        backend: Who renders.
+        progress: Called with the steps done and all there are.
+
+    Raises:
+        InputError: If there are no views, one has no photograph or no label map, or no pixel has
+            a label.
+        ShapeError: If a label map does not have its photograph's proportions.
+    """
+    options = options or SharpenOptions()
+    ordered = voting_views(views, evidence, "a label map")
+    for view in ordered:
+        if view.image is None:
+            raise InputError(f"views: expected a photograph of each, {view.name} has none.")
+    papers = _Papers(evidence)
+    wanted = uplift_options or UpliftOptions()
+    many = max(wanted.candidates, 2 if confusion is None else _CANDIDATES)
+    wanted = replace(wanted, candidates=many, slots=max(wanted.slots, many))
+
+    def decided(now: Gaussians) -> tuple[Labels, float]:
+        votes = uplift(now, ordered, papers, options=wanted, backend=backend)
+        labels = votes if confusion is None else reconsider(votes, options=confusion)
+        return labels, _agreement(votes, labels)
+
+    labels, before = decided(gaussians)
+    after = before
+    trusted = papers
+    if options.trust_pixels >= 0:
+        drawn = replace(labels, candidates=None, shares=None)
+        by_name = {view.name: view for view in ordered}
+        trusted = _Papers(
+            _Trusted(papers, gaussians, by_name, drawn, options.trust_pixels, backend)
+        )
+    base = fit_options or FitOptions()
+    run = Refinement(
+        gaussians,
+        ordered,
+        steps=options.sharpen_steps,
+        start=options.rates_from,
+        options=replace(base, seed=seed),
+        backend=backend,
+    )
+    for done in range(options.sharpen_steps):
+        term = _LabelTerm(trusted, labels.ids.cpu(), options, run.generator, backend)
+        run.step(term)
+        last = done + 1 == options.sharpen_steps
+        if last or (done + 1) % options.decide_every == 0:
+            gaussians = run.gaussians()
+            labels, after = decided(gaussians)
+        if progress is not None:
+            progress(done + 1, options.sharpen_steps)
+    metadata = dict(labels.metadata) | {
+        "sharpened": {"options": asdict(options), "seed": seed, "agreement": [before, after]}
+    }
+    return Sharpened(
+        gaussians=gaussians,
+        labels=replace(labels, metadata=metadata),
+        agreement=(before, after),
+    )
+
+
+def _agreement(votes: Labels, labels: Labels) -> float:
+    """Share of all votes that went to the label their Gaussian has."""
+    if votes.candidates is None or votes.shares is None or votes.evidence is None:
+        return math.nan
+    own = (votes.shares * (votes.candidates == labels.ids[:, None])).sum(1).double()
+    own = torch.where(labels.ids == UNLABELLED, 0.0, own)
+    mass = votes.evidence.double()
+    return float((own * mass).sum() / mass.sum().clamp_min(1e-12))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Papers:
+    """Label maps, compressed once they were made: some take a drawing each time."""
+
+    source: LabelSource
+    kept: dict[str, tuple[tuple[int, ...], bytes, bytes | None]] = field(default_factory=dict)
+    ids: set[int] = field(default_factory=set[int])
+    """All ids of the maps that are kept."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return self.source.view_names
+
+    def label_map(self, name: str) -> LabelMap:
+        if name not in self.kept:
+            paper = self.source.label_map(name)
+            self.ids.update(torch.unique(paper.ids).tolist())
+            shape = (paper.height, paper.width)
+            sure = None if paper.confidence is None else _packed(paper.confidence.float())
+            self.kept[name] = (shape, _packed(paper.ids), sure)
+        shape, ids, sure = self.kept[name]
+        confidence = None if sure is None else _unpacked(sure, np.float32, shape)
+        return LabelMap(ids=_unpacked(ids, np.int32, shape), confidence=confidence)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trusted:
+    """Label maps without the pixels that contradict what a layer shows around them."""
+
+    papers: _Papers
+    gaussians: Gaussians
+    views: Mapping[str, View]
+    labels: Labels
+    pixels: int
+    backend: str
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return self.papers.view_names
+
+    def label_map(self, name: str) -> LabelMap:
+        paper = self.papers.label_map(name)
+        camera = camera_of_map(self.views[name], paper.height, paper.width)
+        drawn = label_map(self.gaussians, camera, self.labels, backend=self.backend).ids
+        near = shown_near(paper.ids, drawn, self.pixels)
+        return LabelMap(ids=torch.where(near, paper.ids, UNLABELLED), confidence=paper.confidence)
+
+
+def shown_near(
+    ids: Int32[Tensor, "height width"], drawn: Int32[Tensor, "height width"], pixels: int
+) -> Bool[Tensor, "height width"]:
+    """Where `drawn` has the pixel's own id at most so many pixels away along each axis."""
+    height, width = ids.shape
+    # No pixel has the id -2.
+    around = torch.nn.functional.pad(drawn, (pixels,) * 4, value=-2)
+    found = torch.zeros(ids.shape, dtype=torch.bool)
+    for down in range(2 * pixels + 1):
+        for across in range(2 * pixels + 1):
+            found |= around[down : down + height, across : across + width] == ids
+    return found
+
+
+def _packed(values: Tensor) -> bytes:
+    return zlib.compress(values.cpu().contiguous().numpy().tobytes(), 1)
+
+
+def _unpacked(packed: bytes, kind: type[np.generic], shape: tuple[int, ...]) -> Tensor:
+    return torch.from_numpy(np.frombuffer(zlib.decompress(packed), kind).reshape(shape).copy())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LabelTerm:
+    """The second term of the loss, for one step."""
+
+    papers: _Papers
+    labels: Int32[Tensor, "n"]
+    options: SharpenOptions
+    generator: torch.Generator
+    backend: str
+
+    def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
+        paper = self.papers.label_map(view.name)
+        own = self.labels[rows.cpu()]
+        known = self.papers.ids | {UNLABELLED, *torch.unique(own).tolist()}
+        names = torch.tensor(sorted(known), dtype=torch.int32)
+        codes = 2.0 * torch.randint(
+            0, 2, (len(names), self.options.codes), generator=self.generator
+        )
+        codes -= 1
+        # What has no label agrees with nothing.
+        codes[names == UNLABELLED] = 0
+        signal = codes[torch.searchsorted(names, own)].to(gaussians.means)
+        drawn = render(
+            gaussians,
+            camera_of_map(view, paper.height, paper.width),
+            signal,
+            backend=self.backend,
+        ).image
+        say = (paper.ids != UNLABELLED).float()
+        if paper.confidence is not None:
+            say = say * paper.confidence
+        wanted = codes[torch.searchsorted(names, paper.ids)] * say.unsqueeze(-1)
+        same = (drawn * wanted.to(drawn)).sum() / self.options.codes
+        worth = float(say.sum())
+        return self.options.label_weight * (1 - same / max(worth, 1.0))

@@ -1,0 +1,1 @@
+"""Labels of Gaussians that no view explains, by their neighbours."""

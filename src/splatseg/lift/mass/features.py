@@ -1,0 +1,271 @@
+r"""Uplift of features: each Gaussian takes the mean of what its pixels show.
+
+.. math:: f_i = \frac{\sum_{views} \sum_p w_{pi} F_p}{\sum_{views} \sum_p w_{pi}}
+
+with :math:`F_p` the feature grid of the view, read at the centre of pixel p: the closed-form
+solution to which gradient descent on rendered features is an approximation.
+
+References:
+    Marrie et al., LUDVIG: Learning-free Uplifting of 2D Visual features to Gaussian Splatting
+    scenes (2024), eq. 4.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg._check import check_choice
+from splatseg.core import (
+    Camera,
+    FeatureMap,
+    Features,
+    FeatureSource,
+    Gaussians,
+    View,
+    camera_of_map,
+)
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift.mass.adjoint import Engine, voting_views
+from splatseg.render import RenderOptions, options_for
+
+FeatureNorm = Literal["none", "unit", "standard"]
+Resampling = Literal["bilinear", "nearest"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureUpliftOptions:
+    """How feature maps become features of Gaussians."""
+
+    feature_norm: FeatureNorm = "none"
+    """What is done to the features of each view before they are summed. unit: every cell's
+    vector gets length 1 (0 stays 0). standard: every channel gets mean 0 and deviation 1 over
+    the view, against drift from view to view; a constant channel becomes 0."""
+
+    resampling: Resampling = "bilinear"
+    """How a pixel reads the grid of cells: the four cell centres around it, or its own cell."""
+
+    min_feature_weight: float = 0.0
+    """Blending weight, summed over pixels and views, that a Gaussian must exceed to get a
+    feature; the others get zeros. One fully visible pixel counts 1."""
+
+    feature_side: int | None = None
+    """Longest side, in pixels, of the views through which the features are seen; smaller is
+    faster and a little blurred. None keeps the size of the evidence."""
+
+    feature_channels: int = 64
+    """Channels carried at a time, which bounds the memory of upsampled images."""
+
+    def __post_init__(self) -> None:
+        check_choice("feature_norm", self.feature_norm, ("none", "unit", "standard"))
+        check_choice("resampling", self.resampling, ("bilinear", "nearest"))
+        if not 0 <= self.min_feature_weight < float("inf"):
+            raise RangeError(
+                f"min_feature_weight: expected 0 or more, got {self.min_feature_weight}."
+            )
+        if self.feature_side is not None and self.feature_side < 1:
+            raise RangeError(f"feature_side: expected at least 1, got {self.feature_side}.")
+        if not 1 <= self.feature_channels <= 1024:
+            raise RangeError(f"feature_channels: expected 1 to 1024, got {self.feature_channels}.")
+
+
+def uplift_features(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: FeatureSource,
+    *,
+    options: FeatureUpliftOptions | None = None,
+    render_options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> Features:
+    """Give Gaussians the mean of the features that their pixels have.
+
+    Each view's features are read once. Sums are float32, over the views in the order of their
+    names, so the order they are given in does not matter.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Those whose features are used.
+        evidence: Their feature maps: grids that cover the photograph, or the photograph reduced
+            in proportion. A last row or column of cells may reach over the edge, or be missing.
+        options: How features are normalised and read.
+        render_options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and all there are.
+
+    Returns:
+        Values (n, channels) float32, zeros where nothing was seen, and the weights (n,) they
+        rest on.
+
+    Raises:
+        InputError: If there are no views, one has no features, or a feature is not finite.
+        ShapeError: If a grid does not fit its photograph, or widths differ between views.
+    """
+    options = options or FeatureUpliftOptions()
+    ordered = voting_views(views, evidence, "features")
+    engine = Engine(
+        gaussians=gaussians,
+        options=render_options or options_for(gaussians, backend),
+        backend=backend,
+    )
+    weights = torch.zeros(len(gaussians))
+    values: Tensor | None = None
+    for done, view in enumerate(ordered):
+        grid = _checked(view, evidence.features(view.name))
+        if values is None:
+            values = torch.zeros(len(gaussians), grid.channels)
+        if grid.channels != values.shape[1]:
+            raise ShapeError(
+                f"evidence: expected {values.shape[1]} channels of view {view.name}, as of view "
+                f"{ordered[0].name}, got {grid.channels}."
+            )
+        weights += _collect(engine, view, grid, options, values)
+        if progress is not None:
+            progress(done + 1, len(ordered))
+    if values is None:
+        raise InputError("views: expected at least one view with features, got none.")
+    seen = weights > options.min_feature_weight
+    values /= torch.where(seen, weights, 1.0).unsqueeze(1)
+    values[~seen] = 0
+    return Features(
+        values=values,
+        weights=weights,
+        metadata={
+            "method": "uplift_features",
+            "options": asdict(options),
+            "views": [view.name for view in ordered],
+        },
+    )
+
+
+def _collect(
+    engine: Engine, view: View, grid: FeatureMap, options: FeatureUpliftOptions, values: Tensor
+) -> Tensor:
+    """Add a view's weighted features to `values`, some channels at a time; gives its weights."""
+    covered, camera = _camera_of_grid(view, grid)
+    if options.feature_side is not None:
+        longest = max(camera.width, camera.height)
+        if longest > options.feature_side:
+            scale = options.feature_side / longest
+            camera = camera.resized(
+                max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+            )
+    features = _normalised(grid.features.float().cpu(), options.feature_norm)
+    weights = torch.zeros(len(values))
+    for start in range(0, grid.channels, options.feature_channels):
+        part = slice(start, start + options.feature_channels)
+        image = read_grid(
+            features[..., part],
+            cells=(covered[0] / grid.stride, covered[1] / grid.stride),
+            size=(camera.height, camera.width),
+            resampling=options.resampling,
+        )
+        sums, weights = engine.collect(camera, image)
+        values[:, part] += sums
+    return weights
+
+
+def read_grid(
+    features: Float[Tensor, "rows columns c"],
+    *,
+    cells: tuple[float, float],
+    size: tuple[int, int],
+    resampling: Resampling,
+) -> Float[Tensor, "height width c"]:
+    r"""An image of a grid of cells, read at the centres of pixels.
+
+    With V cells over H rows of pixels, row y of the image lies at the grid's row
+
+    .. math:: v = (y + \tfrac12) \frac{V}{H} - \tfrac12
+
+    in units in which cell centres are whole numbers. Beyond the outermost centres the image
+    keeps their values.
+
+    Args:
+        features: One feature a cell.
+        cells: How many cells high and wide the image is; need not be whole, nor the grid's.
+        size: Rows and columns of the image.
+        resampling: ``bilinear`` between centres, or the ``nearest`` centre.
+    """
+    rows, columns = features.shape[:2]
+    tall = _taps(rows, cells[0], size[0], resampling)
+    wide = _taps(columns, cells[1], size[1], resampling)
+    # First along the columns of the small grid, then down: the large image is written once.
+    across = _blend(features, wide, dim=1)
+    return _blend(across, tall, dim=0)
+
+
+_Taps = tuple[Tensor, Tensor, Tensor]
+
+
+def _taps(count: int, cells: float, pixels: int, resampling: Resampling) -> _Taps:
+    """The two cells each pixel reads along an axis, and the second one's weight."""
+    at = (torch.arange(pixels, dtype=torch.float64) + 0.5) * (cells / pixels) - 0.5
+    at = at.clamp(0, count - 1)
+    if resampling == "nearest":
+        # A pixel on the border of two cells belongs to the later one, as pixels begin cells.
+        nearest = (at + 0.5).floor().long().clamp_max(count - 1)
+        return nearest, nearest, torch.zeros(pixels)
+    first = at.floor().long()
+    return first, (first + 1).clamp_max(count - 1), (at - first).float()
+
+
+def _blend(image: Tensor, taps: _Taps, *, dim: int) -> Tensor:
+    first, second, share = taps
+    if not bool(share.any()):
+        return image.index_select(dim, first)
+    shape = [1, 1, 1]
+    shape[dim] = -1
+    return torch.lerp(
+        image.index_select(dim, first), image.index_select(dim, second), share.view(shape)
+    )
+
+
+def _camera_of_grid(view: View, grid: FeatureMap) -> tuple[tuple[int, int], Camera]:
+    """Rows and columns of pixels that the grid counts its cells in, and their camera."""
+    rows, columns = view.camera.height, view.camera.width
+    # Whole cells over a photograph that they do not divide: a part of a cell more or less.
+    near = abs(grid.height - rows) < grid.stride and abs(grid.width - columns) < grid.stride
+    if near:
+        return (rows, columns), view.camera
+    return (grid.height, grid.width), camera_of_map(view, grid.height, grid.width)
+
+
+def _checked(view: View, grid: FeatureMap) -> FeatureMap:
+    bad = ~torch.isfinite(grid.features)
+    if bool(bad.any()):
+        raise InputError(
+            f"evidence: expected finite features of view {view.name}, "
+            f"{int(bad.sum())} of {bad.numel()} values are NaN or infinite."
+        )
+    if grid.features.numel() == 0:
+        raise ShapeError(
+            f"evidence: expected at least one cell and channel of view {view.name}, "
+            f"got shape {tuple(grid.features.shape)}."
+        )
+    rows, columns = grid.features.shape[:2]
+    for name, cells, pixels in (("rows", rows, grid.height), ("columns", columns, grid.width)):
+        if abs(cells * grid.stride - pixels) >= grid.stride:
+            raise ShapeError(
+                f"evidence: expected {name} of cells of {grid.stride} pixels that cover "
+                f"{pixels} pixels of view {view.name}, got {cells}."
+            )
+    return grid
+
+
+def _normalised(features: Tensor, norm: FeatureNorm) -> Tensor:
+    if norm == "unit":
+        return torch.nn.functional.normalize(features, dim=-1)
+    if norm == "standard":
+        cells = features.flatten(0, 1)
+        deviation = cells.std(dim=0, correction=0)
+        # What rounding leaves of a constant channel is no deviation.
+        least = 1e-6 * cells.abs().amax(dim=0)
+        flat = deviation <= least
+        scale = torch.where(flat, 0.0, 1 / torch.where(flat, 1.0, deviation))
+        return (features - cells.mean(dim=0)) * scale
+    return features

@@ -1,0 +1,1 @@
+"""Segments of views, and which of them are of one thing."""

@@ -1,0 +1,95 @@
+"""The two terms that identities are trained with, see `methods.identity`."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+_TINY = 1e-10
+"""Added to probabilities before their logarithm, as published."""
+
+
+def pixel_loss(
+    drawn: Float[Tensor, "pixels channels"],
+    weight: Float[Tensor, "classes channels"],
+    bias: Float[Tensor, "classes"],
+    classes: Int64[Tensor, "pixels"],
+    says: Float[Tensor, "pixels"],
+) -> Float[Tensor, ""]:
+    r"""Mean cross-entropy of the logits of rendered features, over the log of the classes.
+
+    .. math:: \frac{1}{P \log C} \sum_p s_p \, \mathrm{CE}(A F_p + b, c_p)
+
+    With a single class there is nothing to learn, and the loss is 0.
+
+    Args:
+        drawn: Rendered identity features F.
+        weight: A.
+        bias: b.
+        classes: Place of each pixel's id.
+        says: Confidence of each pixel's label.
+    """
+    logits = drawn @ weight.T + bias
+    each = torch.nn.functional.cross_entropy(logits, classes, reduction="none")
+    return (each * says).mean() / math.log(max(len(bias), 2))
+
+
+class NeighbourLoss:
+    r"""How far Gaussians' ids are from those of their neighbours in space.
+
+    .. math:: \frac{1}{C} \, \mathrm{mean}_{i, j \in N_k(i)}
+              \sum_c q_{ic} (\log q_{ic} - \log q_{jc})
+
+    Args:
+        means: Centres of all Gaussians.
+        neighbours: k, a Gaussian itself counted.
+        points: Gaussians that take part at most; more are drawn from once and for all.
+        rng: Draws them.
+    """
+
+    def __init__(
+        self,
+        means: Float[Tensor, "n 3"],
+        *,
+        neighbours: int,
+        points: int,
+        rng: np.random.Generator,
+    ) -> None:
+        from scipy.spatial import KDTree
+
+        kept = np.arange(len(means))
+        if len(means) > points:
+            kept = np.sort(rng.choice(len(means), points, replace=False))
+        self._kept = kept
+        self._places = means.double().numpy()[kept]
+        self._tree = KDTree(self._places)
+        self._neighbours = min(neighbours, len(kept))
+
+    def draw(self, samples: int, rng: np.random.Generator) -> Int64[Tensor, "samples k"]:
+        """Some Gaussians' neighbours, nearest first: each itself, unless others share its place.
+
+        Fewer than asked for are drawn where there are fewer.
+        """
+        count = min(samples, len(self._kept))
+        drawn = rng.choice(len(self._kept), count, replace=False)
+        near = np.asarray(self._tree.query(self._places[drawn], k=self._neighbours)[1])
+        near = near.reshape(count, self._neighbours)
+        # Where many share a place a Gaussian may not be its own nearest.
+        near[:, 0] = drawn
+        return torch.from_numpy(self._kept[near])
+
+    def loss(
+        self,
+        features: Float[Tensor, "m channels"],
+        pairs: Int64[Tensor, "samples k"],
+        weight: Float[Tensor, "classes channels"],
+        bias: Float[Tensor, "classes"],
+    ) -> Float[Tensor, ""]:
+        """The term, for rows `pairs` of `features`: each row's first against all of it."""
+        chances = torch.softmax(features @ weight.T + bias, dim=-1)
+        logs = torch.log(chances + _TINY)
+        own = pairs[:, :1]
+        apart = (chances[own] * (logs[own] - logs[pairs])).sum(dim=-1)
+        return apart.mean() / len(bias)

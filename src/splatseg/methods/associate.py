@@ -1,0 +1,264 @@
+r"""Association: segments of unordered views, each with ids of its own, become instances in 3D.
+
+Every segment is a set of Gaussians, those it has most mass on. Segments that agree about the
+Gaussians that both their views see are joined (`splatseg.lift.segments.clustering`): there is no
+tracker, no order of views and no limit on their number or that of ids. Then the views vote:
+
+.. math:: v_{ik} = \sum_{s \in k} q_k \sum_{p \in s} w_{pi}, \qquad
+          q_k = \Bigl(\tfrac{1}{|k|} \sum_{s \in k} m_s\Bigr)^{-\gamma}
+
+with the mass :math:`m_s` of a segment over all Gaussians. The exponent :math:`\gamma` speaks for
+small things where it is above 0. At 0 all pixels vote alike, and small things come to their right
+by `lift.mass.confusion`: a model that misses a cup calls its pixels table, far more often than one
+that sees a cup where there is only table, and the votes themselves tell how often.
+
+Where masks overlap (levels of granularity), groups of masks are taken one after another, those
+that most of the views that could have seen them did see first; a group that mostly covers what
+is taken already is left out.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg._check import check_range
+from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, SegmentSource, View
+from splatseg.errors import RangeError
+from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
+from splatseg.lift.segments.clustering import cluster
+from splatseg.lift.segments.flatten import chosen_groups
+from splatseg.lift.segments.table import SegmentTable, segment_table
+from splatseg.render import RenderOptions
+
+_CANDIDATES = 8
+"""Instances of a Gaussian that are reconsidered."""
+
+_SURE_SEGMENTS = 3
+"""Groups of fewer segments are too few to speak for a small thing: they may be accidents."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AssociateOptions:
+    """How segments of views become instances."""
+
+    agreement: float = 0.2
+    """Least overlap, in (0, 1], at which two groups of segments are one instance: intersection
+    over union on the Gaussians that the views of both see, averaged over all pairs of segments
+    of the two groups. Lower joins more."""
+
+    small_things: float = 0.0
+    """Exponent with which small instances outweigh large ones where views contradict each other;
+    0 treats all alike. 0.25 does most of what reconsidering does, without it."""
+
+    least_views: int = 2
+    """An instance needs segments in so many views, or in all there are if they are fewer."""
+
+    overlap: float = 0.7
+    """Of overlapping masks: a group is left out if more than this share of it, in [0, 1], is
+    covered by groups that were taken before."""
+
+    most_views: int = 50
+    """Views of each Gaussian that are compared, those that see most of it; bounds memory and
+    time."""
+
+    longest_side: int = 640
+    """Segments of larger photographs are read at this many pixels along their longest side;
+    bounds time. What is thinner than a pixel there may be missed."""
+
+    def __post_init__(self) -> None:
+        check_range("agreement", self.agreement, 0.0, 1.0)
+        if not (math.isfinite(self.small_things) and self.small_things >= 0):
+            raise RangeError(f"small_things: expected 0 or more, got {self.small_things}.")
+        check_range("overlap", self.overlap, 0.0, 1.0)
+        for name in ("least_views", "most_views", "longest_side"):
+            if getattr(self, name) < 1:
+                raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
+
+
+def associate(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    source: SegmentSource,
+    *,
+    options: AssociateOptions | None = None,
+    confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
+    classes: ClassTable | None = None,
+    render_options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> Labels:
+    """Instances from segments of views.
+
+    The result depends neither on the order of the views nor on ids of segments. Instances are
+    numbered from 1, the one with most mass first.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Those whose segments count.
+        source: Their segments.
+        options: How segments become instances.
+        confusion: How segments err, see `reconsider`. None takes the majority of the votes.
+        classes: Names of the categories of segments; instances are named after theirs.
+        render_options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and their number.
+
+    Returns:
+        The layer. Its metadata lists ``instances`` (id, name, class, segments, views) and under
+        ``associate`` how many segments there were, what was joined within a view, and what was
+        left out.
+
+    Raises:
+        InputError: If there are no views, if one has no segments, or none has any.
+        ShapeError: If segments do not have their photograph's proportions.
+    """
+    options = options or AssociateOptions()
+    table = segment_table(
+        gaussians,
+        views,
+        source,
+        most_views=options.most_views,
+        longest_side=options.longest_side,
+        render_options=render_options,
+        backend=backend,
+        progress=progress,
+    )
+    agreement = table.agreement()
+    group = cluster(agreement, options.agreement)
+    group = _seen_often(table, group, min(options.least_views, len(table.views)))
+    if source.overlapping:
+        group = chosen_groups(table, agreement, group, overlap=options.overlap)
+    votes = table.votes(group, _say(table, group, options.small_things))
+    group, votes = _by_mass(group, votes)
+    rows = _instances(table, group, classes)
+    labels = _labels(votes)
+    if confusion is not None:
+        labels = reconsider(labels, options=confusion)
+    return replace(
+        labels,
+        candidates=None,
+        shares=None,
+        metadata=dict(labels.metadata)
+        | {
+            "method": "associate",
+            "options": asdict(options),
+            "views": list(table.views),
+            "names": {str(row["id"]): row["name"] for row in rows},
+            "class_of": {str(row["id"]): row["class"] for row in rows if row["class"] > 0},
+            "instances": rows,
+            "associate": _account(table, group, tracked=source.persistent),
+        },
+    )
+
+
+def _seen_often(table: SegmentTable, group: NDArray[np.int64], least: int) -> NDArray[np.int64]:
+    """Groups of segments in too few views get the group -1."""
+    pairs = np.unique(np.stack((group, table.view)), axis=1)
+    views = np.bincount(pairs[0], minlength=int(group.max()) + 1)
+    return np.where(views[group] >= least, group, -1)
+
+
+def _say(table: SegmentTable, group: NDArray[np.int64], exponent: float) -> NDArray[np.float64]:
+    """The factor q of each segment's votes."""
+    there = group >= 0
+    if not there.any():
+        return np.ones(len(group))
+    members = np.bincount(group[there])
+    mean = np.bincount(group[there], table.size[there]) / np.maximum(members, 1)
+    largest = float(mean.max())
+    size = np.where(members >= _SURE_SEGMENTS, mean, largest) / max(largest, 1e-12)
+    return np.where(there, np.maximum(size, 1e-12)[group] ** -exponent, 1.0)
+
+
+def _by_mass(group: NDArray[np.int64], votes: Any) -> tuple[NDArray[np.int64], Any]:
+    """Groups numbered anew by the votes they have, most first; groups without any go."""
+    total = np.asarray(votes.sum(axis=0)).ravel()
+    order = np.lexsort((np.arange(len(total)), -total))
+    order = order[total[order] > 0]
+    rank = np.full(len(total) + 1, -1)
+    rank[order] = np.arange(len(order))
+    return rank[group], votes.tocsc()[:, order].tocsr()
+
+
+def _labels(votes: Any) -> Labels:
+    """The strongest ids of each Gaussian (the smaller among equals), their shares, all votes."""
+    count = votes.shape[0]
+    votes.sort_indices()
+    rows = np.repeat(np.arange(count), np.diff(votes.indptr))
+    order = np.lexsort((votes.indices, -votes.data, rows))
+    rows = rows[order]
+    first = np.ones(len(rows), bool)
+    first[1:] = rows[1:] != rows[:-1]
+    rank = np.arange(len(rows)) - np.flatnonzero(first)[np.cumsum(first) - 1]
+    kept = rank < _CANDIDATES
+    total = np.asarray(votes.sum(axis=1)).ravel()
+    ids = np.full((count, _CANDIDATES), UNLABELLED, np.int32)
+    shares = np.zeros((count, _CANDIDATES), np.float32)
+    place = rows[kept], rank[kept]
+    ids[place] = votes.indices[order][kept] + 1
+    shares[place] = (votes.data[order][kept] / total[place[0]]).clip(0, 1)
+    return Labels(
+        ids=torch.from_numpy(ids[:, 0].copy()),
+        confidence=torch.from_numpy(shares[:, 0].copy()),
+        candidates=torch.from_numpy(ids),
+        shares=torch.from_numpy(shares),
+        evidence=torch.from_numpy(total.astype(np.float32)),
+    )
+
+
+def _instances(
+    table: SegmentTable, group: NDArray[np.int64], classes: ClassTable | None
+) -> list[dict[str, Any]]:
+    """One row an instance: id, name, class (0 for none), segments and views."""
+    rows: list[dict[str, Any]] = []
+    weight = table.size * table.score
+    for place in range(int(group.max(initial=-1)) + 1):
+        members = np.flatnonzero(group == place)
+        known = members[table.category[members] != UNLABELLED]
+        category = 0
+        if len(known):
+            sums = np.bincount(table.category[known], weight[known])
+            category = int(sums.argmax())
+        named = category > 0 and classes is not None
+        name = classes.name_of(category) if named and classes is not None else "object"
+        rows.append(
+            {
+                "id": place + 1,
+                "name": f"{name} {place + 1}",
+                "class": category,
+                "segments": len(members),
+                "views": len(np.unique(table.view[members])),
+            }
+        )
+    return rows
+
+
+def _account(table: SegmentTable, group: NDArray[np.int64], *, tracked: bool) -> dict[str, Any]:
+    """What became of the segments; of tracks, which were joined and which were divided."""
+    there = group >= 0
+    pairs = np.stack((group[there], table.view[there]))
+    _, counts = np.unique(pairs, axis=1, return_counts=True)
+    said: dict[str, Any] = {
+        "segments": len(group),
+        "instances": int(group.max(initial=-1)) + 1,
+        "left_out": int((~there).sum()),
+        "joined_within_views": int((counts - 1).sum()),
+    }
+    if not tracked:
+        return said
+    of: dict[int, set[int]] = {}
+    names: dict[int, set[int]] = {}
+    for instance, name in zip(group[there].tolist(), table.name[there].tolist(), strict=True):
+        of.setdefault(name, set()).add(instance + 1)
+        names.setdefault(instance + 1, set()).add(name)
+    merged = {i: found for i, found in sorted(names.items()) if len(found) > 1}
+    split = {name: found for name, found in sorted(of.items()) if len(found) > 1}
+    return said | {
+        "merged": [{"id": i, "from": sorted(found)} for i, found in merged.items()],
+        "split": [{"from": name, "ids": sorted(found)} for name, found in split.items()],
+    }

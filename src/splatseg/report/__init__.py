@@ -1,0 +1,1 @@
+"""Reports: self-contained HTML pages, charts and sheets of images."""

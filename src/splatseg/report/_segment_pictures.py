@@ -1,0 +1,263 @@
+"""What a report of a segmentation shows of single views."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    LabelMap,
+    Labels,
+    LabelSource,
+    Scene,
+    View,
+    camera_of_map,
+)
+from splatseg.evaluate.agreement import Agreement, agreement
+from splatseg.evaluate.overlaps import Overlaps, instance_score
+from splatseg.io.evidence import Evidence
+from splatseg.io.images import image_camera, load_image, reduced_size
+from splatseg.lift import label_map
+from splatseg.render import render
+from splatseg.report.pictures import (
+    Gallery,
+    Picture,
+    colour_labels,
+    colour_share,
+    mark_errors,
+    overlay_labels,
+)
+
+_LONGEST = 1024
+"""Pixels at which views without a truth are drawn."""
+
+# What the truth calls by an id that no id of the layer was matched to.
+_UNMATCHED = 1 << 30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sight:
+    """One view, looked at; all maps have one size."""
+
+    name: str
+    held_out: bool
+    picture: UInt8[Tensor, "height width 3"]
+    """The photograph, or the rendering where there is none."""
+
+    drawn: Int[Tensor, "height width"]
+    """The layer."""
+
+    confidence: Float[Tensor, "height width"]
+    """Mean confidence of the Gaussians that a pixel shows, -1 where there are none."""
+
+    evidence: Int[Tensor, "height width"] | None
+    truth: Int[Tensor, "height width"] | None
+    agreement: Agreement | None
+    """Of the evidence with the layer."""
+
+
+def look(
+    scene: Scene,
+    labels: Labels,
+    view: View,
+    *,
+    held_out: bool,
+    evidence: LabelSource | None,
+    truth: LabelSource | None,
+    same_ids: bool,
+    backend: str,
+) -> Sight:
+    """Draw a view in the pixels of its truth, else of its photograph reduced.
+
+    Raises:
+        ShapeError: If the truth does not have the photograph's proportions.
+        MissingFileError: If the photograph is not where it was.
+    """
+    true = None
+    if truth is not None and view.name in truth.view_names:
+        true = truth.label_map(view.name).ids
+    camera = image_camera(view, _LONGEST) if true is None else camera_of_map(view, *true.shape)
+    size = (camera.height, camera.width)
+    shown = label_map(scene.gaussians, camera, labels, backend=backend).ids
+    sure = labels.confidence.to(scene.gaussians.means)[:, None]
+    with torch.no_grad():
+        drawn = render(scene.gaussians, camera, sure, backend=backend)
+        colours = None
+        if view.image is None:
+            colours = render(scene.gaussians, camera, backend=backend)
+    alpha = drawn.alpha.float().cpu()
+    mean = drawn.image[..., 0].float().cpu() / alpha.clamp_min(1e-6)
+    if colours is None:
+        picture = _resized(load_image(view, longest=max(size)), size)
+    else:
+        picture = (colours.image.float().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    seen = _evidence_ids(evidence, view.name)
+    seen = None if seen is None else _nearest(seen, size)
+    return Sight(
+        name=view.name,
+        held_out=held_out,
+        picture=picture,
+        drawn=shown,
+        confidence=torch.where(alpha > 0.02, mean.clamp(0, 1), -1.0),
+        evidence=seen,
+        truth=true,
+        agreement=None if seen is None else agreement(shown, seen, same_ids=same_ids),
+    )
+
+
+def rename_truth(sights: Sequence[Sight]) -> dict[int, int]:
+    """Ids of the layer by true id, matched over the views that are shown.
+
+    A true id without a match gets one that no layer has.
+    """
+    total = Overlaps.none()
+    for sight in sights:
+        if sight.truth is not None:
+            total = total + Overlaps.of(sight.drawn, sight.truth)
+    if not len(total.pairs):
+        return {}
+    matches = instance_score(total).matches
+    return {
+        id: matches[id][0] if id in matches else _UNMATCHED + id
+        for id in total.truth_sizes[0].tolist()
+    }
+
+
+def renamed(ids: Int[Tensor, "height width"], names: dict[int, int]) -> Int[Tensor, "height width"]:
+    """A map under other ids; ids without another name, and -1, stay."""
+    found, at = torch.unique(ids.long(), return_inverse=True)
+    return torch.tensor([names.get(i, i) for i in found.tolist()], dtype=torch.int64)[at]
+
+
+def gallery(
+    sights: Sequence[Sight],
+    classes: ClassTable,
+    *,
+    truth_names: dict[int, int] | None,
+    evidence_has_same_ids: bool,
+    longest: int,
+) -> Gallery:
+    """Rows of pictures, one a view: what came, what became of it, and the truth if there is one.
+
+    Args:
+        sights: The views.
+        classes: Names and colours of the layer's ids.
+        truth_names: Ids of the layer by true id where they differ, see `rename_truth`.
+        evidence_has_same_ids: Evidence is coloured as the layer is; otherwise by its own ids.
+        longest: Of the pictures, pixels.
+    """
+    with_evidence = any(sight.evidence is not None for sight in sights)
+    with_truth = any(sight.truth is not None for sight in sights)
+    columns = ["photograph", "labels on it", "confidence"]
+    if with_evidence:
+        columns.insert(1, "evidence as it came")
+    if with_truth:
+        columns += ["truth", "errors in red"]
+    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    for sight in sights:
+        size = _size(sight.picture, longest)
+        photograph = _resized(sight.picture, size)
+        drawn = _nearest(sight.drawn, size)
+        pictures = [
+            Picture(image=photograph),
+            Picture(image=overlay_labels(photograph, drawn, classes)),
+            Picture(image=colour_share(_nearest(sight.confidence, size))),
+        ]
+        if with_evidence:
+            table = classes if evidence_has_same_ids else None
+            pictures.insert(1, _evidence_picture(sight, table, size))
+        if with_truth:
+            pictures += _truth_pictures(sight, classes, truth_names, photograph)
+        label = f"{sight.name}, held out" if sight.held_out else sight.name
+        rows.append((label, tuple(pictures)))
+    return Gallery(
+        title="What it looks like",
+        columns=tuple(columns),
+        rows=tuple(rows),
+        note="Confidence goes from dark (no share of the votes) to light (all of them). "
+        + (
+            "Errors: red is a wrong label, blue none; grey pixels are right or void."
+            if with_truth
+            else ""
+        ),
+    )
+
+
+def _evidence_picture(sight: Sight, classes: ClassTable | None, size: tuple[int, int]) -> Picture:
+    if sight.evidence is None or sight.agreement is None:
+        return _nothing(size)
+    return Picture(
+        image=colour_labels(_nearest(sight.evidence, size), classes),
+        kind="chart",
+        caption=f"{sight.agreement.differ:.1%} differs",
+    )
+
+
+def _truth_pictures(
+    sight: Sight,
+    classes: ClassTable,
+    names: dict[int, int] | None,
+    photograph: UInt8[Tensor, "height width 3"],
+) -> list[Picture]:
+    size = (int(photograph.shape[0]), int(photograph.shape[1]))
+    if sight.truth is None:
+        return [_nothing(size), _nothing(size)]
+    truth = sight.truth if names is None else renamed(sight.truth, names)
+    known = truth != UNLABELLED
+    right = float((sight.drawn == truth)[known].double().mean()) if bool(known.any()) else 0.0
+    marked = mark_errors(
+        photograph, _nearest(sight.drawn, size).long(), truth=_nearest(truth, size).long()
+    )
+    return [
+        Picture(image=colour_labels(_nearest(truth, size), classes), kind="chart"),
+        Picture(image=marked, caption=f"{right:.1%} right"),
+    ]
+
+
+def _nothing(size: tuple[int, int]) -> Picture:
+    grey = torch.full((*size, 3), 128, dtype=torch.uint8)
+    return Picture(image=grey, kind="chart", caption="there is none of this view")
+
+
+def _evidence_ids(evidence: LabelSource | None, name: str) -> Int[Tensor, "height width"] | None:
+    """Ids of a view's evidence; masks are painted from the largest to the smallest."""
+    if evidence is None or name not in evidence.view_names:
+        return None
+    if not isinstance(evidence, Evidence) or evidence.kind in ("labels", "panoptic", "tracked"):
+        return evidence.label_map(name).ids
+    if evidence.kind != "masks":
+        return None
+    masks = evidence.masks(name)
+    paper = torch.full((masks.height, masks.width), UNLABELLED, dtype=torch.int32)
+    areas = [mask.area for mask in masks.masks]
+    for i in sorted(range(len(areas)), key=lambda i: (-areas[i], i)):
+        paper[masks.masks[i].decode()] = i + 1
+    return LabelMap(ids=paper).ids
+
+
+def _size(image: Tensor, longest: int) -> tuple[int, int]:
+    width, height = reduced_size(int(image.shape[1]), int(image.shape[0]), longest)
+    return height, width
+
+
+def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """A map in another size; each pixel takes the value under its centre."""
+    rows, columns = (
+        ((torch.arange(to) + 0.5) * (of / to)).long().clamp(max=of - 1)
+        for to, of in zip(size, values.shape[:2], strict=True)
+    )
+    return values[rows][:, columns]
+
+
+def _resized(
+    image: UInt8[Tensor, "height width 3"], size: tuple[int, int]
+) -> UInt8[Tensor, "rows columns 3"]:
+    if tuple(image.shape[:2]) == size:
+        return image
+    planes = image.movedim(-1, 0)[None].float()
+    small = torch.nn.functional.interpolate(planes, size=size, mode="bilinear", antialias=True)
+    return small[0].movedim(0, -1).round().clamp(0, 255).to(torch.uint8)

@@ -1,0 +1,248 @@
+"""Tables and bars of a report of a segmentation."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from splatseg.core import UNLABELLED, ClassTable, Labels
+from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
+from splatseg.report._segment_pictures import Sight
+from splatseg.report.html import Bars, Block, Cell, Table
+
+_BINS = 10
+_AT_LEAST = (1, 2, 3, 5, 10, 20, 50, 100)
+_CLOSE = (0.5, 0.8, 0.95)
+_ROWS = 60
+_LONG = 200
+
+
+def count_text(count: int) -> str:
+    """A count with thin spaces between thousands."""
+    return f"{count:,}".replace(",", "\N{THIN SPACE}")
+
+
+def support_table(labels: Labels) -> Table:
+    """How many Gaussians have a label, and from where."""
+    labelled = labels.ids != UNLABELLED
+    inferred = labels.inferred if labels.inferred is not None else torch.zeros_like(labelled)
+    rows: list[tuple[Cell, ...]] = []
+
+    def add(name: str, mask: Tensor) -> None:
+        count = int(mask.sum())
+        rows.append((name, count_text(count), f"{count / max(len(labels), 1):.1%}"))
+
+    add("with a label, from evidence of their own", labelled & ~inferred)
+    if labels.inferred is not None:
+        add("with a label, inferred from neighbours", labelled & inferred)
+    add("without a label", ~labelled)
+    if labels.evidence is not None:
+        add("that no evidence spoke for", labels.evidence <= 0)
+        add("with less evidence than one fully visible pixel", labels.evidence < 1)
+    return Table(
+        title="What the labels rest on",
+        columns=("Gaussians", "count", "share"),
+        rows=tuple(rows),
+    )
+
+
+def confidence_bars(labels: Labels) -> Bars:
+    """How the confidence of labelled Gaussians is distributed."""
+    labelled = labels.ids != UNLABELLED
+    values = labels.confidence.detach().double().cpu()[labelled.cpu()].clamp(0, 1)
+    place = (values * _BINS).long().clamp(max=_BINS - 1)
+    series, columns = ["share of the labelled Gaussians"], [_shares(place, None)]
+    if labels.evidence is not None:
+        series.append("share of their evidence")
+        columns.append(_shares(place, labels.evidence.detach().double().cpu()[labelled.cpu()]))
+    rows = tuple(
+        (f"{i / _BINS:.1f} to {(i + 1) / _BINS:.1f}", tuple(column[i] for column in columns))
+        for i in reversed(range(_BINS))
+    )
+    return Bars(
+        title="Confidence",
+        series=tuple(series),
+        rows=rows,
+        note="The share of a Gaussian's evidence that speaks for its label.",
+    )
+
+
+def coverage_bars(seen: Int[Tensor, "n"], *, views: int) -> Bars:
+    """Share of the Gaussians that at least so many views show."""
+    steps = [n for n in _AT_LEAST if n <= views] or [1]
+    count = max(len(seen), 1)
+    return Bars(
+        title="Coverage",
+        series=("share of the Gaussians",),
+        rows=tuple(
+            (f"at least {n} view{'s' if n > 1 else ''}", (int((seen >= n).sum()) / count,))
+            for n in steps
+        ),
+        note=f"A view shows a Gaussian that has at least {SEEN_WEIGHT:g} of a pixel's light in "
+        f"it. {views} of the views that the layer was made from were looked at.",
+    )
+
+
+def conflict_tables(labels: Labels, sights: Sequence[Sight], classes: ClassTable) -> list[Block]:
+    """Where evidence disagrees with itself, Gaussian by Gaussian and view by view."""
+    blocks: list[Block] = []
+    if labels.candidates is not None and labels.candidates.shape[1] > 1 and len(labels):
+        close = [(ratio, contested(labels, ratio=ratio)) for ratio in _CLOSE]
+        blocks.append(
+            Bars(
+                title="Conflicts",
+                series=("share of the Gaussians",),
+                rows=tuple(
+                    (f"second has {ratio:.0%} of the first or more", (float(mask.double().mean()),))
+                    for ratio, mask in close
+                ),
+                note="Gaussians whose second candidate has nearly as many votes as the first.",
+            )
+        )
+        pairs = rivals(labels, ratio=_CLOSE[0])
+        if pairs:
+            blocks.append(
+                Table(
+                    title="Who contests whom",
+                    columns=("label", "second", "Gaussians"),
+                    rows=tuple(
+                        (
+                            classes.name_of(pair.winner),
+                            classes.name_of(pair.second),
+                            pair.count,
+                        )
+                        for pair in pairs
+                    ),
+                    note=f"Where the second has at least {_CLOSE[0]:.0%} of the first one's votes.",
+                )
+            )
+    else:
+        weak = labels.confidence[labels.ids != UNLABELLED]
+        share = float((weak < 0.5).double().mean()) if len(weak) else 0.0
+        blocks.append(
+            Table(
+                title="Conflicts",
+                columns=("Gaussians", "share"),
+                rows=(("whose label has less than half of the votes", f"{share:.1%}"),),
+                note="The layer keeps one candidate a Gaussian; with more, this says who contests "
+                "whom.",
+            )
+        )
+    compared = [(s.name, s.agreement) for s in sights if s.agreement is not None]
+    if compared:
+        compared.sort(key=lambda row: (-row[1].differ, row[0]))
+        blocks.append(
+            Table(
+                title="Evidence that differs from the layer",
+                columns=("view", "pixels compared", "differ"),
+                rows=tuple((name, one.pixels, f"{one.differ:.1%}") for name, one in compared),
+                note="Pixels where both have a label, the most contested view first. Evidence "
+                "with ids of its own: pixels that are not of the id that most of their segment "
+                "has.",
+            )
+        )
+    return blocks
+
+
+def association_tables(metadata: Mapping[str, Any]) -> list[Block]:
+    """What a method that joins ids says of it in the layer's metadata, as far as it says it."""
+    said = metadata.get("associate")
+    if not isinstance(said, Mapping):
+        return []
+    said = cast(Mapping[str, Any], said)
+    blocks: list[Block] = []
+    plain = fact_rows({k: v for k, v in said.items() if not isinstance(v, list | Mapping)})
+    if plain:
+        blocks.append(
+            Table(title="Segments to instances", columns=("what", "value"), rows=tuple(plain))
+        )
+    for name, value in said.items():
+        if isinstance(value, list) and value:
+            blocks.append(_listed(name, cast(list[Any], value)))
+        elif isinstance(value, Mapping) and value:
+            rows = fact_rows(cast(Mapping[str, Any], value))
+            title = name.replace("_", " ").capitalize()
+            blocks.append(Table(title=title, columns=("what", "value"), rows=tuple(rows[:_ROWS])))
+    return blocks
+
+
+def id_table(
+    labels: Labels, classes: ClassTable, *, scores: Mapping[int, float], scored: str
+) -> Table:
+    """One row an id: how many Gaussians, how sure, how good where that is known.
+
+    Where the method lists its instances, also how many segments and views each was seen in.
+    """
+    told = _told_of_instances(labels.metadata)
+    also = [key for key in ("segments", "views") if any(key in row for row in told.values())]
+    ids, confidence = labels.ids.cpu().long(), labels.confidence.detach().double().cpu()
+    rows: list[tuple[Cell, ...]] = []
+    for row in classes.rows:
+        mask = ids == row.id
+        count = int(mask.sum())
+        mean = float(confidence[mask].mean()) if count else None
+        values: list[Cell] = [row.id, row.name, count, mean]
+        values += [_cell(told.get(row.id, {}).get(key)) for key in also]
+        if scores:
+            values.append(scores.get(row.id))
+        rows.append(tuple(values))
+    rows.sort(key=lambda row: (-cast(int, row[2]), cast(int, row[0])))
+    more = len(rows) - _ROWS
+    notes = [f"The {_ROWS} largest; {more} more are left out."] if more > 0 else []
+    if scores:
+        notes.append(f"IoU is of {scored}; a dash where the truth has none of it.")
+    columns = ("id", "name", "Gaussians", "confidence", *also, *(("IoU",) if scores else ()))
+    return Table(title="Labels", columns=columns, rows=tuple(rows[:_ROWS]), note=" ".join(notes))
+
+
+def _told_of_instances(metadata: Mapping[str, Any]) -> dict[int, Mapping[str, Any]]:
+    """What the metadata lists under ``instances``, by id."""
+    rows: Any = metadata.get("instances")
+    listed = cast(list[Any], rows) if isinstance(rows, list) else []
+    objects = [cast(Mapping[str, Any], row) for row in listed if isinstance(row, Mapping)]
+    return {row["id"]: row for row in objects if isinstance(row.get("id"), int)}
+
+
+def fact_rows(values: object) -> list[tuple[Cell, ...]]:
+    """Names and values of a mapping as cells; what is too long for a cell is counted."""
+    if not isinstance(values, Mapping):
+        return []
+    return [
+        (str(name).replace("_", " "), _cell(value))
+        for name, value in cast(Mapping[str, Any], values).items()
+    ]
+
+
+def _listed(name: str, values: list[Any]) -> Table:
+    """A list as a table: of objects by their keys, of lists by place, of others one a row."""
+    title = name.replace("_", " ").capitalize()
+    shown = values[:_ROWS]
+    note = f"{len(values)} in all; the first {_ROWS} are shown." if len(values) > _ROWS else ""
+    if all(isinstance(value, Mapping) for value in shown):
+        rows = [cast(Mapping[str, Any], value) for value in shown]
+        keys = tuple(dict.fromkeys(str(key) for row in rows for key in row))
+        cells = tuple(tuple(_cell(row.get(key)) for key in keys) for row in rows)
+        columns = tuple(key.replace("_", " ") for key in keys)
+        return Table(title=title, columns=columns or ("",), rows=cells if keys else (), note=note)
+    return Table(
+        title=title, columns=(name,), rows=tuple((_cell(value),) for value in shown), note=note
+    )
+
+
+def _cell(value: Any) -> Cell:
+    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
+        return value
+    if isinstance(value, list | tuple):
+        parts = [str(part) for part in cast(Sequence[Any], value)]
+        words = ", ".join(parts)
+        return words if len(words) <= _LONG else f"{len(parts)}: {words[:_LONG]}..."
+    words = str(value)
+    return words if len(words) <= _LONG else f"{words[:_LONG]}..."
+
+
+def _shares(place: Tensor, weights: Tensor | None) -> list[float]:
+    counts = torch.bincount(place, weights=weights, minlength=_BINS).double()
+    # Rounding may carry a share past 1.
+    return (counts / counts.sum().clamp_min(1e-300)).clamp(0, 1).tolist()

@@ -1,0 +1,323 @@
+"""What the demo shows at its end: a contact sheet and a report."""
+
+import math
+import os
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from PIL import Image
+from torch import Tensor
+
+from splatseg.core import ClassTable, Labels, Scene
+from splatseg.errors import InputError
+from splatseg.evaluate import Confusion, SemanticScore, psnr, semantic_score
+from splatseg.io.atomic import atomic_file
+from splatseg.io.evidence import Evidence, open_evidence
+from splatseg.io.images import load_image, save_png
+from splatseg.io.json_files import read_json
+from splatseg.io.scene import load_scene, load_scene_layer
+from splatseg.lift import label_map
+from splatseg.report.html import Bars, Commands, Figure, Legend, Report, Table, report_html
+from splatseg.report.pictures import (
+    Gallery,
+    Picture,
+    colour_depth,
+    colour_labels,
+    contact_sheet,
+    mark_errors,
+)
+
+_T = TypeVar("_T")
+
+_HELD_OUT_ROWS = 6
+_TRAIN_ROWS = 4
+_SHEET_ROWS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoFigures:
+    """What the demo measured."""
+
+    came: SemanticScore
+    """Machine labels against the truth, on the train views."""
+
+    train: Mapping[str, Any]
+    """What evaluate says of the lifted labels on train views."""
+
+    test: Mapping[str, Any]
+    """The same of held-out views."""
+
+    objects: Mapping[str, Any]
+    """What evaluate says of the objects on held-out views."""
+
+    steps: tuple[tuple[str, float], ...]
+    """Names and seconds."""
+
+    commands: tuple[str, ...]
+    """Lines that were run."""
+
+    started: float
+    """`time.monotonic` at the beginning."""
+
+
+def machine_score(capture: Path, evidence: str) -> SemanticScore:
+    """Score the recorded labels of a capture in the views that have them, pooled."""
+    labels, truth = open_evidence(capture / evidence), open_evidence(capture / "semantic")
+    total: Confusion | None = None
+    for name in labels.view_names:
+        one = Confusion.of(labels.label_map(name).ids, truth.label_map(name).ids)
+        total = one if total is None else total + one
+    if total is None:
+        raise InputError(f"{capture / evidence}: expected label maps, got none.")
+    return semantic_score(total)
+
+
+def write_report(
+    folder: Path, figures: DemoFigures, *, seed: int, layer: str, evidence: str, objects: str
+) -> None:
+    """Write contact_sheet.png and report.html of a demo's folder."""
+    scene = load_scene(folder / "scene")
+    truth = open_evidence(folder / "capture" / "semantic")
+    classes = scene.classes or ClassTable(rows=())
+    held_out = _held_out_gallery(folder, scene, truth, layer=layer, objects=objects)
+    labels = load_scene_layer(folder / "scene", layer)
+    if not isinstance(labels, Labels):
+        raise InputError(f"{layer}: expected a layer of labels.")
+    came = open_evidence(folder / "capture" / evidence)
+    mended = _train_gallery(scene, truth, came, labels)
+    decibels, before, after = (
+        figures.test["PSNR"],
+        figures.came.miou,
+        figures.test["mIoU"],
+    )
+    sheet = contact_sheet(
+        Gallery(
+            title="splatseg demo: a generated room, seen from held-out views",
+            columns=held_out.columns,
+            rows=_spread(held_out.rows, _SHEET_ROWS),
+        ),
+        subtitle=(
+            f"PSNR {decibels:.1f} dB on {figures.test['photographs']} held-out views; mIoU of the "
+            f"labels {before:.2f} as they came, {after:.2f} lifted into 3D and rendered"
+        ),
+        classes=classes,
+        cell_width=288,
+    )
+    save_png(sheet, folder / "contact_sheet.png")
+    report = Report(
+        title="A generated room, segmented in 3D",
+        summary=(
+            "Photographs of a room that does not exist, and class maps with the mistakes a "
+            "network makes, went in. Out came Gaussians that look like the room and whose labels "
+            "agree with each other from all sides. The truth is known exactly, because the room "
+            "was generated; held-out views were not used for anything but this report."
+        ),
+        figures=(
+            Figure(
+                label="Pictures of held-out views",
+                value=f"{decibels:.1f} dB",
+                note=f"PSNR, mean of {figures.test['photographs']} views; "
+                f"SSIM {figures.test['SSIM']:.3f}",
+            ),
+            Figure(
+                label="Labels as they came",
+                value=f"{before:.3f}",
+                note="pooled mIoU of the machine labels, train views",
+            ),
+            Figure(
+                label="Labels lifted and rendered",
+                value=f"{after:.3f}",
+                note=f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points",
+            ),
+            Figure(
+                label="Objects, from masks without weights",
+                value=f"{figures.objects['mIoU']:.3f}",
+                note="instance mIoU on held-out views; "
+                f"{figures.objects['predicted_instances']} found, "
+                f"{figures.objects['truth_instances']} true ones",
+            ),
+            Figure(
+                label="Gaussians",
+                value=f"{len(scene.gaussians):,}".replace(",", "\N{THIN SPACE}"),
+                note=f"from {len(scene.train_views)} photographs",
+            ),
+        ),
+        blocks=(
+            held_out,
+            Legend(classes=classes, title="Colours of the classes"),
+            mended,
+            _class_bars(figures, classes),
+            _score_table(figures),
+            _step_table(figures),
+            Commands(
+                title="The same from the shell",
+                lines=figures.commands,
+                note="What the demo ran after it had generated the capture.",
+            ),
+        ),
+        facts=_facts(folder, scene, seed),
+    )
+    with atomic_file(folder / "report.html") as path:
+        path.write_text(report_html(report), encoding="utf-8", newline="\n")
+
+
+def _held_out_gallery(
+    folder: Path, scene: Scene, truth: Evidence, *, layer: str, objects: str
+) -> Gallery:
+    """Photograph, rendering, depth, labels, truth, errors and objects of some test views."""
+    pictures = folder / "render"
+    unit = read_json(pictures / "depth" / "depth.json")["unit"]
+    views = _spread(scene.test_views, _HELD_OUT_ROWS)
+    depths = [_read(pictures / "depth" / f"{view.name}.png").double() * unit for view in views]
+    far = max(float(depth.max()) for depth in depths)
+    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    for view, depth in zip(views, depths, strict=True):
+        photograph = load_image(view)
+        drawn = _read(pictures / "rgb" / f"{view.name}.png").to(torch.uint8)
+        ids = _ids(pictures / layer / f"{view.name}.png")
+        things = _ids(pictures / objects / f"{view.name}.png")
+        true = truth.label_map(view.name).ids
+        rows.append(
+            (
+                view.name,
+                (
+                    Picture(image=photograph),
+                    Picture(image=drawn, caption=f"{psnr(drawn, photograph):.1f} dB"),
+                    Picture(image=colour_depth(depth, near=0.3, far=far)),
+                    _labels(ids, scene.classes),
+                    _labels(true, scene.classes),
+                    Picture(
+                        image=mark_errors(photograph, ids, truth=true),
+                        caption=f"{_right(ids, true):.1%} right",
+                    ),
+                    _labels(things, None),
+                ),
+            )
+        )
+    return Gallery(
+        title="Held-out views",
+        columns=(
+            "photograph",
+            "rendered",
+            "depth",
+            "labels, rendered",
+            "truth",
+            "errors in red",
+            "objects",
+        ),
+        rows=tuple(rows),
+        note="No photograph and no label of these views was used before. Objects come from masks "
+        "that need no weights, joined in 3D; their colours are arbitrary.",
+    )
+
+
+def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels) -> Gallery:
+    """What lifting mends: the labels of train views before and after."""
+    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    for view in _spread(scene.train_views, _TRAIN_ROWS):
+        true = truth.label_map(view.name).ids
+        before = came.label_map(view.name).ids
+        after = label_map(scene.gaussians, view.camera, labels).ids
+        rows.append(
+            (
+                view.name,
+                (
+                    Picture(image=load_image(view)),
+                    _labels(before, scene.classes, right=_right(before, true)),
+                    _labels(after, scene.classes, right=_right(after, true)),
+                    _labels(true, scene.classes),
+                ),
+            )
+        )
+    return Gallery(
+        title="What lifting mends",
+        columns=("photograph", "labels as they came", "lifted and rendered", "truth"),
+        rows=tuple(rows),
+        note=(
+            "Train views. Mistakes of single views are outvoted by the others; an object that "
+            "is mistaken from most sides stays mistaken."
+        ),
+    )
+
+
+def _class_bars(figures: DemoFigures, classes: ClassTable) -> Bars:
+    lifted: Mapping[str, float] = figures.test["per_class"]
+    return Bars(
+        title="IoU of each class",
+        series=("as they came, train views", "lifted, held-out views"),
+        rows=tuple(
+            (row.name, (figures.came.per_class.get(row.id), lifted.get(str(row.id))))
+            for row in classes.rows
+        ),
+        note="Intersection over union, pooled over the pixels of all views.",
+    )
+
+
+def _score_table(figures: DemoFigures) -> Table:
+    came = figures.came
+    rows: list[tuple[str | float, ...]] = [
+        ("as they came", "train", came.miou, came.fwiou, came.accuracy)
+    ]
+    for views, of in (("train", figures.train), ("held out", figures.test)):
+        rows.append(("lifted and rendered", views, of["mIoU"], of["fwIoU"], of["accuracy"]))
+    return Table(
+        title="Class maps against the truth",
+        columns=("labels", "views", "mIoU", "fwIoU", "accuracy"),
+        rows=tuple(rows),
+        note="Pooled over the pixels of all views of a row.",
+    )
+
+
+def _step_table(figures: DemoFigures) -> Table:
+    rows = [(name, f"{seconds:.1f}") for name, seconds in figures.steps]
+    rows.append(("until this report", f"{time.monotonic() - figures.started:.1f}"))
+    return Table(title="Time", columns=("step", "seconds"), rows=tuple(rows))
+
+
+def _facts(folder: Path, scene: Scene, seed: int) -> dict[str, Any]:
+    capture = read_json(folder / "capture" / "metadata.json")
+    return {
+        "room": f"splatseg.synthetic.room(seed={seed})",
+        "photographs": f"{len(scene.train_views)} train and {len(scene.test_views)} held out, "
+        f"{capture['width']} x {capture['height']} pixels",
+        "fit": f"{scene.provenance.get('steps')} steps",
+        "splatseg": metadata.version("splatseg"),
+        "torch": metadata.version("torch"),
+        "Python": platform.python_version(),
+        "cores": os.cpu_count(),
+    }
+
+
+def _spread(items: Sequence[_T], count: int) -> tuple[_T, ...]:
+    """At most `count` items, evenly spread over the whole."""
+    step = max(1.0, len(items) / count)
+    return tuple(items[math.floor(i * step)] for i in range(min(count, len(items))))
+
+
+def _labels(
+    ids: Int[Tensor, "height width"], classes: ClassTable | None, *, right: float | None = None
+) -> Picture:
+    caption = "" if right is None else f"{right:.1%} right"
+    return Picture(image=colour_labels(ids, classes), kind="chart", caption=caption)
+
+
+def _right(ids: Tensor, truth: Tensor) -> float:
+    return float((ids == truth)[truth >= 0].float().mean())
+
+
+def _ids(path: Path) -> Tensor:
+    ids = _read(path).int()
+    return torch.where(ids == 0, -1, ids)
+
+
+def _read(path: Path) -> Tensor:
+    with Image.open(path) as image:
+        return torch.from_numpy(np.array(image).astype(np.int32))

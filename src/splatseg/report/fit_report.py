@@ -1,0 +1,283 @@
+"""The report of a fit: what went in, what came out, how it went, and how good it is."""
+
+import os
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from importlib import metadata
+from typing import Any
+
+from splatseg.core import Capture, View
+from splatseg.evaluate.held_out import PhotographReport
+from splatseg.fit import FitOptions, FitRecord, FitResult, reduction_note
+from splatseg.report.chart import Chart, Line
+from splatseg.report.html import Bars, Block, Commands, Curves, Figure, Report, Table
+from splatseg.report.pictures import Gallery
+
+_LONG_LIST = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitStory:
+    """Everything that the report of a fit tells."""
+
+    capture: Capture
+    """What it learned from."""
+
+    options: FitOptions
+    result: FitResult
+
+    scores: PhotographReport | None
+    """Of held-out views; None where there are none, or no time was left."""
+
+    held_out: int
+    """Held-out views there are, scored or not."""
+
+    file_bytes: int
+    """Size of the file of Gaussians."""
+
+    command: str = ""
+    """The words that started it."""
+
+    poses: Mapping[str, Any] | None = None
+    """What structure from motion said, where it found the poses."""
+
+    facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """More of how it was made, such as the backend."""
+
+
+def fit_report(story: FitStory, *, pairs: Gallery | None = None) -> Report:
+    """The page.
+
+    Args:
+        story: The fit.
+        pairs: Photographs beside pictures of held-out views.
+    """
+    result, scores = story.result, story.scores
+    rate = result.steps / max(result.seconds, 1e-9)
+    ended = "It was stopped early, and can go on with --resume. " if result.interrupted else ""
+    held_out = (
+        "Held-out views were not learned from."
+        if scores is not None
+        else "No held-out view was scored."
+    )
+    blocks: list[Block] = [] if pairs is None else [pairs]
+    curves = _curves(result.history)
+    if curves is not None:
+        blocks.append(curves)
+    blocks += [_stages(result), _input(story), _output(story)]
+    if scores is not None:
+        blocks.append(_score_table(scores))
+    blocks.append(_changed_options(story.options))
+    if story.command:
+        blocks.append(Commands(title="The same from the shell", lines=(story.command,)))
+    return Report(
+        title=f"Fit of {story.capture.path.name}",
+        summary=f"{_length(result)}, {rate:.1f} steps a second. {ended}{held_out}",
+        figures=_figures(story),
+        blocks=tuple(blocks),
+        facts=_facts(story),
+    )
+
+
+def fit_record(story: FitStory) -> dict[str, Any]:
+    """The same as values that JSON holds: fit.json."""
+    result, scores = story.result, story.scores
+    return {
+        "made_by": "splatseg fit",
+        "command": story.command,
+        "interrupted": result.interrupted,
+        "steps": result.steps,
+        "seconds": round(result.seconds, 3),
+        "gaussians": len(result.gaussians),
+        "file_bytes": story.file_bytes,
+        "held_out": None
+        if scores is None
+        else {
+            "views": story.held_out,
+            "scored": len(scores.views),
+            "psnr": scores.psnr,
+            "psnr_min": scores.psnr_min,
+            "ssim": scores.ssim,
+            "per_view": [asdict(score) for score in scores.per_view],
+        },
+        "input": dict(_input_rows(story)),
+        "poses": None if story.poses is None else dict(story.poses),
+        "notes": [*story.capture.notes, *result.notes],
+        "stages_seconds": {name: round(spent, 4) for name, spent in result.stages.items()},
+        "history": [asdict(record) for record in result.history],
+        "options": asdict(story.options),
+        **_facts(story),
+    }
+
+
+def _length(result: FitResult) -> str:
+    minutes, seconds = divmod(round(result.seconds), 60)
+    return f"{result.steps} steps in {minutes} min {seconds:02d} s"
+
+
+def _figures(story: FitStory) -> tuple[Figure, ...]:
+    result, scores = story.result, story.scores
+    out: list[Figure] = []
+    if scores is not None:
+        of = f"{len(scores.views)} of {story.held_out}"
+        out.append(
+            Figure(
+                label="Held-out views",
+                value=f"{scores.psnr:.2f} dB",
+                note=f"PSNR, mean of {of} views; worst {scores.psnr_min:.2f} dB",
+            )
+        )
+        out.append(Figure(label="Likeness", value=f"{scores.ssim:.3f}", note="SSIM, mean"))
+    if result.history:
+        out.append(
+            Figure(
+                label="Training views",
+                value=f"{result.history[-1].psnr:.2f} dB",
+                note="PSNR of the last 50 steps, before each was learned from",
+            )
+        )
+    out.append(
+        Figure(
+            label="Gaussians",
+            value=f"{len(result.gaussians):,}".replace(",", "\N{THIN SPACE}"),
+            note=f"{story.file_bytes / 1e6:.1f} MB",
+        )
+    )
+    return tuple(out)
+
+
+def _curves(history: Sequence[FitRecord]) -> Curves | None:
+    """Loss, PSNR and count over minutes."""
+    if not history:
+        return None
+
+    def chart(title: str, name: str, values: Sequence[float]) -> Chart:
+        minutes = [record.seconds / 60 for record in history]
+        line = Line(name=name, points=tuple(zip(minutes, values, strict=True)))
+        return Chart(title=title, across="minutes", lines=(line,))
+
+    return Curves(
+        title="How it went",
+        charts=(
+            chart("Loss", "training views", [record.loss for record in history]),
+            chart("PSNR, dB", "training views", [record.psnr for record in history]),
+            chart("Gaussians", "count", [float(record.count) for record in history]),
+        ),
+        note="Means of 50 steps, of training views at the resolution of the stage: where it "
+        "grows finer, the task gets harder.",
+    )
+
+
+def _stages(result: FitResult) -> Bars:
+    total = max(sum(result.stages.values()), 1e-9)
+    steps = max(1, result.steps)
+    rows = sorted(result.stages.items(), key=lambda item: -item[1])
+    return Bars(
+        title="Where the time of a step goes",
+        series=("share",),
+        rows=tuple(
+            (f"{name}, {1e3 * spent / steps:.1f} ms", (spent / total,)) for name, spent in rows
+        ),
+        note=f"Means over all steps; {1e3 * total / steps:.1f} ms a step together.",
+    )
+
+
+def _input(story: FitStory) -> Table:
+    notes = (*story.capture.notes, *story.result.notes)
+    rows = [*_input_rows(story), *(("note", note) for note in notes)]
+    if story.poses is not None:
+        rows += _pose_rows(story.poses)
+    return Table(title="What was in", columns=("what", "value"), rows=tuple(rows))
+
+
+def _input_rows(story: FitStory) -> list[tuple[str, str]]:
+    capture, options = story.capture, story.options
+    train = [view for view in capture.train_views if view.image is not None]
+    masks = sum(view.mask is not None for view in train)
+    depths = sum(view.depth is not None for view in train)
+    points = 0 if capture.points is None else len(capture.points)
+    reduced = reduction_note(capture.train_views, longest=options.longest)
+    return [
+        ("capture", f"{capture.path} ({capture.format})"),
+        ("training views", str(len(train))),
+        ("held-out views", str(len(capture.test_views))),
+        ("sizes", _sizes(capture.views)),
+        ("reduced", reduced or "no"),
+        ("masks", f"{masks} ({options.masks})" if masks else "none"),
+        ("depth maps", f"{depths} ({options.depth})" if depths else "none"),
+        ("start points", str(points) if points else "none; places were drawn"),
+    ]
+
+
+def _sizes(views: Sequence[View]) -> str:
+    counts = Counter((view.camera.width, view.camera.height) for view in views)
+    shown = [f"{count} of {w}x{h}" for (w, h), count in counts.most_common(4)]
+    more = len(counts) - len(shown)
+    return ", ".join(shown) + (f" and {more} more sizes" if more else "") or "none"
+
+
+def _pose_rows(poses: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What structure from motion says of itself, as far as it fits into a cell."""
+    rows: list[tuple[str, str]] = []
+    for name, value in poses.items():
+        words = f"{len(value)}" if isinstance(value, (list, dict)) else str(value)
+        if isinstance(value, float):
+            words = f"{value:.3f}"
+        if len(words) <= _LONG_LIST:
+            rows.append((f"poses: {name.replace('_', ' ')}", words))
+    return rows
+
+
+def _output(story: FitStory) -> Table:
+    result = story.result
+    gaussians = result.gaussians
+    rows = [
+        ("Gaussians", f"{len(gaussians)}"),
+        ("harmonics", f"degree {gaussians.sh_degree}"),
+        ("file", f"{story.file_bytes / 1e6:.1f} MB"),
+        ("steps", str(result.steps)),
+        ("time", f"{result.seconds:.1f} s"),
+        ("ended", "interrupted" if result.interrupted else "as planned"),
+    ]
+    if story.scores is not None:
+        rows.append(("held-out views scored", f"{len(story.scores.views)} of {story.held_out}"))
+    return Table(title="What came out", columns=("what", "value"), rows=tuple(rows))
+
+
+def _score_table(scores: PhotographReport) -> Table:
+    worst_first = sorted(scores.per_view, key=lambda score: score.psnr)
+    return Table(
+        title="Held-out views, the worst first",
+        columns=("view", "PSNR, dB", "SSIM"),
+        rows=tuple((score.name, score.psnr, score.ssim) for score in worst_first),
+    )
+
+
+def _changed_options(options: FitOptions) -> Table:
+    """The length, the size, the seed, and what differs from the default."""
+    plain = FitOptions()
+    always = ("minutes", "steps", "max_gaussians", "seed", "strategy")
+    rows: list[tuple[str, str, str]] = []
+    for one in fields(options):
+        value, default = getattr(options, one.name), getattr(plain, one.name)
+        if one.name in always or value != default:
+            rows.append((one.name, str(value), str(default)))
+    return Table(
+        title="Options",
+        columns=("option", "value", "default"),
+        rows=tuple(rows),
+        note="All others are as they come; fit.json lists every one.",
+    )
+
+
+def _facts(story: FitStory) -> dict[str, Any]:
+    return {
+        "seed": story.options.seed,
+        **story.facts,
+        "splatseg": metadata.version("splatseg"),
+        "torch": metadata.version("torch"),
+        "python": platform.python_version(),
+        "cores": os.cpu_count(),
+    }
