@@ -123,10 +123,10 @@ def semantic(bench: Bench) -> None:
     found, gaussians = bench.evidence("labels_semantic"), bench.scene.gaussians
     for title, options in (
         ("vote, no occlusion test", VoteOptions()),
-        ("vote, by depth", VoteOptions(vote_occlusion="depth")),
+        ("vote, by depth", VoteOptions(occlusion="depth")),
         (
             "vote, by transmittance",
-            VoteOptions(vote_occlusion="weight", vote_weight="transmittance"),
+            VoteOptions(occlusion="weight", weight="transmittance"),
         ),
     ):
         bench.row(

@@ -36,6 +36,7 @@ SURFACE = {
     "read_splats",
     "save_layer",
     "save_scene",
+    "segment",
     "uplift",
     "weights",
     "write_splats",
@@ -55,6 +56,7 @@ PACKAGES = {
     "render",
     "report",
     "synthetic",
+    "tasks",
 }
 
 

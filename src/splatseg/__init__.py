@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from splatseg import render as render
     from splatseg import report as report
     from splatseg import synthetic as synthetic
+    from splatseg import tasks as tasks
     from splatseg.core import Camera as Camera
     from splatseg.core import Capture as Capture
     from splatseg.core import FeatureMap as FeatureMap
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
     from splatseg.render import contributors as contributors
     from splatseg.render import get_backend as get_backend
     from splatseg.render import weights as weights
+    from splatseg.tasks import segment as segment
 
 # What the block above says to type checkers, for the interpreter; a test holds the two equal.
 _HOMES = {
@@ -72,6 +74,7 @@ _HOMES = {
     "splatseg.io.splats": "read_splats write_splats",
     "splatseg.lift": "uplift",
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
+    "splatseg.tasks": "segment",
 }
 _PACKAGES = frozenset(
     {
@@ -88,6 +91,7 @@ _PACKAGES = frozenset(
         "render",
         "report",
         "synthetic",
+        "tasks",
     }
 )
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}

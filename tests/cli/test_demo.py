@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tyro
 from PIL import Image
 
-from splatseg.cli import demo, evaluate, export, fit, main, render, see, segment
+from splatseg.cli import demo, main
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.splats import read_splats
 
 SMALL = ["--steps", "40", "--views", "6", "--width", "64", "--max-gaussians", "3000"]
-MODULES = {m.__name__.rsplit(".", 1)[1]: m for m in (fit, see, segment, render, evaluate, export)}
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +74,10 @@ def test_the_record_holds_the_figures_that_the_report_shows(finished: Path):
     assert not re.search(r"(src|href)=\"(?!data:)", page)
 
 
-def test_what_is_printed_is_what_runs(finished: Path):
-    """Each line, typed into a terminal, is parsed to the very command that the demo ran."""
-    command = tyro.cli(demo.Command, args=["-o", str(finished), *SMALL])
-    jobs = demo.main_job(command)
-    assert [name for name, _, _ in jobs] == [
+def test_what_is_printed_makes_the_same(finished: Path, earlier: Path):
+    """The printed lines, typed into a terminal in another folder, give the same files."""
+    lines = json.loads((finished / "demo.json").read_text())["commands"]
+    assert [line.split()[1] for line in lines] == [
         "fit",
         "segment",
         "see",
@@ -91,13 +88,22 @@ def test_what_is_printed_is_what_runs(finished: Path):
         "evaluate",
         "export",
     ]
-    lines = json.loads((finished / "demo.json").read_text())["commands"]
-    for (name, module, job), line in zip(jobs, lines, strict=True):
-        words = line.split()
-        assert words[:2] == ["splatseg", name]
-        assert module is MODULES[name]
-        parsed = tyro.cli(module.Command, args=words[2:], config=(tyro.conf.OmitArgPrefixes,))
-        assert parsed == job
+    for name in ("scene", "render"):
+        shutil.rmtree(earlier / name)
+    (earlier / "labelled.ply").unlink()
+    for line in lines:
+        assert main(line.replace(str(finished), str(earlier)).split()[1:]) == 0, line
+    for name in ("gaussians.ply", "exports/objects/labelled.ply"):
+        assert (earlier / "scene" / name).read_bytes() == (finished / "scene" / name).read_bytes()
+    for name in ("semantic", "objects"):
+        again, first = (load_scene_layer(at / "scene", name) for at in (earlier, finished))
+        assert again.ids.equal(first.ids)
+    assert (earlier / "labelled.ply").read_bytes() == (finished / "labelled.ply").read_bytes()
+    drawn = sorted((finished / "render").rglob("*.png"))
+    assert drawn
+    for path in drawn:
+        other = earlier / path.relative_to(finished)
+        assert other.read_bytes() == path.read_bytes(), path
 
 
 def test_a_second_run_replaces_what_the_first_wrote_and_nothing_else(
@@ -116,11 +122,11 @@ def test_a_second_run_replaces_what_the_first_wrote_and_nothing_else(
 def test_after_ctrl_c_a_second_run_works(
     earlier: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def stop(_) -> None:
+    def stop(*_, **__) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(export, "run", stop)
+        patch.setattr(demo, "export", stop)
         assert main(["demo", "-o", str(earlier), *SMALL]) == 1
     assert "interrupted" in capsys.readouterr().err
     assert json.loads((earlier / "demo.json").read_text())["finished"] is False

@@ -75,7 +75,7 @@ def test_features_are_weighted_means(rng, lens, channels_at_once) -> None:
     expected = sums / torch.where(weights > 0, weights, 1.0).unsqueeze(1)
 
     calls = []
-    options = FeatureUpliftOptions(feature_channels=channels_at_once)
+    options = FeatureUpliftOptions(channels=channels_at_once)
     found = uplift_features(
         gaussians,
         views[::-1],
@@ -141,7 +141,7 @@ def test_each_view_may_be_normalised(rng, views) -> None:
     grids = random_grids(rng, views)
 
     def lift(norm: str, source: Grids) -> torch.Tensor:
-        options = FeatureUpliftOptions(feature_norm=norm)  # type: ignore[arg-type]
+        options = FeatureUpliftOptions(norm=norm)  # type: ignore[arg-type]
         return uplift_features(gaussians, views, source, options=options, backend=BACKEND).values
 
     by_hand = {}
@@ -171,7 +171,7 @@ def test_faint_gaussians_get_nothing() -> None:
     weight = float(matrix_of(gaussians, view.camera).sum())
 
     def lift(least: float) -> list[float]:
-        options = FeatureUpliftOptions(min_feature_weight=least)
+        options = FeatureUpliftOptions(min_weight=least)
         found = uplift_features(gaussians, [view], grids, options=options, backend=BACKEND)
         assert found.weights.tolist() == pytest.approx([weight, 0], rel=1e-5)
         return found.values[:, 0].tolist()
@@ -189,7 +189,7 @@ def test_smaller_views_are_seen_through(rng) -> None:
     values = torch.from_numpy(rng.normal(size=(3, 4, 2))).float()
     large = Grids({"v": grid_of(values, 8, 24, 32)})
     small = Grids({"v": grid_of(values, 4)})
-    options = FeatureUpliftOptions(feature_side=16)
+    options = FeatureUpliftOptions(longest_side=16)
     a = uplift_features(gaussians, [full], large, options=options, backend=BACKEND)
     b = uplift_features(gaussians, [half], small, backend=BACKEND)
     c = uplift_features(gaussians, [full], small, backend=BACKEND)
@@ -221,14 +221,14 @@ def test_bad_input_is_refused(rng, views) -> None:
     with pytest.raises(InputError, match="features of every view that votes, 1 of 1 have none"):
         uplift_features(gaussians, [View(name="x", camera=camera_at())], grids, backend=BACKEND)
     for wrong in (
-        {"feature_norm": "loud"},
+        {"norm": "loud"},
         {"resampling": "cubic"},
-        {"min_feature_weight": -1.0},
-        {"min_feature_weight": float("inf")},
-        {"feature_side": 0},
-        {"feature_channels": 0},
+        {"min_weight": -1.0},
+        {"min_weight": float("inf")},
+        {"longest_side": 0},
+        {"channels": 0},
     ):
         with pytest.raises(InputError, match=next(iter(wrong))):
             FeatureUpliftOptions(**wrong)
-    with pytest.raises(RangeError, match="feature_channels"):
-        FeatureUpliftOptions(feature_channels=1025)
+    with pytest.raises(RangeError, match="channels"):
+        FeatureUpliftOptions(channels=1025)

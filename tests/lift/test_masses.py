@@ -5,7 +5,7 @@ import torch
 
 from splatseg.core import LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.lift import _masses
+from splatseg.lift.mass import segment_masses
 from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.render.warp import warp_into_photograph
 
@@ -33,7 +33,7 @@ def expected(gaussians, camera, images: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("band", [1 << 18, 50])
 @pytest.mark.parametrize("lens", [{}, BARREL])
 def test_overlapping_masks(rng, lens, band, backend, monkeypatch) -> None:
-    monkeypatch.setattr(_masses, "_BAND", band)
+    monkeypatch.setattr(segment_masses, "_BAND", band)
     camera = camera_at(0.1, **lens)
     gaussians = random_gaussians(rng)
     masks = torch.from_numpy(rng.random((7, 12, 16)) < 0.4)

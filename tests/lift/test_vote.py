@@ -64,7 +64,7 @@ def test_each_view_votes_for_the_id_at_the_centre(rng, lens, memory) -> None:
     share, column = (counts / total.clamp_min(1).unsqueeze(1)).max(dim=1)
     expected = torch.where(total > 0, torch.tensor(ids)[column], -1)
 
-    labels = voted(gaussians, views, maps, vote_memory=memory)
+    labels = voted(gaussians, views, maps, memory=memory)
 
     assert labels.ids.tolist() == expected.tolist()
     assert labels.confidence.tolist() == pytest.approx(share.tolist())
@@ -81,17 +81,17 @@ def test_published_votes_are_of_all_views() -> None:
     gaussians = gaussians_at([LEFT])
     visible = voted(gaussians, views, maps)
     assert (visible.ids.tolist(), visible.confidence.tolist()) == ([1], [1.0])
-    published = voted(gaussians, views, maps, vote_rule="published")
+    published = voted(gaussians, views, maps, rule="published")
     assert (published.ids.tolist(), published.confidence.tolist()) == ([1], [0.75])
-    strict = voted(gaussians, views, maps, vote_rule="published", vote_share=0.75)
+    strict = voted(gaussians, views, maps, rule="published", share=0.75)
     assert (strict.ids.tolist(), strict.confidence.tolist()) == ([-1], [0.0])
     # With two of four views looking away, SA-GS loses it and Prompt SA-GS as well.
     views[2] = View(name="v2", camera=views[3].camera)
     for share in (None, 0.6):
-        lost = voted(gaussians, views, maps, vote_rule="published", vote_share=share)
+        lost = voted(gaussians, views, maps, rule="published", share=share)
         assert lost.ids.tolist() == [-1]
     assert voted(gaussians, views, maps).ids.tolist() == [1]
-    assert VoteOptions(vote_rule="published").needed_share == 0.7
+    assert VoteOptions(rule="published").needed_share == 0.7
     assert VoteOptions().needed_share == 0.0
 
 
@@ -101,10 +101,10 @@ def test_void_pixels_say_nothing_or_no() -> None:
     labels = voted(gaussians, views, maps)
     assert labels.ids.tolist() == [1, -1]
     assert labels.confidence.tolist() == [1.0, 0.0]
-    against = voted(gaussians, views, maps, vote_void=True)
+    against = voted(gaussians, views, maps, count_void=True)
     assert against.ids.tolist() == [1, -1]
     assert against.confidence.tolist() == pytest.approx([1 / 3, 0.0])
-    assert voted(gaussians, views, maps, vote_void=True, vote_share=0.5).ids.tolist() == [-1, -1]
+    assert voted(gaussians, views, maps, count_void=True, share=0.5).ids.tolist() == [-1, -1]
 
 
 def test_what_is_hidden_is_not_asked() -> None:
@@ -122,14 +122,14 @@ def test_what_is_hidden_is_not_asked() -> None:
     assert labels.confidence.tolist() == [0.5, 0.5]
     assert labels.ids.tolist() == [1, 1]  # ties to the smaller id
     for how in ("depth", "weight"):
-        seen = voted(gaussians, views, maps, vote_occlusion=how, vote_min_weight=0.1)
+        seen = voted(gaussians, views, maps, occlusion=how, min_weight=0.1)
         assert seen.ids.tolist() == [1, 2]
         assert seen.confidence[1] == 1.0
-    far = voted(gaussians, views, maps, vote_occlusion="depth", vote_depth_tolerance=0.6)
+    far = voted(gaussians, views, maps, occlusion="depth", depth_tolerance=0.6)
     assert far.confidence.tolist() == [0.5, 0.5]
     # No median depth, nothing hidden: both are faint.
     faint = gaussians.replace(opacities=torch.full((2,), 0.3))
-    assert voted(faint, views, maps, vote_occlusion="depth").confidence.tolist() == [0.5, 0.5]
+    assert voted(faint, views, maps, occlusion="depth").confidence.tolist() == [0.5, 0.5]
 
 
 def test_transmittance_weighs_the_votes(rng, views) -> None:
@@ -143,7 +143,7 @@ def test_transmittance_weighs_the_votes(rng, views) -> None:
             if 0 <= u < 16 and 0 <= v < 12:
                 id = int(maps.label_map(view.name).ids[v, u])
                 votes[i, id - 1] += matrix[v, u, i]
-    labels = voted(gaussians, views, maps, vote_weight="transmittance", vote_candidates=3)
+    labels = voted(gaussians, views, maps, weight="transmittance", candidates=3)
     assert labels.evidence is not None
     assert labels.shares is not None
     torch.testing.assert_close(labels.evidence.double(), votes.sum(dim=1), rtol=0, atol=5e-3)
@@ -152,7 +152,7 @@ def test_transmittance_weighs_the_votes(rng, views) -> None:
     torch.testing.assert_close(labels.shares.double(), expected, rtol=0, atol=5e-3)
     unseen = votes.sum(dim=1) == 0
     assert bool((labels.ids[unseen] == -1).all())
-    least = voted(gaussians, views, maps, vote_occlusion="weight", vote_min_weight=0.5)
+    least = voted(gaussians, views, maps, occlusion="weight", min_weight=0.5)
     strong = sum(
         float(matrix_of(gaussians, view.camera)[v, u, 3]) >= 0.5
         for view in views
@@ -209,7 +209,7 @@ def test_regions_vote_for_their_commonest_id() -> None:
     speck[row, column] = 9
     maps = Maps({"v0": LabelMap(ids=speck)})
     assert voted(gaussians, views, maps).ids.tolist() == [9]
-    assert voted(gaussians, views, maps, vote_region=1).ids.tolist() == [1]
+    assert voted(gaussians, views, maps, region=1).ids.tolist() == [1]
 
 
 def test_confidence_and_reduced_maps() -> None:
@@ -217,7 +217,7 @@ def test_confidence_and_reduced_maps() -> None:
     views, maps = ballots(
         halves(1, 1, confidence=sure), halves(2, 2, confidence=0.5 * sure), halves(2, 2)
     )
-    labels = voted(gaussians_at([LEFT]), views, maps, vote_candidates=2)
+    labels = voted(gaussians_at([LEFT]), views, maps, candidates=2)
     assert labels.ids.tolist() == [2]
     assert labels.candidates is not None
     assert labels.shares is not None
@@ -231,7 +231,7 @@ def test_order_of_views_changes_nothing(rng, views) -> None:
     gaussians = random_gaussians(rng, 20)
     maps = random_maps(rng, views, (1, 2, 3))
     calls = []
-    options = VoteOptions(vote_weight="transmittance", vote_candidates=2)
+    options = VoteOptions(weight="transmittance", candidates=2)
     a = vote(gaussians, views, maps, options=options, backend=BACKEND)
     b = vote(
         gaussians,
@@ -252,7 +252,7 @@ def test_metadata_says_how_it_was_made(rng, views) -> None:
     labels = vote(random_gaussians(rng, 30), views, maps, classes=classes, backend=BACKEND)
     metadata = json.loads(json.dumps(dict(labels.metadata)))
     assert metadata["method"] == "vote"
-    assert metadata["options"]["vote_rule"] == "visible"
+    assert metadata["options"]["rule"] == "visible"
     assert metadata["views"] == ["v0", "v1", "v2"]
     assert metadata["names"] == {"4": "chair"}
 
@@ -279,16 +279,16 @@ def test_bad_input_is_refused(rng, views) -> None:
     with pytest.raises(RangeError, match="means"):
         vote(broken, views[:2], maps, backend=BACKEND)
     for wrong in (
-        {"vote_share": 1.1},
-        {"vote_min_weight": -0.1},
-        {"vote_depth_tolerance": -1.0},
-        {"vote_depth_tolerance": math.inf},
-        {"vote_region": -1},
-        {"vote_candidates": 0},
-        {"vote_memory": 0},
+        {"share": 1.1},
+        {"min_weight": -0.1},
+        {"depth_tolerance": -1.0},
+        {"depth_tolerance": math.inf},
+        {"region": -1},
+        {"candidates": 0},
+        {"memory": 0},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             VoteOptions(**wrong)
-    for wrong in ({"vote_rule": "most"}, {"vote_occlusion": "x"}, {"vote_weight": "two"}):
+    for wrong in ({"rule": "most"}, {"occlusion": "x"}, {"weight": "two"}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             VoteOptions(**wrong)

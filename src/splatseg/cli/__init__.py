@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
+from splatseg.cli._words import field_names, with_flags
 from splatseg.errors import InputError, SplatsegError
 
 EXIT_DONE = 0
@@ -182,19 +183,27 @@ def _run(module: CommandModule, name: str, words: list[str]) -> int:
     """Parse the words of one command and run it; tyro's own exits become our status."""
     import tyro  # here, because the top-level help needs none of it
 
+    default_config = (
+        tyro.conf.OmitArgPrefixes,  # --steps, not --options.steps
+        tyro.conf.HelptextFromCommentsOff,  # comments speak to readers of the code
+    )
+    # A command whose flags depend on its words makes its type from them.
+    command_for = getattr(module, "command_for", None)
     try:
         command = tyro.cli(
-            module.Command,
+            module.Command if command_for is None else command_for(words),
             prog=f"splatseg {name}",
             args=words,
-            config=(
-                tyro.conf.OmitArgPrefixes,  # --steps, not --options.steps
-                tyro.conf.HelptextFromCommentsOff,  # comments speak to readers of the code
-            ),
+            config=getattr(module, "CONFIG", default_config),
         )
     except SystemExit as leaving:  # after --help (0) or a usage error (2)
         return leaving.code if isinstance(leaving.code, int) else EXIT_USAGE
-    module.run(command)
+    try:
+        module.run(command)
+    except InputError as error:
+        # Tasks speak of options by their names in Python.
+        error.args = (with_flags(str(error), field_names(command)),)
+        raise
     return EXIT_DONE
 
 

@@ -11,14 +11,15 @@ from typing import Annotated, Any
 import tyro
 from torch import Tensor
 
-from splatseg.cli._columns import label_tables
-from splatseg.cli._work import layer_of, open_scene
+from splatseg.cli._work import open_scene
 from splatseg.core import Features, Gaussians, Labels, Scene, Selection, Similarity, View
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import is_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.splats import SplatWarning, read_splats
 from splatseg.lift import Attached, AttachOptions, attach
+from splatseg.tasks.label_columns import label_tables
+from splatseg.tasks.scene_parts import layer_of
 
 Layer = Labels | Features | Selection
 

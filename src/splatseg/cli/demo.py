@@ -1,29 +1,42 @@
 """``splatseg demo``: a generated room goes through the commands of the main job."""
 
-import contextlib
-import io
-import json
 import shutil
-import sys
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli import evaluate, export, fit, render, see, segment
-from splatseg.cli._work import progress
+from splatseg.cli import fit, see
+from splatseg.cli._work import ConsoleObserver, progress
+from splatseg.core import Scene
 from splatseg.errors import InputError, RangeError
 from splatseg.io.json_files import read_json, write_json
+from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.render import BackendName
 from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.synthetic import cameras, room, write_capture
+from splatseg.tasks import (
+    EvaluationOptions,
+    ExportOptions,
+    RenderingOptions,
+    Segmentation,
+    SegmentOptions,
+    evaluate,
+    export,
+    export_layer,
+    render_views,
+    report_layer,
+    segment,
+)
+from splatseg.tasks.evaluate import Metric
 
+_CONSOLE = ConsoleObserver()
 _RECORD = "demo.json"
 _MADE_BY = "splatseg demo"
 # Everything that the demo writes besides its record; a second run removes these and no more.
@@ -104,30 +117,17 @@ def run(command: Command) -> None:
         )
     steps.append(("generate", time.monotonic() - started))
 
-    lines: list[str] = []
-    printed: dict[tuple[str, str], dict[str, Any]] = {}
-    for name, module, job in main_job(command):
-        line = words_of(name, job)
-        lines.append(" ".join(line))
-        console.print(f"\n[bold]$[/bold] {' '.join(line)}", soft_wrap=True)
-        begin = time.monotonic()
-        if name == "evaluate":
-            printed[job.layer, job.split] = _evaluated(job)
-        else:
-            module.run(job)
-        if steps[-1][0] == name:
-            steps[-1] = (name, steps[-1][1] + time.monotonic() - begin)
-        else:
-            steps.append((name, time.monotonic() - begin))
+    job = _MainJob(command=command, console=console, steps=steps)
+    job.run()
 
     begin = time.monotonic()
     figures = DemoFigures(
         came=machine_score(capture, _EVIDENCE),
-        train=printed[_LAYER, "train"],
-        test=printed[_LAYER, "test"],
-        objects=printed[_OBJECTS, "test"],
+        train=job.figures[_LAYER, "train"],
+        test=job.figures[_LAYER, "test"],
+        objects=job.figures[_OBJECTS, "test"],
         steps=tuple(steps),
-        commands=tuple(lines),
+        commands=tuple(job.lines),
         started=started,
     )
     write_report(
@@ -140,112 +140,121 @@ def run(command: Command) -> None:
     console.print(f"\nOpen {folder / 'report.html'} in a browser.", soft_wrap=True)
 
 
-def main_job(command: Command) -> list[tuple[str, ModuleType, Any]]:
-    """The commands that the demo runs: name, module and parsed form of each."""
-    folder, backend = command.output, command.backend
-    capture, scene, pictures = folder / "capture", folder / "scene", folder / "render"
-    minutes = 1.5 if command.minutes is None and command.steps is None else command.minutes
-    truth = capture / "semantic"
-    return [
-        (
-            "fit",
-            fit,
-            fit.Command(
-                data=capture,
-                output=scene,
-                minutes=minutes,
-                steps=command.steps,
-                max_gaussians=command.max_gaussians,
-                seed=command.seed,
-                backend=backend,
-            ),
-        ),
-        (
-            "segment",
-            segment,
-            segment.Command(
-                scene=scene,
-                method="uplift",
-                evidence=_EVIDENCE,
-                layer=_LAYER,
-                backend=backend,
-            ),
-        ),
-        ("see", see, see.Command(scene=scene, model="classical", evidence=_MASKS)),
-        (
-            "segment",
-            segment,
-            segment.Command(
-                scene=scene,
-                method="associate",
-                evidence=_MASKS,
-                layer=_OBJECTS,
-                export=True,
-                report=True,
-                backend=backend,
-            ),
-        ),
-        (
-            "render",
-            render,
-            render.Command(
-                scene=scene,
-                what=f"rgb,depth,{_LAYER},{_OBJECTS}",
-                output=pictures,
-                backend=backend,
-            ),
-        ),
-        *(
-            (
-                "evaluate",
-                evaluate,
-                evaluate.Command(
-                    scene=scene,
-                    layer=_LAYER,
-                    truth=truth,
-                    split=split,
-                    json=True,
-                    backend=backend,
-                ),
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _MainJob:
+    """The steps of the main job; each prints the command that does the same from the shell."""
+
+    command: Command
+    console: Console
+    steps: list[tuple[str, float]]
+    """Names and seconds."""
+
+    lines: list[str] = field(default_factory=list[str])
+    """The commands."""
+
+    figures: dict[tuple[str, str], dict[str, Any]] = field(
+        default_factory=dict[tuple[str, str], dict[str, Any]]
+    )
+    """Scores by layer and split."""
+
+    def run(self) -> None:
+        """Do all steps."""
+        folder, backend = self.command.output, self.command.backend
+        capture, root = folder / "capture", folder / "scene"
+        with self._step("fit", capture, "-o", root, *self._fit_words()):
+            fit.run(self._fit_command(capture, root))
+        scene = load_scene(root)
+        with self._step(
+            "segment", root, "--method", "uplift", "--evidence", _EVIDENCE, "--layer", _LAYER
+        ):
+            self._segment(scene, "uplift", SegmentOptions(evidence=_EVIDENCE, layer=_LAYER))
+        with self._step("see", root, "--model", "classical", "--evidence", _MASKS):
+            see.run(see.Command(scene=root, model="classical", evidence=_MASKS))
+        with self._step(
+            *("segment", root, "--method", "associate", "--evidence", _MASKS),
+            *("--layer", _OBJECTS, "--export", "--report"),
+        ):
+            made = self._segment(
+                scene, "associate", SegmentOptions(evidence=_MASKS, layer=_OBJECTS)
             )
-            for split in ("train", "test")
-        ),
-        (
-            "evaluate",
-            evaluate,
-            evaluate.Command(
-                scene=scene,
-                layer=_OBJECTS,
-                metric="instances",
-                truth=capture / "instance",
-                json=True,
+            export_layer(scene, root, _OBJECTS, made.layer, backend=backend, observer=_CONSOLE)
+            report_layer(scene, root, made, command=self.lines[-1], backend=backend)
+        what = ("rgb", "depth", _LAYER, _OBJECTS)
+        with self._step("render", root, "--what", ",".join(what), "-o", folder / "render"):
+            render_views(
+                scene,
+                folder / "render",
+                options=RenderingOptions(what=what),
                 backend=backend,
-            ),
-        ),
-        (
-            "export",
-            export,
-            export.Command(
-                scene=scene, layer=_LAYER, instances=_OBJECTS, output=folder / "labelled.ply"
-            ),
-        ),
-    ]
+                observer=_CONSOLE,
+            )
+        for split in ("train", "test"):
+            self._evaluate(scene, _LAYER, split, capture / "semantic", "semantic")
+        self._evaluate(scene, _OBJECTS, "test", capture / "instance", "instances")
+        labelled = folder / "labelled.ply"
+        with self._step("export", root, "--layer", _LAYER, "--instances", _OBJECTS, "-o", labelled):
+            export(scene, labelled, options=ExportOptions(layer=_LAYER, instances=_OBJECTS))
 
+    def _segment(self, scene: Scene, method: str, options: SegmentOptions) -> Segmentation:
+        made = segment(
+            scene, method, options=options, backend=self.command.backend, observer=_CONSOLE
+        )
+        save_scene_layer(self.command.output / "scene", made.name, made.layer)
+        return made
 
-def words_of(name: str, job: Any) -> list[str]:
-    """The words that one would type for a parsed command; defaults are left out.
+    def _evaluate(self, scene: Scene, layer: str, split: str, truth: Path, metric: Metric) -> None:
+        root = self.command.output / "scene"
+        with self._step(
+            *("evaluate", root, "--layer", layer, "--truth", truth),
+            *("--split", split, "--metric", metric),
+        ):
+            found = evaluate(
+                scene,
+                options=EvaluationOptions(layer=layer, truth=truth, split=split, metric=metric),
+                backend=self.command.backend,
+                observer=_CONSOLE,
+            )
+        self.figures[layer, split] = found
+        shown = {key: value for key, value in found.items() if isinstance(value, float)}
+        self.console.print("  ".join(f"{key} {value:.3f}" for key, value in shown.items()))
 
-    Positional arguments come first, which in every command is the first field alone.
-    """
-    first, *rest = fields(job)
-    words = ["splatseg", name, str(getattr(job, first.name))]
-    for field in rest:
-        value = getattr(job, field.name)
-        if value == field.default or not isinstance(value, (str, int, float, Path)):
-            continue
-        flag = "-o" if field.name == "output" else "--" + field.name.replace("_", "-")
-        words += [flag] if value is True and field.default is False else [flag, str(value)]
-    return words
+    @contextmanager
+    def _step(self, name: str, *words: object) -> Generator[None]:
+        """Print a command, and time what does the same."""
+        backend = self.command.backend
+        chosen = [] if backend == "auto" or name == "see" else ["--backend", backend]
+        line = " ".join(["splatseg", name, *map(str, words), *chosen])
+        self.lines.append(line)
+        self.console.print(f"\n[bold]$[/bold] {line}", soft_wrap=True)
+        begin = time.monotonic()
+        yield
+        seconds = time.monotonic() - begin
+        if self.steps[-1][0] == name:
+            self.steps[-1] = (name, self.steps[-1][1] + seconds)
+        else:
+            self.steps.append((name, seconds))
+
+    def _minutes(self) -> float | None:
+        command = self.command
+        return 1.5 if command.minutes is None and command.steps is None else command.minutes
+
+    def _fit_words(self) -> list[object]:
+        command, minutes = self.command, self._minutes()
+        words: list[object] = [] if minutes is None else ["--minutes", minutes]
+        if command.steps is not None:
+            words += ["--steps", command.steps]
+        return [*words, "--max-gaussians", command.max_gaussians, "--seed", command.seed]
+
+    def _fit_command(self, capture: Path, root: Path) -> fit.Command:
+        return fit.Command(
+            data=capture,
+            output=root,
+            minutes=self._minutes(),
+            steps=self.command.steps,
+            max_gaussians=self.command.max_gaussians,
+            seed=self.command.seed,
+            backend=self.command.backend,
+        )
 
 
 def _prepared(folder: Path, console: Console) -> Path:
@@ -274,17 +283,6 @@ def _prepared(folder: Path, console: Console) -> Path:
     for name in _FILES:
         (folder / name).unlink(missing_ok=True)
     return folder
-
-
-def _evaluated(job: evaluate.Command) -> dict[str, Any]:
-    """The figures that ``splatseg evaluate --json`` prints."""
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        evaluate.run(job)
-    figures: dict[str, Any] = json.loads(printed.getvalue())
-    shown = {key: value for key, value in figures.items() if isinstance(value, float)}
-    sys.stdout.write("  ".join(f"{key} {value:.3f}" for key, value in shown.items()) + "\n")
-    return figures
 
 
 def _record(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, cast
 import torch
 import tyro
 
-from splatseg.cli._work import SAME_IDS, check_new_scene, progress, views_that_made
+from splatseg.cli._work import check_new_scene, progress
 from splatseg.core import Gaussians, Labels, Similarity, View
 from splatseg.edit import (
     CutBy,
@@ -33,7 +33,9 @@ from splatseg.evaluate import picture_and_photograph, psnr
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.io.scene import is_scene
 from splatseg.lift import CutOptions
+from splatseg.methods import keeps_ids
 from splatseg.render import BackendName, render
+from splatseg.tasks.scene_parts import views_that_made
 
 Triple = tuple[float, float, float]
 _DRAWN_VIEWS = 40
@@ -340,7 +342,7 @@ def _masks(command: Command, document: Document, where: Where) -> CutBy | None:
         if asked:
             raise InputError("--split masks: expected a layer made from label maps, got none.")
         return None
-    if not asked and (document.history or metadata.get("method") not in SAME_IDS):
+    if not asked and (document.history or not keeps_ids(metadata.get("method"))):
         return None
     places = [place for place in (scene.root, scene.source) if place is not None]
     zero_is_class = "source_ids" in metadata

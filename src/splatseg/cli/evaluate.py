@@ -1,48 +1,23 @@
-"""``splatseg evaluate``: a layer against truth, and pictures against photographs."""
+"""``splatseg evaluate``: a layer against truth, and renders against photographs."""
 
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._figures import (
-    binary_figures,
-    instance_figures,
-    panoptic_figures,
-    point_figures,
-    read_points,
-    read_scores,
-    semantic_figures,
-)
-from splatseg.cli._work import layer_of, mask_use, open_scene, progress, views_of_split
-from splatseg.core import ClassTable, Features, Labels, Layer, Scene, View
-from splatseg.errors import InputError
-from splatseg.evaluate import (
-    SemanticReport,
-    evaluate_binary,
-    evaluate_instances,
-    evaluate_panoptic,
-    evaluate_photographs,
-    evaluate_points,
-    evaluate_semantic,
-)
-from splatseg.evaluate.lpips import Lpips, load_lpips
+from splatseg.cli._work import ConsoleObserver, open_scene
+from splatseg.core import Scene
 from splatseg.evaluate.solid import PointRule
-from splatseg.io.class_tables import class_table
-from splatseg.io.evidence import Evidence, open_evidence
-from splatseg.io.json_files import read_json, write_json
+from splatseg.io.json_files import write_json
 from splatseg.render import BackendName
-
-Metric = Literal["semantic", "instances", "panoptic", "binary"]
-
-# The array of a file of points that holds the truth of each metric.
-_POINT_TRUTH: Mapping[str, str] = {"semantic": "semantic", "instances": "instance"}
+from splatseg.tasks import EvaluationOptions, evaluate
+from splatseg.tasks.evaluate import Metric
 
 _PER_CLASS = {
     "per_class": "classes",
@@ -134,203 +109,21 @@ class Command:
 
 def run(command: Command) -> None:
     """Evaluate a scene."""
-    _check(command)
-    network = load_lpips(command.lpips) if command.lpips else None
     scene = open_scene(command.scene, command.data)
-    figures: dict[str, Any] = {"scene": str(command.scene), "split": command.split}
-    if command.layer is not None:
-        figures |= {"layer": command.layer, "metric": command.metric}
-    if command.truth is not None or command.layer is None:
-        views = views_of_split(scene, command.split)
-        figures |= _in_views(command, scene, views, network)
-    if command.points is not None:
-        figures |= _point_figures(command, scene, command.points)
+    asked = {field.name: getattr(command, field.name) for field in fields(EvaluationOptions)}
+    figures = evaluate(
+        scene,
+        options=EvaluationOptions(**asked),
+        backend=command.backend,
+        observer=ConsoleObserver(),
+    )
+    figures["scene"] = str(command.scene)
     if command.json_file is not None:
         write_json(command.json_file, figures)
     if command.json:
         sys.stdout.write(json.dumps(figures) + "\n")
     else:
         _print_tables(figures, scene)
-
-
-def _check(command: Command) -> None:
-    """Say which options belong together before anything is read."""
-    if command.layer is None and (command.truth or command.points):
-        raise InputError("--layer: expected the layer that --truth and --points are to score.")
-    if command.layer is not None and not (command.truth or command.points):
-        raise InputError("--truth: expected a folder of true id maps (or --points), got none.")
-    panoptic = (
-        command.instances,
-        command.truth_instances,
-        command.metadata,
-        command.scores,
-    )
-    if command.metric == "panoptic" and command.truth_instances is None:
-        raise InputError(
-            "--truth-instances: expected the folder of true instance maps beside --truth, which "
-            "is of classes, got none."
-        )
-    if command.metric != "panoptic" and any(panoptic):
-        raise InputError(
-            "--instances, --truth-instances, --metadata, --scores: expected --metric panoptic "
-            f"with them, got {command.metric}."
-        )
-    if command.points is not None and command.metric not in _POINT_TRUTH:
-        raise InputError(
-            f"--points: expected --metric semantic or instances, got {command.metric}."
-        )
-
-
-def _in_views(
-    command: Command, scene: Scene, views: tuple[View, ...], network: Lpips | None
-) -> dict[str, Any]:
-    """Scores of the layer, and of the pictures where there are photographs or they are asked."""
-    figures: dict[str, Any] = {}
-    if command.layer is not None and command.truth is not None:
-        truth = open_evidence(command.truth, zero_is_class=command.zero_is_class, void=command.void)
-        layer = layer_of(scene, command.layer)
-        figures |= _layer_figures(command, scene, views, layer, truth)
-    if network is not None or _wants_photographs(command, views):
-        figures |= _photograph_figures(command, scene, views, network)
-    elif command.layer is None:
-        raise InputError(
-            f"{command.scene}: expected a layer with a truth, or photographs to score against, "
-            "got neither."
-        )
-    return figures
-
-
-def _layer_figures(
-    command: Command,
-    scene: Scene,
-    views: tuple[View, ...],
-    layer: Layer,
-    truth: Evidence,
-) -> dict[str, Any]:
-    if isinstance(layer, Features):
-        raise InputError(f"--layer: {command.layer} holds features, which have no score.")
-    if command.metric == "binary":
-        with progress("evaluate") as step:
-            report = evaluate_binary(
-                scene.gaussians,
-                views,
-                layer,
-                truth,
-                id=command.id,
-                backend=command.backend,
-                progress=step,
-            )
-        return binary_figures(report)
-    if not isinstance(layer, Labels):
-        raise InputError("--metric: a selection has no classes; use --metric binary.")
-    if command.metric == "panoptic" and command.truth_instances is not None:
-        true_instances = open_evidence(command.truth_instances)
-        return _panoptic_figures(
-            command, scene, views, layer, truth=truth, true_instances=true_instances
-        )
-    method = evaluate_semantic if command.metric == "semantic" else evaluate_instances
-    with progress("evaluate") as step:
-        report = method(
-            scene.gaussians, views, layer, truth, backend=command.backend, progress=step
-        )
-    if isinstance(report, SemanticReport):
-        return semantic_figures(report)
-    return instance_figures(report)
-
-
-def _panoptic_figures(
-    command: Command,
-    scene: Scene,
-    views: tuple[View, ...],
-    layer: Labels,
-    *,
-    truth: Evidence,
-    true_instances: Evidence,
-) -> dict[str, Any]:
-    other = None
-    if command.instances is not None:
-        other = _labels(scene, command.instances, "--instances")
-    with progress("evaluate") as step:
-        report = evaluate_panoptic(
-            scene.gaussians,
-            views,
-            classes=None if other is None else layer,
-            instances=layer if other is None else other,
-            true_classes=truth,
-            true_instances=true_instances,
-            table=_thing_table(command, scene, truth),
-            scores=None if command.scores is None else read_scores(command.scores),
-            backend=command.backend,
-            progress=step,
-        )
-    return panoptic_figures(report)
-
-
-def _thing_table(command: Command, scene: Scene, truth: Evidence) -> ClassTable:
-    if command.metadata is not None:
-        if command.zero_is_class:
-            raise InputError(
-                "--metadata: its ids are those of the files, which --zero-is-class changes; "
-                "put it beside the truth as metadata.json instead."
-            )
-        return class_table(read_json(command.metadata).get("classes"), where=str(command.metadata))
-    table = truth.classes or scene.classes
-    if table is None:
-        raise InputError(
-            "--metadata: expected a JSON file that says which classes are things; neither the "
-            "truth nor the scene does."
-        )
-    return table
-
-
-def _point_figures(command: Command, scene: Scene, path: Path) -> dict[str, Any]:
-    """Scores of points, under names that begin with points_."""
-    labels = _labels(scene, command.layer or "", "--layer")
-    points, truth = read_points(path, _POINT_TRUTH[command.metric])
-    report = evaluate_points(
-        scene.gaussians,
-        labels,
-        points=points,
-        truth=truth,
-        matched=command.metric == "instances",
-        rule=command.points_rule,
-    )
-    return point_figures(report, rule=command.points_rule)
-
-
-def _labels(scene: Scene, name: str, option: str) -> Labels:
-    layer = layer_of(scene, name)
-    if not isinstance(layer, Labels):
-        raise InputError(f"{option}: expected a layer of labels, {name} is none.")
-    return layer
-
-
-def _wants_photographs(command: Command, views: tuple[View, ...]) -> bool:
-    at_hand = all(view.image is not None and view.image.is_file() for view in views)
-    return command.photographs or at_hand
-
-
-def _photograph_figures(
-    command: Command, scene: Scene, views: tuple[View, ...], network: Lpips | None
-) -> dict[str, Any]:
-    with progress("photographs") as step:
-        report = evaluate_photographs(
-            scene.gaussians,
-            views,
-            masks=mask_use(scene),
-            lpips=network,
-            backend=command.backend,
-            progress=step,
-        )
-    figures: dict[str, Any] = {
-        "PSNR": report.psnr,
-        "SSIM": report.ssim,
-        "PSNR_min": report.psnr_min,
-        "photographs": len(report.views),
-    }
-    if network is not None:
-        figures |= {"LPIPS": report.lpips, "LPIPS_network": network.network}
-    return figures
 
 
 def _print_tables(figures: Mapping[str, Any], scene: Scene) -> None:

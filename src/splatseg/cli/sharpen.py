@@ -10,7 +10,7 @@ from typing import Annotated, Any, cast
 import torch
 import tyro
 
-from splatseg.cli._work import SAME_IDS, check_new_scene, mask_use, progress, views_that_made
+from splatseg.cli._work import check_new_scene, progress
 from splatseg.core import UNLABELLED, Gaussians, Labels, LabelSource, Scene, View
 from splatseg.edit import Document, load_document, save_document
 from splatseg.edit._document import BASE, HISTORY
@@ -26,7 +26,9 @@ from splatseg.lift import (
     SharpenOptions,
     sharpen,
 )
+from splatseg.methods import keeps_ids
 from splatseg.render import BackendName
+from splatseg.tasks.scene_parts import mask_use, views_that_made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,7 +179,7 @@ def _source(
     zero = own and "source_ids" in layer.metadata
     evidence = open_evidence(find_evidence(places, name), zero_is_class=zero)
     views = _views(scene, layer, evidence)
-    same = own and layer.metadata.get("method") in SAME_IDS
+    same = own and keeps_ids(layer.metadata.get("method"))
     if same and evidence.kind in ("labels", "tracked"):
         return evidence, evidence, views
     if evidence.kind not in ("masks", "panoptic", "tracked"):

@@ -19,7 +19,7 @@ is taken already is left out.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,9 @@ from splatseg.errors import RangeError
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
 from splatseg.lift.segments.clustering import cluster
 from splatseg.lift.segments.flatten import chosen_groups
+from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.lift.segments.table import SegmentTable, segment_table
+from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import RenderOptions
 
 _CANDIDATES = 8
@@ -262,3 +264,42 @@ def _account(table: SegmentTable, group: NDArray[np.int64], *, tracked: bool) ->
         "merged": [{"id": i, "from": sorted(found)} for i, found in merged.items()],
         "split": [{"from": name, "ids": sorted(found)} for name, found in split.items()],
     }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AssociateMethodOptions:
+    """Association, and what corrects its votes."""
+
+    association: AssociateOptions = field(default_factory=AssociateOptions)
+    """How segments become instances."""
+
+    reconsider: bool = True
+    """Decide anew under how often the evidence takes one instance for another, which finds small
+    things that most views miss."""
+
+    confusion: ConfusionOptions = field(default_factory=ConfusionOptions)
+    """How the evidence errs."""
+
+
+def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels:
+    """Join segments of views, see `associate`."""
+    return associate(
+        inputs.gaussians,
+        inputs.views,
+        EvidenceSegments(evidence=inputs.evidence),
+        options=options.association,
+        confusion=options.confusion if options.reconsider else None,
+        classes=inputs.categories,
+        backend=inputs.backend,
+        progress=inputs.progress,
+    )
+
+
+METHOD = Method(
+    name="associate",
+    summary="segments of all views become instances by the Gaussians they share; no tracker",
+    reference="docs/decisions/0012-association.md",
+    evidence=("masks", "panoptic", "tracked"),
+    options=AssociateMethodOptions,
+    run=run,
+)

@@ -46,6 +46,7 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.methods._identity_loss import NeighbourLoss, pixel_loss
 from splatseg.methods._identity_rows import Batch, Sampler, batches_of
+from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import RenderOptions, options_for, render
 
 _ROWS = 65536
@@ -387,3 +388,29 @@ class _Trainer:
         (self._options.identity_kl_weight * loss).backward()
         if told.grad is not None:
             self._gradient[names] += told.grad
+
+
+def run(inputs: MethodInputs, options: IdentityOptions) -> Labels:
+    """Train identities, see `identity`."""
+    return identity(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,
+        options=options,
+        classes=inputs.label_names,
+        backend=inputs.backend,
+        progress=inputs.progress,
+        seed=inputs.seed,
+    )
+
+
+METHOD = Method(
+    name="identity",
+    summary="features of 16 channels and a classifier are trained; for comparison",
+    reference="Gaussian Grouping (Ye et al. 2024), eq. 3 to 5",
+    evidence=("labels", "tracked"),
+    options=IdentityOptions,
+    run=run,
+    keeps_ids=True,
+    seeded=True,
+)

@@ -45,6 +45,7 @@ from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.mass.centres import Centres, centres_in, in_front, majority_map, own_weights
 from splatseg.lift.mass.vote_table import VoteTable
+from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import RenderOptions, options_for
 
 VoteRule = Literal["visible", "published"]
@@ -59,68 +60,68 @@ _SLOTS = 32
 class VoteOptions:
     """How views vote."""
 
-    vote_rule: VoteRule = "visible"
+    rule: VoteRule = "visible"
     """visible: shares are of the votes of views that see a Gaussian. published: they are of all
     views, as in SA-GS; views that do not see it vote against it."""
 
-    vote_share: float | None = None
+    share: float | None = None
     """Share in [0, 1] that the winner must exceed. None is 0 for visible and SA-GS's 0.7 for
     published; Prompt SA-GS takes 0.6."""
 
-    vote_occlusion: VoteOcclusion = "none"
+    occlusion: VoteOcclusion = "none"
     """Which views see a centre. none: all with a pixel for it, whatever hides it. depth: those
     where it is not behind the rendered median depth. weight: those where the Gaussian has
     blending weight at that pixel."""
 
-    vote_depth_tolerance: float = 0.05
+    depth_tolerance: float = 0.05
     """How far behind the median depth a centre may lie, as a part of that depth."""
 
-    vote_min_weight: float = 0.01
+    min_weight: float = 0.01
     """Blending weight in [0, 1] at the pixel of its centre that a Gaussian needs to be seen, for
     the occlusion test by weight."""
 
-    vote_weight: VoteWeight = "one"
+    weight: VoteWeight = "one"
     """What a view's vote counts. transmittance: the Gaussian's blending weight at the pixel of
     its centre, its opacity there times the transmittance before it."""
 
-    vote_region: int = 0
+    region: int = 0
     """Pixels on each side of the centre's pixel that decide with it: the vote is for the
     commonest id of the square. 0 is the pixel alone."""
 
-    vote_void: bool = False
+    count_void: bool = False
     """Views that see a centre on an unlabelled pixel count against every id, as they do when
     published: for masks of single objects, whose outside has no label."""
 
-    vote_candidates: int = 1
+    candidates: int = 1
     """Ids kept for each Gaussian. 1 makes a hard layer; with more the layer keeps their shares
     and is drawn softly."""
 
-    vote_memory: int = 1 << 30
+    memory: int = 1 << 30
     """Bytes of an exact table of votes, 4 for each id and Gaussian. With more ids than fit, each
     Gaussian remembers its strongest 32."""
 
     def __post_init__(self) -> None:
-        check_choice("vote_rule", self.vote_rule, ("visible", "published"))
-        check_choice("vote_occlusion", self.vote_occlusion, ("none", "depth", "weight"))
-        check_choice("vote_weight", self.vote_weight, ("one", "transmittance"))
-        if self.vote_share is not None:
-            check_range("vote_share", self.vote_share, 0.0, 1.0)
-        check_range("vote_min_weight", self.vote_min_weight, 0.0, 1.0)
-        tolerance = self.vote_depth_tolerance
+        check_choice("rule", self.rule, ("visible", "published"))
+        check_choice("occlusion", self.occlusion, ("none", "depth", "weight"))
+        check_choice("weight", self.weight, ("one", "transmittance"))
+        if self.share is not None:
+            check_range("share", self.share, 0.0, 1.0)
+        check_range("min_weight", self.min_weight, 0.0, 1.0)
+        tolerance = self.depth_tolerance
         if not (math.isfinite(tolerance) and tolerance >= 0):
-            raise RangeError(f"vote_depth_tolerance: expected 0 or more, got {tolerance}.")
-        if self.vote_region < 0:
-            raise RangeError(f"vote_region: expected 0 or more, got {self.vote_region}.")
-        for name in ("vote_candidates", "vote_memory"):
+            raise RangeError(f"depth_tolerance: expected 0 or more, got {tolerance}.")
+        if self.region < 0:
+            raise RangeError(f"region: expected 0 or more, got {self.region}.")
+        for name in ("candidates", "memory"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
 
     @property
     def needed_share(self) -> float:
-        """`vote_share`, or what None stands for."""
-        if self.vote_share is not None:
-            return self.vote_share
-        return _PUBLISHED_SHARE if self.vote_rule == "published" else 0.0
+        """`share`, or what None stands for."""
+        if self.share is not None:
+            return self.share
+        return _PUBLISHED_SHARE if self.rule == "published" else 0.0
 
 
 def vote(
@@ -168,8 +169,8 @@ def vote(
         drawing=render_options or options_for(gaussians, backend),
         backend=backend,
     )
-    slots = max(_SLOTS, options.vote_candidates)
-    table = VoteTable(len(gaussians), memory=options.vote_memory, slots=slots)
+    slots = max(_SLOTS, options.candidates)
+    table = VoteTable(len(gaussians), memory=options.memory, slots=slots)
     against = torch.zeros(len(gaussians))
     ids: set[int] = set()
     for done, view in enumerate(ordered):
@@ -212,32 +213,32 @@ class _Booth:
         centres, weight = self._seen(centres, camera)
         column, row = centres.pixels.unbind(dim=1)
         say = torch.ones(len(weight))
-        if self.options.vote_weight == "transmittance":
+        if self.options.weight == "transmittance":
             say = weight
         if paper.confidence is not None:
             say = say * paper.confidence.cpu().float()[row, column]
-        ids = majority_map(paper.ids.cpu(), self.options.vote_region)
+        ids = majority_map(paper.ids.cpu(), self.options.region)
         return _Cast(gaussians=centres.gaussians, ids=ids[row, column].long(), weights=say)
 
     def _seen(self, centres: Centres, camera: Camera) -> tuple[Centres, Tensor]:
         """The centres that pass the occlusion test, and their weights where they are needed."""
-        how = self.options.vote_occlusion
+        how = self.options.occlusion
         if how == "depth":
             front = in_front(
                 centres,
                 self.gaussians,
                 camera,
-                tolerance=self.options.vote_depth_tolerance,
+                tolerance=self.options.depth_tolerance,
                 options=self.drawing,
                 backend=self.backend,
             )
             centres = centres[front]
         weight = torch.ones(len(centres.gaussians))
-        if how == "weight" or self.options.vote_weight == "transmittance":
+        if how == "weight" or self.options.weight == "transmittance":
             weight = own_weights(
                 centres, self.gaussians, camera, options=self.drawing, backend=self.backend
             )
-            least = self.options.vote_min_weight if how == "weight" else 0.0
+            least = self.options.min_weight if how == "weight" else 0.0
             seen = (weight > 0) & (weight >= least)
             centres, weight = centres[seen], weight[seen]
         return centres, weight
@@ -251,15 +252,15 @@ def _elected(
     views: Sequence[View],
     names: dict[str, str],
 ) -> Labels:
-    ranking = table.rank(options.vote_candidates)
-    total = ranking.total + against if options.vote_void else ranking.total
-    if options.vote_rule == "published":
+    ranking = table.rank(options.candidates)
+    total = ranking.total + against if options.count_void else ranking.total
+    if options.rule == "published":
         total = torch.full_like(ranking.total, float(len(views)))
     shares = ranking.votes / torch.where(total > 0, total, 1.0).unsqueeze(1)
     # Sums in float32 may leave a lone id's share a hair above 1.
     shares = shares.clamp(0, 1)
     sure = (ranking.ids[:, 0] != UNLABELLED) & (shares[:, 0] > options.needed_share)
-    soft = options.vote_candidates > 1
+    soft = options.candidates > 1
     return Labels(
         ids=torch.where(sure, ranking.ids[:, 0], UNLABELLED),
         confidence=torch.where(sure, shares[:, 0], 0.0),
@@ -278,3 +279,28 @@ def _elected(
 def _names(classes: ClassTable | None, ids: set[int]) -> dict[str, str]:
     known = () if classes is None else classes.rows
     return {str(row.id): row.name for row in known if row.id in ids}
+
+
+def run(inputs: MethodInputs, options: VoteOptions) -> Labels:
+    """Let views vote by the pixels of centres, see `vote`."""
+    return vote(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,
+        options=options,
+        classes=inputs.label_names,
+        backend=inputs.backend,
+        progress=inputs.progress,
+    )
+
+
+METHOD = Method(
+    name="vote",
+    summary="views vote for Gaussians by the pixel of their centre, with or without occlusion test",
+    reference="SA-GS (Hu et al. 2024), section 4.3; Prompt SA-GS (2024), eq. 7 and 8",
+    evidence=("labels", "tracked"),
+    options=VoteOptions,
+    run=run,
+    keeps_ids=True,
+    published=VoteOptions(rule="published"),
+)

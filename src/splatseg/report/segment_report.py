@@ -17,6 +17,7 @@ from splatseg.evaluate.agreement import SEEN_LONGEST, views_that_show
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
 from splatseg.evaluate.overlaps import InstanceScore, Overlaps, instance_score
 from splatseg.io.atomic import atomic_file
+from splatseg.methods import keeps_ids
 from splatseg.report._segment_ids import class_table, ids_agree, ids_are_classes
 from splatseg.report._segment_pictures import Sight, gallery, look, rename_truth
 from splatseg.report._segment_tables import (
@@ -50,7 +51,6 @@ _LARGEST = 4_500_000
 _PICTURE_SIZES = (448, 320, 224, 128)
 
 # Methods whose layers keep the ids of the evidence.
-_SAME_IDS = ("uplift", "vote", "identity")
 
 _T = TypeVar("_T")
 
@@ -181,7 +181,7 @@ def write_segmentation_report(
         ShapeError: If a truth does not have its photograph's proportions.
     """
     same = evidence is not None and ids_agree(
-        labels, evidence, otherwise=labels.metadata.get("method", "uplift") in _SAME_IDS
+        labels, evidence, otherwise=keeps_ids(labels.metadata.get("method", "uplift"))
     )
     known = set(evidence.view_names) if evidence is not None else set[str]()
     learned = [view for view in views if _at_hand(view)]
@@ -265,7 +265,7 @@ def _scores(
     scored = held_out or with_truth
     kind = "held-out view" if held_out else "view that the layer was made from"
     words = f"{len(scored)} {kind.replace('view', 'views', 1) if len(scored) > 1 else kind}"
-    otherwise = ids_are_classes(evidence) and labels.metadata.get("method", "uplift") in _SAME_IDS
+    otherwise = ids_are_classes(evidence) and keeps_ids(labels.metadata.get("method", "uplift"))
     if ids_agree(labels, truth, otherwise=otherwise):
         pooled = Confusion.none()
         for sight in scored:

@@ -40,7 +40,7 @@ Resampling = Literal["bilinear", "nearest"]
 class FeatureUpliftOptions:
     """How feature maps become features of Gaussians."""
 
-    feature_norm: FeatureNorm = "none"
+    norm: FeatureNorm = "none"
     """What is done to the features of each view before they are summed. unit: every cell's
     vector gets length 1 (0 stays 0). standard: every channel gets mean 0 and deviation 1 over
     the view, against drift from view to view; a constant channel becomes 0."""
@@ -48,28 +48,26 @@ class FeatureUpliftOptions:
     resampling: Resampling = "bilinear"
     """How a pixel reads the grid of cells: the four cell centres around it, or its own cell."""
 
-    min_feature_weight: float = 0.0
+    min_weight: float = 0.0
     """Blending weight, summed over pixels and views, that a Gaussian must exceed to get a
     feature; the others get zeros. One fully visible pixel counts 1."""
 
-    feature_side: int | None = None
+    longest_side: int | None = None
     """Longest side, in pixels, of the views through which the features are seen; smaller is
     faster and a little blurred. None keeps the size of the evidence."""
 
-    feature_channels: int = 64
+    channels: int = 64
     """Channels carried at a time, which bounds the memory of upsampled images."""
 
     def __post_init__(self) -> None:
-        check_choice("feature_norm", self.feature_norm, ("none", "unit", "standard"))
+        check_choice("norm", self.norm, ("none", "unit", "standard"))
         check_choice("resampling", self.resampling, ("bilinear", "nearest"))
-        if not 0 <= self.min_feature_weight < float("inf"):
-            raise RangeError(
-                f"min_feature_weight: expected 0 or more, got {self.min_feature_weight}."
-            )
-        if self.feature_side is not None and self.feature_side < 1:
-            raise RangeError(f"feature_side: expected at least 1, got {self.feature_side}.")
-        if not 1 <= self.feature_channels <= 1024:
-            raise RangeError(f"feature_channels: expected 1 to 1024, got {self.feature_channels}.")
+        if not 0 <= self.min_weight < float("inf"):
+            raise RangeError(f"min_weight: expected 0 or more, got {self.min_weight}.")
+        if self.longest_side is not None and self.longest_side < 1:
+            raise RangeError(f"longest_side: expected at least 1, got {self.longest_side}.")
+        if not 1 <= self.channels <= 1024:
+            raise RangeError(f"channels: expected 1 to 1024, got {self.channels}.")
 
 
 def uplift_features(
@@ -128,7 +126,7 @@ def uplift_features(
             progress(done + 1, len(ordered))
     if values is None:
         raise InputError("views: expected at least one view with features, got none.")
-    seen = weights > options.min_feature_weight
+    seen = weights > options.min_weight
     values /= torch.where(seen, weights, 1.0).unsqueeze(1)
     values[~seen] = 0
     return Features(
@@ -147,17 +145,17 @@ def _collect(
 ) -> Tensor:
     """Add a view's weighted features to `values`, some channels at a time; gives its weights."""
     covered, camera = _camera_of_grid(view, grid)
-    if options.feature_side is not None:
+    if options.longest_side is not None:
         longest = max(camera.width, camera.height)
-        if longest > options.feature_side:
-            scale = options.feature_side / longest
+        if longest > options.longest_side:
+            scale = options.longest_side / longest
             camera = camera.resized(
                 max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
             )
-    features = _normalised(grid.features.float().cpu(), options.feature_norm)
+    features = _normalised(grid.features.float().cpu(), options.norm)
     weights = torch.zeros(len(values))
-    for start in range(0, grid.channels, options.feature_channels):
-        part = slice(start, start + options.feature_channels)
+    for start in range(0, grid.channels, options.channels):
+        part = slice(start, start + options.channels)
         image = read_grid(
             features[..., part],
             cells=(covered[0] / grid.stride, covered[1] / grid.stride),

@@ -1,4 +1,4 @@
-"""What ``splatseg export --what coco`` draws: label maps of one or two layers as segments."""
+"""Label maps of one or two layers as panoptic segments."""
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from splatseg.cli._legend import colour_of, names_of
 from splatseg.core import UNLABELLED, Labels, Scene, View
 from splatseg.io.export import Category, Frame, SegmentInfo, classes_of
 from splatseg.lift import label_map
+from splatseg.report.legend import colour_of, names_of
 
 _OBJECT = "object"
 

@@ -4,8 +4,8 @@ from typing import Any, Literal
 
 import torch
 
-from splatseg.cli._legend import colour_of, names_of
 from splatseg.core import UNLABELLED, ClassTable, Labels, Selection
+from splatseg.report.legend import colour_of, names_of
 
 _NONE = 0
 

@@ -1,4 +1,4 @@
-"""What ``splatseg render`` needs for a path through a scene and for films."""
+"""A path through a scene, and films."""
 
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -9,7 +9,6 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from splatseg.cli._legend import coloured
 from splatseg.core import ClassTable, Labels, Scene, View
 from splatseg.errors import InputError, RangeError
 from splatseg.io.cameras import cameras_content
@@ -17,6 +16,7 @@ from splatseg.io.json_files import read_json, write_json
 from splatseg.io.video import check_encoder, write_video
 from splatseg.render import BackendName, render
 from splatseg.render.paths import camera_path, is_forward_facing
+from splatseg.report.legend import coloured
 from splatseg.report.pictures import colour_depth
 
 # Depths beyond these shares of all are shown in the end colours.
@@ -32,9 +32,9 @@ def path_views(scene: Scene, *, frames: int, backend: BackendName) -> tuple[View
     """
     along = scene.train_views or scene.views
     if not along:
-        raise InputError("--split: a path goes along the scene's views, and this scene has none.")
+        raise InputError("split: a path goes along the scene's views, and this scene has none.")
     if frames < 1:
-        raise RangeError(f"--frames: expected at least 1, got {frames}.")
+        raise RangeError(f"frames: expected at least 1, got {frames}.")
     focus = _focus(scene, along, backend) if is_forward_facing(along) else None
     cameras = camera_path(along, frames=frames, up=scene.up, focus=focus)
     digits = max(4, len(str(frames - 1)))
@@ -88,7 +88,7 @@ def check_film(views: Sequence[View], *, fps: float) -> None:
     sizes = sorted({(view.camera.width, view.camera.height) for view in views})
     if len(sizes) > 1:
         shown = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
-        raise InputError(f"--video: expected views of one size, got {shown}; use --split path.")
+        raise InputError(f"video: expected views of one size, got {shown}; a path has.")
     check_encoder(fps)
 
 

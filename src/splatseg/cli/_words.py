@@ -1,0 +1,62 @@
+"""Words of a command line: values of options before they are parsed, lists, names of flags."""
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import fields, is_dataclass
+
+from splatseg.errors import InputError
+
+_NAMED = re.compile(r"^(\w+(?:, \w+)*): ")
+
+
+def option_value(words: Sequence[str], flag: str) -> str | None:
+    """The value that words give an option, as ``--flag VALUE`` or ``--flag=VALUE``; the last."""
+    found = None
+    for index, word in enumerate(words):
+        if word == flag and index + 1 < len(words):
+            found = words[index + 1]
+        elif word.startswith(f"{flag}="):
+            found = word.removeprefix(f"{flag}=")
+    return found
+
+
+def listed(flag: str, text: str) -> tuple[str, ...]:
+    """The names in a list with commas or spaces between them.
+
+    Raises:
+        InputError: If there is none.
+
+    Example:
+        >>> listed("--what", "rgb, depth semantic")
+        ('rgb', 'depth', 'semantic')
+    """
+    names = tuple(text.replace(",", " ").split())
+    if not names:
+        raise InputError(f"{flag}: expected names with commas between them, got {text!r}.")
+    return names
+
+
+def field_names(command: object) -> set[str]:
+    """Names of all fields of a parsed command, those of nested dataclasses included."""
+    if not is_dataclass(command):
+        return set()
+    names: set[str] = set()
+    for field in fields(command):
+        names |= {field.name} | field_names(getattr(command, field.name))
+    return names
+
+
+def with_flags(message: str, fields: Collection[str]) -> str:
+    """A message that begins with names of options, with the flags of a command instead.
+
+    Example:
+        >>> with_flags("min_confidence: expected 0 to 1, got 2.", {"min_confidence"})
+        '--min-confidence: expected 0 to 1, got 2.'
+    """
+    found = _NAMED.match(message)
+    if found is None:
+        return message
+    names = found[1].split(", ")
+    if not all(name in fields for name in names):
+        return message
+    return ", ".join("--" + name.replace("_", "-") for name in names) + message[found.end(1) :]

@@ -1,0 +1,77 @@
+"""The default way from label maps to labels of Gaussians: votes, relabelling, completion."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, LabelSource, View
+from splatseg.lift.completion.complete import CompletionOptions, complete
+from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
+from splatseg.lift.mass.uplift import UpliftOptions, uplift
+from splatseg.render import RenderOptions
+
+_CANDIDATES = 8
+"""Ids of each Gaussian that relabelling chooses from."""
+
+_DEFAULT_COMPLETION = CompletionOptions()
+
+
+def lift_labels(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: LabelSource,
+    *,
+    options: UpliftOptions | None = None,
+    confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
+    completion: CompletionOptions | None = _DEFAULT_COMPLETION,
+    classes: ClassTable | None = None,
+    render_options: RenderOptions | None = None,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> Labels:
+    """Label Gaussians by label maps as well as it is known how; what `segment` does by default.
+
+    The votes of `uplift`, decided anew under how often the evidence takes one id for another
+    (`reconsider`), and completed where no view sees anything (`complete`).
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Those that vote: a method that is to be measured uses train views only.
+        evidence: Their label maps, whose ids mean the same in all views.
+        options: How votes become labels.
+        confusion: How the evidence errs. None takes the ids with most votes, and so do rules
+            other than ``share``.
+        completion: How neighbours' labels spread. None leaves unseen Gaussians without.
+        classes: Names of the ids, for the metadata.
+        render_options: Switches of the blending model.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and all there are to do.
+
+    Returns:
+        The layer; soft only if `options` ask for more than one candidate.
+
+    Raises:
+        InputError: If there are no views, if one has no label map, or no pixel has a label.
+        ShapeError: If a label map does not have its photograph's proportions.
+    """
+    options = options or UpliftOptions()
+    relabel = confusion is not None and options.label_rule == "share"
+    wanted = options.candidates
+    if relabel and wanted < 2:
+        options = replace(options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES))
+    labels = uplift(
+        gaussians,
+        views,
+        evidence,
+        options=options,
+        classes=classes,
+        render_options=render_options,
+        backend=backend,
+        progress=progress,
+    )
+    if relabel:
+        labels = reconsider(labels, options=confusion)
+        if wanted < 2:
+            labels = replace(labels, candidates=None, shares=None)
+    if completion is not None and bool((labels.ids != UNLABELLED).any()):
+        labels = complete(gaussians, labels, options=completion)
+    return labels

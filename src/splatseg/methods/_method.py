@@ -1,0 +1,134 @@
+"""What a method declares of itself; flags, help, documentation and refusals follow from it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, Literal
+
+from splatseg.core import ClassTable, Gaussians, Layer, View
+from splatseg.errors import InputError
+from splatseg.io.evidence import Evidence, EvidenceKind, TrackedEvidence
+
+Returns = Literal["labels", "features", "tree", "field"]
+"""labels: one id a Gaussian. features: one vector a Gaussian, with the head that reads it. tree:
+instances with groups above and parts below them. field: something that is no Gaussian's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MethodInputs:
+    """What a method is given."""
+
+    gaussians: Gaussians
+    views: tuple[View, ...]
+    """Those it may learn from; all of them have evidence."""
+
+    evidence: Evidence
+    """Of one of the kinds that the method takes."""
+
+    classes: ClassTable | None = None
+    """Names of the scene's classes."""
+
+    backend: str = "auto"
+    """Name of the rendering backend."""
+
+    seed: int = 0
+    """Of all random choices; a method that declares itself not seeded makes none."""
+
+    progress: Callable[[int, int], None] | None = None
+    """Called with the steps done and all there are. An exception from it ends the method."""
+
+    @property
+    def label_names(self) -> ClassTable | None:
+        """Names of the evidence's ids, where these are classes; those of tracks mean nothing."""
+        return (self.evidence.classes or self.classes) if self.evidence.kind == "labels" else None
+
+    @property
+    def categories(self) -> ClassTable | None:
+        """Names of the categories of segments; a tracker's own table is of its tracks."""
+        if isinstance(self.evidence, TrackedEvidence):
+            return self.evidence.maps.table or self.classes
+        return self.evidence.classes or self.classes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Method:
+    """A way from evidence of views to a layer of the scene.
+
+    Raises:
+        InputError: If the options are no frozen dataclass whose fields all have defaults.
+
+    Example:
+        >>> from splatseg.methods import find_method
+        >>> find_method("vote").evidence
+        ('labels', 'tracked')
+    """
+
+    name: str
+    """How it is asked for: the name of its paper, or the field's word for it."""
+
+    summary: str
+    """What it does, in one line."""
+
+    reference: str
+    """The paper, or the page of documentation, that describes it."""
+
+    evidence: tuple[EvidenceKind, ...]
+    """Kinds of evidence it takes."""
+
+    options: type[Any]
+    """Frozen dataclass of its options: fields become flags, the strings below them help."""
+
+    run: Callable[[MethodInputs, Any], Layer]
+    """Makes the layer, from the inputs and an instance of `options`."""
+
+    returns: Returns = "labels"
+
+    keeps_ids: bool = False
+    """Whether the ids of the layer are those of the evidence, rather than new ones."""
+
+    seeded: bool = False
+    """Whether the seed makes a difference."""
+
+    published: Any = None
+    """The options of the publication, an instance of `options`; None where the defaults are."""
+
+    complete: bool = True
+    """Whether Gaussians that no view explains take the labels of their neighbours by default."""
+
+    def __post_init__(self) -> None:
+        parameters = getattr(self.options, "__dataclass_params__", None)
+        if not (is_dataclass(self.options) and parameters is not None and parameters.frozen):
+            raise InputError(f"method {self.name!r}: expected options in a frozen dataclass.")
+        try:
+            self.options()
+        except TypeError as error:
+            raise InputError(
+                f"method {self.name!r}: expected a default for every option ({error})."
+            ) from error
+
+    @property
+    def published_options(self) -> Any:
+        """The setting of the publication."""
+        return self.options() if self.published is None else self.published
+
+    def option_names(self) -> tuple[str, ...]:
+        """Names of all options, those of nested dataclasses included."""
+        return tuple(_field_names(self.options))
+
+    def check_evidence(self, evidence: Evidence) -> None:
+        """Raise `InputError` unless the method takes evidence of this kind."""
+        if evidence.kind not in self.evidence:
+            raise InputError(
+                f"{evidence.folder}: method {self.name} takes evidence of "
+                f"{' or '.join(self.evidence)}, got {evidence.kind}."
+            )
+
+
+def _field_names(options: type[Any]) -> list[str]:
+    names: list[str] = []
+    for field in fields(options):
+        nested = field.default_factory if callable(field.default_factory) else None
+        if isinstance(nested, type) and is_dataclass(nested):
+            names += _field_names(nested)
+        else:
+            names.append(field.name)
+    return names

@@ -1,0 +1,336 @@
+"""A layer against truth, and renders against photographs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from splatseg.core import ClassTable, Features, Labels, Layer, Scene, View
+from splatseg.errors import InputError
+from splatseg.evaluate import (
+    SemanticReport,
+    evaluate_binary,
+    evaluate_instances,
+    evaluate_panoptic,
+    evaluate_photographs,
+    evaluate_points,
+    evaluate_semantic,
+)
+from splatseg.evaluate.lpips import Lpips, load_lpips
+from splatseg.evaluate.solid import PointRule
+from splatseg.io.class_tables import class_table
+from splatseg.io.evidence import Evidence, open_evidence
+from splatseg.io.json_files import read_json
+from splatseg.render import BackendName
+from splatseg.tasks._figures import (
+    binary_figures,
+    instance_figures,
+    panoptic_figures,
+    point_figures,
+    read_points,
+    read_scores,
+    semantic_figures,
+)
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.scene_parts import layer_of, mask_use, views_of_split
+
+Metric = Literal["semantic", "instances", "panoptic", "binary"]
+
+# The array of a file of points that holds the truth of each metric.
+_POINT_TRUTH: Mapping[str, str] = {"semantic": "semantic", "instances": "instance"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationOptions:
+    """What is scored against what."""
+
+    layer: str | None = None
+    """Name of the layer to score. None scores the pictures only."""
+
+    truth: Path | None = None
+    """Folder of the true id maps, one PNG a view; 0 is void. Of classes, or of instances with
+    metric instances."""
+
+    instances: str | None = None
+    """With panoptic: name of the layer of instances; `layer` is that of the classes. None takes
+    `layer` for both: its metadata must tell each instance's class, as that of associate does."""
+
+    truth_instances: Path | None = None
+    """With panoptic: folder of the true instance maps; `truth` is that of the classes."""
+
+    metadata: Path | None = None
+    """With panoptic: JSON whose "classes" say which are things (id, name, isthing). None takes
+    the metadata.json beside the truth, else the classes of the scene."""
+
+    scores: Path | None = None
+    """With panoptic: JSON object of a score by instance id, by which AP50 ranks. None ranks all
+    alike."""
+
+    points: Path | None = None
+    """Also score labels of points: an .npz with xyz (n x 3, world) and, as the metric asks,
+    semantic or instance (n, 0 is void)."""
+
+    points_rule: PointRule = "weighted"
+    """How a point takes its label: weighted, by the density there of the Gaussians around it;
+    nearest, that of the nearest centre."""
+
+    zero_is_class: bool = False
+    """The id 0 of the truth's files is a class and not void: ids grow by 1."""
+
+    void: int | None = None
+    """A further id of the truth's files that means void, such as 255."""
+
+    split: str = "test"
+    """Which views: test, train, another split of the scene, or all."""
+
+    metric: Metric = "semantic"
+    """What to score: semantic, classes; instances, objects whatever their ids; panoptic, both
+    together; binary, one id or a selection as a mask."""
+
+    id: int | None = None
+    """With binary: the id to score. None takes every labelled pixel."""
+
+    photographs: bool = False
+    """Insist on scoring the pictures (PSNR, SSIM). Without it they are scored where the
+    photographs are at hand."""
+
+    lpips: tuple[Path, ...] = ()
+    """Also score LPIPS with your weights: AlexNet's or VGG-16's, and the heads', as .safetensors
+    or .npz with the names of torchvision and of the lpips package."""
+
+
+def evaluate(
+    scene: Scene,
+    *,
+    options: EvaluationOptions | None = None,
+    layers: Mapping[str, Layer] | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> dict[str, Any]:
+    """Score a layer against the truth, and renders against the photographs.
+
+    mIoU, fwIoU and accuracy are pooled over all views and equal to those of the usual scorers;
+    the per-image mIoU is the mean over views. Predictions are drawn in the truth's own pixels.
+    Instances are matched one to one over the whole scene; panoptic quality takes a segment as
+    all its pixels in all views.
+
+    Args:
+        scene: The scene.
+        options: What to score.
+        layers: Layers at hand; others are read from the scene's folder.
+        backend: Who renders.
+        observer: Is told of the progress.
+
+    Returns:
+        Scores by name, in values that JSON holds; those of classes in mappings of their own.
+
+    Raises:
+        InputError: If options do not belong together, or something asked for is not there.
+    """
+    options = options or EvaluationOptions()
+    _check(options)
+    job = _Job(
+        scene=scene, options=options, layers=layers or {}, backend=backend, observer=observer
+    )
+    network = load_lpips(options.lpips) if options.lpips else None
+    figures: dict[str, Any] = {"scene": str(scene.root), "split": options.split}
+    if options.layer is not None:
+        figures |= {"layer": options.layer, "metric": options.metric}
+    if options.truth is not None or options.layer is None:
+        views = views_of_split(scene, options.split)
+        figures |= _in_views(job, views, network)
+    if options.points is not None:
+        figures |= _point_figures(job, options.points)
+    return figures
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    scene: Scene
+    options: EvaluationOptions
+    layers: Mapping[str, Layer]
+    backend: BackendName
+    observer: Observer
+
+    def layer(self, name: str) -> Layer:
+        return layer_of(self.scene, name, self.layers)
+
+
+def _check(options: EvaluationOptions) -> None:
+    """Say which options belong together before anything is read."""
+    if options.layer is None and (options.truth or options.points):
+        raise InputError(
+            "layer: expected the layer that the truth and the points are to score, got none."
+        )
+    if options.layer is not None and not (options.truth or options.points):
+        raise InputError("truth: expected a folder of true id maps (or points), got none.")
+    panoptic = (
+        options.instances,
+        options.truth_instances,
+        options.metadata,
+        options.scores,
+    )
+    if options.metric == "panoptic" and options.truth_instances is None:
+        raise InputError(
+            "truth_instances: expected the folder of true instance maps beside the truth, which "
+            "is of classes, got none."
+        )
+    if options.metric != "panoptic" and any(panoptic):
+        raise InputError(
+            "instances, truth_instances, metadata, scores: expected the metric panoptic with them, "
+            f"got {options.metric}."
+        )
+    if options.points is not None and options.metric not in _POINT_TRUTH:
+        raise InputError(
+            f"points: expected the metric semantic or instances, got {options.metric}."
+        )
+
+
+def _in_views(job: _Job, views: tuple[View, ...], network: Lpips | None) -> dict[str, Any]:
+    """Scores of the layer, and of the pictures where there are photographs or they are asked."""
+    figures: dict[str, Any] = {}
+    if job.options.layer is not None and job.options.truth is not None:
+        truth = open_evidence(
+            job.options.truth, zero_is_class=job.options.zero_is_class, void=job.options.void
+        )
+        layer = job.layer(job.options.layer)
+        figures |= _layer_figures(job, views, layer, truth)
+    if network is not None or _wants_photographs(job, views):
+        figures |= _photograph_figures(job, views, network)
+    elif job.options.layer is None:
+        raise InputError(
+            f"{job.scene.root}: expected a layer with a truth, or photographs to score against, "
+            "got neither."
+        )
+    return figures
+
+
+def _layer_figures(
+    job: _Job,
+    views: tuple[View, ...],
+    layer: Layer,
+    truth: Evidence,
+) -> dict[str, Any]:
+    if isinstance(layer, Features):
+        raise InputError(f"layer: {job.options.layer} holds features, which have no score.")
+    if job.options.metric == "binary":
+        with job.observer.stage("evaluate") as step:
+            report = evaluate_binary(
+                job.scene.gaussians,
+                views,
+                layer,
+                truth,
+                id=job.options.id,
+                backend=job.backend,
+                progress=step,
+            )
+        return binary_figures(report)
+    if not isinstance(layer, Labels):
+        raise InputError("metric: a selection has no classes, expected the metric binary.")
+    if job.options.metric == "panoptic" and job.options.truth_instances is not None:
+        true_instances = open_evidence(job.options.truth_instances)
+        return _panoptic_figures(job, views, layer, truth=truth, true_instances=true_instances)
+    method = evaluate_semantic if job.options.metric == "semantic" else evaluate_instances
+    with job.observer.stage("evaluate") as step:
+        report = method(
+            job.scene.gaussians, views, layer, truth, backend=job.backend, progress=step
+        )
+    if isinstance(report, SemanticReport):
+        return semantic_figures(report)
+    return instance_figures(report)
+
+
+def _panoptic_figures(
+    job: _Job,
+    views: tuple[View, ...],
+    layer: Labels,
+    *,
+    truth: Evidence,
+    true_instances: Evidence,
+) -> dict[str, Any]:
+    other = None
+    if job.options.instances is not None:
+        other = _labels(job, job.options.instances, "instances")
+    with job.observer.stage("evaluate") as step:
+        report = evaluate_panoptic(
+            job.scene.gaussians,
+            views,
+            classes=None if other is None else layer,
+            instances=layer if other is None else other,
+            true_classes=truth,
+            true_instances=true_instances,
+            table=_thing_table(job, truth),
+            scores=None if job.options.scores is None else read_scores(job.options.scores),
+            backend=job.backend,
+            progress=step,
+        )
+    return panoptic_figures(report)
+
+
+def _thing_table(job: _Job, truth: Evidence) -> ClassTable:
+    if job.options.metadata is not None:
+        if job.options.zero_is_class:
+            raise InputError(
+                "metadata: its ids are those of the files, which zero_is_class changes; "
+                "put it beside the truth as metadata.json instead."
+            )
+        return class_table(
+            read_json(job.options.metadata).get("classes"), where=str(job.options.metadata)
+        )
+    table = truth.classes or job.scene.classes
+    if table is None:
+        raise InputError(
+            "metadata: expected a JSON file that says which classes are things; neither the "
+            "truth nor the scene does."
+        )
+    return table
+
+
+def _point_figures(job: _Job, path: Path) -> dict[str, Any]:
+    """Scores of points, under names that begin with points_."""
+    labels = _labels(job, job.options.layer or "", "layer")
+    points, truth = read_points(path, _POINT_TRUTH[job.options.metric])
+    report = evaluate_points(
+        job.scene.gaussians,
+        labels,
+        points=points,
+        truth=truth,
+        matched=job.options.metric == "instances",
+        rule=job.options.points_rule,
+    )
+    return point_figures(report, rule=job.options.points_rule)
+
+
+def _labels(job: _Job, name: str, option: str) -> Labels:
+    layer = job.layer(name)
+    if not isinstance(layer, Labels):
+        raise InputError(f"{option}: expected a layer of labels, {name} is none.")
+    return layer
+
+
+def _wants_photographs(job: _Job, views: tuple[View, ...]) -> bool:
+    at_hand = all(view.image is not None and view.image.is_file() for view in views)
+    return job.options.photographs or at_hand
+
+
+def _photograph_figures(
+    job: _Job, views: tuple[View, ...], network: Lpips | None
+) -> dict[str, Any]:
+    with job.observer.stage("photographs") as step:
+        report = evaluate_photographs(
+            job.scene.gaussians,
+            views,
+            masks=mask_use(job.scene),
+            lpips=network,
+            backend=job.backend,
+            progress=step,
+        )
+    figures: dict[str, Any] = {
+        "PSNR": report.psnr,
+        "SSIM": report.ssim,
+        "PSNR_min": report.psnr_min,
+        "photographs": len(report.views),
+    }
+    if network is not None:
+        figures |= {"LPIPS": report.lpips, "LPIPS_network": network.network}
+    return figures

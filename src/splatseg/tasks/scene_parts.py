@@ -1,0 +1,53 @@
+"""Parts of a scene by the names that people give them: views of a split, layers, evidence."""
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+from splatseg.core import Layer, Scene, View
+from splatseg.errors import InputError
+from splatseg.evaluate.held_out import MaskUse
+from splatseg.io.evidence import Evidence
+from splatseg.io.scene import load_scene_layer
+
+
+def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
+    """The views of a split, or all of them.
+
+    Raises:
+        InputError: If the scene has no view of this split.
+    """
+    views = tuple(view for view in scene.views if split in ("all", view.split))
+    if views:
+        return views
+    known = ", ".join(sorted({view.split for view in scene.views})) or "none: it has no views"
+    raise InputError(f"split: expected all or a split of the scene ({known}), got {split!r}.")
+
+
+def layer_of(scene: Scene, name: str, layers: Mapping[str, Layer] | None = None) -> Layer:
+    """A layer by name: one of `layers`, or of the folder that the scene was loaded from."""
+    if layers is not None and name in layers:
+        return layers[name]
+    if scene.root is None:
+        raise InputError(f"layer {name!r}: the scene has no folder to read it from.")
+    return load_scene_layer(scene.root, name)
+
+
+def views_that_made(
+    scene: Scene, metadata: Mapping[str, Any], evidence: Evidence
+) -> tuple[View, ...]:
+    """Views with evidence that made a layer, where it says which; else the training views."""
+    known = set(evidence.view_names)
+    used = metadata.get("views")
+    names = set(cast("list[str]", used)) if isinstance(used, list) else None
+    return tuple(
+        view
+        for view in scene.views
+        if view.name in known and (view.split == "train" if names is None else view.name in names)
+    )
+
+
+def mask_use(scene: Scene) -> MaskUse:
+    """What the masks of the photographs meant when the scene was fitted."""
+    options = scene.provenance.get("options")
+    said = options.get("masks") if isinstance(options, Mapping) else None  # pyright: ignore[reportUnknownMemberType]
+    return "alpha" if said == "alpha" else "ignore" if said == "ignore" else "off"

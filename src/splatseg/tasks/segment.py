@@ -1,0 +1,267 @@
+"""Evidence becomes a layer of a scene, by any method."""
+
+import importlib.metadata
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatseg.core import UNLABELLED, ClassTable, Features, Labels, Layer, Scene, View
+from splatseg.errors import InputError
+from splatseg.io.evidence import (
+    Evidence,
+    TrackedEvidence,
+    evidence_names,
+    find_evidence,
+    open_evidence,
+)
+from splatseg.io.scene import check_name
+from splatseg.lift.completion.complete import CompletionOptions, complete
+from splatseg.lift.segments.panoptic import merge_panoptic
+from splatseg.methods import Method, MethodInputs, find_method
+from splatseg.render import BackendName
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.scene_parts import layer_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegmentOptions:
+    """What every method shares."""
+
+    evidence: str | None = None
+    """Name of the evidence: a folder of the scene's or of its capture, such as labels_semantic.
+    None takes the only one there is."""
+
+    layer: str | None = None
+    """Name of the layer. None names it like the evidence."""
+
+    zero_is_class: bool = False
+    """The id 0 of the evidence's files is a class and not void: ids grow by 1, and the layer
+    records what they were."""
+
+    void: int | None = None
+    """A further id of the evidence's files that means none, such as 255."""
+
+    views: str = "train"
+    """Which views may be used: train, all, or names with commas between them. What is asked for
+    is recorded in the layer."""
+
+    published: bool = False
+    """The method as its authors published it: their options, and no completion."""
+
+    complete: bool = True
+    """Label Gaussians that no view explains by their neighbours; they are marked as inferred."""
+
+    completion: CompletionOptions = field(default_factory=CompletionOptions)
+    """How neighbours' labels spread."""
+
+    classes: str | None = None
+    """With instances: name of a layer of classes to merge them with. Instances take their class
+    from it, and what is no thing becomes one segment a class: the layer is panoptic."""
+
+    seed: int = 0
+    """Seed of random choices, recorded in the layer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Segmentation:
+    """A layer, and what it was made from."""
+
+    layer: Layer
+    name: str
+    """What the layer is to be called."""
+
+    evidence: Evidence
+    views: tuple[View, ...]
+    timings: Mapping[str, float]
+    """Seconds by stage."""
+
+    @property
+    def labels(self) -> Labels:
+        """The layer, where it is one of labels.
+
+        Raises:
+            InputError: If the method gives something else.
+        """
+        if not isinstance(self.layer, Labels):
+            raise InputError(
+                f"layer {self.name!r}: expected labels, got {type(self.layer).__name__.lower()}."
+            )
+        return self.layer
+
+
+def segment(
+    scene: Scene,
+    method: str | Method = "uplift",
+    *,
+    options: SegmentOptions | None = None,
+    method_options: Any = None,
+    layers: Mapping[str, Layer] | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> Segmentation:
+    """Lift what was seen in photographs onto the Gaussians, as well as the method knows how.
+
+    What the command ``splatseg segment`` does: with the defaults, votes are corrected for how
+    the evidence errs, and Gaussians that no view explains are completed from their neighbours.
+
+    Args:
+        scene: The scene; it stays as it is. `io.scene.save_scene_layer` writes a layer into it.
+        method: The method, or its name (`methods.method_names`).
+        options: Which evidence and views, and what follows the method.
+        method_options: An instance of the method's options; None is its default, or the
+            published setting where `options` ask for it.
+        layers: Layers at hand; others are read from the scene's folder.
+        backend: Who renders.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If there is no such method, evidence or layer, or they do not fit together.
+        ShapeError: If evidence does not have its photograph's proportions.
+    """
+    started = time.monotonic()
+    options = options or SegmentOptions()
+    method = find_method(method) if isinstance(method, str) else method
+    chosen = _method_options(method, method_options, options)
+    evidence_name, evidence = _evidence(scene, options)
+    method.check_evidence(evidence)
+    merged = _classes_to_merge(scene, options, evidence, layers)
+    name = options.layer or evidence_name
+    check_name("layer", name)
+    views = _views(scene, evidence, options.views, observer)
+    timings = {"open": time.monotonic() - started}
+    with observer.stage("segment") as step:
+        began = time.monotonic()
+        layer = method.run(
+            MethodInputs(
+                gaussians=scene.gaussians,
+                views=views,
+                evidence=evidence,
+                classes=scene.classes,
+                backend=backend,
+                seed=options.seed,
+                progress=step,
+            ),
+            chosen,
+        )
+        timings[method.name] = time.monotonic() - began
+    if isinstance(layer, Labels):
+        layer = _completed(scene, layer, method, options, timings)
+        if merged is not None:
+            layer = merge_panoptic(scene.gaussians, layer, *merged)
+    elif merged is not None:
+        raise InputError(
+            f"classes: goes with methods that give labels; {method.name} gives {method.returns}."
+        )
+    layer = _described(layer, evidence_name, evidence, options)
+    return Segmentation(layer=layer, name=name, evidence=evidence, views=views, timings=timings)
+
+
+def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
+    if given is None:
+        return method.published_options if options.published else method.options()
+    if not isinstance(given, method.options):
+        raise InputError(
+            f"method_options: expected {method.options.__name__} for method {method.name}, "
+            f"got {type(given).__name__}."
+        )
+    return given
+
+
+def _completed(
+    scene: Scene,
+    labels: Labels,
+    method: Method,
+    options: SegmentOptions,
+    timings: dict[str, float],
+) -> Labels:
+    wanted = options.complete and method.complete and not options.published
+    if not (wanted and bool((labels.ids != UNLABELLED).any())):
+        return labels
+    began = time.monotonic()
+    labels = complete(scene.gaussians, labels, options=options.completion)
+    timings["complete"] = time.monotonic() - began
+    return labels
+
+
+def _described(
+    layer: Layer, evidence_name: str, evidence: Evidence, options: SegmentOptions
+) -> Layer:
+    """The layer with a record of what it was made from."""
+    metadata = dict(layer.metadata) | {
+        "evidence": evidence_name,
+        "views_asked": options.views,
+        "seed": options.seed,
+        "versions": {
+            "splatseg": importlib.metadata.version("splatseg"),
+            "torch": str(torch.__version__),
+        },
+    }
+    if isinstance(layer, Labels) and evidence.source_ids is not None:
+        present = layer.present.tolist()
+        metadata["source_ids"] = {str(id): evidence.source_ids[id] for id in present}
+    return replace(layer, metadata=metadata)
+
+
+def _classes_to_merge(
+    scene: Scene,
+    options: SegmentOptions,
+    evidence: Evidence,
+    layers: Mapping[str, Layer] | None,
+) -> tuple[Labels, ClassTable] | None:
+    """The layer of classes and what its ids mean."""
+    if options.classes is None:
+        return None
+    if evidence.kind == "labels":
+        raise InputError(f"classes: goes with evidence of instances, not of {evidence.kind}.")
+    layer = layer_of(scene, options.classes, layers)
+    if not isinstance(layer, Labels):
+        kind = "features" if isinstance(layer, Features) else "a selection"
+        raise InputError(f"classes: expected a layer of labels, got {kind}.")
+    table = evidence.classes or scene.classes
+    if isinstance(evidence, TrackedEvidence):
+        table = evidence.maps.table or scene.classes
+    if table is None:
+        raise InputError(
+            "classes: expected a table that says which classes are things, and neither the "
+            "capture nor the evidence has one."
+        )
+    return layer, table
+
+
+def _evidence(scene: Scene, options: SegmentOptions) -> tuple[str, Evidence]:
+    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
+    name = options.evidence
+    if name is None:
+        names = evidence_names(folders)
+        if len(names) != 1:
+            known = ", ".join(names) or "there is none"
+            raise InputError(f"evidence: expected a name ({known}), got none.")
+        name = names[0]
+    folder = find_evidence(folders, name)
+    return name, open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
+
+
+def _views(scene: Scene, evidence: Evidence, asked: str, observer: Observer) -> tuple[View, ...]:
+    """The views asked for that have evidence; named ones must have it."""
+    if asked not in ("train", "all"):
+        return tuple(scene.view(name.strip()) for name in asked.split(","))
+    allowed = scene.views if asked == "all" else scene.train_views
+    known = set(evidence.view_names)
+    views = tuple(view for view in allowed if view.name in known)
+    if not views:
+        raise InputError(
+            f"evidence: expected some of at least one of the {len(allowed)} views that "
+            f"{asked} allows, got none."
+        )
+    lacking = [view for view in allowed if view.name not in known]
+    # Evidence of the train views alone is as it should be, whatever is allowed.
+    if any(view.split == "train" for view in lacking):
+        observer.note(
+            f"{len(lacking)} of {len(allowed)} views have no such evidence, the first is "
+            f"{lacking[0].name}"
+        )
+    return views
