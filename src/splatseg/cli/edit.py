@@ -27,7 +27,7 @@ from splatseg.edit import (
     select,
     undo,
 )
-from splatseg.edit._document import BASE, HISTORY
+from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import picture_and_photograph, psnr
 from splatseg.io.evidence import find_evidence, open_evidence

@@ -13,7 +13,7 @@ import tyro
 from splatseg.cli._work import check_new_scene, progress
 from splatseg.core import UNLABELLED, Gaussians, Labels, LabelSource, Scene, View
 from splatseg.edit import Document, load_document, save_document
-from splatseg.edit._document import BASE, HISTORY
+from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.evaluate import picture_and_photograph, psnr
 from splatseg.fit import FitOptions

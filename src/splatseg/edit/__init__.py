@@ -1,8 +1,5 @@
 """Edits as pure functions: Gaussians and their layers change in step, and a history replays."""
 
-from splatseg.edit._document import Document as Document
-from splatseg.edit._document import load_document as load_document
-from splatseg.edit._document import save_document as save_document
 from splatseg.edit._merge import merged_layers as merged_layers
 from splatseg.edit._operation import CutBy as CutBy
 from splatseg.edit._operation import Operation as Operation
@@ -10,6 +7,9 @@ from splatseg.edit._operation import Recolour as Recolour
 from splatseg.edit._where import Where as Where
 from splatseg.edit._where import ids_named as ids_named
 from splatseg.edit._where import select as select
+from splatseg.edit.document import Document as Document
+from splatseg.edit.document import load_document as load_document
+from splatseg.edit.document import save_document as save_document
 from splatseg.edit.history import Prepared as Prepared
 from splatseg.edit.history import apply as apply
 from splatseg.edit.history import prepare as prepare

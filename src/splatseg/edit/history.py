@@ -24,10 +24,10 @@ from splatseg.core import (
     Similarity,
     View,
 )
-from splatseg.edit._document import HISTORY, Document, load_document
 from splatseg.edit._merge import merged_layers
 from splatseg.edit._operation import CutBy, Operation
 from splatseg.edit._where import Where, layer_called, select
+from splatseg.edit.document import HISTORY, Document, load_document
 from splatseg.edit.operations import duplicate, extract, merge, recolour, remove, transform
 from splatseg.errors import InputError
 from splatseg.io.evidence import find_evidence, open_evidence

@@ -15,7 +15,7 @@ import torch
 
 from splatseg.core import Camera, View
 from splatseg.errors import FileFormatError
-from splatseg.io.captures._build import checked_pose, opencv_from_opengl
+from splatseg.io.captures.build import checked_pose, opencv_from_opengl
 from splatseg.io.captures.nerfstudio import MILLIMETRE, frame_matrix, lens_of, number
 
 _MODEL_NAMES = {"pinhole": "PINHOLE", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}

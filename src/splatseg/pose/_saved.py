@@ -20,9 +20,9 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import Capture
-from splatseg.io.captures._build import RawView, build_capture
-from splatseg.io.captures._colmap_model import intrinsics_of, poses_of
+from splatseg.io.captures.build import RawView, build_capture
 from splatseg.io.captures.colmap import read_colmap_model
+from splatseg.io.captures.colmap_model import intrinsics_of, poses_of
 from splatseg.io.json_files import read_json, write_json
 from splatseg.pose._options import PoseOptions
 from splatseg.pose._report import PoseReport

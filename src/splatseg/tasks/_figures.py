@@ -17,8 +17,8 @@ from splatseg.evaluate import (
     SemanticScore,
 )
 from splatseg.evaluate.overlaps import InstanceScore
-from splatseg.io.evidence._features import read_npz
 from splatseg.io.json_files import read_json
+from splatseg.io.npz import read_npz
 
 
 def semantic_figures(report: SemanticReport) -> dict[str, Any]:

@@ -13,8 +13,8 @@ import torch
 from splatseg.core import Camera
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
-from splatseg.io.captures._colmap_model import MODELS, ColmapCamera, intrinsics_of
 from splatseg.io.captures.colmap import read_colmap_model
+from splatseg.io.captures.colmap_model import MODELS, ColmapCamera, intrinsics_of
 
 WIDTH, HEIGHT = 64, 48
 

@@ -21,7 +21,8 @@ import numpy as np
 
 from splatseg.core import PointCloud
 from splatseg.errors import FileFormatError
-from splatseg.io.captures._colmap_model import (
+from splatseg.io.captures._points import point_cloud
+from splatseg.io.captures.colmap_model import (
     MODELS,
     ColmapCamera,
     ColmapFrame,
@@ -29,7 +30,6 @@ from splatseg.io.captures._colmap_model import (
     ColmapRig,
     rigid_matrix,
 )
-from splatseg.io.captures._points import point_cloud
 
 _CAMERA_SENSOR = 0
 _MAX_NAME = 4096

@@ -16,14 +16,14 @@ import numpy as np
 
 from splatseg.core import PointCloud
 from splatseg.errors import FileFormatError
-from splatseg.io.captures._colmap_model import (
+from splatseg.io.captures._points import point_cloud
+from splatseg.io.captures.colmap_model import (
     ColmapCamera,
     ColmapFrame,
     ColmapImage,
     ColmapRig,
     rigid_matrix,
 )
-from splatseg.io.captures._points import point_cloud
 
 _T = TypeVar("_T")
 

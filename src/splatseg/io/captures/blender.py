@@ -6,8 +6,8 @@ from typing import Any
 
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError
-from splatseg.io.captures._build import Intrinsics, RawView, build_capture
 from splatseg.io.captures._points_beside import points_beside
+from splatseg.io.captures.build import Intrinsics, RawView, build_capture
 from splatseg.io.captures.nerfstudio import cam_from_world_of, focal_of, number
 from splatseg.io.images import IMAGE_SUFFIXES, image_size
 from splatseg.io.json_files import read_json

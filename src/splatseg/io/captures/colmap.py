@@ -6,9 +6,9 @@ from pathlib import Path
 from splatseg.core import Capture
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures import _colmap_binary, _colmap_text
-from splatseg.io.captures._build import RawView, build_capture
-from splatseg.io.captures._colmap_model import ColmapModel, intrinsics_of, poses_of
 from splatseg.io.captures._nerfstudio_split import splits_beside
+from splatseg.io.captures.build import RawView, build_capture
+from splatseg.io.captures.colmap_model import ColmapModel, intrinsics_of, poses_of
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".", "0")
 _IMAGE_FOLDERS = ("images", "input", "rgb", "images_2", "images_4", "images_8", ".")

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, Capture, PointCloud
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.captures._build import (
+from splatseg.io.captures._nerfstudio_split import frame_splits
+from splatseg.io.captures._points import ply_holds_splats, read_ply_points
+from splatseg.io.captures._points_beside import points_beside
+from splatseg.io.captures.build import (
     Intrinsics,
     RawView,
     build_capture,
     opencv_from_opengl,
 )
-from splatseg.io.captures._nerfstudio_split import frame_splits
-from splatseg.io.captures._points import ply_holds_splats, read_ply_points
-from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.json_files import read_json
 
 FILE = "transforms.json"

@@ -6,7 +6,7 @@ vector is ``normalise((q * scale + offset) @ basis + mean)``.
 """
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,41 +20,13 @@ from typing_extensions import override
 
 from splatseg._check import check_shape
 from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
+from splatseg.io.npz import read_npz
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"
 TEXT_FILE = "text_embeddings.npz"
-
-
-def read_npz(
-    path: Path, names: Sequence[str], *, optional: Sequence[str] = ()
-) -> dict[str, NDArray[Any]]:
-    """Named arrays of an npz, and those of the optional ones that are there.
-
-    Raises:
-        MissingFileError: If there is no such file.
-        FileFormatError: If it is no npz, or lacks one of them.
-    """
-    if not path.is_file():
-        raise MissingFileError(f"{path}: there is no such file.")
-    try:
-        with zipfile.ZipFile(path):
-            pass
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [name for name in names if name not in archive.files]
-            if missing:
-                found = ", ".join(archive.files)
-                raise FileFormatError(f"{path}: expected an array {missing[0]!r}, got {found}.")
-            there = [name for name in optional if name in archive.files]
-            return {name: archive[name] for name in (*names, *there)}
-    except FileFormatError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise FileFormatError(
-            f"{path}: expected an npz, but it cannot be read ({error})."
-        ) from error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

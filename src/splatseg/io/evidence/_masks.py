@@ -18,9 +18,9 @@ from typing_extensions import override
 from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet, Rle
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
-from splatseg.io.evidence._features import read_npz
 from splatseg.io.evidence._labels import read_id_map
 from splatseg.io.json_files import read_json
+from splatseg.io.npz import read_npz
 
 MASK_TABLE = "metadata.csv"
 """What SAM's tool writes beside the pictures of masks of one photograph."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, PointCloud
 from splatseg.errors import InputError
-from splatseg.io.captures._build import Intrinsics
+from splatseg.io.captures.build import Intrinsics
 
 MODELS: dict[int, tuple[str, int]] = {
     0: ("SIMPLE_PINHOLE", 3),

@@ -1,0 +1,231 @@
+"""Methods by name: help, refusals, and the ten lines of docs/methods.md, outside and inside."""
+
+import os
+import re
+import subprocess
+import sys
+import types
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+import splatseg as package
+from splatseg.errors import FileFormatError, InputError, MissingPackageError
+from splatseg.io.scene import load_scene, load_scene_layer
+from splatseg.methods import (
+    ENTRY_POINT_GROUP,
+    Method,
+    _registry,
+    find_method,
+    keeps_ids,
+    method_names,
+    methods,
+    methods_table,
+    with_table,
+)
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+
+
+def block(language: str, index: int) -> str:
+    found = re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    return found[index]
+
+
+MAJORITY = block("python", 1)
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Entry points as if another package had been installed with them."""
+
+    def install(**values: str) -> None:
+        entries = [EntryPoint(name=n, value=v, group=ENTRY_POINT_GROUP) for n, v in values.items()]
+        monkeypatch.setattr(_registry, "entry_points", lambda group: entries)
+
+    return install
+
+
+def test_a_method_of_another_package_is_installed_and_runs(small, tmp_path) -> None:
+    source, target = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    (source / "majority.py").write_text(MAJORITY)
+    (source / "pyproject.toml").write_text(block("toml", 0))
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps"]
+    subprocess.run(
+        [*pip, "--no-build-isolation", "--target", str(target), str(source)],
+        check=True,
+        capture_output=True,
+    )
+    words = ["segment", str(small.scene), "--method", "majority", "--share", "0.6"]
+    done = subprocess.run(
+        [sys.executable, "-m", "splatseg", *words, "--evidence", "labels_semantic"],
+        env={**os.environ, "PYTHONPATH": str(target)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    layer = load_scene_layer(small.scene, "labels_semantic")
+    assert layer.metadata["method"] == "uplift"
+    assert layer.metadata["options"]["min_share"] == 0.6
+
+
+def test_the_same_file_is_a_method_of_ours(small, splatseg, monkeypatch) -> None:
+    module = types.ModuleType("splatseg.methods.majority")
+    exec(compile(MAJORITY, "majority.py", "exec"), module.__dict__)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(_registry, "_OWN", (*_registry._OWN, "majority"))
+    status, _, error = splatseg(
+        *("segment", small.scene, "--method", "majority", "--share", "0.6"),
+        *("--evidence", "labels_semantic"),
+    )
+    assert status == 0, error
+    assert load_scene_layer(small.scene, "labels_semantic").metadata["options"]["min_share"] == 0.6
+    assert "majority" in splatseg("segment", "--help")[1]
+    assert keeps_ids("majority")
+
+
+def test_no_more_than_ten_lines_of_code() -> None:
+    """The declaration itself; imports and blank lines aside."""
+    lines = [line for line in MAJORITY.splitlines() if line.strip()]
+    assert sum(not line.startswith(("from ", "import ")) for line in lines) <= 10
+
+
+def test_help_shows_the_flags_of_one_method_only(splatseg) -> None:
+    status, text, _ = splatseg("segment", "--method", "vote", "--help")
+    assert status == 0
+    assert "--occlusion" in text
+    assert "--evidence" in text
+    assert "--completion.neighbours" in text
+    for foreign in ("--label-rule", "--agreement", "--identity"):
+        assert foreign not in text
+    assert "SA-GS" in text
+
+
+def test_help_without_a_method_lists_them_all(splatseg) -> None:
+    status, text, _ = splatseg("segment", "--help")
+    assert status == 0
+    flat = " ".join(text.replace("│", " ").split())
+    for method in methods():
+        assert f"{method.name}: {method.summary}" in flat
+    assert "--occlusion" not in text
+
+
+def test_flags_of_another_method_are_refused(small, splatseg) -> None:
+    words = ("segment", small.scene, "--evidence", "labels_semantic")
+    status, _, error = splatseg(*words, "--method", "uplift", "--occlusion", "depth")
+    assert status == 2
+    assert "--occlusion" in error
+    assert not (small.scene / "layers" / "labels_semantic.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("uplit", "did you mean uplift"),
+        ("asociate", "did you mean associate"),
+        ("xyzzy", "known: uplift, features, vote, associate, identity"),
+    ],
+)
+def test_an_unknown_method_gets_the_nearest_names(small, splatseg, name, said) -> None:
+    status, _, error = splatseg("segment", small.scene, "--method", name)
+    assert status == 2
+    assert f"there is no method '{name}'" in error
+    assert said in error
+    assert splatseg("segment", small.scene, f"--method={name}")[0] == 2
+
+
+def test_published_takes_the_options_of_the_publication(small, splatseg) -> None:
+    words = ("segment", small.scene, "--evidence", "labels_semantic", "--method", "vote")
+    assert splatseg(*words, "--published", "--layer", "published")[0] == 0
+    assert splatseg(*words, "--layer", "default")[0] == 0
+    assert splatseg(*words, "--published", "--share", "0.6", "--layer", "other")[0] == 0
+    options = {
+        name: load_scene_layer(small.scene, name).metadata["options"]
+        for name in ("published", "default", "other")
+    }
+    assert options["published"]["rule"] == "published"
+    assert options["default"]["rule"] == "visible"
+    assert (options["other"]["rule"], options["other"]["share"]) == ("published", 0.6)
+    inferred = load_scene_layer(small.scene, "published").inferred
+    assert inferred is None or not inferred.any(), "published layers are not completed"
+
+
+def test_every_method_has_a_published_setting() -> None:
+    for method in methods():
+        assert isinstance(method.published_options, method.options)
+
+
+def test_python_gives_what_the_command_gives(small, splatseg) -> None:
+    words = ("segment", small.scene, "--method", "uplift", "--evidence", "labels_semantic")
+    assert splatseg(*words)[0] == 0
+    scene = load_scene(small.scene, data=small.capture)
+    made = package.segment(
+        scene, "uplift", options=package.tasks.SegmentOptions(evidence="labels_semantic")
+    )
+    saved = load_scene_layer(small.scene, "labels_semantic")
+    assert made.name == "labels_semantic"
+    assert made.labels.ids.equal(saved.ids)
+    assert made.labels.confidence.equal(saved.confidence)
+    assert made.layer.metadata == saved.metadata
+
+
+def test_options_of_another_method_are_refused_in_python(small) -> None:
+    scene = load_scene(small.scene, data=small.capture)
+    options = package.tasks.SegmentOptions(evidence="labels_semantic")
+    vote = find_method("vote").options()
+    with pytest.raises(InputError, match="expected UpliftMethodOptions for method uplift"):
+        package.segment(scene, "uplift", options=options, method_options=vote)
+
+
+def test_ours_come_first_and_cannot_be_replaced(installed) -> None:
+    installed(uplift="json:loads", other="splatseg.methods.vote:METHOD")
+    assert method_names() == (*_registry._OWN, "other")
+    assert find_method("uplift").name == "uplift"
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "said"),
+    [
+        ("nowhere:METHOD", MissingPackageError, "cannot be loaded"),
+        ("json:nothing", MissingPackageError, "cannot be loaded"),
+        ("json:loads", InputError, "expected a splatseg.methods.Method, got function"),
+        ("splatseg.methods.vote:METHOD", InputError, "expected a method of this name, got 'vote'"),
+    ],
+)
+def test_what_is_no_method_is_refused(installed, value, error, said) -> None:
+    installed(theirs=value)
+    with pytest.raises(error, match=said):
+        find_method("theirs")
+
+
+def test_a_method_must_have_options_with_defaults() -> None:
+    import dataclasses
+
+    class Plain:
+        pass
+
+    needs = dataclasses.make_dataclass("Needs", [("count", int)], frozen=True)
+    thawed = dataclasses.make_dataclass("Thawed", [("count", int, 3)])
+    about = {"name": "m", "summary": "", "reference": "", "evidence": (), "run": print}
+    for options, said in (
+        (Plain, "in a frozen dataclass"),
+        (thawed, "in a frozen dataclass"),
+        (needs, "a default for every option"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Method(options=options, **about)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/methods.md"])
+def test_the_table_of_methods_is_what_they_declare(page) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert with_table(text, methods_table(methods())) == text, "run scripts/methods_table"
+
+
+def test_a_page_without_marks_is_refused() -> None:
+    with pytest.raises(FileFormatError, match="expected the marks"):
+        with_table("no marks", "table")
