@@ -1,6 +1,6 @@
 """What a backend does, and what it gives back: the matrix W of a view and its adjoint.
 
-With the geometry frozen a view is a sparse linear map (DESIGN, "One idea carries everything"):
+With the geometry frozen a view is a sparse linear map (docs/architecture.md):
 
     w[p, i] = alpha_i(p) * prod_{j before i} (1 - alpha_j(p))      W: pixels x Gaussians
 
