@@ -392,7 +392,7 @@ def test_features_that_are_nan(small, splatseg, refused) -> None:
     assert status == 2
     assert f"{folder / 'train_1.npz'}: expected an npz" in err
     sentence = refused("segment", "--method", "uplift", "--evidence", folder.name)
-    assert "needs label maps" in sentence
+    assert "takes evidence of labels or tracked" in sentence
 
 
 def test_a_half_written_cache(small, splatseg, tmp_path) -> None:

@@ -220,7 +220,7 @@ def refusals(labelled, tmp_path):
         (layer, "--truth"),
         (panoptic, "--truth-instances"),
         ((*panoptic, "--truth-instances", instance), "tells the class of each instance"),
-        ((*layer, "--truth", semantic, "--instances", "objects"), "--metric panoptic"),
+        ((*layer, "--truth", semantic, "--instances", "objects"), "expected metric panoptic"),
         ((*whole, "--scores", tmp_path / "bad.json"), "bad.json: expected scores"),
         ((*whole, "--instances", "nothing"), "nothing"),
         ((*whole, "--metadata", tmp_path / "no.json"), "no.json"),

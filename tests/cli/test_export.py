@@ -219,7 +219,7 @@ def test_mistakes_get_one_sentence(labelled, splatseg, tmp_path) -> None:
     save_scene_layer(scene, "empty", empty)
     out = ("-o", tmp_path / "out")
     cases = [
-        (("--what", "objects", *out), "--layer NAME"),
+        (("--what", "objects", *out), "--layer, --instances: expected the labels"),
         (("--what", "objects", "--layer", "walls", "-o", mine), "other files"),
         (("--what", "coco", "--layer", "walls", "-o", mine), "other files"),
         (("--what", "objects", "--layer", "walls", "-o", scene), "other files"),

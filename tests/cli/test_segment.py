@@ -213,9 +213,18 @@ def test_mistakes_cost_one_sentence_and_nothing_else(masks, splatseg, tmp_path) 
     (tmp_path / "file").write_text("x")
     before = sorted(scene.rglob("*"))
     for arguments, word in (
-        (("--method", "uplift", "--evidence", "masks"), "--method uplift needs label maps"),
-        (("--method", "identity", "--evidence", "masks"), "--method identity needs label maps"),
-        (("--method", "associate", "--evidence", "labels_semantic"), "needs segments of objects"),
+        (
+            ("--method", "uplift", "--evidence", "masks"),
+            "method uplift takes evidence of labels or tracked",
+        ),
+        (
+            ("--method", "identity", "--evidence", "masks"),
+            "method identity takes evidence of labels or tracked",
+        ),
+        (
+            ("--method", "associate", "--evidence", "labels_semantic"),
+            "associate takes evidence of masks",
+        ),
         (("--method", "uplift"), "--evidence: expected a name (labels_semantic, masks)"),
         (("--method", "uplift", "--evidence", "nothing"), "nothing"),
         (("--method", "associate", "--evidence", "masks", "--layer", "a/b"), "--layer"),

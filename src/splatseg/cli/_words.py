@@ -20,19 +20,19 @@ def option_value(words: Sequence[str], flag: str) -> str | None:
     return found
 
 
-def listed(flag: str, text: str) -> tuple[str, ...]:
-    """The names in a list with commas or spaces between them.
+def listed(flag: str, words: Sequence[str]) -> tuple[str, ...]:
+    """Names given as several words, with commas between them, or both.
 
     Raises:
         InputError: If there is none.
 
     Example:
-        >>> listed("--what", "rgb, depth semantic")
-        ('rgb', 'depth', 'semantic')
+        >>> listed("--what", ["rgb,depth", "left wall"])
+        ('rgb', 'depth', 'left wall')
     """
-    names = tuple(text.replace(",", " ").split())
+    names = tuple(name.strip() for word in words for name in word.split(",") if name.strip())
     if not names:
-        raise InputError(f"{flag}: expected names with commas between them, got {text!r}.")
+        raise InputError(f"{flag}: expected one name or more, got none.")
     return names
 
 

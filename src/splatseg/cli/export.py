@@ -51,8 +51,8 @@ class Command:
     """Format of splats: ply, compressed.ply, splat, spz, spz3 (SPZ version 3). Default: what
     OUT ends in, ply for objects."""
 
-    only: str | None = None
-    """Only these objects, by id or name with commas between. Other Gaussians are left out."""
+    only: tuple[str, ...] = ()
+    """Only these objects, by id or name, by comma or by space. Other Gaussians are left out."""
 
     min_confidence: float = 0.0
     """Labels less sure than this, in [0, 1], count as none."""
@@ -88,7 +88,7 @@ def run(command: Command) -> None:
             layer=command.layer,
             instances=command.instances,
             format=command.format,
-            only=() if command.only is None else listed("--only", command.only),
+            only=listed("--only", command.only) if command.only else (),
             min_confidence=command.min_confidence,
             min_opacity=command.min_opacity,
             unlabelled=command.unlabelled,

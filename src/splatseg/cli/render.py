@@ -35,8 +35,8 @@ class Command:
     """Which views: test, train, another split of the scene, all, or path: a smooth path near the
     training cameras."""
 
-    what: str = "rgb"
-    """What to draw, with commas between: rgb, depth, alpha, and names of layers."""
+    what: tuple[str, ...] = ("rgb",)
+    """What to draw: rgb, depth, alpha, and names of layers, by comma or by space."""
 
     coloured: bool = False
     """Also write DIR/<layer>_coloured with pictures of label layers in the legend's colours."""

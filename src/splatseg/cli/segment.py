@@ -16,6 +16,7 @@ from splatseg.core import UNLABELLED, Features, Labels
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import save_scene_layer
+from splatseg.lift import CompletionOptions
 from splatseg.methods import Method, find_method, methods
 from splatseg.render import BackendName
 from splatseg.tasks import (
@@ -62,6 +63,9 @@ class Command:
 
     data: Path | None = None
     """Folder of the capture, where it was moved."""
+
+    completion: CompletionOptions = field(default_factory=CompletionOptions)
+    """How neighbours' labels spread."""
 
     options: Any = None
     """Options of the method."""
@@ -125,6 +129,7 @@ def run(command: Command) -> None:
         method,
         options=command.shared,
         method_options=command.options,
+        completion=command.completion,
         backend=command.backend,
         observer=observer,
     )

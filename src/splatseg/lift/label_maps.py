@@ -1,4 +1,4 @@
-r"""From a layer of labels to the label map of a view (DESIGN, "From Gaussians to a label map").
+r"""From a layer of labels to the label map of a view.
 
 A pixel's id is the one with most blending weight behind it:
 

@@ -177,7 +177,7 @@ def _check(options: EvaluationOptions) -> None:
         )
     if options.metric != "panoptic" and any(panoptic):
         raise InputError(
-            "instances, truth_instances, metadata, scores: expected the metric panoptic with them, "
+            "instances, truth_instances, metadata, scores: expected metric panoptic with them, "
             f"got {options.metric}."
         )
     if options.points is not None and options.metric not in _POINT_TRUTH:

@@ -35,8 +35,9 @@ def check_layer_exports(scene: Scene, root: Path, layer: str) -> None:
     for folder in (root / EXPORTS_FOLDER, root / EXPORTS_FOLDER / layer):
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: expected a folder for exports, got a file.")
-    for what, name in _FILES:
-        check_export(scene, root / EXPORTS_FOLDER / layer / name, what)
+    if (root / EXPORTS_FOLDER / layer).is_dir():
+        for what, name in _FILES:
+            check_export(scene, root / EXPORTS_FOLDER / layer / name, what)
 
 
 def export_layer(

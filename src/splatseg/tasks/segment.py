@@ -3,7 +3,7 @@
 import importlib.metadata
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +55,6 @@ class SegmentOptions:
     complete: bool = True
     """Label Gaussians that no view explains by their neighbours; they are marked as inferred."""
 
-    completion: CompletionOptions = field(default_factory=CompletionOptions)
-    """How neighbours' labels spread."""
-
     classes: str | None = None
     """With instances: name of a layer of classes to merge them with. Instances take their class
     from it, and what is no thing becomes one segment a class: the layer is panoptic."""
@@ -99,6 +96,7 @@ def segment(
     *,
     options: SegmentOptions | None = None,
     method_options: Any = None,
+    completion: CompletionOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
@@ -114,6 +112,7 @@ def segment(
         options: Which evidence and views, and what follows the method.
         method_options: An instance of the method's options; None is its default, or the
             published setting where `options` ask for it.
+        completion: How neighbours' labels spread.
         layers: Layers at hand; others are read from the scene's folder.
         backend: Who renders.
         observer: Is told of the progress.
@@ -149,7 +148,8 @@ def segment(
         )
         timings[method.name] = time.monotonic() - began
     if isinstance(layer, Labels):
-        layer = _completed(scene, layer, method, options, timings)
+        if options.complete and method.complete and not options.published:
+            layer = _completed(scene, layer, completion, timings)
         if merged is not None:
             layer = merge_panoptic(scene.gaussians, layer, *merged)
     elif merged is not None:
@@ -174,15 +174,13 @@ def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
 def _completed(
     scene: Scene,
     labels: Labels,
-    method: Method,
-    options: SegmentOptions,
+    completion: CompletionOptions | None,
     timings: dict[str, float],
 ) -> Labels:
-    wanted = options.complete and method.complete and not options.published
-    if not (wanted and bool((labels.ids != UNLABELLED).any())):
+    if not bool((labels.ids != UNLABELLED).any()):
         return labels
     began = time.monotonic()
-    labels = complete(scene.gaussians, labels, options=options.completion)
+    labels = complete(scene.gaussians, labels, options=completion)
     timings["complete"] = time.monotonic() - began
     return labels
 

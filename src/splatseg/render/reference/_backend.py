@@ -1,4 +1,4 @@
-"""The readable backend: every product is written out as in DESIGN, in float64."""
+"""The readable backend: every product is written out as its equation, in float64."""
 
 from dataclasses import replace
 from typing import ClassVar
