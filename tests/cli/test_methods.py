@@ -68,6 +68,14 @@ def test_a_method_of_another_package_is_installed_and_runs(small, tmp_path) -> N
         check=False,
     )
     assert done.returncode == 0, done.stderr
+    listed = subprocess.run(
+        [sys.executable, "-m", "splatseg", "segment", "--help"],
+        env={**os.environ, "PYTHONPATH": str(target)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "majority: the id with most votes" in " ".join(listed.stdout.split())
     layer = load_scene_layer(small.scene, "labels_semantic")
     assert layer.metadata["method"] == "uplift"
     assert layer.metadata["options"]["min_share"] == 0.6
@@ -84,7 +92,7 @@ def test_the_same_file_is_a_method_of_ours(small, splatseg, monkeypatch) -> None
     )
     assert status == 0, error
     assert load_scene_layer(small.scene, "labels_semantic").metadata["options"]["min_share"] == 0.6
-    assert "majority" in splatseg("segment", "--help")[1]
+    assert "the id with most votes" in splatseg("segment", "--method", "majority", "--help")[1]
     assert not keeps_ids("majority")
     assert keeps_ids("vote")
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
+from splatseg.cli._pages import kept_page
 from splatseg.cli._words import field_names, with_flags
 from splatseg.errors import InputError, SplatsegError
 
@@ -156,6 +157,7 @@ def overview() -> str:
         "2D models see in them.\n\n"
         f"commands:\n{rows}\n\n"
         "splatseg COMMAND --help   the flags of one command, with their units and defaults\n"
+        "splatseg help COMMAND     the same\n"
         "splatseg --version        the version\n"
         "--debug                   with any command: the traceback of an error\n\n"
         "exit status: 0 done, 2 bad input or usage, 1 everything else"
@@ -167,6 +169,8 @@ def _dispatch(words: list[str]) -> int:
         print(overview(), file=sys.stderr)
         return EXIT_USAGE
     name, rest = words[0], words[1:]
+    if name == "help" and rest:
+        name, rest = rest[0], [*rest[1:], "--help"]
     if name in ("--help", "-h", "help"):
         print(overview())
         return EXIT_DONE
@@ -175,26 +179,27 @@ def _dispatch(words: list[str]) -> int:
         return EXIT_DONE
     if name not in COMMANDS:
         raise InputError(_unknown(name))
+    page = kept_page(name, rest)
+    if page is not None:
+        sys.stdout.write(page)
+        return EXIT_DONE
     module = cast("CommandModule", importlib.import_module(COMMANDS[name].module))
     return _run(module, name, rest)
 
 
 def _run(module: CommandModule, name: str, words: list[str]) -> int:
     """Parse the words of one command and run it; tyro's own exits become our status."""
-    import tyro  # here, because the top-level help needs none of it
+    from splatseg.cli._pages import default_config
+    from splatseg.cli._parse import parse  # here: the top-level help needs none of it
 
-    default_config = (
-        tyro.conf.OmitArgPrefixes,  # --steps, not --options.steps
-        tyro.conf.HelptextFromCommentsOff,  # comments speak to readers of the code
-    )
     # A command whose flags depend on its words makes its type from them.
     command_for = getattr(module, "command_for", None)
     try:
-        command = tyro.cli(
+        command = parse(
             module.Command if command_for is None else command_for(words),
+            words,
             prog=f"splatseg {name}",
-            args=words,
-            config=getattr(module, "CONFIG", default_config),
+            config=getattr(module, "CONFIG", None) or default_config(),
         )
     except SystemExit as leaving:  # after --help (0) or a usage error (2)
         return leaving.code if isinstance(leaving.code, int) else EXIT_USAGE

@@ -1,0 +1,150 @@
+"""Frozen dataclasses as command lines: flags, help as flowing text, short placeholders.
+
+tyro makes the parser. It takes the strings below fields for help line by line as they stand in
+the source, and writes ``{None}|STR`` for an optional word; so it is given a copy of the class in
+which both are as a person wants to read them, and its answer is copied back.
+"""
+
+import dataclasses
+import inspect
+import types
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Union, cast, get_args, get_origin, get_type_hints
+
+import docstring_parser
+import tyro
+
+_PLACEHOLDERS: dict[Any, str] = {str: "NAME", int: "N", float: "X", Path: "PATH"}
+
+
+def parse(
+    command: type[Any], words: Sequence[str], *, prog: str, config: tuple[Any, ...]
+) -> object:
+    """An instance of a dataclass from the words of a command line.
+
+    Raises:
+        SystemExit: After the help (status 0), or after words that cannot be used (2).
+    """
+    shown = _readable(command)
+    return _original(tyro.cli(shown, prog=prog, args=list(words), config=config), command)
+
+
+def flowing(text: str) -> str:
+    r"""Text without the line breaks of the source; blank lines between paragraphs stay.
+
+    Example:
+        >>> flowing("one line,\\n    and its end.\\n\\n    Another.")
+        'one line, and its end.\\n\\nAnother.'
+    """
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+
+def _readable(command: type[Any]) -> type[Any]:
+    """A subclass with annotated fields; nested dataclasses likewise."""
+    hints = get_type_hints(command, include_extras=True)
+    texts = _texts(command)
+    made: list[tuple[str, Any, Any]] = []
+    for field in dataclasses.fields(command):
+        kind, notes = _unwrapped(hints[field.name])
+        default = field.default
+        factory = field.default_factory
+        if dataclasses.is_dataclass(kind):
+            inner = _readable(cast("type[Any]", kind))
+            value = factory() if factory is not dataclasses.MISSING else default
+            if value is not dataclasses.MISSING:
+                default = _copied(value, inner)
+            factory = dataclasses.MISSING
+            kind = inner
+        configured = [note for note in notes if _is_argument(note)]
+        help = next((note.help for note in configured if note.help), None) or texts.get(field.name)
+        metavar = next((note.metavar for note in configured if note.metavar), None)
+        if metavar is None and not dataclasses.is_dataclass(kind):
+            metavar = _placeholder(kind)
+        argument = tyro.conf.arg(
+            help=help,
+            metavar=metavar,
+            aliases=next((note.aliases for note in configured if note.aliases), None),
+        )
+        others = [note for note in notes if not _is_argument(note)]
+        annotated: Any = Annotated[kind, argument]
+        for note in others:
+            annotated = Annotated[annotated, note]
+        spec = (
+            dataclasses.field(default_factory=factory)
+            if factory is not dataclasses.MISSING
+            else dataclasses.field(default=default)
+            if default is not dataclasses.MISSING
+            else dataclasses.field()
+        )
+        made.append((field.name, annotated, spec))
+    shown = dataclasses.make_dataclass(
+        command.__name__, made, bases=(command,), frozen=True, kw_only=True
+    )
+    shown.__doc__ = flowing(command.__doc__ or "")
+    return shown
+
+
+def _original(value: object, kind: type[Any]) -> object:
+    """An instance of `kind` with the values of an instance of its readable copy."""
+    hints = get_type_hints(kind, include_extras=True)
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(kind):
+        inner, _ = _unwrapped(hints[field.name])
+        held = getattr(value, field.name)
+        values[field.name] = (
+            _original(held, cast("type[Any]", inner)) if dataclasses.is_dataclass(inner) else held
+        )
+    return kind(**values)
+
+
+def _copied(value: Any, kind: type[Any]) -> Any:
+    """An instance of a readable copy with the values of an original."""
+    hints = get_type_hints(kind, include_extras=True)
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(kind):
+        inner, _ = _unwrapped(hints[field.name])
+        held = getattr(value, field.name)
+        values[field.name] = (
+            _copied(held, cast("type[Any]", inner)) if dataclasses.is_dataclass(inner) else held
+        )
+    return kind(**values)
+
+
+def _texts(command: type[Any]) -> dict[str, str]:
+    """The string below each field, flowing; a subclass's before its base's."""
+    found: dict[str, str] = {}
+    for cls in reversed(command.__mro__):
+        if not dataclasses.is_dataclass(cls):
+            continue
+        try:
+            parsed = docstring_parser.parse_from_object(cls)
+        except (OSError, TypeError):  # made at run time: it has no source
+            continue
+        for entry in parsed.params:
+            if entry.description is not None:
+                found[entry.arg_name] = flowing(entry.description)
+    return found
+
+
+def _unwrapped(hint: Any) -> tuple[Any, list[Any]]:
+    if get_origin(hint) is Annotated:
+        kind, *notes = get_args(hint)
+        return kind, notes
+    return hint, []
+
+
+def _is_argument(note: object) -> bool:
+    return type(note).__name__ == "_ArgConfig"
+
+
+def _placeholder(kind: Any) -> str | None:
+    """What stands for the value of a word; None leaves it to tyro."""
+    if get_origin(kind) in (Union, types.UnionType):
+        inner = [part for part in get_args(kind) if part is not type(None)]
+        return _placeholder(inner[0]) if len(inner) == 1 else None
+    if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
+        parts = [_placeholder(part) for part in get_args(kind)]
+        return None if None in parts else " ".join(part for part in parts if part is not None)
+    return _PLACEHOLDERS.get(kind)
