@@ -88,6 +88,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.attach",
         summary="labels put back on splats that an editor cropped, moved or rounded",
     ),
+    "completion": CommandEntry(
+        module="splatseg.cli.completion",
+        summary="a script that completes commands and flags in bash, zsh or fish",
+    ),
 }
 """Every command, in the order of the work."""
 
