@@ -199,19 +199,33 @@ def test_names_belong_to_the_ids(shared_data) -> None:
     assert open_evidence(shared_data / "office/depth").classes is None
 
 
-def test_names_of_evidence_leave_truth_out(shared_data) -> None:
-    assert evidence_names([shared_data / "office"]) == (
-        "features_dino",
-        "features_text",
-        "labels_panoptic",
-        "labels_semantic",
-        "labels_tracked",
-        "masks_sam",
-    )
-    assert evidence_names([shared_data / "real/replica_office0"]) == (
-        "pano_reference",
-        "sem_reference",
-    )
+TRUTH = {"semantic", "instance", "part", "depth", "images", "masks", "colmap"}
+
+
+def test_names_of_evidence_leave_truth_out(tmp_path) -> None:
+    seen = ("features_dino", "labels_tracked_hard", "masks_nested", "pano_reference")
+    for name in (*seen, *TRUTH):
+        (tmp_path / name).mkdir()
+    (tmp_path / "labels_notes.txt").write_text("no folder")
+    assert evidence_names([tmp_path]) == seen
+
+
+@pytest.mark.parametrize(
+    ("scene", "seen"),
+    [
+        ("office", {"masks_sam", "masks_nested", "labels_semantic_hard", "features_text"}),
+        ("real/replica_office0", {"pano_reference", "sem_reference"}),
+        ("real/dtu_scan37", set()),
+    ],
+)
+def test_names_of_recorded_evidence_leave_truth_out(shared_data, scene, seen) -> None:
+    """Whatever else is recorded there later: it opens as evidence, and no truth is among it."""
+    names = evidence_names([shared_data / scene])
+    assert seen <= set(names)
+    assert TRUTH & {path.name for path in (shared_data / scene).iterdir()}
+    assert not TRUTH & set(names)
+    for name in names:
+        assert open_evidence(shared_data / scene / name).view_names
 
 
 # Label maps
