@@ -97,17 +97,17 @@ def test_fix_writes_a_capture_that_is_healthy(broken, generated_room, splatseg, 
 
 def test_sizes_that_contradict_the_photographs(broken, generated_room, splatseg, tmp_path) -> None:
     """Width and height exchanged, intrinsics right: `read_capture` refuses it."""
-    folder = broken(lambda content: content.update(w=176, h=240))
+    folder = broken(lambda content: content.update(w=240, h=320))
     status, out, err = splatseg(
         "doctor", folder, "--views", 12, "--fix", tmp_path / "out", "--json"
     )
     assert status == 0, err
     facts = json.loads(out)
     assert [fault["name"] for fault in facts["faults"]] == ["image-size"]
-    assert "176x240" in facts["faults"][0]["sentence"]
+    assert "240x320" in facts["faults"][0]["sentence"]
     assert facts["written"] == str(tmp_path / "out")
     camera, true = (read_capture(f).views[0].camera for f in (tmp_path / "out", generated_room))
-    assert (camera.width, camera.height) == (240, 176)
+    assert (camera.width, camera.height) == (320, 240)
     assert (camera.fx, camera.cx) == (true.fx, true.cx)
 
 

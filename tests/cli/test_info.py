@@ -18,12 +18,12 @@ def line(capsys, *words: str) -> str:
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        (".", "nerfstudio capture, 19 views 240x176 (16 train, 3 test), pinhole; 4000 start"),
+        (".", "nerfstudio capture, 19 views 320x240 (16 train, 3 test), pinhole; 4000 start"),
         (".", "evidence features_dino, features_text, labels_panoptic"),
         ("labels_panoptic", "evidence of the kind panoptic of 16 views"),
-        ("features_text", "22 x 30 cells of 8 pixels, 16 channels"),
+        ("features_text", "30 x 40 cells of 8 pixels, 16 channels"),
         ("masks_sam", "evidence of the kind masks of 16 views; train_0000 has "),
-        ("images", "19 photographs, 240x176; no poses"),
+        ("images", "19 photographs, 320x240; no poses"),
         ("semantic", "evidence of the kind labels of 19 views"),
         ("sparse/0", "colmap capture, 19 views"),
     ],
@@ -37,8 +37,8 @@ def test_one_line_of_a_capture(capsys, generated_room, path, words) -> None:
 def test_one_line_of_other_layouts(capsys, generated_room, tmp_path) -> None:
     capture = read_capture(generated_room)
     out = line(capsys, str(write_llff(capture, tmp_path / "fern")))
-    assert "intrinsics of 960x704 were scaled to photographs of 240x176" in out
-    assert "idr capture, 19 views 240x176" in line(capsys, str(write_idr(capture, tmp_path / "a")))
+    assert "intrinsics of 1280x960 were scaled to photographs of 320x240" in out
+    assert "idr capture, 19 views 320x240" in line(capsys, str(write_idr(capture, tmp_path / "a")))
     words = "folder of captures or scenes (a, fern)"
     assert words in line(capsys, str(tmp_path))
 

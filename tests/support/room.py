@@ -18,7 +18,7 @@ from splatseg.core import View
 from splatseg.synthetic import SyntheticScene, Truth, look_at, room, write_capture
 from support import recorded
 
-WIDTH, HEIGHT = 240, 176  # whole cells of 16 pixels
+WIDTH, HEIGHT = 320, 240  # whole cells of 16 pixels
 TRAIN, TEST = 16, 3
 STEP = 2 * math.pi / TRAIN  # between two train views: neighbours share most of what they see
 
