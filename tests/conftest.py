@@ -53,23 +53,46 @@ def shared_data() -> Path:
     return SHARED.folder
 
 
+def made_once(
+    tmp_path_factory: pytest.TempPathFactory,
+    worker_id: str,
+    name: str,
+    make: Callable[[Path], None],
+) -> Path:
+    """A folder of this session that the workers of pytest-xdist share."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base if worker_id == "master" else base.parent) / "generated" / name
+    folder.parent.mkdir(exist_ok=True)
+    with FileLock(f"{folder}.lock"):
+        if not folder.is_dir():
+            unfinished = folder.with_name(f"{name}-unfinished")
+            shutil.rmtree(unfinished, ignore_errors=True)
+            make(unfinished)
+            unfinished.rename(folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def generated_room(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
     """A generated capture with evidence of every kind, see `support.room`; not to be changed.
 
     The workers of pytest-xdist share one: photographing it takes ten seconds.
     """
-    base = tmp_path_factory.getbasetemp()
-    base = base if worker_id == "master" else base.parent
-    folder = base / "generated" / "room"
-    folder.parent.mkdir(exist_ok=True)
-    with FileLock(f"{folder}.lock"):
-        if not folder.is_dir():
-            unfinished = folder.with_name("unfinished")
-            shutil.rmtree(unfinished, ignore_errors=True)
-            write_room(unfinished)
-            unfinished.rename(folder)
-    return folder
+    return made_once(tmp_path_factory, worker_id, "room", write_room)
+
+
+@pytest.fixture(scope="session")
+def fitted_room(
+    tmp_path_factory: pytest.TempPathFactory, worker_id: str, generated_room: Path
+) -> Path:
+    """A scene fitted to `generated_room` by the command; not to be changed."""
+    from splatseg.cli import main
+
+    def fit(folder: Path) -> None:
+        words = ("fit", generated_room, "-o", folder, "--steps", 200, "--max-gaussians", 4000)
+        assert main([str(word) for word in words]) == 0
+
+    return made_once(tmp_path_factory, worker_id, "scene", fit)
 
 
 @pytest.fixture
