@@ -1,12 +1,21 @@
 """Fixtures and settings that every test shares."""
 
+import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
+from support import shared
+from support.room import write_room
+from support.scorer import SCORERS, Score
+
 PROJECT_ROOT = Path(__file__).resolve().parent.parent
+SHARED = shared.SharedData.find(os.environ, PROJECT_ROOT)
 
 # The same examples in every run (a red run can be repeated), and no deadline: the
 # machines that run this are shared, and a slow moment is not a defect.
@@ -19,6 +28,11 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("splatseg")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Tests marked `data` run where the folder of large scenes is, and are told of elsewhere."""
+    config.pluginmanager.register(shared.DataTests(SHARED), "splatseg-data-tests")
 
 
 @pytest.fixture(scope="session")
@@ -35,15 +49,66 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real and rendered test input, beside the project's own folder.
+    """The folder of large scenes. Every test that takes it is marked `data`."""
+    return SHARED.folder
 
-    It never skips: a run that could not see its data must not look green.
-    """
-    folder = PROJECT_ROOT.parent / "shared" / "data"
-    if not (folder / "README.md").is_file():
-        pytest.fail(
-            "this test needs the test data in the folder shared/data beside the project's "
-            "folder (../shared/data/README.md), which is missing",
-            pytrace=False,
-        )
+
+def made_once(
+    tmp_path_factory: pytest.TempPathFactory,
+    worker_id: str,
+    name: str,
+    make: Callable[[Path], None],
+) -> Path:
+    """A folder of this session that the workers of pytest-xdist share."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base if worker_id == "master" else base.parent) / "generated" / name
+    folder.parent.mkdir(exist_ok=True)
+    with FileLock(f"{folder}.lock"):
+        if not folder.is_dir():
+            unfinished = folder.with_name(f"{name}-unfinished")
+            shutil.rmtree(unfinished, ignore_errors=True)
+            make(unfinished)
+            unfinished.rename(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def generated_room(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """A generated capture with evidence of every kind, see `support.room`; not to be changed.
+
+    The workers of pytest-xdist share one: photographing it takes ten seconds.
+    """
+    return made_once(tmp_path_factory, worker_id, "room", write_room)
+
+
+@pytest.fixture(scope="session")
+def fitted_room(
+    tmp_path_factory: pytest.TempPathFactory, worker_id: str, generated_room: Path
+) -> Path:
+    """A scene fitted to `generated_room` by the command; not to be changed."""
+    from splatseg.cli import main
+
+    def fit(folder: Path) -> None:
+        words = ("fit", generated_room, "-o", folder, "--steps", 200, "--max-gaussians", 4000)
+        assert main([str(word) for word in words]) == 0
+
+    return made_once(tmp_path_factory, worker_id, "scene", fit)
+
+
+@pytest.fixture
+def rich_capture(request: pytest.FixtureRequest) -> Path:
+    """A capture with evidence of every kind: `support.shared.generated_and` says which."""
+    if request.param == shared.GENERATED:
+        return request.getfixturevalue("generated_room")
+    return SHARED.folder / request.param
+
+
+@pytest.fixture(
+    params=[
+        "reference",
+        pytest.param("score.py", marks=pytest.mark.data),
+    ]
+)
+def score(request: pytest.FixtureRequest) -> Callable[..., Score]:
+    """A scorer that knows nothing of this project: ours of a few loops, and the shared one."""
+    return SCORERS[request.param](SHARED)

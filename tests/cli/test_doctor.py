@@ -9,18 +9,18 @@ import pytest
 
 from splatseg.io.captures import read_capture
 
-FRAMES = 20
+FRAMES = 16
 Content = dict[str, object]
 
 
 @pytest.fixture
-def broken(shared_data, tmp_path) -> Callable[..., Path]:
-    """A copy of twenty frames of the office's transforms.json, changed; photographs stay."""
+def broken(generated_room, tmp_path) -> Callable[..., Path]:
+    """A copy of the train frames of a transforms.json, changed; photographs stay."""
 
     def make(change: Callable[[Content], None] = lambda content: None) -> Path:
-        source = shared_data / "office"
+        source = generated_room
         content = json.loads((source / "transforms.json").read_text())
-        frames = [f for f in content["frames"] if f["split"] == "train"][:FRAMES]
+        frames = [f for f in content["frames"] if f["split"] == "train"]
         for frame in frames:
             frame["file_path"] = str(source / frame["file_path"])
         content |= {"frames": frames, "ply_file_path": str(source / "points3D.ply")}
@@ -68,7 +68,7 @@ def test_a_fault_without_fix_is_status_2(broken, splatseg) -> None:
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
 
 
-def test_fix_writes_a_capture_that_is_healthy(broken, shared_data, splatseg, tmp_path) -> None:
+def test_fix_writes_a_capture_that_is_healthy(broken, generated_room, splatseg, tmp_path) -> None:
     """Two faults at once: OpenCV poses, and intrinsics of photographs half the size."""
 
     def change(content: Content) -> None:
@@ -80,7 +80,7 @@ def test_fix_writes_a_capture_that_is_healthy(broken, shared_data, splatseg, tmp
     status, out, err = splatseg("doctor", folder, "--views", 12, "--fix", tmp_path / "out")
     assert (status, err) == (0, "")
     assert "2 faults found" in out
-    fixed, true = read_capture(tmp_path / "out"), read_capture(shared_data / "office")
+    fixed, true = read_capture(tmp_path / "out"), read_capture(generated_room)
     assert len(fixed.views) == FRAMES
     assert fixed.up == (0.0, 0.0, 1.0)
     assert fixed.metres_per_unit == 1.0
@@ -95,19 +95,20 @@ def test_fix_writes_a_capture_that_is_healthy(broken, shared_data, splatseg, tmp
     assert json.loads(out)["healthy"]
 
 
-def test_sizes_that_contradict_the_photographs(broken, splatseg, tmp_path) -> None:
+def test_sizes_that_contradict_the_photographs(broken, generated_room, splatseg, tmp_path) -> None:
     """Width and height exchanged, intrinsics right: `read_capture` refuses it."""
-    folder = broken(lambda content: content.update(w=384, h=512))
+    folder = broken(lambda content: content.update(w=240, h=320))
     status, out, err = splatseg(
         "doctor", folder, "--views", 12, "--fix", tmp_path / "out", "--json"
     )
     assert status == 0, err
     facts = json.loads(out)
     assert [fault["name"] for fault in facts["faults"]] == ["image-size"]
-    assert "384x512" in facts["faults"][0]["sentence"]
+    assert "240x320" in facts["faults"][0]["sentence"]
     assert facts["written"] == str(tmp_path / "out")
-    camera = read_capture(tmp_path / "out").views[0].camera
-    assert (camera.width, camera.height, camera.fx, camera.cx) == (512, 384, 335.0, 256.0)
+    camera, true = (read_capture(f).views[0].camera for f in (tmp_path / "out", generated_room))
+    assert (camera.width, camera.height) == (320, 240)
+    assert (camera.fx, camera.cx) == (true.fx, true.cx)
 
 
 def test_the_applied_transform_is_named(broken, splatseg) -> None:

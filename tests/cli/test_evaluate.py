@@ -1,8 +1,6 @@
 """evaluate: every metric equals the independent scorer's on the maps that render writes."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,9 +52,8 @@ def labelled(small):
 
 
 @pytest.fixture
-def both(labelled, splatseg, shared_data, tmp_path):
+def both(labelled, splatseg, score, tmp_path):
     """Run evaluate, and the scorer on what render writes of the same views."""
-    script = shared_data.parent / "score" / "score.py"
     out = tmp_path / "out"
     words = ("--split", "all", "--what", "classes,objects", "-o", out, *CPU)
     assert splatseg("render", labelled.scene, *words)[0] == 0
@@ -66,11 +63,7 @@ def both(labelled, splatseg, shared_data, tmp_path):
             "evaluate", labelled.scene, *ours, "--split", "all", "--json", *CPU
         )
         assert status == 0, err
-        done = subprocess.run(
-            [sys.executable, str(script), *map(str, theirs)], capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        return json.loads(text), json.loads(done.stdout)
+        return json.loads(text), score(*theirs)
 
     run.out = out
     return run

@@ -73,16 +73,25 @@ def test_up(splat_file, splatseg, tmp_path) -> None:
     assert all(abs(float(v.camera.cam_from_world[0, 2])) < 1e-9 for v in scene.views)
 
 
-def test_gltf_is_y_up(shared_data, splatseg, tmp_path) -> None:
-    file = shared_data / "splats" / "khr_conformance_matrix.glb"
+def test_gltf_is_y_up(project_root, splatseg, tmp_path) -> None:
+    file = project_root / "tests" / "golden" / "tools" / "ring.glb"
     status, _, err = splatseg("import", file, "-o", tmp_path / "s", *SMALL)
     assert status == 0, err
     assert load_scene(tmp_path / "s").up == (0.0, 1.0, 0.0)
 
 
+@pytest.mark.parametrize("name", ["ring.ply", "ring.splat", "ring.spz", "ring.sog"])
+def test_files_of_other_tools(name, project_root, splatseg, tmp_path) -> None:
+    check_coverage(project_root / "tests" / "golden" / "tools" / name, splatseg, tmp_path)
+
+
 @pytest.mark.parametrize("name", ["inria_point_cloud_9080.ply", "lastchance_14007.splat"])
-def test_files_of_other_tools(name, shared_data, splatseg, tmp_path) -> None:
-    file = shared_data / "splats" / name
+def test_large_files_of_other_tools(name, shared_data, splatseg, tmp_path) -> None:
+    check_coverage(shared_data / "splats" / name, splatseg, tmp_path)
+
+
+def check_coverage(file, splatseg, tmp_path) -> None:
+    """Virtual cameras see nearly all Gaussians of the file."""
     status, _, err = splatseg("import", file, "-o", tmp_path / "s", *SMALL)
     assert status == 0, err
     record = json.loads((tmp_path / "s" / "scene.json").read_text())

@@ -6,11 +6,54 @@ import numpy as np
 import pytest
 
 from splatseg.cli import main
+from splatseg.io.captures import read_capture
+from support.layouts import write_idr, write_llff
 
 
 def line(capsys, *words: str) -> str:
     assert main(["info", *words]) == 0
     return capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        (".", "nerfstudio capture, 19 views 320x240 (16 train, 3 test), pinhole; 4000 start"),
+        (".", "evidence features_dino, features_text, labels_panoptic"),
+        ("labels_panoptic", "evidence of the kind panoptic of 16 views"),
+        ("features_text", "30 x 40 cells of 8 pixels, 16 channels"),
+        ("masks_sam", "evidence of the kind masks of 16 views; train_0000 has "),
+        ("images", "19 photographs, 320x240; no poses"),
+        ("semantic", "evidence of the kind labels of 19 views"),
+        ("sparse/0", "colmap capture, 19 views"),
+    ],
+)
+def test_one_line_of_a_capture(capsys, generated_room, path, words) -> None:
+    out = line(capsys, str(generated_room / path))
+    assert words in out
+    assert out.count("\n") == 1
+
+
+def test_one_line_of_other_layouts(capsys, generated_room, tmp_path) -> None:
+    capture = read_capture(generated_room)
+    out = line(capsys, str(write_llff(capture, tmp_path / "fern")))
+    assert "intrinsics of 1280x960 were scaled to photographs of 320x240" in out
+    assert "idr capture, 19 views 320x240" in line(capsys, str(write_idr(capture, tmp_path / "a")))
+    words = "folder of captures or scenes (a, fern)"
+    assert words in line(capsys, str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        (".", "splat files (1 compressed.ply, 2 gltf, 1 ply, 2 sog, 1 splat, 3 spz)"),
+        ("three.splat", "3 Gaussians, harmonics of degree 0"),
+        ("three.ply", "ply splats, 3 Gaussians, harmonics of degree 1"),
+        ("three.v2.sog", "sog splats, 3 Gaussians"),
+    ],
+)
+def test_one_line_of_splats(capsys, project_root, path, words) -> None:
+    assert words in line(capsys, str(project_root / "tests/golden/splats" / path))
 
 
 @pytest.mark.parametrize(
@@ -38,7 +81,7 @@ def line(capsys, *words: str) -> str:
         ("splats/sog_playbot_6_0", "sog splats, 1873 Gaussians"),
     ],
 )
-def test_one_line(capsys, shared_data, path, words) -> None:
+def test_one_line_of_large_scenes(capsys, shared_data, path, words) -> None:
     out = line(capsys, str(shared_data / path))
     assert words in out
     assert out.count("\n") == 1
@@ -53,19 +96,19 @@ def test_a_scene_and_its_layer(capsys, project_root) -> None:
     assert "layer of labels of 2 ids, 3 rows" in line(capsys, str(root / "layers/semantic.npz"))
 
 
-def test_json_has_the_same_facts(capsys, shared_data) -> None:
-    facts = json.loads(line(capsys, str(shared_data / "office"), "--json"))
-    assert (facts["kind"], facts["format"], facts["views"]) == ("capture", "nerfstudio", 125)
-    assert facts["split"] == {"train": 100, "test": 25}
-    assert (facts["points"], facts["classes"], facts["up"]) == (30000, 91, [0, 0, 1])
+def test_json_has_the_same_facts(capsys, generated_room) -> None:
+    facts = json.loads(line(capsys, str(generated_room), "--json"))
+    assert (facts["kind"], facts["format"], facts["views"]) == ("capture", "nerfstudio", 19)
+    assert facts["split"] == {"train": 16, "test": 3}
+    assert (facts["points"], facts["classes"], facts["up"]) == (4000, 16, [0, 0, 1])
     assert facts["other_formats"] == ["colmap"]
-    other = json.loads(line(capsys, str(shared_data / "office"), "--json", "--format", "colmap"))
+    other = json.loads(line(capsys, str(generated_room), "--json", "--format", "colmap"))
     assert (other["format"], other["split"]) == ("colmap", facts["split"])
 
 
-def test_details_come_a_line_each(capsys, shared_data) -> None:
-    out = line(capsys, str(shared_data / "real/camvid"), "--verbose").splitlines()
-    assert "  points: 5503" in out
+def test_details_come_a_line_each(capsys, generated_room) -> None:
+    out = line(capsys, str(generated_room), "--verbose").splitlines()
+    assert "  points: 4000" in out
     assert "  splats: none" in out
 
 

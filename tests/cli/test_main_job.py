@@ -1,8 +1,6 @@
 """segment, render, evaluate, export: the main job after a fit, as the shell runs it."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +22,6 @@ def segmented(small, splatseg):
     assert (status, err.strip()) == (0, ""), err
     assert "3 ids" in out or "2 ids" in out
     return small
-
-
-def shared_score(shared_data: Path, *arguments: object) -> dict:
-    script = shared_data.parent / "score" / "score.py"
-    done = subprocess.run(
-        [sys.executable, str(script), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout)
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -235,7 +222,7 @@ def test_an_interrupted_segment_leaves_the_layer_as_it_was(
     assert after == before
 
 
-def test_evaluate_agrees_with_the_scorer(segmented, splatseg, shared_data, tmp_path) -> None:
+def test_evaluate_agrees_with_the_scorer(segmented, splatseg, score, tmp_path) -> None:
     truth = segmented.capture / "semantic"
     status, text, err = splatseg(
         "evaluate", segmented.scene, "--layer", "semantic", "--truth", truth, "--split", "test",
@@ -251,17 +238,15 @@ def test_evaluate_agrees_with_the_scorer(segmented, splatseg, shared_data, tmp_p
         )[0]
         == 0
     )  # fmt: skip
-    theirs = shared_score(
-        shared_data, "semantic", "--pred", out / "semantic", "--truth", truth, "--views", "test_*"
-    )
+    theirs = score("semantic", "--pred", out / "semantic", "--truth", truth, "--views", "test_*")
     for key in ("mIoU", "fwIoU", "accuracy", "mAcc"):
         assert ours[key] == pytest.approx(theirs[key], abs=1e-9)
     assert {k: round(v, 4) for k, v in ours["per_class"].items()} == theirs["per_class"]
     assert ours["mIoU_per_image"] == pytest.approx(ours["mIoU"])
     assert (ours["views"], ours["learned_from"]) == (1, 0)
     assert ours["mIoU"] > 0.7
-    pictures = shared_score(
-        shared_data, "image", "--pred", out / "rgb", "--truth", segmented.capture / "images",
+    pictures = score(
+        "image", "--pred", out / "rgb", "--truth", segmented.capture / "images",
         "--views", "test_*",
     )  # fmt: skip
     for key in ("PSNR", "SSIM", "PSNR_min"):

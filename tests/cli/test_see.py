@@ -20,6 +20,7 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.scene import load_scene
 from splatseg.models import record_evidence
+from support.shared import generated_and
 
 WIDTH, HEIGHT = 28, 20
 TRAIN = ("train_0", "train_1", "train_3")
@@ -321,15 +322,16 @@ def test_recorded_label_maps_keep_names_and_void(small, splatseg) -> None:
     )
 
 
-def test_recorded_panoptic_tracked_and_features_of_the_shared_scenes(
-    splatseg, shared_data, tmp_path
+@generated_and("toys")
+def test_recorded_panoptic_tracked_and_features_of_other_programs(
+    splatseg, rich_capture, tmp_path
 ) -> None:
-    """A scene around two views of toys: every kind is copied and reads back the same."""
+    """A scene around two views: every kind is copied and reads back the same."""
     from splatseg.core import Gaussians, Scene
     from splatseg.io.captures import read_capture
     from splatseg.io.scene import save_scene
 
-    views = read_capture(shared_data / "toys").train_views[:2]
+    views = read_capture(rich_capture).train_views[:2]
     one = Gaussians(
         means=torch.zeros(1, 3),
         rotations=torch.tensor([[1.0, 0, 0, 0]]),
@@ -339,7 +341,7 @@ def test_recorded_panoptic_tracked_and_features_of_the_shared_scenes(
     )
     save_scene(Scene(gaussians=one, views=views), tmp_path / "S")
     for name in ("labels_panoptic", "labels_tracked", "features_dino", "features_text"):
-        source = open_evidence(shared_data / "toys" / name)
+        source = open_evidence(rich_capture / name)
         words = ("see", tmp_path / "S", "--model", source.folder, "--evidence", name)
         assert splatseg(*words)[0] == 0
         copy = open_evidence(tmp_path / "S" / "evidence" / name)

@@ -1,14 +1,8 @@
 """The measures, by hand and against the independent scorer."""
 
-import json
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.evaluate.metrics import (
@@ -21,38 +15,13 @@ from splatseg.evaluate.metrics import (
 )
 
 
-@pytest.fixture
-def scorer(shared_data: Path):
-    """Run score.py, which knows nothing of this project."""
-    script = shared_data.parent / "score" / "score.py"
-
-    def run(command: str, predicted: Path, truth: Path, *extra: str) -> dict:
-        arguments = [command, "--pred", str(predicted), "--truth", str(truth), *extra]
-        done = subprocess.run(
-            [sys.executable, str(script), *arguments],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        return json.loads(done.stdout)
-
-    return run
-
-
-def write_maps(folder: Path, maps: list[np.ndarray]) -> Path:
-    folder.mkdir()
-    for i, array in enumerate(maps):
-        Image.fromarray(array).save(folder / f"view_{i}.png")
-    return folder
-
-
 def in_memory(array: np.ndarray) -> torch.Tensor:
     """Ids of files (0 void) as those of memory (-1 none)."""
     return torch.from_numpy(array.astype(np.int64)) - 1
 
 
 @pytest.mark.parametrize("classes", [2, 7, 300])
-def test_semantic_scores_equal_the_scorers(rng, tmp_path, scorer, classes) -> None:
+def test_semantic_scores_equal_the_scorers(rng, score, maps_in, classes) -> None:
     truth = [rng.integers(0, classes, (23, 31)).astype(np.uint16) for _ in range(3)]
     # Right about half the time, void at times, and with a class that the truth lacks.
     predicted = [
@@ -63,11 +32,7 @@ def test_semantic_scores_equal_the_scorers(rng, tmp_path, scorer, classes) -> No
         )
         for t in truth
     ]
-    theirs = scorer(
-        "semantic",
-        write_maps(tmp_path / "p", predicted),
-        write_maps(tmp_path / "t", truth),
-    )
+    theirs = score("semantic", "--pred", maps_in("p", predicted), "--truth", maps_in("t", truth))
     views = [
         Confusion.of(in_memory(p), in_memory(t)) for p, t in zip(predicted, truth, strict=True)
     ]
@@ -136,14 +101,14 @@ def test_sizes_and_ranges_are_checked() -> None:
         ssim(torch.zeros(10, 20, 3), torch.zeros(10, 20, 3))
 
 
-def test_binary_scores_equal_the_scorers(rng, tmp_path, scorer) -> None:
+def test_binary_scores_equal_the_scorers(rng, score, maps_in) -> None:
     truth = [rng.random((9, 14)) < share for share in (0.5, 0.1, 0.0)]
     predicted = [t ^ (rng.random(t.shape) < 0.2) for t in truth[:2]] + [truth[2]]
-    theirs = scorer(
+    theirs = score(
         "binary",
-        write_maps(tmp_path / "p", [(p * 255).astype(np.uint8) for p in predicted]),
-        write_maps(tmp_path / "t", [t.astype(np.uint8) for t in truth]),
-    )
+        "--pred", maps_in("p", [(p * 255).astype(np.uint8) for p in predicted]),
+        "--truth", maps_in("t", [t.astype(np.uint8) for t in truth]),
+    )  # fmt: skip
     ours = binary_score(
         (torch.from_numpy(p), torch.from_numpy(t)) for p, t in zip(predicted, truth, strict=True)
     )
@@ -158,12 +123,12 @@ def test_binary_score_of_nothing_at_all() -> None:
     assert (score.iou_mean, score.iou_pooled, score.accuracy) == (1.0, 0.0, 1.0)
 
 
-def test_picture_scores_equal_the_scorers(rng, tmp_path, scorer) -> None:
+def test_picture_scores_equal_the_scorers(rng, score, maps_in) -> None:
     truth = [rng.integers(0, 256, (24, 33, 3), dtype=np.uint8) for _ in range(2)]
     noise = [rng.integers(-40, 41, t.shape) for t in truth]
     image = [np.clip(t + n, 0, 255).astype(np.uint8) for t, n in zip(truth, noise, strict=True)]
     image[1] = truth[1].copy()
-    theirs = scorer("image", write_maps(tmp_path / "p", image), write_maps(tmp_path / "t", truth))
+    theirs = score("image", "--pred", maps_in("p", image), "--truth", maps_in("t", truth))
     pairs = [(torch.from_numpy(a), torch.from_numpy(b)) for a, b in zip(image, truth, strict=True)]
     decibels = [psnr(a, b) for a, b in pairs]
     assert np.mean(decibels) == pytest.approx(theirs["PSNR"], abs=1e-9)

@@ -10,8 +10,10 @@ import torch
 from splatseg.core import Camera, Gaussians, LabelMap, View
 from splatseg.render import RenderOptions, get_backend
 from splatseg.render.warp import straightened
+from support.backends import each_backend as each_backend
+from support.backends import pytest_generate_tests as pytest_generate_tests
 
-BACKEND = "reference"
+BACKEND = "reference"  # in test modules: each in turn, see support.backends
 BARREL = {"model": "opencv", "distortion": (-0.15, 0.02)}
 
 

@@ -36,6 +36,7 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.images import load_image
 from splatseg.models import find_model, recorded_model
+from support.shared import generated_and
 
 H, W = 48, 64
 
@@ -187,22 +188,23 @@ def test_panoptic_and_tracked_folders_are_written_read_and_asked(tmp_path) -> No
         list(model.track([("v1", image())], {"v1": LabelMap(ids=ids)}))
 
 
-@pytest.mark.parametrize("scene", ["office"])
-def test_recorded_features_of_the_shared_scenes(shared_data, scene) -> None:
-    view = read_capture(shared_data / scene).train_views[0]
+@generated_and("office")
+def test_recorded_features_of_other_programs(rich_capture) -> None:
+    view = read_capture(rich_capture).train_views[0]
+    rows, columns = view.camera.height // 16, view.camera.width // 16
     photograph = load_image(view)
-    dino = find_model(shared_data / scene / "features_dino")
+    dino = find_model(rich_capture / "features_dino")
     assert isinstance(dino, DenseFeatures)
     assert not isinstance(dino, TextFeatures)
     deep = dino.features(photograph, view=view.name)
     assert deep.depths == ("block3", "block6", "block9", "block12")
-    assert [m.features.shape for m in deep.maps] == [torch.Size([24, 32, 48])] * 4
+    assert [m.features.shape[:2] for m in deep.maps] == [(rows, columns)] * 4
     assert not torch.equal(deep.maps[0].features, deep.maps[3].features)
 
-    text = find_model(shared_data / scene / "features_text")
+    text = find_model(rich_capture / "features_text")
     assert isinstance(text, TextFeatures)
     dense = text.text_features(photograph, view=view.name)
-    words = text.encode_text(["desk", "wall"])
+    words = text.encode_text(["floor", "wall"])
     assert words.shape == (2, dense.channels)
     for vectors in (dense.features, words):
         assert torch.allclose(vectors.norm(dim=-1), torch.ones(vectors.shape[:-1]), atol=1e-4)

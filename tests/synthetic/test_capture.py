@@ -36,6 +36,17 @@ def written(small_room: SyntheticScene, views, tmp_path_factory) -> tuple[Path, 
     return folder, write_capture(small_room, folder, views=views, points=800, seed=2)
 
 
+def test_files_that_are_written(written):
+    folder, _ = written
+    for name in ("images", "semantic", "instance", "depth"):
+        assert len(list((folder / name).iterdir())) == 7
+    modes = {"semantic": "L", "instance": "I;16", "depth": "I;16", "labels_semantic": "L"}
+    assert {kind: mode_of(folder / kind / "train_0000.png") for kind in modes} == modes
+    content = json.loads((folder / "transforms.json").read_text())
+    assert {"w", "h", "fl_x", "fl_y", "cx", "cy", "ply_file_path"} <= content.keys()
+    assert content["frames"][0].keys() == {"file_path", "transform_matrix", "split"}
+
+
 def test_files_are_those_of_the_rendered_benchmark(written, shared_data):
     folder, _ = written
     office = shared_data / "office"

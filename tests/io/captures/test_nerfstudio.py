@@ -11,6 +11,7 @@ from PIL import Image
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
 from splatseg.io.images import load_image, load_mask
+from support.shared import generated_and
 
 WIDTH, HEIGHT = 64, 48
 
@@ -275,10 +276,12 @@ def test_rendered_scenes(shared_data, name, train, test) -> None:
     assert (capture.up, capture.metres_per_unit) == ((0, 0, 1), 1)
 
 
-def test_both_descriptions_of_a_scene_agree(shared_data) -> None:
+@generated_and("office")
+def test_both_descriptions_of_a_scene_agree(rich_capture) -> None:
     """transforms.json and the COLMAP model of one capture give the same cameras."""
-    one = read_capture(shared_data / "office")
-    other = read_capture(shared_data / "office", format="colmap")
+    one = read_capture(rich_capture)
+    other = read_capture(rich_capture, format="colmap")
+    assert (one.format, other.format) == ("nerfstudio", "colmap")
     for a, b in zip(one.views, other.views, strict=True):
         assert a.name == b.name
         np.testing.assert_allclose(a.camera.cam_from_world, b.camera.cam_from_world, atol=1e-7)

@@ -1,7 +1,6 @@
 """LLFF, IDR, points beside poses, and the choice between layouts."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import bare_photographs, find_formats, read_capture
 from splatseg.io.captures._points import read_ply_points
 from splatseg.io.captures.idr import decompose
+from support.layouts import write_idr, write_llff
 
 
 def rotation(rng) -> np.ndarray:
@@ -55,15 +55,31 @@ def test_llff_never_unpickles(tmp_path) -> None:
         read_capture(tmp_path)
 
 
+@pytest.mark.parametrize("write", [write_llff, write_idr])
+def test_other_layouts_of_one_capture_give_its_cameras(write, generated_room, tmp_path) -> None:
+    known = read_capture(generated_room)
+    capture = read_capture(write(known, tmp_path / "a"))
+    assert capture.format == write.__name__.removeprefix("write_")
+    assert len(capture.points) == len(known.points)
+    for ours, view in zip(capture.views, known.views, strict=True):
+        camera, expected = ours.camera, view.camera
+        np.testing.assert_allclose(camera.cam_from_world, expected.cam_from_world, atol=1e-6)
+        np.testing.assert_allclose(camera.K, expected.K, rtol=1e-6, atol=1e-4)
+        assert (camera.width, camera.height) == (expected.width, expected.height)
+
+
+def share_inside(capture, view) -> float:
+    """Of the start points, those that fall into a view's photograph."""
+    pixels, depth = view.camera.project(capture.points.points.double())
+    size = torch.tensor([view.camera.width, view.camera.height])
+    inside = (depth > 0) & (pixels > 0).all(1) & (pixels < size).all(1)
+    return float(inside.float().mean())
+
+
 def test_llff_points_lie_before_its_cameras(shared_data) -> None:
     capture = read_capture(shared_data / "real/llff_fern")
     assert (len(capture.views), len(capture.points)) == (20, 10091)
-    points = capture.points.points.double()
-    for view in capture.views:
-        pixels, depth = view.camera.project(points)
-        size = torch.tensor([view.camera.width, view.camera.height])
-        inside = (depth > 0) & (pixels > 0).all(1) & (pixels < size).all(1)
-        assert inside.float().mean() > 0.5
+    assert min(share_inside(capture, view) for view in capture.views) > 0.5
 
 
 def test_decompose_is_the_inverse_of_composing(rng) -> None:
@@ -84,46 +100,55 @@ def test_decompose_refuses_what_is_no_projection(bad) -> None:
         decompose(bad, where="x")
 
 
-def test_idr_capture(shared_data) -> None:
-    capture = read_capture(shared_data / "real/dtu_scan37")
+@pytest.mark.parametrize(
+    "folder", ["generated", pytest.param("real/dtu_scan37", marks=pytest.mark.data)]
+)
+def test_idr_capture(request, folder, generated_room, tmp_path) -> None:
+    if folder == "generated":
+        path = write_idr(read_capture(generated_room), tmp_path / "a")
+    else:
+        path = request.getfixturevalue("shared_data") / folder
+    capture = read_capture(path)
     assert capture.format == "idr"
-    assert len(capture.views) == 49
+    assert len(capture.views) == len(list((path / "images").iterdir()))
     camera = capture.views[0].camera
-    with np.load(shared_data / "real/dtu_scan37/cameras_sphere.npz") as archive:
+    with np.load(path / "cameras_sphere.npz") as archive:
         projection = archive["world_mat_0"][:3].astype(np.float64)
         centre = archive["scale_mat_0"][:3, 3].astype(np.float64)
-    for point in (centre, centre + 20):
+        forward = camera.cam_from_world[2, :3].numpy()
+    for point in (centre, centre + 0.5 * forward):
         homogeneous = projection @ np.append(point, 1)
         pixels, depth = camera.project(torch.from_numpy(point)[None])
         np.testing.assert_allclose(pixels[0], 0.5 * homogeneous[:2] / homogeneous[2], atol=2e-3)
         assert depth > 0
-    assert capture.views[3].mask.name == "000003.png"
+    assert capture.views[3].mask.stem == capture.views[3].image.stem
     assert "intrinsics were scaled by 0.5 to fit the photographs" in capture.notes
 
 
-def test_idr_photographs_of_no_scale_are_refused(tmp_path, shared_data, write_image) -> None:
-    shutil.copy(shared_data / "real/dtu_scan37/cameras_sphere.npz", tmp_path)
-    for i in range(49):
-        write_image(tmp_path / "images" / f"{i:03d}.png", 700, 200)
+def test_idr_photographs_of_no_scale_are_refused(tmp_path, generated_room, write_image) -> None:
+    folder = write_idr(read_capture(generated_room), tmp_path / "a")
+    for path in sorted((folder / "images").iterdir()):
+        path.unlink()
+        write_image(path.with_suffix(".png"), 700, 200)
     with pytest.raises(InputError, match="expected principal points near the middle"):
-        read_capture(tmp_path)
+        read_capture(folder)
 
 
-def test_layouts_come_in_order(tmp_path, shared_data) -> None:
-    assert find_formats(shared_data / "office") == ("nerfstudio", "colmap")
-    assert find_formats(shared_data / "real/llff_fern") == ("llff",)
+def test_layouts_come_in_order(tmp_path, generated_room) -> None:
+    assert find_formats(generated_room) == ("nerfstudio", "colmap")
     assert find_formats(tmp_path) == ()
+    assert find_formats(write_llff(read_capture(generated_room), tmp_path / "a")) == ("llff",)
 
 
 @pytest.mark.parametrize("path", ["transforms.json", "."])
-def test_a_file_or_its_folder(shared_data, path) -> None:
-    assert len(read_capture(shared_data / "toys" / path).views) == 100
+def test_a_file_or_its_folder(generated_room, path) -> None:
+    assert len(read_capture(generated_room / path).views) == 19
 
 
-def test_bare_photographs_have_no_poses(shared_data) -> None:
-    assert len(bare_photographs(shared_data / "real/banana")) == 16
-    with pytest.raises(InputError, match="got 16 photographs without"):
-        read_capture(shared_data / "real/banana")
+def test_bare_photographs_have_no_poses(generated_room) -> None:
+    assert len(bare_photographs(generated_room / "images")) == 19
+    with pytest.raises(InputError, match="got 19 photographs without"):
+        read_capture(generated_room / "images")
 
 
 def test_nothing_is_nothing(tmp_path) -> None:

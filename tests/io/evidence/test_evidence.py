@@ -26,8 +26,7 @@ from splatseg.io.evidence import (
     save_label_map,
     save_masks,
 )
-
-SCENES = ["office", "toys", "frontal"]
+from support.shared import generated_and
 
 
 def png(path: Path, values, mode: str | None = None) -> None:
@@ -39,7 +38,7 @@ def png(path: Path, values, mode: str | None = None) -> None:
 # What others recorded
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@generated_and("office", "toys", "frontal")
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
@@ -51,33 +50,38 @@ def png(path: Path, values, mode: str | None = None) -> None:
         ("features_text", "features"),
     ],
 )
-def test_recorded_evidence_is_of_the_train_views(shared_data, scene, name, kind) -> None:
-    capture = read_capture(shared_data / scene)
+def test_recorded_evidence_is_of_the_train_views(rich_capture, name, kind) -> None:
+    capture = read_capture(rich_capture)
     evidence = open_evidence(find_evidence([capture.path], name))
     assert evidence.kind == kind
     assert evidence.view_names == tuple(view.name for view in capture.train_views)
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_recorded_masks(shared_data, scene) -> None:
+@generated_and("office", "toys", "frontal")
+@pytest.mark.parametrize("folder", ["masks_sam", "masks_nested"])
+def test_recorded_masks(rich_capture, folder) -> None:
     """Areas and boxes in the files are those of the masks that were decoded."""
-    evidence = open_evidence(shared_data / scene / "masks_sam")
+    if not (rich_capture / folder).is_dir():
+        folder = "masks_sam"  # frontal has no nested ones
+    evidence = open_evidence(rich_capture / folder)
     name = evidence.view_names[7]
-    rows = json.loads((shared_data / scene / "masks_sam" / f"{name}.json").read_text())["masks"]
+    content = json.loads((rich_capture / folder / f"{name}.json").read_text())
+    rows = content["masks"]
     masks = evidence.masks(name)
     assert len(masks) == len(rows) > 10
     for i, row in enumerate(rows):
         dense = masks.dense(i)
-        assert dense.shape == (384, 512)
+        assert dense.shape == (content["height"], content["width"])
         assert int(dense.sum()) == row["area"]
         assert list(masks.masks[i].bbox) == row["bbox"]
         assert float(masks.scores[i]) == pytest.approx(row["predicted_iou"])
 
 
-def test_recorded_semantic_labels(shared_data) -> None:
-    evidence = open_evidence(shared_data / "office/labels_semantic")
+@generated_and("office")
+def test_recorded_semantic_labels(rich_capture) -> None:
+    evidence = open_evidence(rich_capture / "labels_semantic")
     name = evidence.view_names[0]
-    with Image.open(shared_data / f"office/labels_semantic/{name}.png") as image:
+    with Image.open(rich_capture / f"labels_semantic/{name}.png") as image:
         stored = np.asarray(image).astype(int)
     ids = evidence.label_map(name).ids
     np.testing.assert_array_equal(ids, np.where(stored == 0, -1, stored))
@@ -90,10 +94,11 @@ def test_recorded_semantic_labels(shared_data) -> None:
         np.testing.assert_array_equal(masks.dense(i), stored == id)
 
 
-def test_recorded_panoptic_segments(shared_data) -> None:
-    evidence = open_evidence(shared_data / "office/labels_panoptic")
+@generated_and("office")
+def test_recorded_panoptic_segments(rich_capture) -> None:
+    evidence = open_evidence(rich_capture / "labels_panoptic")
     assert isinstance(evidence, PanopticEvidence)
-    table = json.loads((shared_data / "office/labels_panoptic/segments.json").read_text())
+    table = json.loads((rich_capture / "labels_panoptic/segments.json").read_text())
     name = evidence.view_names[3]
     rows = {row["id"]: row for row in table[name]["segments_info"]}
     ids, categories = evidence.label_map(name), evidence.category_map(name)
@@ -106,24 +111,28 @@ def test_recorded_panoptic_segments(shared_data) -> None:
     assert ((ids.ids == -1) == (categories.ids == -1)).all()
 
 
-def test_recorded_tracks(shared_data) -> None:
-    evidence = open_evidence(shared_data / "office/labels_tracked")
+@generated_and("office")
+def test_recorded_tracks(rich_capture) -> None:
+    evidence = open_evidence(rich_capture / "labels_tracked")
     assert isinstance(evidence, TrackedEvidence)
-    table = json.loads((shared_data / "office/labels_tracked/tracks.json").read_text())
+    table = json.loads((rich_capture / "labels_tracked/tracks.json").read_text())
     assert evidence.order == tuple(table["order"])
     assert [track.id for track in evidence.tracks] == sorted(map(int, table["tracks"]))
-    first = evidence.tracks[0]
-    assert dict(first.votes) == {"window": 333366, "picture": 8124, "curtain": 4143}
-    assert first.category == "window"
-    assert evidence.classes.name_of(1) == "window 1"
+    for track in evidence.tracks:
+        votes = table["tracks"][str(track.id)]["category_votes"]
+        assert dict(track.votes) == votes
+        assert track.category == max(votes, key=votes.__getitem__)
+        assert evidence.classes.name_of(track.id) == f"{track.category} {track.id}"
     seen = {
         int(i) for name in evidence.view_names[:5] for i in evidence.label_map(name).ids.unique()
     }
     assert seen - {-1} <= {track.id for track in evidence.tracks}
 
 
-def test_recorded_dino_features(shared_data) -> None:
-    folder = shared_data / "office/features_dino"
+@generated_and("office")
+def test_recorded_dino_features(rich_capture) -> None:
+    folder = rich_capture / "features_dino"
+    camera = read_capture(rich_capture).train_views[0].camera
     evidence = open_evidence(folder)
     assert isinstance(evidence, FeatureEvidence)
     name = evidence.view_names[2]
@@ -132,8 +141,9 @@ def test_recorded_dino_features(shared_data) -> None:
     assert evidence.blocks == ("block3", "block6", "block9", "block12")
     for i, block in enumerate(evidence.blocks):
         features = evidence.block_features(name, block)
-        assert (features.stride, features.height, features.width) == (16, 384, 512)
-        for row, column, channel in ((0, 0, 0), (23, 31, 47), (5, 9, 20)):
+        size = (camera.height, camera.width)
+        assert (features.stride, features.height, features.width) == (16, *size)
+        for row, column, channel in ((0, 0, 0), (-1, -1, -1), (5, 9, 7)):
             expected = codes[i, row, column, channel] * scale[i, channel] + offset[i, channel]
             assert float(features.features[row, column, channel]) == pytest.approx(expected)
     last = evidence.features(name).features
@@ -144,22 +154,26 @@ def test_recorded_dino_features(shared_data) -> None:
         evidence.expand(last)
 
 
-def test_text_features_expand_to_unit_vectors_near_their_words(shared_data) -> None:
+@generated_and("office")
+def test_text_features_expand_to_unit_vectors_near_their_words(rich_capture) -> None:
     """A pixel's full vector is nearer to its class's word than to most others."""
-    evidence = open_evidence(shared_data / "office/features_text")
-    words = load_text_embeddings(shared_data / "office")
+    evidence = open_evidence(rich_capture / "features_text")
+    words = load_text_embeddings(rich_capture)
     name = evidence.view_names[0]
     features = evidence.features(name)
-    assert features.features.shape == (48, 64, 24)
+    with np.load(evidence.folder / "basis.npz") as basis:
+        channels, length = basis["basis"].shape
+    rows, columns = -(-features.height // 8), -(-features.width // 8)
+    assert features.features.shape == (rows, columns, channels)
     full = evidence.expand(features.features)
-    assert full.shape == (48, 64, 512)
+    assert full.shape == (rows, columns, length)
     np.testing.assert_allclose(full.norm(dim=-1), 1, atol=1e-5)
     with np.load(evidence.folder / f"{name}.npz") as archive:
         code = archive["f"][9, 13].astype(np.float64)
     with np.load(evidence.folder / "basis.npz") as basis:
         exact = (code * basis["scale"] + basis["offset"]) @ basis["basis"] + basis["mean"]
     np.testing.assert_allclose(full[9, 13], exact / np.linalg.norm(exact), atol=1e-6)
-    labels = open_evidence(shared_data / "office/labels_semantic").label_map(name).ids[4::8, 4::8]
+    labels = open_evidence(rich_capture / "labels_semantic").label_map(name).ids[4::8, 4::8]
     classes = [i for i, kind in enumerate(words.kinds) if kind == "class"]
     scores = full @ words.vectors[classes].T
     order = scores.argsort(dim=-1, descending=True)
@@ -191,27 +205,44 @@ def test_other_label_maps(shared_data, path, views) -> None:
     assert int(evidence.label_map(evidence.view_names[-1]).ids.max()) > 0
 
 
-def test_names_belong_to_the_ids(shared_data) -> None:
+@generated_and("office")
+def test_names_belong_to_the_ids(rich_capture) -> None:
     """Instance ids are named after instances, not after the classes of the same number."""
-    assert open_evidence(shared_data / "office/semantic").classes.name_of(2) == "floor"
-    assert open_evidence(shared_data / "office/instance").classes.name_of(1) == "walls"
-    assert open_evidence(shared_data / "office/part").classes.name_of(1) == "north wall"
-    assert open_evidence(shared_data / "office/depth").classes is None
+    part = json.loads((rich_capture / "metadata.json").read_text())["parts"][0]
+    assert open_evidence(rich_capture / "semantic").classes.name_of(2) == "floor"
+    assert open_evidence(rich_capture / "instance").classes.name_of(1) == "walls"
+    assert open_evidence(rich_capture / "part").classes.name_of(part["id"]) == part["name"]
+    assert part["name"] != "walls"
+    assert open_evidence(rich_capture / "depth").classes is None
 
 
-def test_names_of_evidence_leave_truth_out(shared_data) -> None:
-    assert evidence_names([shared_data / "office"]) == (
-        "features_dino",
-        "features_text",
-        "labels_panoptic",
-        "labels_semantic",
-        "labels_tracked",
-        "masks_sam",
-    )
-    assert evidence_names([shared_data / "real/replica_office0"]) == (
-        "pano_reference",
-        "sem_reference",
-    )
+TRUTH = {"semantic", "instance", "part", "depth", "images", "masks", "colmap"}
+
+
+def test_names_of_evidence_leave_truth_out(tmp_path) -> None:
+    seen = ("features_dino", "labels_tracked_hard", "masks_nested", "pano_reference")
+    for name in (*seen, *TRUTH):
+        (tmp_path / name).mkdir()
+    (tmp_path / "labels_notes.txt").write_text("no folder")
+    assert evidence_names([tmp_path]) == seen
+
+
+@pytest.mark.parametrize(
+    ("scene", "seen"),
+    [
+        ("office", {"masks_sam", "masks_nested", "labels_semantic_hard", "features_text"}),
+        ("real/replica_office0", {"pano_reference", "sem_reference"}),
+        ("real/dtu_scan37", set()),
+    ],
+)
+def test_names_of_recorded_evidence_leave_truth_out(shared_data, scene, seen) -> None:
+    """Whatever else is recorded there later: it opens as evidence, and no truth is among it."""
+    names = evidence_names([shared_data / scene])
+    assert seen <= set(names)
+    assert TRUTH & {path.name for path in (shared_data / scene).iterdir()}
+    assert not TRUTH & set(names)
+    for name in names:
+        assert open_evidence(shared_data / scene / name).view_names
 
 
 # Label maps
@@ -392,16 +423,15 @@ def test_features_that_are_broken(tmp_path) -> None:
 # Folders
 
 
-def test_kinds_that_are_not_there_are_refused(shared_data) -> None:
-    office = shared_data / "office"
+def test_kinds_that_are_not_there_are_refused(generated_room) -> None:
     with pytest.raises(InputError, match="expected evidence of label maps, got masks"):
-        open_evidence(office / "masks_sam").label_map("train_0000")
+        open_evidence(generated_room / "masks_sam").label_map("train_0000")
     with pytest.raises(InputError, match="expected evidence of masks, got features"):
-        open_evidence(office / "features_dino").masks("train_0000")
+        open_evidence(generated_room / "features_dino").masks("train_0000")
     with pytest.raises(InputError, match="expected evidence of features, got tracked"):
-        open_evidence(office / "labels_tracked").features("train_0000")
-    with pytest.raises(InputError, match=r"nothing of view 'test_0000' among 100 views"):
-        open_evidence(office / "labels_semantic").label_map("test_0000")
+        open_evidence(generated_room / "labels_tracked").features("train_0000")
+    with pytest.raises(InputError, match=r"nothing of view 'test_0000' among 16 views"):
+        open_evidence(generated_room / "labels_semantic").label_map("test_0000")
 
 
 def test_evidence_of_a_scene_comes_before_that_of_its_capture(tmp_path) -> None:
@@ -437,7 +467,7 @@ def test_the_header_tells_kind_classes_and_version(tmp_path) -> None:
     assert not (tmp_path / "f").exists()
 
 
-def test_what_is_no_evidence(tmp_path, shared_data) -> None:
+def test_what_is_no_evidence(tmp_path) -> None:
     with pytest.raises(MissingFileError, match="no such folder of evidence"):
         open_evidence(tmp_path / "gone")
     with pytest.raises(InputError, match="expected evidence"):

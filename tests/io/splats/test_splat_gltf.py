@@ -1,5 +1,6 @@
 """glTF: the conformance files, nodes that move Gaussians, and what is not understood."""
 
+import base64
 import json
 import struct
 from collections.abc import Callable
@@ -65,6 +66,61 @@ def test_conformance_matrix(shared_data: Path, suffix: str) -> None:
     torch.testing.assert_close(g.sh[14, 1:4, 0], torch.tensor([1.1, 2.1, 3.1]))
     marks = g.extra[LINEAR_COLOUR].tolist()
     assert marks == [1, 1, 1, 0, *[1] * 11]
+
+
+COMPONENTS = {np.int8: 5120, np.uint8: 5121, np.int16: 5122, np.uint16: 5123}
+
+
+def stored_as(document: dict[str, Any], name: str, rows: list, dtype: type, *, unit: bool) -> None:
+    """Let an attribute be of integers, each row on a boundary of four bytes."""
+    array = np.array(rows, dtype)
+    stride = -(-array.itemsize * array.shape[1] // 4) * 4
+    data = b"".join(row.tobytes().ljust(stride, b"\0") for row in array)
+    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    document["buffers"].append({"byteLength": len(data), "uri": uri})
+    document["bufferViews"].append(
+        {"buffer": len(document["buffers"]) - 1, "byteLength": len(data), "byteStride": stride}
+    )
+    accessor = document["accessors"][attributes(document)[f"KHR_gaussian_splatting:{name}"]]
+    accessor.pop("byteOffset", None)
+    accessor |= {"bufferView": len(document["bufferViews"]) - 1}
+    accessor |= {"componentType": COMPONENTS[dtype], "normalized": unit}
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "unit", "rows", "values"),
+    [
+        ("SCALE", np.int8, False, [[1, -2, 3]], [[1.0, -2, 3]]),
+        ("SCALE", np.int16, False, [[2, -3, 4]], [[2.0, -3, 4]]),
+        ("SCALE", np.int8, True, [[127, 0, -128]], [[1.0, 0, -1]]),
+        ("SCALE", np.int16, True, [[32767, 0, -32768]], [[1.0, 0, -1]]),
+        ("OPACITY", np.uint8, True, [[64]], [[64 / 255]]),
+        ("OPACITY", np.uint16, True, [[16384]], [[16384 / 65535]]),
+        ("ROTATION", np.int8, True, [[0, 127, 0, 0]], [[0.0, 1, 0, 0]]),
+        ("ROTATION", np.int16, True, [[0, 0, 0, -32767]], [[0.0, 0, 0, -1]]),
+    ],
+)
+def test_component_types(golden: Path, tmp_path: Path, name, dtype, unit, rows, values) -> None:
+    document = draft(golden)
+    stored_as(document, name, rows * 3, dtype, unit=unit)
+    g, want = read_splats(written(tmp_path, document)), torch.tensor(values * 3)
+    if name == "SCALE":
+        torch.testing.assert_close(g.scales.log(), want)
+    elif name == "OPACITY":
+        torch.testing.assert_close(g.opacities, want[:, 0])
+    else:
+        assert torch.equal(g.rotations, want[:, [3, 0, 1, 2]])  # stored as x, y, z, w
+
+
+def test_unknown_kernels_and_colour_spaces_are_told(golden: Path, tmp_path: Path) -> None:
+    document, plain = draft(golden), read_splats(golden / "three.draft.gltf")
+    extension(document).update(kernel="customShape", colorSpace="custom_space_display")
+    with pytest.warns(SplatWarning) as caught:
+        g = read_splats(written(tmp_path, document))
+    messages = " ".join(str(warning.message) for warning in caught)
+    assert "the kernel customShape is not known" in messages
+    assert "the colour space custom_space_display is not known" in messages
+    assert torch.equal(g.sh, plain.sh)
 
 
 def test_unknown_kernel_and_colour_space_fall_back(shared_data: Path) -> None:

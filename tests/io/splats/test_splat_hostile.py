@@ -151,8 +151,8 @@ def test_ply_headers(golden: Path, tmp_path: Path) -> None:
     )
 
 
-def test_point_cloud_is_no_splat(tmp_path: Path, shared_data: Path) -> None:
-    path = shared_data / "office" / "points3D.ply"
+def test_point_cloud_is_no_splat(generated_room: Path) -> None:
+    path = generated_room / "points3D.ply"
     with pytest.raises(FileFormatError, match=r"without f_dc_0, .*: a point cloud\.$"):
         read_splats(path)
 

@@ -1,0 +1,1 @@
+"""What tests of several folders share: a generated capture, evidence, a scorer."""
