@@ -11,6 +11,7 @@ import torch
 
 from splatseg.cli import main
 from splatseg.core import Capture, Labels
+from splatseg.fit import recorded_exposures
 from splatseg.io.scene import load_scene, save_scene_layer
 
 
@@ -79,6 +80,17 @@ def test_a_scene_is_written_and_scored(folder: Path, tmp_path: Path, capsys) -> 
     assert record["options"]["max_gaussians"] == 80
     assert record["options"]["minutes"] is None
     assert set(record["versions"]) == {"splatseg", "torch"}
+
+
+def test_exposures_go_into_the_scene(folder: Path, tmp_path: Path) -> None:
+    words = ["fit", str(folder), "--steps", "12", "--max-gaussians", "80"]
+    assert main([*words, "-o", str(tmp_path / "plain")]) == 0
+    assert "exposures" not in load_scene(tmp_path / "plain").provenance
+    assert main([*words, "-o", str(tmp_path / "freed"), "--exposure"]) == 0
+    scene = load_scene(tmp_path / "freed")
+    found = recorded_exposures(scene.provenance)
+    assert sorted(found) == sorted(view.name for view in scene.train_views)
+    assert any(one.gain != (1.0, 1.0, 1.0) for one in found.values())
 
 
 def test_without_points_it_says_where_it_starts(folder: Path, tmp_path: Path, capsys) -> None:

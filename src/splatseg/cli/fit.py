@@ -17,6 +17,7 @@ from splatseg.cli._output import check_output
 from splatseg.cli._photographs import Poses, capture_of
 from splatseg.core import Capture, Scene
 from splatseg.fit import (
+    EXPOSURES,
     Checkpoints,
     FitOptions,
     FitProgress,
@@ -25,6 +26,7 @@ from splatseg.fit import (
     Strategy,
     deferred_interrupts,
     discard_checkpoint,
+    exposures_record,
     fit,
     random_start_count,
     reduction_note,
@@ -292,6 +294,7 @@ def _provenance(command: Command, options: FitOptions, result: FitResult) -> dic
         "preset": command.preset,
         "backend": command.backend,
         "options": asdict(options),
+        **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),
         "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
     }
 
