@@ -86,7 +86,8 @@ def fit(
         wanted = interrupted or (checkpoints is not None and checkpoints.at_end)
         if wanted and run.between_steps and not interrupts.impatient:
             keep()
-    gaussians, refined = run.gaussians(), run.views.refined(capture.views)
+    with one_torch_thread():
+        gaussians, refined = run.gaussians(), run.views.refined(capture.views)
     notes = run.views.notes()
     if options.prune_floaters and not interrupted:
         with one_torch_thread():

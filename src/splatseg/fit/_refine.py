@@ -15,7 +15,7 @@ from splatseg.fit._exposure import Exposure
 from splatseg.fit._initialise import scene_extent
 from splatseg.fit._loop import one_torch_thread
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters
+from splatseg.fit._parameters import Parameters, settled_gaussians
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._schedule import rates_at
 from splatseg.fit._step import ExtraLoss, StepSettings, TrainingStep
@@ -79,13 +79,14 @@ class Refinement:
         self._model = gaussians
         self._generator = torch.Generator().manual_seed(options.seed)
         around = options.refine_poses or options.depth == "relative"
-        self._views = ViewParts.of(
-            views,
-            points=_points_of(gaussians, views, backend=renderer.name) if around else None,
-            options=options,
-            where="refine",
-            exposures=exposures,
-        )
+        with one_torch_thread():
+            self._views = ViewParts.of(
+                views,
+                points=_points_of(gaussians, views, backend=renderer.name) if around else None,
+                options=options,
+                where="refine",
+                exposures=exposures,
+            )
         self._training = TrainingStep(
             name="refine",
             options=options,
@@ -118,7 +119,8 @@ class Refinement:
 
     def gaussians(self) -> Gaussians:
         """As they are now, on the CPU, as many as at the start and in the same order."""
-        now = self._views.settled(self._state[0].gaussians().to(device="cpu"))
+        with one_torch_thread():
+            now = self._views.settled(settled_gaussians(self._state[0]))
         return self._model.replace(
             means=now.means,
             rotations=now.rotations,

@@ -13,7 +13,7 @@ from splatseg.fit._density import density_of
 from splatseg.fit._initialise import initial_parameters, scene_extent, scene_size
 from splatseg.fit._loss import Loss
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters
+from splatseg.fit._parameters import Parameters, settled_gaussians
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._records import FitProgress, FitRecord
 from splatseg.fit._schedule import degree_at, rates_at, reduction_at
@@ -111,9 +111,8 @@ class FitRun:
         return self.progress >= 1.0
 
     def gaussians(self) -> Gaussians:
-        parameters = self._state[0]
-        alive = parameters.logits.sigmoid().squeeze(1) > self._options.dead_opacity
-        found = parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
+        found = settled_gaussians(self._state[0])
+        found = found[found.opacities > self._options.dead_opacity]
         return self.views.settled(
             found.replace(
                 antialiased=self._options.antialiased, low_pass=self._options.low_pass_drawn
