@@ -223,6 +223,29 @@ def test_a_kept_checkpoint_makes_a_finished_fit_longer(
     assert load_scene(scene).provenance["steps"] == 5
 
 
+def test_a_fit_that_an_older_build_left_stopped(
+    folder: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    """It cannot be resumed, and that is said in a sentence; it can be begun again."""
+    from splatseg.fit import _checkpoint
+
+    scene = tmp_path / "scene"
+    words = ["fit", str(folder), "-o", str(scene), "--steps", "5"]
+    with monkeypatch.context() as patch:
+        patch.setattr(_checkpoint, "VERSION", 0)
+        assert main([*words, "--keep-checkpoint"]) == 0
+    capsys.readouterr()
+    assert main([*words, "--resume"]) == 2
+    said = capsys.readouterr().err
+    assert "this fit cannot be resumed" in said
+    assert len(said.strip().splitlines()) == 1
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "was stopped by another splatseg and cannot be resumed; --overwrite begins" in said
+    assert "--resume" not in said
+    assert main([*words, "--overwrite"]) == 0
+
+
 def test_a_folder_with_a_checkpoint_alone_is_known(folder: Path, tmp_path: Path, capsys) -> None:
     """What is left of a process that was killed."""
     scene = tmp_path / "scene"

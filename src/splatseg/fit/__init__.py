@@ -5,6 +5,7 @@ go on learning, from photographs and from anything else that can be drawn of the
 """
 
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
+from splatseg.fit._checkpoint import CheckpointVersionError as CheckpointVersionError
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
 from splatseg.fit._checkpoint import discard_checkpoint as discard_checkpoint
 from splatseg.fit._exposure import Exposure as Exposure
