@@ -127,9 +127,9 @@ def test_contributors_and_w_read_the_nearest_straight_pixel(gaussians) -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_rows_of_w_sum_to_the_alpha_of_the_nearest_warp(lens) -> None:
-    """A small opaque thing: at its edge the four pixels around are far from the one."""
+    """A small opaque thing in a corner, where the lens moves pixels by most of one."""
     thing = Gaussians(
-        means=torch.tensor([[0.1, -0.05, 2.0]]),
+        means=torch.tensor([[0.75, -0.55, 2.0]]),
         rotations=torch.tensor([[1.0, 0, 0, 0]]),
         scales=torch.full((1, 3), 0.06),
         opacities=torch.tensor([0.99]),
@@ -142,7 +142,7 @@ def test_rows_of_w_sum_to_the_alpha_of_the_nearest_warp(lens) -> None:
         for mode in ("nearest", "bilinear")
     }
     torch.testing.assert_close(rows, alpha["nearest"], rtol=0, atol=2e-3)
-    assert float((rows - alpha["bilinear"]).abs().max()) > 0.05
+    assert float((rows - alpha["bilinear"]).abs().max()) > 0.02
     # By hand: what bilinear reads is the mean of four rows, by how near they are.
     straight = render(thing, straightened(camera), backend="cpu").alpha
     at = straightened(camera).project(
