@@ -38,7 +38,7 @@ def test_at_most_a_line_every_ten_seconds(clock: Clock, lines: list[str]) -> Non
         clock.now += 0.7
     assert len(lines) == 6
     # The first call after 10 s is that of 15 * 0.7 s; the next that of 30 * 0.7 s.
-    assert lines[0] == "see: 15 of 100, 15 %, 0:10 elapsed, about 1:00 left\n"
+    assert lines[0] == "see: 15 of 100, 15 %, 0:10 elapsed, about 0:59 left\n"
     assert lines[1] == "see: 30 of 100, 30 %, 0:21 elapsed, about 0:49 left\n"
 
 

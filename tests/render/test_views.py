@@ -145,9 +145,13 @@ def test_rows_of_w_sum_to_the_alpha_of_the_nearest_warp(lens) -> None:
     assert float((rows - alpha["bilinear"]).abs().max()) > 0.02
     # By hand: what bilinear reads is the mean of four rows, by how near they are.
     straight = render(thing, straightened(camera), backend="cpu").alpha
-    at = straightened(camera).project(
-        camera.unproject(camera.pixel_centres(), torch.ones(11, 15).double()).reshape(-1, 3)
-    )[0].reshape(11, 15, 2)
+    at = (
+        straightened(camera)
+        .project(
+            camera.unproject(camera.pixel_centres(), torch.ones(11, 15).double()).reshape(-1, 3)
+        )[0]
+        .reshape(11, 15, 2)
+    )
     v, u = divmod(int(alpha["nearest"].argmax()), 15)
     x, y = (at[v, u] - 0.5).tolist()
     i, j = int(x), int(y)

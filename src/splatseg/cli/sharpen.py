@@ -9,7 +9,8 @@ from typing import Annotated
 import torch
 import tyro
 
-from splatseg.cli._work import check_new_scene, progress
+from splatseg.cli._progress import progress
+from splatseg.cli._work import check_new_scene
 from splatseg.core import UNLABELLED, Gaussians, Labels, LabelSource, Scene, View
 from splatseg.edit import Document, load_document, save_document
 from splatseg.edit.document import BASE, HISTORY
