@@ -148,9 +148,12 @@ class TrainingStep:
         options = settings.render_options
         with self.timed("gather"):
             rows = rows_in_view(parameters, example.camera, near=options.near)
-            gaussians = gathered(parameters, rows).replace(
-                antialiased=options.antialiased, low_pass=options.low_pass
-            )
+            gaussians = gathered(parameters, rows)
+            if settings.extra_loss is not None:
+                # Whoever draws them again draws them as they are drawn here.
+                gaussians = gaussians.replace(
+                    antialiased=options.antialiased, low_pass=options.low_pass
+                )
         with self.timed("render"):
             screen = None
             if settings.screen:
