@@ -19,7 +19,7 @@ from pathlib import Path
 
 from splatseg.core import Capture
 from splatseg.evaluate import evaluate_photographs
-from splatseg.fit import FitOptions, _loop, _run
+from splatseg.fit import FitOptions, _loop, _run, _step
 from splatseg.fit._photographs import Photographs
 from splatseg.io.captures import read_capture
 from splatseg.render import get_backend
@@ -64,11 +64,12 @@ def main() -> None:
     values = {name: json.loads(value) for name, value in (p.split("=") for p in arguments.set)}
     options = FitOptions(**({"minutes": arguments.minutes} | values))
     clock = Clock(arguments.clock)
-    # The fit reads these two clocks and no other.
-    _run.time = type("Clocks", (), {"monotonic": clock.now, "perf_counter": clock.now})
+    # The fit reads these clocks and no other.
+    for module in (_run, _step):
+        module.time = type("Clocks", (), {"monotonic": clock.now, "perf_counter": clock.now})
     print(f"{platform.processor() or platform.machine()}, {threads()} threads, {isa()}, {options}")
 
-    photographs = Photographs(capture.train_views, longest=options.longest)
+    photographs = Photographs.of(capture.train_views, options=options)
     marks = sorted({*arguments.marks, arguments.minutes})
     run = _run.FitRun(capture, options, get_backend("cpu"), photographs)
     before, steps, last = dict(run.stages), 0, (0, 0.0)

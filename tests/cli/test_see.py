@@ -186,6 +186,49 @@ def test_other_settings_are_refused_and_named(small, splatseg) -> None:
     assert header(folder)["metadata"]["settings"]["regions"]["least_area"] == 0.1
 
 
+def recorded_otherwise(folder, change) -> None:
+    """The evidence's header as if another build had written it."""
+    path = folder / "evidence.json"
+    content = json.loads(path.read_text())
+    change(content["metadata"])
+    path.write_text(json.dumps(content))
+
+
+def test_settings_that_came_later_count_as_their_defaults(small, splatseg) -> None:
+    words = ("see", small.scene, *CLASSICAL)
+    assert splatseg(*words)[0] == 0
+    folder = small.scene / "evidence" / "masks"
+
+    def before_least_area(metadata) -> None:
+        for key in ("settings", "default_settings"):
+            del metadata[key]["regions"]["least_area"]
+
+    recorded_otherwise(folder, before_least_area)
+    sentence = refused(splatseg(*words, "--least-area", "0.1"))
+    assert "made in another way (least_area 0.0005 there, 0.1 now)" in sentence
+    status, out, _ = splatseg(*words)
+    assert status == 0
+    assert "3 of them were there" in out
+
+    def with_a_setting_that_went(metadata) -> None:
+        metadata["settings"]["cut"]["gone"] = 3
+        metadata["default_settings"]["cut"]["gone"] = 4
+
+    recorded_otherwise(folder, with_a_setting_that_went)
+    assert "(gone 3 there, not known now)" in refused(splatseg(*words))
+    recorded_otherwise(folder, lambda m: m["default_settings"]["cut"].update(gone=3))
+    assert splatseg(*words)[0] == 0
+
+
+def test_evidence_that_an_older_build_left_stopped(small, splatseg) -> None:
+    words = ("see", small.scene, *CLASSICAL)
+    assert splatseg(*words)[0] == 0
+    recorded_otherwise(small.scene / "evidence" / "masks", lambda m: m.pop("settings"))
+    sentence = refused(splatseg(*words))
+    assert "cannot be gone on with, as it does not say how it was made" in sentence
+    assert splatseg(*words, "--overwrite")[0] == 0
+
+
 def test_a_folder_of_something_else_is_never_touched(small, splatseg) -> None:
     folder = small.scene / "evidence" / "masks"
     folder.mkdir(parents=True)

@@ -11,8 +11,11 @@ from PIL import Image
 
 from splatseg.core import Labels, Selection
 from splatseg.errors import InputError
+from splatseg.fit import recorded_exposures
 from splatseg.io.evidence import open_evidence
+from splatseg.io.images import save_png
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
+from splatseg.render import render
 
 QUICK = ("--sharpen-steps", 60, "--decide-every", 30, "--rates-from", 0, "--no-reconsider")
 
@@ -162,13 +165,69 @@ def test_the_fit_goes_on_as_it_was(labelled) -> None:
     from splatseg.cli.sharpen import _fit_options
 
     scene = load_scene(labelled.scene, data=labelled.capture)
-    unknown = _fit_options(scene)
+    unknown = _fit_options(scene, scene.views)
     assert (unknown.background, unknown.masks) == ("black", "off")
-    said = {"options": {"masks": "ignore", "background": [0, 0.5, 1], "longest": 700}}
-    known = _fit_options(replace(scene, provenance=said))
-    assert (known.background, known.masks, known.longest) == ((0, 0.5, 1), "ignore", 700)
-    plain = _fit_options(replace(scene, provenance={"options": {"masks": "alpha"}}))
-    assert (plain.background, plain.masks) == ("random", "alpha")
+    said = {"options": {"masks": "ignore", "depth": "metric"}}
+    known = replace(scene, provenance=said)
+    assert _fit_options(known, scene.views).depth == "off", "no view has a depth map"
+    measured = tuple(replace(view, depth=view.image) for view in scene.views)
+    assert _fit_options(known, measured).depth == "metric"
+
+
+def cut_out(scene_folder, data):
+    """The scene as if it had been fitted with --masks alpha before a yellow backdrop."""
+    record = scene_folder / "scene.json"
+    content = json.loads(record.read_text())
+    content["provenance"] = {"options": {"masks": "alpha", "background": "random"}}
+    record.write_text(json.dumps(content))
+    scene = load_scene(scene_folder, data=data)
+    cameras = scene_folder / "cameras" / "transforms.json"
+    frames = json.loads(cameras.read_text())
+    (scene_folder / "masks").mkdir()
+    for view, frame in zip(scene.views, frames["frames"], strict=True):
+        drawn = render(scene.gaussians, view.camera, backend="cpu")
+        alpha, backdrop = drawn.alpha.unsqueeze(-1), torch.tensor([1.0, 0.9, 0.2])
+        colour = torch.where(alpha > 0.02, drawn.image / alpha.clamp_min(0.02), backdrop)
+        save_png(colour.clamp(0, 1), view.image)
+        save_png(drawn.alpha, scene_folder / "masks" / f"{view.name}.png")
+        frame["mask_path"] = f"../masks/{view.name}.png"
+    cameras.write_text(json.dumps(frames))
+
+
+def test_a_scene_that_was_cut_out_by_its_masks_stays_what_it_is(
+    labelled, splatseg, tmp_path
+) -> None:
+    """Its backdrop is not in the scene: compared with it, everything would turn yellow."""
+    cut_out(labelled.scene, labelled.capture)
+    status, _, said = sharpened(splatseg, labelled, tmp_path / "new", "--label-weight", 0.1)
+    assert status == 0, said
+    before, after = load_scene(tmp_path / "new").provenance["sharpened"]["psnr"]
+    assert before > 50
+    assert after > 35
+
+
+def test_exposures_of_the_fit_are_gone_on_from_and_kept(labelled, splatseg, tmp_path) -> None:
+    """Photographs of half the brightness: the scene does not darken, as its exposures say so."""
+    record = labelled.scene / "scene.json"
+    content = json.loads(record.read_text())
+    scene = load_scene(labelled.scene, data=labelled.capture)
+    half = {"gain": [0.5, 0.5, 0.5], "bias": [0.0, 0.0, 0.0]}
+    content["provenance"] = {
+        "options": {"background": "black", "masks": "off", "exposure": True},
+        "exposures": {view.name: half for view in scene.train_views},
+    }
+    record.write_text(json.dumps(content))
+    for view in scene.train_views:
+        Image.fromarray(np.asarray(Image.open(view.image)) // 2).save(view.image)
+    status, _, said = sharpened(splatseg, labelled, tmp_path / "new")
+    assert status == 0, said
+    provenance = load_scene(tmp_path / "new").provenance
+    assert provenance["sharpened"]["psnr"][1] > 35
+    found = recorded_exposures(provenance)
+    assert sorted(found) == sorted(view.name for view in scene.train_views)
+    gains = torch.tensor([one.gain for one in found.values()])
+    assert float(gains.log().mean().exp()) == pytest.approx(0.5, abs=1e-4)
+    assert bool((gains != 0.5).all()), "those learned are written, not those that were there"
 
 
 def test_nothing_is_measured_if_not_asked(labelled, splatseg, tmp_path) -> None:

@@ -11,6 +11,7 @@ import torch
 
 from splatseg.cli import main
 from splatseg.core import Capture, Labels
+from splatseg.fit import recorded_exposures
 from splatseg.io.scene import load_scene, save_scene_layer
 
 
@@ -79,6 +80,17 @@ def test_a_scene_is_written_and_scored(folder: Path, tmp_path: Path, capsys) -> 
     assert record["options"]["max_gaussians"] == 80
     assert record["options"]["minutes"] is None
     assert set(record["versions"]) == {"splatseg", "torch"}
+
+
+def test_exposures_go_into_the_scene(folder: Path, tmp_path: Path) -> None:
+    words = ["fit", str(folder), "--steps", "12", "--max-gaussians", "80"]
+    assert main([*words, "-o", str(tmp_path / "plain")]) == 0
+    assert "exposures" not in load_scene(tmp_path / "plain").provenance
+    assert main([*words, "-o", str(tmp_path / "freed"), "--exposure"]) == 0
+    scene = load_scene(tmp_path / "freed")
+    found = recorded_exposures(scene.provenance)
+    assert sorted(found) == sorted(view.name for view in scene.train_views)
+    assert any(one.gain != (1.0, 1.0, 1.0) for one in found.values())
 
 
 def test_without_points_it_says_where_it_starts(folder: Path, tmp_path: Path, capsys) -> None:
@@ -209,6 +221,29 @@ def test_a_kept_checkpoint_makes_a_finished_fit_longer(
     assert "stopped" not in capsys.readouterr().out
     assert main([*words, "5"]) == 0, "a finished scene is replaced, with its checkpoint"
     assert load_scene(scene).provenance["steps"] == 5
+
+
+def test_a_fit_that_an_older_build_left_stopped(
+    folder: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    """It cannot be resumed, and that is said in a sentence; it can be begun again."""
+    from splatseg.fit import _checkpoint
+
+    scene = tmp_path / "scene"
+    words = ["fit", str(folder), "-o", str(scene), "--steps", "5"]
+    with monkeypatch.context() as patch:
+        patch.setattr(_checkpoint, "VERSION", 0)
+        assert main([*words, "--keep-checkpoint"]) == 0
+    capsys.readouterr()
+    assert main([*words, "--resume"]) == 2
+    said = capsys.readouterr().err
+    assert "this fit cannot be resumed" in said
+    assert len(said.strip().splitlines()) == 1
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "was stopped by another splatseg and cannot be resumed; --overwrite begins" in said
+    assert "--resume" not in said
+    assert main([*words, "--overwrite"]) == 0
 
 
 def test_a_folder_with_a_checkpoint_alone_is_known(folder: Path, tmp_path: Path, capsys) -> None:

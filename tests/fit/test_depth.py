@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Camera, Capture, PointCloud, View
+from splatseg.core import Camera, PointCloud, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import FitOptions, fit
 from splatseg.fit._depth import DepthMaps, aligned_inverse
@@ -39,8 +39,8 @@ def _maps(folder: Path, values: np.ndarray, *, width: int, height: int, **change
         depth=folder / "depth.npy",
         depth_unit=1.0,
     )
-    capture = Capture(path=folder, format="test", views=(view,))
-    return DepthMaps([view], capture=capture, options=replace(OPTIONS, **changes))
+    options = replace(OPTIONS, **changes)
+    return DepthMaps([view], points=None, options=options, where=str(folder))
 
 
 def test_the_loss_by_hand(tmp_path: Path) -> None:
@@ -146,9 +146,7 @@ def test_there_must_be_something_to_learn_from(photograph) -> None:
         capture, views=tuple(replace(v, depth=v.image) for v in capture.views), points=None
     )
     with pytest.raises(InputError, match="start points to align relative depth maps"):
-        DepthMaps(
-            with_maps.train_views, capture=with_maps, options=replace(options, depth="relative")
-        )
+        fit(with_maps, options=replace(options, depth="relative", start="random"))
 
 
 @pytest.mark.parametrize("kind", ["metric", "relative"])

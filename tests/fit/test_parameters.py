@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 
 from splatseg import _native
 from splatseg.core import Camera
-from splatseg.fit._parameters import Parameters, gathered, rows_in_view, rows_in_view_torch
+from splatseg.fit._parameters import (
+    Parameters,
+    gathered,
+    rows_in_view,
+    rows_in_view_torch,
+    settled_gaussians,
+)
 from splatseg.render import RenderOptions, get_backend
 
 
@@ -121,3 +127,31 @@ def test_gathered_rows_match_the_twin(isa: str) -> None:
 def test_rows_beyond_the_parameters_are_refused() -> None:
     with pytest.raises(ValueError, match="rows do not fit"):
         gathered(_random(3, 50), torch.tensor([50]))
+
+
+def test_settled_gaussians_do_not_depend_on_threads(rng) -> None:
+    """Nor on where a row stands; and they are what the differentiable ones are."""
+    count = 70_001
+    parameters = Parameters(
+        means=torch.from_numpy(rng.normal(size=(count, 3))).float(),
+        log_scales=torch.from_numpy(rng.normal(size=(count, 3))).float(),
+        rotations=torch.from_numpy(rng.normal(size=(count, 4))).float(),
+        logits=torch.from_numpy(rng.normal(scale=3, size=(count, 1))).float(),
+        sh=torch.from_numpy(rng.normal(size=(count, 3))).float(),
+    )
+    before = torch.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(settled_gaussians(parameters))
+    finally:
+        torch.set_num_threads(before)
+    some = torch.arange(3, count, 7)
+    alone = settled_gaussians(parameters.rows(some))
+    plain = parameters.gaussians()
+    for name in ("means", "rotations", "scales", "opacities", "sh"):
+        first = getattr(found[0], name)
+        assert all(torch.equal(getattr(other, name), first) for other in found[1:])
+        assert torch.equal(getattr(alone, name), first[some])
+        torch.testing.assert_close(first, getattr(plain, name), rtol=1e-6, atol=1e-7)

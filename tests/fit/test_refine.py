@@ -62,7 +62,15 @@ def test_no_steps_change_nothing_but_rounding(make_capture, tiny) -> None:
 
 def test_the_filter_of_the_gaussians_stays(make_capture, tiny) -> None:
     start = tiny.replace(antialiased=True, low_pass=0.1)
-    found = refine(start, make_capture().train_views, steps=2, options=QUICK, backend="cpu")
+    seen = []
+
+    def extra(view, gaussians, rows):
+        seen.append((gaussians.antialiased, gaussians.low_pass))
+        return gaussians.opacities.sum()
+
+    views = make_capture().train_views
+    found = refine(start, views, steps=2, extra_loss=extra, options=QUICK, backend="cpu")
+    assert seen == [(True, 0.1)] * 2
     assert found.antialiased
     assert found.low_pass == 0.1
 
@@ -123,18 +131,18 @@ def test_gaussians_cover_a_background_that_the_photographs_do_not_have(make_capt
     assert light("white") > light("black") + 0.01
 
 
-def test_a_further_term_is_learned_from(make_capture, tiny) -> None:
-    """A term that wants Gaussians transparent, much stronger than the photographs."""
+def test_an_extra_loss_is_learned_from(make_capture, tiny) -> None:
+    """A loss that wants Gaussians transparent, much stronger than the photographs."""
     views = make_capture().train_views
     asked: list[str] = []
 
-    def term(view, gaussians, rows):
+    def extra(view, gaussians, rows):
         asked.append(view.name)
         assert len(gaussians) == len(rows)
         assert gaussians.opacities.requires_grad
         return 100 * gaussians.opacities.sum()
 
-    found = refine(tiny, views, steps=len(views), term=term, options=QUICK, backend="cpu")
+    found = refine(tiny, views, steps=len(views), extra_loss=extra, options=QUICK, backend="cpu")
     assert bool((found.opacities < tiny.opacities).all())
     assert sorted(asked) == sorted(view.name for view in views)
 
@@ -174,9 +182,16 @@ def test_no_gaussians_are_refused(make_capture, tiny) -> None:
         refine(none, make_capture().train_views, steps=1, options=QUICK, backend="cpu")
 
 
-def test_a_term_that_is_no_number_stops_it(make_capture, tiny) -> None:
-    def term(view, gaussians, rows):
+def test_a_loss_that_is_no_number_stops_it(make_capture, tiny) -> None:
+    def extra(view, gaussians, rows):
         return gaussians.opacities.sum() * float("nan")
 
     with pytest.raises(SplatsegError, match="expected a finite loss"):
-        refine(tiny, make_capture().train_views, steps=1, term=term, options=QUICK, backend="cpu")
+        refine(
+            tiny,
+            make_capture().train_views,
+            steps=1,
+            extra_loss=extra,
+            options=QUICK,
+            backend="cpu",
+        )

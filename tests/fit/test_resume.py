@@ -15,6 +15,7 @@ from splatseg.core import Capture, Gaussians, PointCloud
 from splatseg.errors import FileFormatError, InputError, SplatsegError
 from splatseg.fit import (
     Checkpoints,
+    CheckpointVersionError,
     FitOptions,
     FitProgress,
     checkpoint_summary,
@@ -213,6 +214,68 @@ def test_another_fit_is_refused_by_what_differs(capture: Capture, path: Path) ->
     swapped["view_00"] = swapped["view_01"]
     views = tuple(replace(v, image=swapped.get(v.name, v.image)) for v in capture.views)
     assert "other photographs" in refusal(replace(capture, views=views), OPTIONS)
+
+
+def _recorded_otherwise(path: Path, **changes: object) -> None:
+    """The checkpoint as if a build with other options had written it; None takes one away."""
+    found = read_checkpoint(path)
+    identity = dict(found.identity)
+    for group in ("options", "defaults"):
+        table = {**identity[group], **changes.get(group, {})}
+        identity[group] = {name: value for name, value in table.items() if value != "absent"}
+    write_checkpoint(path, replace(found, identity=identity))
+
+
+def test_options_that_came_later_count_as_their_defaults(capture: Capture, path: Path) -> None:
+    """And those that went are forgiven at the default that they had."""
+    straight = fit(capture, options=OPTIONS)
+    checkpoints = Checkpoints(path=path, resume=True)
+    fit(capture, options=OPTIONS, checkpoints=checkpoints, progress=_stop_after(30))
+    assert OPTIONS.exposure is FitOptions().exposure
+    assert OPTIONS.sh_degree != FitOptions().sh_degree
+
+    _recorded_otherwise(path, options={"exposure": "absent"}, defaults={"exposure": "absent"})
+    with pytest.raises(InputError, match="exposure false instead of true"):
+        fit(capture, options=replace(OPTIONS, exposure=True), checkpoints=checkpoints)
+
+    _recorded_otherwise(path, options={"gone": 3, "bent": [1]}, defaults={"gone": 3, "bent": [2]})
+    with pytest.raises(InputError) as caught:
+        fit(capture, options=OPTIONS, checkpoints=checkpoints)
+    assert "bent [1], which this splatseg has not" in str(caught.value)
+    assert "gone" not in str(caught.value)
+
+    _recorded_otherwise(path, options={"bent": [2]})
+    rest = fit(capture, options=OPTIONS, checkpoints=checkpoints)
+    assert _same(rest.gaussians, straight.gaussians)
+
+
+def test_an_option_whose_default_is_not_asked_for_is_not_forgiven(
+    capture: Capture, path: Path
+) -> None:
+    checkpoints = Checkpoints(path=path, resume=True)
+    fit(capture, options=OPTIONS, checkpoints=checkpoints, progress=_stop_after(3))
+    _recorded_otherwise(path, options={"sh_degree": "absent"})
+    with pytest.raises(InputError, match="sh_degree 2 instead of 1"):
+        fit(capture, options=OPTIONS, checkpoints=checkpoints)
+
+
+def test_a_checkpoint_of_another_version_cannot_be_resumed(
+    capture: Capture, path: Path, monkeypatch
+) -> None:
+    from splatseg.fit import _checkpoint
+
+    checkpoints = Checkpoints(path=path, resume=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(_checkpoint, "VERSION", 0)
+        fit(capture, options=OPTIONS, checkpoints=checkpoints, progress=_stop_after(3))
+    for ask in (lambda: fit(capture, options=OPTIONS, checkpoints=checkpoints),
+                lambda: checkpoint_summary(path)):  # fmt: skip
+        with pytest.raises(CheckpointVersionError) as caught:
+            ask()
+        said = str(caught.value)
+        assert said.startswith(f"{path}: this fit cannot be resumed")
+        assert "version 1, got version 0" in said
+        assert "\n" not in said
 
 
 def test_data_that_moved_are_the_same_data(capture: Capture, path: Path, tmp_path: Path) -> None:

@@ -93,6 +93,24 @@ def test_without_weight_labels_do_nothing(scene) -> None:
     assert after == pytest.approx(before, abs=0.01)
 
 
+def test_poses_stay_whatever_the_fit_did(scene) -> None:
+    """Label maps are drawn with the poses of the views: photographs must not move them."""
+    gaussians, views, maps = scene
+    options = replace(OPTIONS, sharpen_steps=9)
+    found = [
+        sharpen(
+            gaussians,
+            views,
+            maps,
+            options=options,
+            fit_options=replace(BLACK, refine_poses=refine_poses),
+            backend="cpu",
+        )
+        for refine_poses in (False, True)
+    ]
+    assert torch.equal(found[0].gaussians.means, found[1].gaussians.means)
+
+
 def test_a_thing_that_lets_light_through_becomes_opaque(tmp_path) -> None:
     """Before a wall of its colour; only labels tell that what is seen is all of the thing."""
     x, y = torch.meshgrid(torch.arange(-1.2, 1.3, 0.2), torch.arange(-1.0, 1.1, 0.2), indexing="ij")

@@ -123,3 +123,42 @@ def test_contributors_and_w_read_the_nearest_straight_pixel(gaussians) -> None:
     )
     with pytest.raises(InputError, match="blocks"):
         weights(gaussians, camera, layout="blocks", backend=BACKEND)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_rows_of_w_sum_to_the_alpha_of_the_nearest_warp(lens) -> None:
+    """A small opaque thing in a corner, where the lens moves pixels by most of one."""
+    thing = Gaussians(
+        means=torch.tensor([[0.75, -0.55, 2.0]]),
+        rotations=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.full((1, 3), 0.06),
+        opacities=torch.tensor([0.99]),
+        sh=torch.zeros(1, 1, 3),
+    )
+    camera = camera_of(lens)
+    rows = weights(thing, camera, backend="cpu").render(torch.ones(1, 1))[:, 0].reshape(11, 15)
+    alpha = {
+        mode: render(thing, camera, backend="cpu", warp=mode).alpha
+        for mode in ("nearest", "bilinear")
+    }
+    torch.testing.assert_close(rows, alpha["nearest"], rtol=0, atol=2e-3)
+    assert float((rows - alpha["bilinear"]).abs().max()) > 0.02
+    # By hand: what bilinear reads is the mean of four rows, by how near they are.
+    straight = render(thing, straightened(camera), backend="cpu").alpha
+    at = (
+        straightened(camera)
+        .project(
+            camera.unproject(camera.pixel_centres(), torch.ones(11, 15).double()).reshape(-1, 3)
+        )[0]
+        .reshape(11, 15, 2)
+    )
+    v, u = divmod(int(alpha["nearest"].argmax()), 15)
+    x, y = (at[v, u] - 0.5).tolist()
+    i, j = int(x), int(y)
+    across, down = x - i, y - j
+    taps = straight[j : j + 2, i : i + 2]
+    expected = (1 - down) * ((1 - across) * taps[0, 0] + across * taps[0, 1])
+    expected += down * ((1 - across) * taps[1, 0] + across * taps[1, 1])
+    assert float(alpha["bilinear"][v, u]) == pytest.approx(float(expected), abs=1e-4)
+    nearest = straight[int(at[v, u, 1]), int(at[v, u, 0])]
+    assert float(rows[v, u]) == pytest.approx(float(nearest), abs=2e-3)

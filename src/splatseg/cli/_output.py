@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
-from splatseg.fit import CheckpointSummary, checkpoint_summary
+from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
 from splatseg.io.scene import CHECKPOINT_FILE, is_scene, is_unfinished, scene_layer_names
 
 
@@ -44,8 +44,9 @@ def check_output(root: Path, *, resume: bool, overwrite: bool) -> str | None:
         stopped = where_it_stopped(checkpoint)
         if stopped is not None:
             raise InputError(
-                f"{root}: expected a new folder, got a fit that {stopped}; --resume continues it, "
-                "--overwrite begins again."
+                f"{root}: expected a new folder, got a fit that {stopped}; "
+                f"{'--resume continues it, ' if _resumable(checkpoint) else ''}--overwrite begins "
+                "again."
             )
     return None
 
@@ -54,9 +55,19 @@ def where_it_stopped(checkpoint: Path) -> str | None:
     """Where the fit of a checkpoint was stopped, in words; None if it was finished."""
     try:
         summary = checkpoint_summary(checkpoint)
+    except CheckpointVersionError:
+        return "was stopped by another splatseg and cannot be resumed"
     except FileFormatError:
         return "was stopped and has a damaged checkpoint"
     return None if summary.progress >= 1 else f"was stopped at {_place(summary)}"
+
+
+def _resumable(checkpoint: Path) -> bool:
+    try:
+        checkpoint_summary(checkpoint)
+    except FileFormatError:
+        return False
+    return True
 
 
 def _resumed(root: Path, checkpoint: Path) -> str:

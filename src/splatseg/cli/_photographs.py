@@ -9,6 +9,7 @@ from typing import Literal
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from splatseg.cli._progress import lines_on_stderr
 from splatseg.core import Capture
 from splatseg.errors import InputError
 from splatseg.io.captures import find_formats, read_capture
@@ -47,7 +48,7 @@ def capture_of(
     if not _without_poses(data, format, poses):
         return read_capture(data, format=format)
     options = PoseOptions(seed=seed, frames=frames)
-    with _progress_bar() as show:
+    with _shown_progress() as show:
         result = recover_poses(data, folder=scene / POSES_FOLDER, options=options, progress=show)
     sys.stdout.write(_told(data, scene / POSES_FOLDER, result))
     sys.stdout.flush()
@@ -67,8 +68,17 @@ def _without_poses(data: Path, format: str, poses: Poses) -> bool:
 
 
 @contextmanager
-def _progress_bar() -> Generator[Callable[[PoseProgress], None]]:
-    """A bar on stderr: the stage and how much of it is done."""
+def _shown_progress() -> Generator[Callable[[PoseProgress], None]]:
+    """On stderr: the stage and how much of it is done."""
+    lines = lines_on_stderr("poses")
+    if lines is not None:
+
+        def write(now: PoseProgress) -> None:
+            # Stages take differently long: there is no estimate of the whole.
+            lines.show(now.done, None, text=_stage(now))
+
+        yield write
+        return
     columns = (
         TextColumn("poses"),
         BarColumn(bar_width=24),
@@ -79,10 +89,13 @@ def _progress_bar() -> Generator[Callable[[PoseProgress], None]]:
         task = bar.add_task("", total=None)
 
         def show(now: PoseProgress) -> None:
-            text = f"{now.stage} {now.done}/{now.total}" if now.total else now.stage
-            bar.update(task, description=text, completed=now.done, total=now.total or None)
+            bar.update(task, description=_stage(now), completed=now.done, total=now.total or None)
 
         yield show
+
+
+def _stage(now: PoseProgress) -> str:
+    return f"{now.stage} {now.done}/{now.total}" if now.total else now.stage
 
 
 def _told(data: Path, folder: Path, result: PoseResult) -> str:

@@ -1,14 +1,13 @@
-"""What commands that go through views share: which views, which layer, and a progress bar."""
+"""What commands that go through views share: which views, which layer, and who is told."""
 
 import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typing_extensions import override
 
+from splatseg.cli._progress import progress
 from splatseg.core import Scene
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene
@@ -21,24 +20,6 @@ def check_new_scene(out: Path) -> None:
         raise InputError(f"{out}: expected a new folder, got one that is there.")
     if not out.resolve().parent.is_dir():
         raise InputError(f"{out}: expected a place in a folder that is there, got none.")
-
-
-@contextmanager
-def progress(what: str) -> Generator[Callable[[int, int], None]]:
-    """A bar on stderr with an estimate; gives a function of (done, total)."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(compact=True),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-
-        def step(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield step
 
 
 def open_scene(root: Path, data: Path | None) -> Scene:
@@ -60,7 +41,7 @@ class ConsoleObserver(Observer):
     @override
     @contextmanager
     def stage(self, stage: str) -> Generator[Callable[[int, int], None]]:
-        """A bar for the stage."""
+        """A bar or lines for the stage."""
         with progress(stage) as step:
             yield step
 

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from splatseg.cli import fit, see
-from splatseg.cli._work import ConsoleObserver, progress
+from splatseg.cli._progress import progress
+from splatseg.cli._work import ConsoleObserver
 from splatseg.core import Scene
 from splatseg.errors import InputError, RangeError
 from splatseg.io.json_files import read_json, write_json

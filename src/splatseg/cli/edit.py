@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal, cast
 import torch
 import tyro
 
-from splatseg.cli._work import check_new_scene, progress
+from splatseg.cli._progress import progress
+from splatseg.cli._work import check_new_scene
 from splatseg.core import Gaussians, Labels, Similarity, View
 from splatseg.edit import (
     CutBy,

@@ -15,8 +15,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from splatseg.cli._fit_report import score_and_report
 from splatseg.cli._output import check_output
 from splatseg.cli._photographs import Poses, capture_of
+from splatseg.cli._progress import lines_on_stderr
 from splatseg.core import Capture, Scene
 from splatseg.fit import (
+    EXPOSURES,
     Checkpoints,
     FitOptions,
     FitProgress,
@@ -25,6 +27,7 @@ from splatseg.fit import (
     Strategy,
     deferred_interrupts,
     discard_checkpoint,
+    exposures_record,
     fit,
     random_start_count,
     reduction_note,
@@ -159,7 +162,7 @@ def run(command: Command) -> None:
         sys.stdout.write(f"{place}\n")
         sys.stdout.flush()
     with deferred_interrupts() as interrupts:
-        with _progress_bar() as show:
+        with _shown_progress() as show:
             result = fit(
                 capture,
                 options=options,
@@ -245,9 +248,38 @@ def _beginning(capture: Capture, options: FitOptions) -> str:
     )
 
 
+class _Smoothed:
+    """Loss and PSNR of single views, smoothed over many of them."""
+
+    def __init__(self) -> None:
+        self._values: tuple[float, float] | None = None
+
+    def text(self, now: FitProgress) -> str:
+        """What a line of progress says of a step."""
+        loss, psnr = self._values or (now.loss, now.psnr)
+        loss += _SMOOTHING * (now.loss - loss)
+        psnr += _SMOOTHING * (now.psnr - psnr)
+        self._values = loss, psnr
+        speed = now.step / max(now.seconds, 1e-9)
+        return (
+            f"step {now.step}, loss {loss:.4f}, PSNR {psnr:.2f}, {now.count} Gaussians, "
+            f"{speed:.1f} it/s"
+        )
+
+
 @contextmanager
-def _progress_bar() -> Generator[Callable[[FitProgress], None]]:
-    """A bar on stderr: share done, smoothed loss and PSNR, count, speed, estimate."""
+def _shown_progress() -> Generator[Callable[[FitProgress], None]]:
+    """On stderr: share done, smoothed loss and PSNR, count, speed, estimate."""
+    smoothed = _Smoothed()
+    lines = lines_on_stderr("fit")
+    if lines is not None:
+
+        def write(now: FitProgress) -> None:
+            text = smoothed.text(now)
+            lines.show(now.progress, 1.0, text=text, seconds_left=now.seconds_left)
+
+        yield write
+        return
     columns = (
         TextColumn("fit"),
         BarColumn(bar_width=24),
@@ -258,24 +290,14 @@ def _progress_bar() -> Generator[Callable[[FitProgress], None]]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=1.0, left="")
-        smooth: list[float] = []
         shown = 0.0
 
         def show(now: FitProgress) -> None:
-            nonlocal smooth, shown
-            if not smooth:
-                smooth = [now.loss, now.psnr]
-            smooth = [
-                old + _SMOOTHING * (new - old)
-                for old, new in zip(smooth, (now.loss, now.psnr), strict=True)
-            ]
+            nonlocal shown
+            text = smoothed.text(now)
             if now.seconds - shown < 0.25:
                 return
             shown = now.seconds
-            text = (
-                f"step {now.step}  loss {smooth[0]:.4f}  PSNR {smooth[1]:.2f}  "
-                f"{now.count} Gaussians  {now.step / now.seconds:.1f} it/s"
-            )
             left = f"{now.seconds_left / 60:.1f} min left"
             bar.update(task, completed=now.progress, description=text, left=left)
 
@@ -292,6 +314,7 @@ def _provenance(command: Command, options: FitOptions, result: FitResult) -> dic
         "preset": command.preset,
         "backend": command.backend,
         "options": asdict(options),
+        **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),
         "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
     }
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseg.cli._work import progress
+from splatseg.cli._progress import progress
 from splatseg.core import Capture, Gaussians, Scene
 from splatseg.errors import InputError
 from splatseg.importing import Alignment, SceneKind, VirtualViews, align, place_cameras

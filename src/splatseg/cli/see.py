@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from splatseg.cli._work import open_scene, progress
+from splatseg.cli._progress import progress
+from splatseg.cli._work import open_scene
 from splatseg.core import Model, Scene, View
 from splatseg.errors import InputError
 from splatseg.io.scene import check_name

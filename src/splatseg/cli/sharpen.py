@@ -2,21 +2,27 @@
 
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated
 
 import torch
 import tyro
 
-from splatseg.cli._work import check_new_scene, progress
+from splatseg.cli._progress import progress
+from splatseg.cli._work import check_new_scene
 from splatseg.core import UNLABELLED, Gaussians, Labels, LabelSource, Scene, View
 from splatseg.edit import Document, load_document, save_document
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.evaluate import picture_and_photograph, psnr
-from splatseg.fit import FitOptions
+from splatseg.fit import (
+    EXPOSURES,
+    FitOptions,
+    exposures_record,
+    recorded_exposures,
+    refinement_options,
+)
 from splatseg.io.evidence import Evidence, copy_evidence, find_evidence, open_evidence
 from splatseg.lift import (
     ConfusionOptions,
@@ -97,6 +103,7 @@ def run(command: Command) -> None:
     evidence, source, views = _source(command, scene, layer)
     spaced = _spaced(scene, command.measure)
     before = _psnr(scene, scene.gaussians, spaced, command.backend)
+    exposures = recorded_exposures(scene.provenance)
     with progress("sharpen") as step:
         found = sharpen(
             scene.gaussians,
@@ -104,7 +111,8 @@ def run(command: Command) -> None:
             source,
             options=command.sharpen,
             confusion=command.confusion if command.reconsider else None,
-            fit_options=_fit_options(scene),
+            fit_options=_fit_options(scene, views),
+            exposures=exposures,
             seed=command.seed,
             backend=command.backend,
             progress=step,
@@ -121,6 +129,8 @@ def run(command: Command) -> None:
         "agreement": list(found.agreement),
         "psnr": [before, after],
     }
+    if found.exposures:
+        provenance[EXPOSURES] = exposures_record({**exposures, **found.exposures})
     layers = {**document.layers, command.layer: merged(layer, found)}
     scene = replace(scene, gaussians=found.gaussians, provenance=provenance)
     save_document(Document(scene=scene, layers=layers), out)
@@ -210,15 +220,12 @@ def _views(scene: Scene, layer: Labels, evidence: Evidence) -> tuple[View, ...]:
     return views
 
 
-def _fit_options(scene: Scene) -> FitOptions:
-    """What the scene was fitted with, as far as it matters here and is known."""
-    said = scene.provenance.get("options")
-    table = cast("Mapping[str, Any]", said) if isinstance(said, Mapping) else {}
-    background = table.get("background", "random" if table else "black")
-    longest = table.get("longest", FitOptions().longest)
-    if isinstance(background, list):
-        background = tuple(background)
-    return FitOptions(background=background, longest=int(longest), masks=mask_use(scene))
+def _fit_options(scene: Scene, views: tuple[View, ...]) -> FitOptions:
+    """How the scene's photographs are compared; without depth where no view has a depth map."""
+    options = refinement_options(scene.provenance)
+    if all(view.depth is None for view in views):
+        options = replace(options, depth="off")
+    return options
 
 
 def _spaced(scene: Scene, most: int) -> tuple[View, ...]:

@@ -45,6 +45,16 @@ class Model(Protocol):
 
 
 @runtime_checkable
+class ModelWithDefaults(Model, Protocol):
+    """A model that knows its settings as they are when nobody chose any."""
+
+    @property
+    def default_settings(self) -> Mapping[str, Any]:
+        """Like `settings`. Work that was begun before a setting existed counts as having these."""
+        ...
+
+
+@runtime_checkable
 class AutomaticMasks(Model, Protocol):
     """Finds the things in an image by itself."""
 

@@ -5,19 +5,25 @@ go on learning, from photographs and from anything else that can be drawn of the
 """
 
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
+from splatseg.fit._checkpoint import CheckpointVersionError as CheckpointVersionError
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
 from splatseg.fit._checkpoint import discard_checkpoint as discard_checkpoint
+from splatseg.fit._exposure import Exposure as Exposure
 from splatseg.fit._interrupts import deferred_interrupts as deferred_interrupts
 from splatseg.fit._loop import fit as fit
 from splatseg.fit._options import FitOptions as FitOptions
 from splatseg.fit._options import Preset as Preset
 from splatseg.fit._options import Strategy as Strategy
 from splatseg.fit._photographs import reduction_note as reduction_note
+from splatseg.fit._provenance import EXPOSURES as EXPOSURES
+from splatseg.fit._provenance import exposures_record as exposures_record
+from splatseg.fit._provenance import recorded_exposures as recorded_exposures
+from splatseg.fit._provenance import refinement_options as refinement_options
 from splatseg.fit._records import FitProgress as FitProgress
 from splatseg.fit._records import FitRecord as FitRecord
 from splatseg.fit._records import FitResult as FitResult
 from splatseg.fit._refine import Refinement as Refinement
-from splatseg.fit._refine import Term as Term
 from splatseg.fit._refine import refine as refine
 from splatseg.fit._resume import Checkpoints as Checkpoints
 from splatseg.fit._start import random_start_count as random_start_count
+from splatseg.fit._step import ExtraLoss as ExtraLoss

@@ -29,6 +29,10 @@ VERSION = 1
 _HEADER = "header"
 
 
+class CheckpointVersionError(FileFormatError):
+    """A checkpoint is whole, but of a version that cannot be gone on from."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Checkpoint:
     """A state, and what it is the state of."""
@@ -69,7 +73,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
     Raises:
         MissingFileError: If there is no such file.
-        FileFormatError: If it is no checkpoint, damaged, or of another version.
+        CheckpointVersionError: If it is of another version.
+        FileFormatError: If it is no checkpoint or damaged.
     """
     with _opened(path) as archive:
         header = _header(path, archive)
@@ -98,7 +103,8 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
 
     Raises:
         MissingFileError: If there is no such file.
-        FileFormatError: If it is no checkpoint, damaged, or of another version.
+        CheckpointVersionError: If it is of another version.
+        FileFormatError: If it is no checkpoint or damaged.
     """
     with _opened(path) as archive:
         content = _header(path, archive)["content"]
@@ -158,9 +164,9 @@ def _header(path: Path, archive: NpzFile) -> dict[str, Any]:
             f"{path}: expected the checkpoint of a fit, got {header.get('format')!r}."
         )
     if header.get("version") != VERSION:
-        raise FileFormatError(
-            f"{path}: expected a checkpoint of version {VERSION}, got version "
-            f"{header.get('version')!r}; another splatseg wrote it."
+        raise CheckpointVersionError(
+            f"{path}: this fit cannot be resumed, as another splatseg stopped it (expected a "
+            f"checkpoint of version {VERSION}, got version {header.get('version')!r})."
         )
     if not isinstance(header.get("content"), dict) or not isinstance(header.get("identity"), dict):
         raise FileFormatError(f"{path}: expected a header with content and identity.")

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatseg.core import Camera, Capture, View
+from splatseg.core import Camera, View
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 from splatseg.io.depths import load_depth
@@ -49,11 +49,11 @@ class DepthMaps:
 
     Args:
         views: The training views; those without a depth map have no depth loss.
-        cameras: Their cameras at the size of the fit, before straightening.
-        capture: Its start points align relative maps.
+        points: Points on what is shown, which relative maps are aligned to.
         options: ``metric`` maps hold z-depth. ``relative`` ones hold inverse depth up to a scale
             and a shift of each view, as networks that see one photograph give it; median and
-            mean deviation of the start points in view settle the two (see `aligned_inverse`).
+            mean deviation of the points in view settle the two (see `aligned_inverse`).
+        where: Messages begin with it.
 
     Raises:
         InputError: If no view has a depth map, or relative maps have no points to align to.
@@ -63,12 +63,13 @@ class DepthMaps:
         self,
         views: Sequence[View],
         *,
-        capture: Capture,
+        points: Float[Tensor, "n 3"] | None,
         options: FitOptions,
+        where: str,
     ) -> None:
         if not any(view.depth is not None for view in views):
             raise InputError(
-                f"{capture.path}: expected depth maps of training views, as depth supervision "
+                f"{where}: expected depth maps of training views, as depth supervision "
                 "needs them, got none."
             )
         self._views = tuple(views)
@@ -76,12 +77,11 @@ class DepthMaps:
         self._weight = options.depth_weight
         self._points: Tensor | None = None
         if self._relative:
-            if capture.points is None or len(capture.points) == 0:
+            if points is None or len(points) == 0:
                 raise InputError(
-                    f"{capture.path}: expected start points to align relative depth maps to, "
-                    "got none."
+                    f"{where}: expected start points to align relative depth maps to, got none."
                 )
-            self._points = capture.points.points
+            self._points = points
         self._kept: dict[int, tuple[Tensor, float] | None] = {}
 
     def loss(

@@ -5,13 +5,16 @@ The 3DGS code has an affine map of the colour for each training view as an optio
 is what automatic exposure and white balance change.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatseg.errors import RangeError
 from splatseg.fit._options import FitOptions
 from splatseg.fit._view_adam import ViewAdam
 
@@ -23,25 +26,49 @@ _BIAS_SHARE = 0.1
 contrast the two cannot be told apart."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exposure:
+    """How one photograph shows the scene's colours: ``gain * colour + alpha * bias``."""
+
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factor of red, green and blue, greater than 0."""
+
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What is added to red, green and blue, in [0, 1] units of the colour."""
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(value) and value > 0 for value in self.gain):
+            raise RangeError(f"gain: expected positive numbers, got {self.gain}.")
+        if not all(math.isfinite(value) for value in self.bias):
+            raise RangeError(f"bias: expected finite numbers, got {self.bias}.")
+
+
 class Exposures:
     r"""Gain and bias of each training view.
 
     .. math:: I' = e^{g} I + \alpha b
 
-    with g and b a number a channel, both 0 at the start. The means of g and of b over the views
-    stay 0: the scene itself is what a photograph of mean exposure shows, and views that were
-    not trained on are drawn without either. A term :math:`p (|g|^2 + |b|^2)` in the loss keeps
-    them where the photographs do not say otherwise.
+    with g and b a number a channel, both 0 unless `start` says otherwise. The means of g and of
+    b over the views stay what they are at the start: the scene itself is what a photograph of
+    mean exposure shows, and views that were not trained on are drawn without either. A term
+    :math:`p (|g|^2 + |b|^2)` in the loss keeps them where the photographs do not say otherwise.
 
     Args:
         views: Number of training views.
         options: Rate and weight p.
+        start: Where each view begins; None is nowhere brighter or darker.
     """
 
-    def __init__(self, views: int, *, options: FitOptions) -> None:
+    def __init__(
+        self, views: int, *, options: FitOptions, start: Sequence[Exposure] | None = None
+    ) -> None:
         self._rate = options.exposure_rate
         self._prior = options.exposure_prior
         self._values = torch.zeros(views, 6, dtype=torch.float64)
+        for i, one in enumerate(start or ()):
+            logs = [math.log(gain) for gain in one.gain]
+            self._values[i] = torch.tensor([*logs, *one.bias], dtype=torch.float64)
+        self._mean = self._values.mean(dim=0)
         self._adam = ViewAdam(views, 6)
         self._leaf: Tensor | None = None
 
@@ -77,8 +104,13 @@ class Exposures:
         move = rate * self._adam.direction(index, slope)
         move[3:] *= _BIAS_SHARE
         values[index] -= move
-        self._values = values - values.mean(dim=0)
+        self._values = values - (values.mean(dim=0) - self._mean)
         self._leaf = None
+
+    def learned(self) -> tuple[Exposure, ...]:
+        """Those of all views, in their order."""
+        rows = torch.cat((self.gains, self.biases), dim=1).tolist()
+        return tuple(Exposure(gain=(r, g, b), bias=(x, y, z)) for r, g, b, x, y, z in rows)
 
     def state(self) -> dict[str, Tensor]:
         """Everything it holds, by name."""

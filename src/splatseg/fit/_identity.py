@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Camera, Capture, View
+from splatseg.core.recorded_options import ABSENT, option_differences
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 
@@ -43,13 +44,18 @@ def fit_identity(
         "depth maps": _digest([*map(_depth, views)]),
         "start points": _points(capture),
     }
-    # Tuples come back from JSON as lists: compare what is written, not what was meant.
-    kept = json.loads(json.dumps(asdict(options)))
-    return {"data": data, "options": kept, "backend": backend}
+    return {
+        "data": data,
+        "options": _as_recorded(options),
+        "defaults": _as_recorded(FitOptions()),
+        "backend": backend,
+    }
 
 
 def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise unless a checkpoint is of the fit that is to go on.
+
+    Options that the checkpoint does not have count as their defaults (`option_differences`).
 
     Args:
         path: Of the checkpoint.
@@ -61,14 +67,7 @@ def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any])
     """
     before, after = _of(saved, "data"), _of(now, "data")
     differing = [f"other {name}" for name in _differing(before, after)]
-    before, after = _of(saved, "options"), _of(now, "options")
-    names = _differing(before, after)
-    free = {*_LENGTH, _WITH_LENGTH} if not _LENGTH.isdisjoint(names) else set[str]()
-    differing += [
-        f"{name} {json.dumps(before.get(name))} instead of {json.dumps(after.get(name))}"
-        for name in names
-        if name not in free
-    ]
+    differing += _other_options(saved, now)
     if saved.get("backend") != now.get("backend"):
         differing.append(f"backend {saved.get('backend')!r} instead of {now.get('backend')!r}")
     if differing:
@@ -76,6 +75,34 @@ def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any])
             f"{path}: expected the data and options of the fit to resume, which has "
             f"{', '.join(differing)}."
         )
+
+
+def _other_options(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """In words, the options that differ and may not."""
+    differences = option_differences(
+        _of(saved, "options"),
+        _of(now, "options"),
+        defaults=_of(now, "defaults"),
+        recorded_defaults=_of(saved, "defaults"),
+    )
+    names = {difference.name for difference in differences}
+    free = {*_LENGTH, _WITH_LENGTH} if not _LENGTH.isdisjoint(names) else set[str]()
+    found: list[str] = []
+    for one in differences:
+        if one.name in free:
+            continue
+        if one.wanted is ABSENT:
+            found.append(f"{one.name} {json.dumps(one.recorded)}, which this splatseg has not")
+        else:
+            found.append(
+                f"{one.name} {json.dumps(one.recorded)} instead of {json.dumps(one.wanted)}"
+            )
+    return found
+
+
+def _as_recorded(options: FitOptions) -> dict[str, Any]:
+    """Tuples come back from JSON as lists: compare what is written, not what was meant."""
+    return json.loads(json.dumps(asdict(options)))
 
 
 def _of(identity: Mapping[str, Any], group: str) -> Mapping[str, Any]:

@@ -7,7 +7,6 @@ import torch
 
 from splatseg.core import Capture
 from splatseg.errors import InputError
-from splatseg.fit._background import fixed_colour
 from splatseg.fit._identity import fit_identity
 from splatseg.fit._interrupts import deferred_interrupts
 from splatseg.fit._options import FitOptions
@@ -62,12 +61,7 @@ def fit(
     if checkpoints is not None:
         identity = fit_identity(capture, views, options=options, backend=renderer.name)
         clock = CheckpointClock(checkpoints, identity=identity)
-    photographs = Photographs(
-        views,
-        longest=options.longest,
-        masks=options.masks,
-        keep_alpha=fixed_colour(options.background) is not None,
-    )
+    photographs = Photographs.of(views, options=options)
     saved = None if clock is None else clock.saved()
     with one_torch_thread():
         run = FitRun(capture, options, renderer, photographs, saved=saved)
@@ -92,7 +86,8 @@ def fit(
         wanted = interrupted or (checkpoints is not None and checkpoints.at_end)
         if wanted and run.between_steps and not interrupts.impatient:
             keep()
-    gaussians, refined = run.gaussians(), run.views.refined(capture)
+    with one_torch_thread():
+        gaussians, refined = run.gaussians(), run.views.refined(capture.views)
     notes = run.views.notes()
     if options.prune_floaters and not interrupted:
         with one_torch_thread():
@@ -112,6 +107,7 @@ def fit(
         stages=dict(run.stages),
         views=refined,
         notes=notes,
+        exposures=run.views.learned_exposures(),
     )
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.core import Camera, Gaussians
+from splatseg.core.activations import exponential, sigmoid
 
 # 2 ln 255: beyond this Mahalanobis distance squared even an opaque Gaussian's alpha is < 1/255.
 _REACH = 3.34
@@ -79,6 +80,22 @@ class Parameters:
             opacities=self.logits.sigmoid().squeeze(1),
             sh=self.sh.view(len(self), -1, 3),
         )
+
+
+def settled_gaussians(parameters: Parameters) -> Gaussians:
+    """The Gaussians at the end, detached and on the CPU; of a row, the same wherever it stands.
+
+    `Parameters.gaussians` is differentiable, but the last bits of its opacities depend on how
+    many threads torch has.
+    """
+    raw = {name: tensor.detach().cpu() for name, tensor in parameters.tensors()}
+    return Gaussians(
+        means=raw["means"].clone(),
+        rotations=torch.nn.functional.normalize(raw["rotations"], dim=1),
+        scales=torch.from_numpy(exponential(raw["log_scales"].numpy())),
+        opacities=torch.from_numpy(sigmoid(raw["logits"].squeeze(1).numpy())),
+        sh=raw["sh"].reshape(len(parameters), -1, 3).clone(),
+    )
 
 
 def rows_in_view(parameters: Parameters, camera: Camera, *, near: float) -> Int64[Tensor, "m"]:

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg.core import Camera, View
+from splatseg.fit._background import fixed_colour
+from splatseg.fit._options import FitOptions
 from splatseg.io.images import image_camera, load_alpha, load_image, load_mask, reduced_size
 from splatseg.render.warp import photograph_to_pinhole, straightened
 
@@ -64,6 +66,16 @@ class Photographs:
         self._kept: dict[int, _Pixels] = {}
         self._bytes = 0
         self._cameras = [straightened(image_camera(view, longest)) for view in self._views]
+
+    @classmethod
+    def of(cls, views: Sequence[View], *, options: FitOptions) -> "Photographs":
+        """The photographs of views as the options of a fit want them."""
+        return cls(
+            views,
+            longest=options.longest,
+            masks=options.masks,
+            keep_alpha=fixed_colour(options.background) is not None,
+        )
 
     def __len__(self) -> int:
         return len(self._views)

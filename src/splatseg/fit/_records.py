@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from splatseg.core import Gaussians, View
+from splatseg.fit._exposure import Exposure
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,3 +80,6 @@ class FitResult:
 
     notes: tuple[str, ...] = ()
     """Sentences on what was learned besides the Gaussians: exposures, poses."""
+
+    exposures: Mapping[str, Exposure] = field(default_factory=dict[str, Exposure])
+    """Of each training view, by its name; empty without `FitOptions.exposure`."""

@@ -3,49 +3,40 @@
 None is added, moved to another place or left out: row i stays row i, so that layers stay in step.
 """
 
-import math
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
-from jaxtyping import Int64
 from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import Gaussians, View
-from splatseg.errors import InputError, SplatsegError
-from splatseg.fit._background import background_colour
+from splatseg.errors import InputError
+from splatseg.fit._exposure import Exposure
 from splatseg.fit._initialise import scene_extent
 from splatseg.fit._loop import one_torch_thread
-from splatseg.fit._loss import l1_dssim
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters, gathered, rows_in_view
+from splatseg.fit._parameters import Parameters, settled_gaussians
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._schedule import rates_at
-from splatseg.fit._update import UpdateSettings, gradients_of, update_rows
-from splatseg.render import get_backend, options_for
+from splatseg.fit._step import ExtraLoss, StepSettings, TrainingStep
+from splatseg.fit._update import UpdateSettings
+from splatseg.fit._view_parts import ViewParts
+from splatseg.render import get_backend, options_for, render
+from splatseg.render.warp import straightened
 
-_LEAST_SCALE = 1e-12
+_MIN_SCALE = 1e-12
 _OPACITY_MARGIN = 1e-6
 """Logs and logits of what lies at a limit would be infinite."""
 
-
-class Term(Protocol):
-    """Something to learn from beside the photograph of a view."""
-
-    def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
-        """A scalar to be added to the loss.
-
-        Args:
-            view: The view whose turn it is.
-            gaussians: Those that it may show, leaves that want a gradient.
-            rows: Which they are among all.
-        """
-        ...
+_DEPTH_PIXELS = 64
+"""Longest side of the depth maps that stand for start points."""
 
 
 class Refinement:
-    """Gaussians that go on learning, step by step.
+    """Gaussians that go on learning, step by step, by the step of `fit` (`TrainingStep`).
+
+    What the Gaussians show stands for the start points: relative depth maps are aligned to it.
+    With `FitOptions.refine_poses` the poses of the views move too; `views` tells where to.
 
     Args:
         gaussians: Where to begin.
@@ -53,12 +44,16 @@ class Refinement:
         steps: How many steps there will be, for the rates.
         start: Progress, in [0, 1], of a fit whose learning rates the first step has; the last
             has those of a fit's end.
-        options: Rates, loss, background and masks of `fit`. Its steps, growth, exposures and
-            poses have no meaning here.
+        options: Rates, loss, background, masks, exposures, depth and poses of `fit`. Its steps,
+            growth, penalties and random walk have no meaning here.
+        exposures: What the photographs of a fit were found to need (`FitResult.exposures`), by
+            name of the view: where `FitOptions.exposure` goes on from. Views without one, and
+            all where it is None, begin at none.
         backend: Who renders.
 
     Raises:
-        InputError: If there are no Gaussians, or no view with a photograph.
+        InputError: If there are no Gaussians, no view with a photograph, or depth is asked for
+            and no view has a depth map.
         RangeError: If `start` is outside [0, 1].
     """
 
@@ -70,6 +65,7 @@ class Refinement:
         steps: int,
         start: float,
         options: FitOptions,
+        exposures: Mapping[str, Exposure] | None = None,
         backend: str = "auto",
     ) -> None:
         check_range("start", start, 0.0, 1.0)
@@ -77,18 +73,33 @@ class Refinement:
             raise InputError("gaussians: expected at least one, got none.")
         if not views:
             raise InputError("views: expected at least one to learn from, got none.")
-        self._backend = get_backend(backend)
-        self._render_options = options_for(gaussians, self._backend.name)
+        renderer = get_backend(backend)
+        self._render_options = options_for(gaussians, renderer.name)
         self._options, self._steps, self._start = options, steps, start
         self._model = gaussians
-        device = torch.device("cuda" if self._backend.name == "cuda" else "cpu")
-        raw = _parameters(gaussians)
-        self._parameters = Parameters(**{name: part.to(device) for name, part in raw.tensors()})
-        self._first, self._second = self._parameters.zeros_like(), self._parameters.zeros_like()
-        self._extent = scene_extent(tuple(views), raw.means)
-        self._photographs = Photographs(views, longest=options.longest, masks=options.masks)
         self._generator = torch.Generator().manual_seed(options.seed)
-        self._order: list[int] = []
+        around = options.refine_poses or options.depth == "relative"
+        with one_torch_thread():
+            self._views = ViewParts.of(
+                views,
+                points=_points_of(gaussians, views, backend=renderer.name) if around else None,
+                options=options,
+                where="refine",
+                exposures=exposures,
+            )
+        self._training = TrainingStep(
+            name="refine",
+            options=options,
+            backend=renderer,
+            photographs=Photographs.of(views, options=options),
+            views=self._views,
+            generator=self._generator,
+        )
+        raw = _parameters(gaussians)
+        device = self._training.device
+        parameters = Parameters(**{name: part.to(device) for name, part in raw.tensors()})
+        self._state = (parameters, parameters.zeros_like(), parameters.zeros_like())
+        self._extent = scene_extent(tuple(views), raw.means)
         self._done = 0
 
     @property
@@ -96,9 +107,20 @@ class Refinement:
         """Where all chance comes from."""
         return self._generator
 
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The views, with `FitOptions.refine_poses` where they are now."""
+        return self._views.refined(self._views.views)
+
+    @property
+    def exposures(self) -> dict[str, Exposure]:
+        """By name of the view, as they are now; empty without `FitOptions.exposure`."""
+        return self._views.learned_exposures()
+
     def gaussians(self) -> Gaussians:
         """As they are now, on the CPU, as many as at the start and in the same order."""
-        now = self._parameters.gaussians().to(device="cpu")
+        with one_torch_thread():
+            now = self._views.settled(settled_gaussians(self._state[0]))
         return self._model.replace(
             means=now.means,
             rotations=now.rotations,
@@ -107,59 +129,51 @@ class Refinement:
             sh=now.sh,
         )
 
-    def step(self, term: Term | None = None) -> None:
-        """Learn from the photograph of the next view, and from a further term.
+    def step(self, extra_loss: ExtraLoss | None = None) -> None:
+        """Learn from the photograph of the next view, and from a further loss.
 
         Raises:
             SplatsegError: If the loss is no longer a number.
         """
         with one_torch_thread():
-            self._step(term)
+            self._step(extra_loss)
 
-    def _step(self, term: Term | None) -> None:
-        if not self._order:
-            count = len(self._photographs)
-            self._order = torch.randperm(count, generator=self._generator).tolist()
-        index = self._order.pop()
-        example = self._photographs.example(index)
-        rows = rows_in_view(self._parameters, example.camera, near=self._render_options.near)
-        leaves = gathered(self._parameters, rows)
-        leaves = leaves.replace(antialiased=self._model.antialiased, low_pass=self._model.low_pass)
-        drawn = self._backend.render(leaves, example.camera, None, options=self._render_options)
-        picture = drawn.image
-        colour = background_colour(self._options.background, generator=self._generator)
-        if colour is not None:
-            picture = picture + (1 - drawn.alpha).unsqueeze(-1) * colour.to(picture)
-        mask = None if example.mask is None else example.mask.to(picture.device)
-        loss = l1_dssim(
-            picture,
-            example.photograph.to(picture.device),
-            mask=mask,
-            dssim_weight=self._options.dssim_weight,
-        )
-        roots, slopes, value = [picture], [loss.gradient], loss.value
-        if term is not None:
-            further = term(self._photographs.views[index], leaves, rows)
-            if further.requires_grad:
-                roots.append(further)
-                slopes.append(torch.ones_like(further))
-            value += float(further.detach())
-        if not math.isfinite(value):
-            raise SplatsegError(f"refine: expected a finite loss, got {value} at {self._done}.")
-        torch.autograd.backward(roots, slopes)
+    def _step(self, extra_loss: ExtraLoss | None) -> None:
         progress = self._start + (1 - self._start) * self._done / max(1, self._steps)
-        rates = rates_at(min(1.0, progress), options=self._options, extent=self._extent)
+        progress = min(1.0, progress)
+        example = self._training.next_example()
+        settings = StepSettings(
+            step=self._done,
+            progress=progress,
+            render_options=self._render_options,
+            extra_loss=extra_loss,
+        )
+        found = self._training.gradients(self._state[0], example, settings=settings)
         self._done += 1
-        settings = UpdateSettings(rates=rates, step=self._done)
+        rates = rates_at(progress, options=self._options, extent=self._extent)
         with torch.no_grad():
-            update_rows(
-                self._parameters,
-                self._first,
-                self._second,
-                gradients_of(leaves),
-                rows=rows,
-                settings=settings,
-            )
+            update = UpdateSettings(rates=rates, step=self._done)
+            self._training.update(self._state, found, settings=update)
+            self._views.update(example.index, progress=progress)
+
+
+def _points_of(gaussians: Gaussians, views: Sequence[View], *, backend: str) -> Tensor:
+    """Points on the surfaces that the views show, as structure from motion would find them.
+
+    Centres of Gaussians would not do: many lie inside of things.
+    """
+    found: list[Tensor] = []
+    for view in views:
+        camera = straightened(view.camera)
+        longest = max(camera.width, camera.height)
+        share = min(1.0, _DEPTH_PIXELS / longest)
+        size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+        camera = camera.resized(*size)
+        with torch.no_grad():
+            depth = render(gaussians, camera, backend=backend).median_depth.cpu().double()
+        solid = depth > 0
+        found.append(camera.unproject(camera.pixel_centres()[solid], depth[solid]))
+    return torch.cat(found).float()
 
 
 def _parameters(gaussians: Gaussians) -> Parameters:
@@ -167,7 +181,7 @@ def _parameters(gaussians: Gaussians) -> Parameters:
     opacities = gaussians.opacities.clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
     return Parameters(
         means=gaussians.means.float().clone(),
-        log_scales=gaussians.scales.float().clamp_min(_LEAST_SCALE).log(),
+        log_scales=gaussians.scales.float().clamp_min(_MIN_SCALE).log(),
         rotations=gaussians.rotations.float().clone(),
         logits=opacities.float().logit().unsqueeze(1),
         sh=gaussians.sh.float().reshape(len(gaussians), -1).clone(),
@@ -179,9 +193,10 @@ def refine(
     views: Sequence[View],
     *,
     steps: int,
-    term: Term | None = None,
+    extra_loss: ExtraLoss | None = None,
     start: float = 0.6,
     options: FitOptions = FitOptions(),
+    exposures: Mapping[str, Exposure] | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Gaussians:
@@ -189,9 +204,17 @@ def refine(
 
     With the same seed the result is the same, whatever the number of threads.
     """
-    run = Refinement(gaussians, views, steps=steps, start=start, options=options, backend=backend)
+    run = Refinement(
+        gaussians,
+        views,
+        steps=steps,
+        start=start,
+        options=options,
+        exposures=exposures,
+        backend=backend,
+    )
     for done in range(steps):
-        run.step(term)
+        run.step(extra_loss)
         if progress is not None:
             progress(done + 1, steps)
     return run.gaussians()

@@ -1,31 +1,28 @@
-"""One fit under way: its state, and one step of it."""
+"""One fit under way: its state, and what a step of it adds to the shared one."""
 
 import math
 import time
-from collections.abc import Generator
-from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, cast
 
 import torch
-from torch import Tensor
 
-from splatseg.core import Capture, Gaussians
-from splatseg.errors import FileFormatError, SplatsegError
-from splatseg.fit._background import background_colour
+from splatseg.core import Camera, Capture, Gaussians
+from splatseg.errors import FileFormatError
 from splatseg.fit._density import density_of
 from splatseg.fit._initialise import initial_parameters, scene_extent, scene_size
-from splatseg.fit._loss import Loss, l1_dssim
+from splatseg.fit._loss import Loss
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters, gathered, rows_in_view
-from splatseg.fit._photographs import Example, Photographs
+from splatseg.fit._parameters import Parameters, settled_gaussians
+from splatseg.fit._photographs import Photographs
 from splatseg.fit._records import FitProgress, FitRecord
 from splatseg.fit._schedule import degree_at, rates_at, reduction_at
 from splatseg.fit._start import with_start_points
 from splatseg.fit._state import FitState, Part, named, parameters_of
-from splatseg.fit._update import UpdateSettings, gradients_of, update_rows
+from splatseg.fit._step import StepGradients, StepSettings, TrainingStep
+from splatseg.fit._update import UpdateSettings
 from splatseg.fit._view_parts import ViewParts
-from splatseg.render import Backend, Rendered, default_options
+from splatseg.render import Backend, default_options
 
 _RECORD_EVERY = 50  # steps
 # Noise and the penalty on scales have the strength that they should in a scene of this size
@@ -53,15 +50,25 @@ class FitRun:
         self._begin = time.monotonic()
         self._options = options
         self._backend = backend
-        self._photographs = photographs
-        self.views = ViewParts.of(capture, photographs.views, options=options)
+        self.views = ViewParts.of(
+            photographs.views,
+            points=None if capture.points is None else capture.points.points,
+            options=options,
+            where=str(capture.path),
+        )
         self._generator = torch.Generator().manual_seed(options.seed)
-        self._device = torch.device("cuda" if backend.name == "cuda" else "cpu")
-        self._order: list[int] = []
+        self._training = TrainingStep(
+            name="fit",
+            options=options,
+            backend=backend,
+            photographs=photographs,
+            views=self.views,
+            generator=self._generator,
+        )
+        self._device = self._training.device
         self._batch: list[FitProgress] = []
         self.steps = 0
         self.history: list[FitRecord] = []
-        self.stages: dict[str, float] = {}
         self.between_steps = True
         if saved is None:
             capture = with_start_points(
@@ -84,6 +91,11 @@ class FitRun:
                 part.restore(saved.group(name, part.state(), device=self._device))
 
     @property
+    def stages(self) -> dict[str, float]:
+        """Seconds spent in each part of a step; the caller may count further parts."""
+        return self._training.stages
+
+    @property
     def seconds(self) -> float:
         return time.monotonic() - self._begin
 
@@ -99,9 +111,8 @@ class FitRun:
         return self.progress >= 1.0
 
     def gaussians(self) -> Gaussians:
-        parameters = self._state[0]
-        alive = parameters.logits.sigmoid().squeeze(1) > self._options.dead_opacity
-        found = parameters.rows(alive.nonzero().squeeze(1)).gaussians().to(device="cpu")
+        found = settled_gaussians(self._state[0])
+        found = found[found.opacities > self._options.dead_opacity]
         return self.views.settled(
             found.replace(
                 antialiased=self._options.antialiased, low_pass=self._options.low_pass_drawn
@@ -122,7 +133,7 @@ class FitRun:
         tensors |= named("first", dict(first.tensors()))
         tensors |= named("second", dict(second.tensors()))
         tensors |= {"generator": self._generator.get_state()}
-        tensors |= {"order": torch.tensor(self._order, dtype=torch.int64)}
+        tensors |= {"order": torch.tensor(self._training.order, dtype=torch.int64)}
         for name, part in self._parts().items():
             tensors |= named(name, part.state())
         content = {
@@ -151,9 +162,10 @@ class FitRun:
         self._state = (parameters, first, second)
         if len({len(one) for one in self._state}) != 1:
             raise FileFormatError(f"{saved.where}: expected as many moments as Gaussians.")
-        self._order = saved.tensor("order").tolist()
-        if not all(0 <= index < len(self._photographs) for index in self._order):
+        order = saved.tensor("order").tolist()
+        if not all(0 <= index < len(self.views.views) for index in order):
             raise FileFormatError(f"{saved.where}: expected an order of the training views.")
+        self._training.order = order
         self._extent = saved.number("extent")
         self._size = saved.number("size")
         self._start_count = int(saved.number("start_count"))
@@ -162,7 +174,8 @@ class FitRun:
         content = cast(dict[str, Any], saved.content)
         try:
             self._generator.set_state(saved.tensor("generator"))
-            self.stages = {str(name): float(spent) for name, spent in content["stages"].items()}
+            stages = {str(name): float(spent) for name, spent in content["stages"].items()}
+            self._training.stages = stages
             self.history = [FitRecord(**record) for record in content["history"]]
             self._batch = [FitProgress(**status) for status in content["batch"]]
         except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
@@ -172,96 +185,40 @@ class FitRun:
 
     def _step(self) -> FitProgress:
         done = self.progress
-        with self._timed("read"):
-            example = self._next_example(done)
+        example = self._training.next_example(lambda camera: self._reduction(camera, done))
         parameters = self._state[0]
-        degree = degree_at(done, options=self._options)
-        render_options = default_options(
-            self._backend.name,
-            sh_degree=degree,
-            antialiased=self._options.antialiased,
-            low_pass=self._options.low_pass_drawn,
+        settings = StepSettings(
+            step=self.steps,
+            progress=done,
+            render_options=default_options(
+                self._backend.name,
+                sh_degree=degree_at(done, options=self._options),
+                antialiased=self._options.antialiased,
+                low_pass=self._options.low_pass_drawn,
+            ),
+            screen=self._density.looks_at_screen,
         )
-        with self._timed("gather"):
-            rows = rows_in_view(parameters, example.camera, near=render_options.near)
-            gaussians = gathered(parameters, rows)
-        with self._timed("render"):
-            screen = None
-            if self._density.looks_at_screen:
-                screen = torch.zeros_like(gaussians.means[:, :2]).requires_grad_()
-            camera = self.views.camera_to_draw(example.index, example.camera)
-            rendered = self._backend.render(
-                gaussians, camera, None, options=render_options, screen=screen
-            )
-        with self._timed("loss"):
-            picture, photograph = self._over_background(rendered, example)
-            loss = l1_dssim(
-                picture,
-                photograph,
-                mask=example.mask,
-                dssim_weight=self._options.dssim_weight,
-            )
-            depth = None
-            if self.views.depths is not None:
-                depth = self.views.depths.loss(
-                    example.index, rendered.depth, rendered.alpha, progress=done, mask=example.mask
-                )
-        if not math.isfinite(loss.value):
-            raise SplatsegError(
-                f"fit: expected a finite loss, got {loss.value} at step {self.steps}; lower rates "
-                "may help."
-            )
-        with self._timed("backward"):
-            roots, slopes = [picture], [loss.gradient]
-            if depth is not None:
-                roots.append(rendered.depth)
-                slopes.append(depth.gradient)
-            torch.autograd.backward(roots, slopes)
-        with self._timed("update"), torch.no_grad():
-            self._update(gaussians, rows, done)
+        found = self._training.gradients(parameters, example, settings=settings)
+        with self._training.timed("update"), torch.no_grad():
+            self._update(found, done)
             self.views.update(example.index, progress=done)
         self.steps += 1
-        with self._timed("densify"), torch.no_grad():
-            if screen is not None and screen.grad is not None:
-                self._density.see(rows, screen.grad, camera=example.camera, parameters=parameters)
+        with self._training.timed("densify"), torch.no_grad():
+            if found.screen is not None:
+                self._density.see(
+                    found.rows, found.screen, camera=example.camera, parameters=parameters
+                )
             self._state = self._density.after(
                 self._state, steps=self.steps, progress=done, generator=self._generator
             )
-        return self._report(loss)
+        return self._report(found.loss)
 
-    def _next_example(self, progress: float) -> Example:
-        """The next view: all of them in random order, then all again in another."""
-        if not self._order:
-            self._order = torch.randperm(len(self._photographs), generator=self._generator).tolist()
-        index = self._order.pop()
-        camera = self._photographs.camera(index)
-        reduction = reduction_at(
+    def _reduction(self, camera: Camera, progress: float) -> int:
+        return reduction_at(
             progress, options=self._options, width=camera.width, height=camera.height
         )
-        example = self._photographs.example(index, reduction=reduction)
-        mask, alpha = example.mask, example.alpha
-        return Example(
-            index=index,
-            camera=self.views.camera(index, example.camera),
-            photograph=example.photograph.to(self._device),
-            mask=None if mask is None else mask.to(self._device),
-            alpha=None if alpha is None else alpha.to(self._device),
-        )
 
-    def _over_background(self, rendered: Rendered, example: Example) -> tuple[Tensor, Tensor]:
-        """Picture and photograph as they are compared: over one colour, in one exposure."""
-        picture, photograph = rendered.image, example.photograph
-        if self.views.exposures is not None:
-            picture = self.views.exposures.applied(example.index, picture, rendered.alpha)
-        colour = background_colour(self._options.background, generator=self._generator)
-        if colour is not None:
-            colour = colour.to(picture)
-            picture = picture + (1 - rendered.alpha).unsqueeze(-1) * colour
-            if example.alpha is not None:
-                photograph = photograph + (1 - example.alpha).unsqueeze(-1) * colour
-        return picture, photograph
-
-    def _update(self, gaussians: Gaussians, rows: Tensor, progress: float) -> None:
+    def _update(self, found: StepGradients, progress: float) -> None:
         count = len(self._state[0])
         rates = rates_at(progress, options=self._options, extent=self._extent)
         unit = _REFERENCE_SIZE / self._size
@@ -273,7 +230,7 @@ class FitRun:
             noise=self._options.noise * rates.means * unit**2,
             seed=self._options.seed,
         )
-        update_rows(*self._state, gradients_of(gaussians), rows=rows, settings=settings)
+        self._training.update(self._state, found, settings=settings)
 
     def _report(self, loss: Loss) -> FitProgress:
         seconds, done = self.seconds, self.progress
@@ -300,11 +257,3 @@ class FitRun:
             self.history.append(record)
             self._batch = []
         return status
-
-    @contextmanager
-    def _timed(self, stage: str) -> Generator[None]:
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin

@@ -1,13 +1,15 @@
 """What a fit learns about single training views besides the scene: exposure, depth, pose."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from splatseg.core import Camera, Capture, Gaussians, View
+from splatseg.core import Camera, Gaussians, View
 from splatseg.fit._depth import DepthMaps
-from splatseg.fit._exposure import Exposures
+from splatseg.fit._exposure import Exposure, Exposures
 from splatseg.fit._options import FitOptions
 from splatseg.fit._poses import Poses
 from splatseg.fit._state import Part
@@ -25,24 +27,40 @@ class ViewParts:
     poses: Poses | None
 
     @classmethod
-    def of(cls, capture: Capture, views: Sequence[View], *, options: FitOptions) -> "ViewParts":
+    def of(
+        cls,
+        views: Sequence[View],
+        *,
+        points: Float[Tensor, "n 3"] | None,
+        options: FitOptions,
+        where: str,
+        exposures: Mapping[str, Exposure] | None = None,
+    ) -> "ViewParts":
         """Those that the options ask for.
+
+        Args:
+            views: The training views.
+            points: Points on what is shown: they say how far things are.
+            options: Which parts, and their rates.
+            where: Messages begin with it.
+            exposures: Where exposures begin, by name of the view.
 
         Raises:
             InputError: If depth is asked for and there are no depth maps.
         """
         poses = None
         if options.refine_poses:
-            points = torch.zeros(0, 3) if capture.points is None else capture.points.points
-            poses = Poses([view.camera for view in views], points=points, options=options)
-        return cls(
-            views=tuple(views),
-            exposures=Exposures(len(views), options=options) if options.exposure else None,
-            depths=None
-            if options.depth == "off"
-            else DepthMaps(views, capture=capture, options=options),
-            poses=poses,
-        )
+            around = torch.zeros(0, 3) if points is None else points
+            poses = Poses([view.camera for view in views], points=around, options=options)
+        learned = None
+        if options.exposure:
+            known = exposures or {}
+            start = [known.get(view.name, Exposure()) for view in views]
+            learned = Exposures(len(views), options=options, start=start)
+        depths = None
+        if options.depth != "off":
+            depths = DepthMaps(views, points=points, options=options, where=where)
+        return cls(views=tuple(views), exposures=learned, depths=depths, poses=poses)
 
     def parts(self) -> dict[str, Part]:
         """Those that remember something."""
@@ -61,6 +79,11 @@ class ViewParts:
         """The same, with a pose that learns from the gradient."""
         return camera if self.poses is None else self.poses.leaf(index, camera)
 
+    def view(self, index: int) -> View:
+        """A view where it is now."""
+        view = self.views[index]
+        return view if self.poses is None else replace(view, camera=self.camera(index, view.camera))
+
     def update(self, index: int, *, progress: float) -> None:
         """Take a step along the gradients of the last view."""
         if self.exposures is not None:
@@ -72,12 +95,19 @@ class ViewParts:
         """Gaussians of the fit in the world of the capture."""
         return gaussians if self.poses is None else gaussians.transformed(self.poses.aligned()[0])
 
-    def refined(self, capture: Capture) -> tuple[View, ...]:
-        """All views of the capture, training views where they are now."""
+    def refined(self, views: Sequence[View]) -> tuple[View, ...]:
+        """The given views, those that were learned from where they are now."""
         if self.poses is None:
-            return capture.views
+            return tuple(views)
         moved = {view.name: view for view in self.poses.refined(self.views)}
-        return tuple(moved.get(view.name, view) for view in capture.views)
+        return tuple(moved.get(view.name, view) for view in views)
+
+    def learned_exposures(self) -> dict[str, Exposure]:
+        """By name of the view; empty where exposures are not learned."""
+        if self.exposures is None:
+            return {}
+        names = (view.name for view in self.views)
+        return dict(zip(names, self.exposures.learned(), strict=True))
 
     def notes(self) -> tuple[str, ...]:
         """Sentences on what was learned."""

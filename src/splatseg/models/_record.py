@@ -6,10 +6,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from splatseg.core import View
-from splatseg.core.models import Model
+from splatseg.core.models import Model, ModelWithDefaults
+from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
 from splatseg.errors import InputError
 from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header
 from splatseg.io.json_files import json_text, parse_object
@@ -21,6 +22,9 @@ from splatseg.models.recorded import AnyRecorded
 
 _SAME = ("model", "settings", "what")
 """What must be as it was for interrupted work to go on."""
+
+_DEFAULTS = "default_settings"
+"""What a setting counts as that was not recorded, where the model says so."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,6 +128,7 @@ def _metadata(model: Model, source: Source, asked: str) -> dict[str, Any]:
     metadata = {
         "model": model.name,
         "settings": dict(model.settings),
+        _DEFAULTS: dict(model.default_settings) if isinstance(model, ModelWithDefaults) else {},
         "what": source.what,
         "note": model.note,
         "views_asked": asked,
@@ -176,10 +181,20 @@ def _check_same(
     folder: Path, header: Mapping[str, Any], source: Source, metadata: Mapping[str, Any]
 ) -> None:
     recorded = header.get("metadata")
-    before: Mapping[str, Any] = recorded if isinstance(recorded, dict) else {}  # pyright: ignore[reportUnknownVariableType]
-    differs = [key for key in _SAME if before.get(key) != metadata[key]]
-    if header.get("kind") != source.kind or differs:
-        changed = ", ".join(_difference(key, before.get(key), metadata[key]) for key in differs)
+    before = cast("Mapping[str, Any]", recorded) if isinstance(recorded, Mapping) else {}
+    if any(key not in before for key in _SAME):
+        raise InputError(
+            f"{folder}: this evidence cannot be gone on with, as it does not say how it was made; "
+            "overwrite it or choose another name."
+        )
+    differences = option_differences(
+        {key: before[key] for key in _SAME},
+        {key: metadata[key] for key in _SAME},
+        defaults={"settings": metadata[_DEFAULTS]},
+        recorded_defaults={"settings": before.get(_DEFAULTS, {})},
+    )
+    if header.get("kind") != source.kind or differences:
+        changed = ", ".join(map(_in_words, differences))
         raise InputError(
             f"{folder}: holds evidence made in another way "
             f"({changed or 'kind ' + str(header.get('kind'))}); overwrite it or choose another "
@@ -187,12 +202,10 @@ def _check_same(
         )
 
 
-def _difference(key: str, before: object, now: object) -> str:
-    """What differs, down to the setting."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        keys = [k for k in {**now, **before} if before.get(k) != now.get(k)]  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]
-        return ", ".join(_difference(str(k), before.get(k), now.get(k)) for k in keys)  # pyright: ignore[reportUnknownArgumentType, reportUnknownMemberType]
-    return f"{key} {before!r:.60} there, {now!r:.60} now"
+def _in_words(one: OptionDifference) -> str:
+    there = "not known" if one.recorded is ABSENT else f"{one.recorded!r:.60}"
+    now = "not known" if one.wanted is ABSENT else f"{one.wanted!r:.60}"
+    return f"{one.name} {there} there, {now} now"
 
 
 def _write_header(folder: Path, source: Source, metadata: Mapping[str, Any]) -> None:

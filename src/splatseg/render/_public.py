@@ -51,7 +51,9 @@ def render(
         options: Switches of the blending model; None is what the Gaussians are
             meant for, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
-        warp: How distorted pixels read the straightened image; ``nearest`` for ids.
+        warp: How distorted pixels read the straightened image: ``bilinear`` from the four
+            pixels around, or ``nearest``, for ids and wherever the result is to agree with
+            `weights` and `contributors`. Without distortion the two are the same.
 
     Returns:
         Image, alpha, expected and median depth, see `Rendered`.
@@ -157,6 +159,13 @@ def weights(
     backend: str = "auto",
 ) -> ViewWeights:
     """W of one view as a matrix, for views that are used again and again.
+
+    With lens distortion a row is that of the pinhole pixel which the photograph's pixel falls
+    into, so that a row holds the Gaussians of one ray: its sum is the alpha of
+    ``render(..., warp="nearest")``. ``render`` itself reads four pinhole pixels by default
+    (``warp="bilinear"``); at the edges of things its alpha differs from the row's sum by up to
+    a third. Take ``warp="nearest"`` in `render` and `back_project` where they are to agree with
+    rows of W.
 
     Args:
         gaussians: What the view shows.

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians
+from splatseg.core.activations import exponential, sigmoid
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import FileFormatError, MissingFileError
 
@@ -118,8 +119,8 @@ class Rows:
         Minus infinity becomes scale or opacity 0 and plus infinity opacity 1, as some tools
         mean it; NaN and a scale beyond float32 stay for `finish` to refuse.
         """
-        torch.from_numpy(self.scales).exp_()
-        torch.from_numpy(self.opacities).sigmoid_()
+        self.scales[:] = exponential(self.scales)
+        self.opacities[:] = sigmoid(self.opacities)
 
 
 ANTIALIASED = "splatseg antialiased"

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatseg.core import Gaussians
+from splatseg.core.activations import sigmoid
 from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.splats._common import Array, Filter, Rows, blocks, check_file, finish
 from splatseg.io.splats._json import Json
@@ -205,8 +206,7 @@ def _bytes(
         return
     alpha = pixels[:, 3]
     if version == 1:  # a logit between bounds
-        with np.errstate(over="ignore"):
-            rows.opacities[:] = (1 / (1 + np.exp(-tables[3])))[alpha]
+        rows.opacities[:] = sigmoid(tables[3])[alpha]
     else:
         rows.opacities[:] = alpha / np.float32(255)
 

@@ -43,7 +43,7 @@ from torch import Tensor
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, LabelSource, View, camera_of_map
 from splatseg.errors import InputError, RangeError
-from splatseg.fit import FitOptions, Refinement
+from splatseg.fit import Exposure, FitOptions, Refinement
 from splatseg.lift.label_maps import label_map
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
@@ -107,6 +107,9 @@ class Sharpened:
     """Before and after: share of the light of labelled pixels, in [0, 1], that comes from
     Gaussians of the pixel's id."""
 
+    exposures: Mapping[str, Exposure] = field(default_factory=dict[str, Exposure])
+    """Of the views that were learned from; empty without `FitOptions.exposure`."""
+
 
 def sharpen(
     gaussians: Gaussians,
@@ -117,6 +120,7 @@ def sharpen(
     uplift_options: UpliftOptions | None = None,
     confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
     fit_options: FitOptions | None = None,
+    exposures: Mapping[str, Exposure] | None = None,
     seed: int = 0,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
@@ -135,7 +139,10 @@ def sharpen(
         uplift_options: How Gaussians get labels; candidates are at least 8 where labels are
             reconsidered.
         confusion: How the evidence errs, see `reconsider`; None takes the majority.
-        fit_options: Rates, loss, background and masks of the fit; its seed is not used.
+        fit_options: How the photographs are compared (see `refinement_options`), and rates. Its
+            seed is not used, and the poses of the views stay as they are: the label maps are
+            drawn with them.
+        exposures: Where exposures begin, for ``fit_options.exposure``, by name of the view.
         seed: Order of views and codes.
         backend: Who renders.
         progress: Called with the steps done and all there are.
@@ -175,7 +182,8 @@ def sharpen(
         ordered,
         steps=options.sharpen_steps,
         start=options.rates_from,
-        options=replace(base, seed=seed),
+        options=replace(base, seed=seed, refine_poses=False),
+        exposures=exposures,
         backend=backend,
     )
     for done in range(options.sharpen_steps):
@@ -194,6 +202,7 @@ def sharpen(
         gaussians=gaussians,
         labels=replace(labels, metadata=metadata),
         agreement=(before, after),
+        exposures=run.exposures,
     )
 
 

@@ -51,6 +51,11 @@ class Classical:
         }
 
     @property
+    def default_settings(self) -> Mapping[str, Any]:
+        """The settings of a model that was made without options."""
+        return Classical().settings
+
+    @property
     def note(self) -> str:
         """That it is a stand-in."""
         return "a stand-in without weights: it goes by colour and edges, not by what things are"

@@ -1,0 +1,240 @@
+"""One step of learning from a photograph: all that fitting and refining have in common."""
+
+import math
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from splatseg.core import Camera, Gaussians, View
+from splatseg.errors import SplatsegError
+from splatseg.fit._background import background_colour
+from splatseg.fit._density import State
+from splatseg.fit._depth import DepthLoss
+from splatseg.fit._loss import Loss, l1_dssim
+from splatseg.fit._options import FitOptions
+from splatseg.fit._parameters import Parameters, gathered, rows_in_view
+from splatseg.fit._photographs import Example, Photographs
+from splatseg.fit._update import UpdateSettings, gradients_of, update_rows
+from splatseg.fit._view_parts import ViewParts
+from splatseg.render import Backend, Rendered, RenderOptions
+
+
+class ExtraLoss(Protocol):
+    """Something to learn from beside the photograph of a view."""
+
+    def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
+        """A scalar to be added to the loss.
+
+        Args:
+            view: The view whose turn it is, with its present pose.
+            gaussians: Those that it may show, leaves that want a gradient.
+            rows: Which they are among all.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepSettings:
+    """What may differ from step to step."""
+
+    step: int
+    """Steps done before; messages name it."""
+
+    progress: float
+    """In [0, 1]: rates and weights fall with it."""
+
+    render_options: RenderOptions
+    """Filter and degree of the harmonics."""
+
+    screen: bool = False
+    """Whether gradients in the projected centres are wanted."""
+
+    extra_loss: ExtraLoss | None = None
+    """What else is learned from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StepGradients:
+    """What one view says about the Gaussians that it may show."""
+
+    example: Example
+    rows: Int64[Tensor, "m"]
+    """Which Gaussians, among all."""
+
+    gaussians: Gaussians
+    """The Gaussians of these rows: leaves that hold gradients."""
+
+    loss: Loss
+    """Of the photograph alone."""
+
+    screen: Float[Tensor, "m 2"] | None
+    """Gradient in the projected centres, per pixel; None unless it was wanted and there is one."""
+
+
+class TrainingStep:
+    """Renders a training view, compares it with its photograph, and gives gradients.
+
+    Exposures, depth maps and poses of the views (`ViewParts`) take part wherever they are given,
+    and photographs with an alpha are blended over the background that the rendering is over. It
+    remembers the views that are still to come in this round; the Gaussians are the caller's.
+
+    Args:
+        name: ``fit`` or ``refine``; messages begin with it.
+        options: Loss and background.
+        backend: Who renders.
+        photographs: What is learned from.
+        views: Exposures, depth maps and poses of the same views.
+        generator: Source of the order of the views and of random backgrounds.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        options: FitOptions,
+        backend: Backend,
+        photographs: Photographs,
+        views: ViewParts,
+        generator: torch.Generator,
+    ) -> None:
+        self._name = name
+        self._options = options
+        self._backend = backend
+        self._photographs = photographs
+        self._views = views
+        self._generator = generator
+        self.device = torch.device("cuda" if backend.name == "cuda" else "cpu")
+        self.order: list[int] = []
+        """Views of this round that had no turn yet; the last is the next."""
+        self.stages: dict[str, float] = {}
+        """Seconds spent in each part of a step."""
+
+    def next_example(self, reduction: Callable[[Camera], int] = lambda _: 1) -> Example:
+        """The next view: all of them in random order, then all again in another.
+
+        Args:
+            reduction: By how much the photograph of a camera is to be reduced.
+        """
+        with self.timed("read"):
+            if not self.order:
+                count = len(self._photographs)
+                self.order = torch.randperm(count, generator=self._generator).tolist()
+            index = self.order.pop()
+            camera = self._photographs.camera(index)
+            example = self._photographs.example(index, reduction=reduction(camera))
+            mask, alpha = example.mask, example.alpha
+            return Example(
+                index=index,
+                camera=self._views.camera(index, example.camera),
+                photograph=example.photograph.to(self.device),
+                mask=None if mask is None else mask.to(self.device),
+                alpha=None if alpha is None else alpha.to(self.device),
+            )
+
+    def gradients(
+        self, parameters: Parameters, example: Example, *, settings: StepSettings
+    ) -> StepGradients:
+        """Render the view of an example and go back from the loss. Changes no parameters.
+
+        Raises:
+            SplatsegError: If the loss is no longer a number.
+        """
+        options = settings.render_options
+        with self.timed("gather"):
+            rows = rows_in_view(parameters, example.camera, near=options.near)
+            gaussians = gathered(parameters, rows)
+            if settings.extra_loss is not None:
+                # Whoever draws them again draws them as they are drawn here.
+                gaussians = gaussians.replace(
+                    antialiased=options.antialiased, low_pass=options.low_pass
+                )
+        with self.timed("render"):
+            screen = None
+            if settings.screen:
+                screen = torch.zeros_like(gaussians.means[:, :2]).requires_grad_()
+            camera = self._views.camera_to_draw(example.index, example.camera)
+            rendered = self._backend.render(gaussians, camera, None, options=options, screen=screen)
+        with self.timed("loss"):
+            image, photograph = self._over_background(rendered, example)
+            loss = l1_dssim(
+                image, photograph, mask=example.mask, dssim_weight=self._options.dssim_weight
+            )
+            depth = self._depth_loss(rendered, example, progress=settings.progress)
+            extra = None
+            if settings.extra_loss is not None:
+                view = self._views.view(example.index)
+                extra = settings.extra_loss(view, gaussians, rows)
+        self._check_finite(loss, depth, extra, step=settings.step)
+        with self.timed("backward"):
+            outputs, gradients = [image], [loss.gradient]
+            if depth is not None:
+                outputs.append(rendered.depth)
+                gradients.append(depth.gradient)
+            if extra is not None and extra.requires_grad:
+                outputs.append(extra)
+                gradients.append(torch.ones_like(extra))
+            torch.autograd.backward(outputs, gradients)
+        return StepGradients(
+            example=example,
+            rows=rows,
+            gaussians=gaussians,
+            loss=loss,
+            screen=None if screen is None else screen.grad,
+        )
+
+    def update(self, state: State, found: StepGradients, *, settings: UpdateSettings) -> None:
+        """Adam's step on the rows that the view showed, in place."""
+        update_rows(*state, gradients_of(found.gaussians), rows=found.rows, settings=settings)
+
+    @contextmanager
+    def timed(self, stage: str) -> Generator[None]:
+        """Count the time that is spent inside towards a stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin
+
+    def _over_background(self, rendered: Rendered, example: Example) -> tuple[Tensor, Tensor]:
+        """Rendering and photograph as they are compared: over one colour, in one exposure."""
+        image, photograph = rendered.image, example.photograph
+        if self._views.exposures is not None:
+            image = self._views.exposures.applied(example.index, image, rendered.alpha)
+        colour = background_colour(self._options.background, generator=self._generator)
+        if colour is not None:
+            colour = colour.to(image)
+            image = image + (1 - rendered.alpha).unsqueeze(-1) * colour
+            if example.alpha is not None:
+                photograph = photograph + (1 - example.alpha).unsqueeze(-1) * colour
+        return image, photograph
+
+    def _depth_loss(
+        self, rendered: Rendered, example: Example, *, progress: float
+    ) -> DepthLoss | None:
+        if self._views.depths is None:
+            return None
+        return self._views.depths.loss(
+            example.index,
+            rendered.depth,
+            rendered.alpha,
+            progress=progress,
+            mask=example.mask,
+        )
+
+    def _check_finite(
+        self, loss: Loss, depth: DepthLoss | None, extra: Tensor | None, *, step: int
+    ) -> None:
+        value = loss.value
+        value += 0.0 if depth is None else depth.value
+        value += 0.0 if extra is None else float(extra.detach())
+        if not math.isfinite(value):
+            raise SplatsegError(
+                f"{self._name}: expected a finite loss, got {value} at step {step}; lower rates "
+                "may help."
+            )
