@@ -144,7 +144,7 @@ def test_what_cannot_be_done_is_said_before_the_work(folder: Path, tmp_path: Pat
         return capsys.readouterr().err
 
     scene = str(tmp_path / "scene")
-    assert "minutes, steps: expected one of the two" in refused(
+    assert "--minutes, --steps: expected one of the two" in refused(
         str(folder), "-o", scene, "--steps", "2", "--minutes", "1"
     )
     assert "expected an empty folder or a new one" in refused(
