@@ -3,24 +3,10 @@
 #include <algorithm>
 #include <cstring>
 
+#include "half.h"
 #include "pool.h"
 
 namespace splatseg {
-namespace {
-
-float float_from_half(uint16_t h) {
-  const uint32_t sign = static_cast<uint32_t>(h & 0x8000u) << 16, e = (h >> 10) & 31u, m = h & 1023u;
-  float f;
-  if (!e) {
-    f = static_cast<float>(m) * 5.9604644775390625e-8f;
-    return sign ? -f : f;
-  }
-  const uint32_t bits = sign | ((e + 112u) << 23) | (m << 13);
-  std::memcpy(&f, &bits, 4);
-  return f;
-}
-
-}  // namespace
 
 void BlockMatrix::build(View& view, int64_t gaussians) {
   const Frame& frame = view.frame();
