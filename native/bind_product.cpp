@@ -65,6 +65,7 @@ void define(nb::module_& m) {
 
 void register_product(nb::module_& m) {
   define<float, Half, uint16_t>(m);
+  define<float, Units, int32_t>(m);
   define<float, float>(m);
   define<float, double>(m);
   define<double, float>(m);

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cstring>
 
-#include "half.h"
 #include "pool.h"
 
 namespace splatseg {
@@ -11,7 +10,12 @@ namespace {
 
 double number(float value) { return value; }
 double number(double value) { return value; }
-double number(Half value) { return float_from_half(value.bits); }
+double number(Units value) { return value.count * 5.9604644775390625e-8; }
+double number(Half value) {
+  const int64_t exponent = value.bits >> 10 & 31, fraction = value.bits & 1023;
+  const int64_t units = exponent ? (1024 | fraction) << (exponent - 1) : fraction;
+  return static_cast<double>(value.bits & 0x8000 ? -units : units) * 5.9604644775390625e-8;
+}
 
 // A row with more of all columns than this is read off from its first column to its last, one
 // with fewer by the list of its columns, sorted.
@@ -104,6 +108,7 @@ SparseProduct sparse_product(const int64_t* indptr, const int32_t* columns, cons
                                               const int64_t*, const int64_t*, const int32_t*,  \
                                               const B*, int64_t);
 SPLATSEG_PRODUCT(float, Half)
+SPLATSEG_PRODUCT(float, Units)
 SPLATSEG_PRODUCT(float, float)
 SPLATSEG_PRODUCT(float, double)
 SPLATSEG_PRODUCT(double, float)

@@ -19,6 +19,11 @@ struct Half {
   uint16_t bits;
 };
 
+// A multiple of 2^-24, the smallest number of half precision.
+struct Units {
+  int32_t count;
+};
+
 // C = A B with B's row r in entries begin[r] to end[r]. Every sum is taken in double precision in
 // the order of A's row, whoever takes it; columns come out ascending, without zeros. A's columns
 // must be rows of B, and B's columns below `width`.

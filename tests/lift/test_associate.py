@@ -225,7 +225,7 @@ def test_pairs_that_share_next_to_nothing_are_left_out() -> None:
 
     dense = np.zeros((402, 4))
     dense[0, 0] = dense[:400, 1] = dense[:401, 2] = dense[401, 3] = 1
-    found = _shared(scipy.sparse.csr_matrix(dense)).toarray()
+    found = _shared(scipy.sparse.csr_matrix(dense.T, dtype=np.float32)).toarray()
     whole = dense.T @ dense
     assert whole[0, 1] == 1
     assert whole[0, 2] == 1
