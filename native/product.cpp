@@ -21,6 +21,8 @@ double number(Half value) {
 // with fewer by the list of its columns, sorted.
 constexpr int64_t kFewColumns = 16;
 
+constexpr int64_t kAhead = 8;
+
 struct Scratch {
   std::vector<double> sums;      // of all columns; zero between rows
   std::vector<int32_t> touched;  // columns of this row; one may come twice if its sum was zero
@@ -75,6 +77,12 @@ SparseProduct sparse_product(const int64_t* indptr, const int32_t* columns, cons
     double* sums = mine.sums.data();
     for (int64_t row = from; row < to; ++row) {
       for (int64_t a = indptr[row]; a < indptr[row + 1]; ++a) {
+        // Rows of B lie anywhere; a row's beginning is asked for some rows ahead.
+        if (a + kAhead < indptr[row + 1]) {
+          const int64_t next = begin[columns[a + kAhead]];
+          __builtin_prefetch(of_columns + next);
+          __builtin_prefetch(of_values + next);
+        }
         const double factor = number(values[a]);
         const int32_t middle = columns[a];
         for (int64_t b = begin[middle]; b < end[middle]; ++b) {

@@ -129,20 +129,22 @@ class SegmentTable:
         segments share many Gaussians, a sample of them speaks for all (`_sample`). Pairs that
         share next to nothing are left out.
         """
-        import scipy.sparse
-
         held = np.zeros(self.gaussians, np.int64)
         for entries in self._slices():
             holds, _ = self._shares(entries)
             held += np.bincount(self.gaussian[entries][holds], minlength=self.gaussians)
         worth = self._sample(held)
         masses = self._weighted_masses(held, worth)
-        sights: Any = self.sights().tocsr()
-        sights = scipy.sparse.diags_array(np.sqrt(worth)).tocsr() @ sights
-        sights.eliminate_zeros()
-        rows = sights.indptr.astype(np.int64), sights.indices, sights.data
-        seen = sparse_product(masses, rows, len(self.views))
+        seen = sparse_product(masses, _entries(self._weighted_sights(worth)), len(self.views))
         return Agreement(shared=_shared(masses), seen=seen, view=self.view)
+
+    def _weighted_sights(self, worth: NDArray[np.float64]) -> Any:
+        """Sparse (Gaussians, views), float64: sights times the root of worth, where there is any."""
+        sights = self.sights().tocsr()
+        kept = np.repeat(worth > 0, np.diff(sights.indptr))
+        ends = np.append(0, np.cumsum(np.where(worth > 0, np.diff(sights.indptr), 0)))
+        root = np.repeat(np.sqrt(worth), np.diff(ends))
+        return type(sights)((root * sights.data[kept], sights.indices[kept], ends), sights.shape)
 
     def _weighted_masses(self, held: NDArray[np.int64], worth: NDArray[np.float64]) -> Any:
         """Sparse (segments, Gaussians): shares times the root of what the view sees and of worth.
