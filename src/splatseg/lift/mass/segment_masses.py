@@ -1,7 +1,8 @@
 r"""How much of each Gaussian each segment of a view holds: two sparse products a view.
 
-With the pieces of the image that no segment divides (`lift._pieces`) as rows of a sparse matrix P
-over its pixels, and the segments as rows of a sparse 0/1 matrix M over the pieces, all masses are
+With the pieces of the image that no segment divides (`lift.mass.pieces`) as rows of a sparse
+matrix P over its pixels, and the segments as rows of a sparse 0/1 matrix M over the pieces, all
+masses are
 
 .. math:: M (P W), \qquad m_{si} = \sum_{p \in s} w_{pi}
 
@@ -23,8 +24,8 @@ from torch import Tensor
 
 from splatseg.core import Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.lift._pieces import Pieces, pieces_of
-from splatseg.lift._products import sparse_product
+from splatseg.lift.mass.pieces import Pieces, pieces_of
+from splatseg.lift.mass.products import sparse_product
 from splatseg.render import ImageWeights, RenderOptions, SparseWeights, options_for, weights
 from splatseg.render.warp import straightened, warp_into_photograph
 

@@ -139,7 +139,7 @@ class SegmentTable:
         return Agreement(shared=_shared(masses), seen=seen, view=self.view)
 
     def _weighted_sights(self, worth: NDArray[np.float64]) -> Any:
-        """Sparse (Gaussians, views), float64: sights times the root of worth, where there is any."""
+        """Sparse (Gaussians, views): sights times the root of worth, where there is any."""
         sights = self.sights().tocsr()
         kept = np.repeat(worth > 0, np.diff(sights.indptr))
         ends = np.append(0, np.cumsum(np.where(worth > 0, np.diff(sights.indptr), 0)))

@@ -29,8 +29,6 @@ def sparse_product(
     import scipy.sparse
 
     indptr, columns, values = right
-    if int(left.indices.max(initial=-1)) >= len(indptr) - 1:
-        raise IndexError(f"left: expected {len(indptr) - 1} columns, got more.")
     found = _native.sparse_product(
         left.indptr.astype(np.int64),
         left.indices.astype(np.int32, copy=False),
