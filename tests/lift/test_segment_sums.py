@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from splatseg import _native
+from splatseg.lift.segments import shared
 from splatseg.lift.segments import table as module
 from splatseg.lift.segments.table import SegmentTable
 
@@ -40,7 +41,7 @@ def rows(table: SegmentTable):
 @pytest.fixture(autouse=True)
 def few_at_a_time(monkeypatch) -> None:
     monkeypatch.setattr(module, "_ENTRIES", 37)
-    monkeypatch.setattr(module, "_BLOCK", 5)
+    monkeypatch.setattr(shared, "_BLOCK", 5)
 
 
 def test_votes(table, rng) -> None:

@@ -44,3 +44,8 @@ def sparse_product(
     )
     rows.has_sorted_indices = True
     return rows
+
+
+def entries_of(rows: Any) -> Entries:
+    """Where rows of a scipy matrix begin, their columns and values."""
+    return rows.indptr.astype(np.int64), rows.indices.astype(np.int32, copy=False), rows.data

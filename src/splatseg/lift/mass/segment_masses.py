@@ -25,7 +25,7 @@ from torch import Tensor
 from splatseg.core import Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
 from splatseg.lift.mass.pieces import Pieces, pieces_of
-from splatseg.lift.mass.products import sparse_product
+from splatseg.lift.mass.products import entries_of, sparse_product
 from splatseg.render import ImageWeights, RenderOptions, SparseWeights, options_for, weights
 from splatseg.render.warp import straightened, warp_into_photograph
 
@@ -86,35 +86,44 @@ def view_masses(
     import scipy.sparse
 
     pieces = pieces_of(segments)
-    pinhole = straightened(camera)
-    seen_at = None if camera.is_pinhole else _pinhole_pixels(camera)
     options = options or options_for(gaussians, backend)
-    sums: list[Any] = []
-    visible = torch.zeros(len(gaussians))
-    bands = list(_bands(pinhole.height * pinhole.width))
-    if len(bands) == 1 and seen_at is None and pieces.weight is None:
-        sums.append(_image_sums(pieces, gaussians, camera, options=options, backend=backend))
-        bands = []
-    for band in bands:
-        rows = _rows(gaussians, pinhole, band, options=options, backend=backend)
-        sums.append(_piece_sums(_band_pieces(pieces, band, seen_at), rows))
-        if pieces.weight is not None:
-            visible += _visible(rows, band, seen_at)
+    sums, visible = _sums(pieces, gaussians, camera, options=options, backend=backend)
+    bands = scipy.sparse.hstack([pieces.segments] * len(sums), format="csr", dtype=np.float32)
     of_pieces: Any = scipy.sparse.vstack(sums, format="csr")
-    if pieces.weight is None:
+    found = sparse_product(bands, entries_of(of_pieces), len(gaussians))
+    if visible is None:
         everything = np.bincount(of_pieces.indices, of_pieces.data, minlength=len(gaussians))
         visible = torch.from_numpy(everything.astype(np.float32))
-    found = sparse_product(
-        scipy.sparse.hstack([pieces.segments] * len(sums), format="csr", dtype=np.float32),
-        (of_pieces.indptr.astype(np.int64), of_pieces.indices, of_pieces.data),
-        len(gaussians),
-    )
     return ViewMasses(
         segment=torch.from_numpy(np.repeat(pieces.names, np.diff(found.indptr))),
         gaussian=torch.from_numpy(found.indices.astype(np.int64)),
         weight=torch.from_numpy(found.data.astype(np.float32)),
         visible=visible,
     )
+
+
+def _sums(
+    pieces: Pieces,
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    options: RenderOptions,
+    backend: str,
+) -> tuple[list[Any], Tensor | None]:
+    """Sparse (pieces, Gaussians) of each band, and what all pixels see where pieces do not tell."""
+    pinhole = straightened(camera)
+    bands = list(_bands(pinhole.height * pinhole.width))
+    if len(bands) == 1 and camera.is_pinhole and pieces.weight is None:
+        return [_image_sums(pieces, gaussians, camera, options=options, backend=backend)], None
+    seen_at = None if camera.is_pinhole else _pinhole_pixels(camera)
+    sums: list[Any] = []
+    visible = torch.zeros(len(gaussians))
+    for band in bands:
+        rows = _rows(gaussians, pinhole, band, options=options, backend=backend)
+        sums.append(_piece_sums(_band_pieces(pieces, band, seen_at), rows))
+        if pieces.weight is not None:
+            visible += _visible(rows, band, seen_at)
+    return sums, None if pieces.weight is None else visible
 
 
 def _image_sums(

@@ -34,6 +34,9 @@ class SegmentEntries:
         self._cut = np.zeros(gaussians, np.float32)
         self._last = np.full(gaussians, -1, np.int32)
 
+    def __len__(self) -> int:
+        return len(self._mass)
+
     def add(
         self,
         counts: NDArray[np.int64],

@@ -25,10 +25,11 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.errors import InputError
-from splatseg.lift.mass.products import sparse_product
+from splatseg.lift.mass.products import entries_of, sparse_product
 from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
 from splatseg.lift.segments.clustering import Agreement
 from splatseg.lift.segments.entries import SegmentEntries
+from splatseg.lift.segments.shared import shared_masses
 from splatseg.render import RenderOptions
 
 _LEAST_WEIGHT = 0.05
@@ -42,12 +43,6 @@ _LEAST_MASS = 1e-3
 
 _PAIRS = 4e9
 """Products of pairs of entries at most: about a minute. A sample of Gaussians does beyond it."""
-
-_LEAST_ALIKE = 0.05
-"""Least cosine of two segments' masses: of two sets one a 400th of the other's size reaches it."""
-
-_BLOCK = 512
-"""Segments that are compared with all others at a time."""
 
 _ENTRIES = 1 << 22
 """Entries of the table that are looked at at a time."""
@@ -135,8 +130,8 @@ class SegmentTable:
             held += np.bincount(self.gaussian[entries][holds], minlength=self.gaussians)
         worth = self._sample(held)
         masses = self._weighted_masses(held, worth)
-        seen = sparse_product(masses, _entries(self._weighted_sights(worth)), len(self.views))
-        return Agreement(shared=_shared(masses), seen=seen, view=self.view)
+        seen = sparse_product(masses, entries_of(self._weighted_sights(worth)), len(self.views))
+        return Agreement(shared=shared_masses(masses), seen=seen, view=self.view)
 
     def _weighted_sights(self, worth: NDArray[np.float64]) -> Any:
         """Sparse (Gaussians, views): sights times the root of worth, where there is any."""
@@ -216,42 +211,6 @@ class SegmentTable:
         return np.where(taken, 1 / np.maximum(chance, 1e-12), 0.0)
 
 
-def _shared(masses: Any) -> Any:
-    """Products of the rows with each other, without those of nearly nothing, sparse.
-
-    Args:
-        masses: Sparse (segments, Gaussians), float32.
-    """
-    import scipy.sparse
-
-    turned: Any = masses.T.tocsr()
-    count, width = masses.shape
-    squares = np.square(masses.data, dtype=np.float64)
-    length = np.sqrt(np.bincount(_rows_of(masses), squares, minlength=count))
-    begin, entries = turned.indptr[:-1].astype(np.int64), _entries(turned)
-    blocks: list[Any] = []
-    for start in range(0, count, _BLOCK):
-        rows = masses[start : start + _BLOCK]
-        block = sparse_product(rows, entries, count, begin=begin).tocoo()
-        row, column = block.row + start, block.col
-        kept = block.data > _LEAST_ALIKE * length[row] * length[column]
-        kept &= column >= row
-        blocks.append((row[kept], column[kept], block.data[kept].astype(np.float32)))
-        # What is before a block was multiplied with it before.
-        begin += np.bincount(rows.indices, minlength=width)
-    row, column, value = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    upper: Any = scipy.sparse.csr_matrix((value, (row, column)), shape=(count, count))
-    return (upper + scipy.sparse.triu(upper, 1).T).tocsr()
-
-
-def _entries(rows: Any) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[Any]]:
-    return rows.indptr.astype(np.int64), rows.indices, rows.data
-
-
-def _rows_of(rows: Any) -> NDArray[np.int32]:
-    return np.repeat(np.arange(rows.shape[0], dtype=np.int32), np.diff(rows.indptr))
-
-
 def segment_table(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -312,7 +271,7 @@ def segment_table(
     view_of, name_of, category, score = (np.array(column) for column in zip(*rows, strict=True))
     gaussian, segment, mass, seen = entries.result()
     starts = np.searchsorted(segment, np.arange(len(rows) + 1)).tolist()
-    size = [mass[a:b].sum(dtype=np.float64) for a, b in pairwise(starts)]
+    size = [float(mass[a:b].sum(dtype=np.float64)) for a, b in pairwise(starts)]
     return SegmentTable(
         gaussians=len(gaussians),
         gaussian=gaussian,
