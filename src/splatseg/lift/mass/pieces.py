@@ -56,7 +56,7 @@ def pieces_of(segments: LabelMap | MaskSet) -> Pieces:
     ids = segments.ids.cpu().reshape(-1).numpy()
     found, piece = np.unique(ids, return_inverse=True)
     confidence = segments.confidence
-    all_of: Any = scipy.sparse.identity(len(found), np.float32, format="csr")
+    all_of: Any = scipy.sparse.identity(len(found), "f4", format="csr")
     known = np.flatnonzero(found != UNLABELLED)
     return Pieces(
         names=found[known].astype(np.int64),

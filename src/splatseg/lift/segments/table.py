@@ -171,7 +171,8 @@ class SegmentTable:
     def _shares(self, entries: slice) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """Which entries are more than a touch, and each one's share of what its view sees."""
         seen = self.seen[entries]
-        share = self.mass[entries] / np.maximum(seen, _LEAST_MASS)
+        least = np.maximum(seen, _LEAST_MASS)
+        share: NDArray[np.float32] = np.divide(self.mass[entries], least, dtype=np.float32)
         return (seen > _LEAST_WEIGHT) & (share > _LEAST_SHARE), share
 
     def _slices(self) -> Iterator[slice]:
