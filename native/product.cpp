@@ -17,8 +17,9 @@ double number(Half value) {
   return static_cast<double>(value.bits & 0x8000 ? -units : units) * 5.9604644775390625e-8;
 }
 
-// A row with more of all columns than this is read off from its first column to its last, one
-// with fewer by the list of its columns, sorted.
+// Rows of at most so many columns are read off from the first to the last, without a list of those
+// that are there. Others are only if a 16th of the columns is there, else by their list, sorted.
+constexpr int64_t kNarrow = 1 << 15;
 constexpr int64_t kFewColumns = 16;
 
 constexpr int64_t kAhead = 8;
@@ -43,10 +44,10 @@ struct Scratch {
   // Entries of the row, which are moved behind those of the rows before it.
   int64_t finish_row() {
     const int64_t before = values.size(), width = static_cast<int64_t>(sums.size());
-    const int64_t most = std::min(static_cast<int64_t>(touched.size()), width);
+    const int64_t most = width <= kNarrow ? width : std::min(static_cast<int64_t>(touched.size()), width);
     columns.reserve(before + most);
     values.reserve(before + most);
-    if (static_cast<int64_t>(touched.size()) * kFewColumns < width) {
+    if (width > kNarrow && static_cast<int64_t>(touched.size()) * kFewColumns < width) {
       std::sort(touched.begin(), touched.end());
       for (int32_t column : touched) append(column);
     } else {
@@ -85,6 +86,11 @@ SparseProduct sparse_product(const int64_t* indptr, const int32_t* columns, cons
         }
         const double factor = number(values[a]);
         const int32_t middle = columns[a];
+        if (width <= kNarrow) {
+          for (int64_t b = begin[middle]; b < end[middle]; ++b)
+            sums[of_columns[b]] += factor * number(of_values[b]);
+          continue;
+        }
         for (int64_t b = begin[middle]; b < end[middle]; ++b) {
           double& sum = sums[of_columns[b]];
           if (sum == 0) mine.touched.push_back(of_columns[b]);
