@@ -128,6 +128,10 @@ struct Kernels {
   void (*block_weights)(const Frame&, int tile, void* scratch, int32_t* counts, int32_t* ids,
                         uint16_t* weights, int64_t capacity);
 
+  // Sums of a block's half weights over the pixels of `lanes`, in units of 2^-24 and so without
+  // rounding: no weight is above 1.
+  void (*block_sums)(const uint16_t* weights, int64_t count, uint32_t lanes, int32_t* sums);
+
   // out[16 x D] of one block from half weights; acc holds 16 * D floats.
   void (*blocks_forward)(const uint16_t* weights, const int32_t* ids, int64_t count,
                          const float* signal, int channels, int64_t stride, float* acc);

@@ -5,6 +5,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
+#include <memory>
 #include <optional>
 #include <stdexcept>
 
@@ -17,6 +18,7 @@ namespace nb = nanobind;
 namespace splatseg {
 void register_loss(nb::module_& m);
 void register_adam(nb::module_& m);
+void register_product(nb::module_& m);
 }  // namespace splatseg
 
 namespace splatseg {
@@ -194,6 +196,14 @@ nb::ndarray<nb::numpy, T, nb::ndim<1>> hand_over(std::vector<T>&& values) {
   return nb::ndarray<nb::numpy, T, nb::ndim<1>>(kept->data(), {kept->size()}, owner);
 }
 
+// A part of something that NumPy's arrays keep alive together.
+template <class T, class Owner>
+nb::ndarray<nb::numpy, T> lent(std::shared_ptr<Owner> owner, T* data, size_t size) {
+  nb::capsule keeps(new std::shared_ptr<Owner>(std::move(owner)),
+                    [](void* p) noexcept { delete static_cast<std::shared_ptr<Owner>*>(p); });
+  return nb::ndarray<nb::numpy, T>(data, {size}, keeps);
+}
+
 }  // namespace
 }  // namespace splatseg
 
@@ -310,6 +320,21 @@ NB_MODULE(_native, m) {
              nb::gil_scoped_release release;
              self.fill_rows(indptr.data(), ids.data(), weights.data());
            })
+      .def("sums_of_parts",
+           [](const BlockMatrix& self, const Array<const int32_t>& part) {
+             require(part.size() == static_cast<size_t>(self.width()) * static_cast<size_t>(self.height()),
+                     "part");
+             std::shared_ptr<BlockSums> found;
+             {
+               nb::gil_scoped_release release;
+               found = std::make_shared<BlockSums>(self.sums_of_parts(part.data()));
+             }
+             const size_t entries = static_cast<size_t>(found->ids.size());
+             return nb::make_tuple(lent(found, found->part.data(), found->part.size()),
+                                   lent(found, found->indptr.data(), found->indptr.size()),
+                                   lent(found, found->ids.data(), entries),
+                                   lent(found, found->sums.data(), entries));
+           })
       .def_prop_ro("entries", &BlockMatrix::entries)
       .def_prop_ro("nbytes", &BlockMatrix::bytes);
 
@@ -334,4 +359,5 @@ NB_MODULE(_native, m) {
   });
   register_loss(m);
   register_adam(m);
+  register_product(m);
 }

@@ -63,4 +63,18 @@ void block_weights(const Frame& frame, int index, void* scratch, int32_t* counts
   }
 }
 
+void block_sums(const uint16_t* weights, int64_t count, uint32_t lanes, int32_t* sums) {
+  uint32_t wanted[16];
+  for (int l = 0; l < 16; ++l) wanted[l] = lanes >> l & 1 ? ~0u : 0u;
+  for (int64_t i = 0; i < count; ++i) {
+    uint32_t sum = 0;
+    for (int l = 0; l < 16; ++l) {
+      const uint32_t h = weights[i * 16 + l], exponent = h >> 10, fraction = h & 1023u;
+      const uint32_t normal = (1024u | fraction) << ((exponent - 1u) & 31u);
+      sum += (exponent ? normal : fraction) & wanted[l];
+    }
+    sums[i] = static_cast<int32_t>(sum);
+  }
+}
+
 }  // namespace splatseg::SPLATSEG_ISA

@@ -19,6 +19,7 @@ SPLATSEG_KERNEL(backward_colour)
 SPLATSEG_KERNEL(backward_features)
 SPLATSEG_KERNEL(chain)
 SPLATSEG_KERNEL(block_weights)
+SPLATSEG_KERNEL(block_sums)
 SPLATSEG_KERNEL(blocks_forward)
 SPLATSEG_KERNEL(blocks_adjoint)
 SPLATSEG_KERNEL(tile_weights)
@@ -26,7 +27,7 @@ SPLATSEG_KERNEL(tile_weights)
 const Kernels& table() {
   static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, find_tiles, forward_colour,
                                   forward_features, adjoint, backward_colour, backward_features,
-                                  chain, block_weights, blocks_forward, blocks_adjoint,
+                                  chain, block_weights, block_sums, blocks_forward, blocks_adjoint,
                                   tile_weights};
   return kernels;
 }

@@ -187,6 +187,102 @@ void BlockMatrix::fill_rows(const int64_t* indptr, int32_t* ids, uint16_t* weigh
   });
 }
 
+namespace {
+
+// What one thread finds in its blocks.
+struct PartScratch {
+  Buffer<int32_t> ids, sums;
+  std::vector<int32_t> part;
+  std::vector<int64_t> counts;
+
+  void add(const uint16_t* weights, const int32_t* block_ids, int64_t count, uint32_t lanes,
+           int32_t of) {
+    const int64_t before = ids.size();
+    int32_t* to_ids = ids.reserve(before + count) + before;
+    int32_t* to_sums = sums.reserve(before + count) + before;
+    kernels().block_sums(weights, count, lanes, to_sums);
+    int64_t kept = 0;
+    for (int64_t i = 0; i < count; ++i) {
+      to_ids[kept] = block_ids[i];
+      to_sums[kept] = to_sums[i];
+      kept += to_sums[i] != 0;
+    }
+    ids.set_size(before + kept);
+    sums.set_size(before + kept);
+    part.push_back(of);
+    counts.push_back(kept);
+  }
+};
+
+}  // namespace
+
+BlockSums BlockMatrix::sums_of_parts(const int32_t* part) const {
+  // Blocks in runs: each run is one thread's, and runs are put together in their order.
+  constexpr int64_t kRun = 256;
+  const int64_t blocks = static_cast<int64_t>(tiles_x_) * tiles_y_ * 16;
+  const int64_t runs = (blocks + kRun - 1) / kRun;
+  std::vector<PartScratch> found(static_cast<size_t>(threads()));
+  struct Place {
+    size_t thread;
+    size_t row, rows;
+    int64_t entry, entries;
+  };
+  std::vector<Place> places(static_cast<size_t>(runs));
+  parallel_for_thread(runs, 1, [&](int thread, int64_t from, int64_t to) {
+    PartScratch& mine = found[static_cast<size_t>(thread)];
+    for (int64_t run = from; run < to; ++run) {
+      Place& place = places[static_cast<size_t>(run)];
+      place = {static_cast<size_t>(thread), mine.part.size(), 0, mine.ids.size(), 0};
+      for (int64_t i = run * kRun; i < std::min(blocks, (run + 1) * kRun); ++i) {
+        const int64_t begin = begin_[static_cast<size_t>(i)];
+        const int64_t count = begin_[static_cast<size_t>(i) + 1] - begin;
+        if (!count) continue;
+        const int64_t tile = i >> 4, b = i & 15;
+        int32_t of[16];
+        uint32_t left = 0;
+        for (int l = 0; l < 16; ++l) {
+          const int64_t x = tile % tiles_x_ * kTile + (b & 3) * 4 + (l & 3);
+          const int64_t y = tile / tiles_x_ * kTile + (b >> 2) * 4 + (l >> 2);
+          of[l] = x < width_ && y < height_ ? part[y * width_ + x] : -1;
+          left |= of[l] >= 0 ? 1u << l : 0u;
+        }
+        while (left) {
+          const int32_t next = of[__builtin_ctz(left)];
+          uint32_t lanes = 0;
+          for (int l = 0; l < 16; ++l) lanes |= of[l] == next ? 1u << l : 0u;
+          mine.add(weights_.data() + begin * 16, ids_.data() + begin, count, lanes, next);
+          left &= ~lanes;
+        }
+      }
+      place.rows = mine.part.size() - place.row;
+      place.entries = mine.ids.size() - place.entry;
+    }
+  });
+  BlockSums all;
+  int64_t entries = 0;
+  all.indptr.push_back(0);
+  for (const Place& place : places) {
+    const PartScratch& source = found[place.thread];
+    for (size_t row = place.row; row < place.row + place.rows; ++row) {
+      all.part.push_back(source.part[row]);
+      all.indptr.push_back(all.indptr.back() + source.counts[row]);
+    }
+    entries += place.entries;
+  }
+  int32_t* ids = all.ids.resize(entries);
+  int32_t* sums = all.sums.resize(entries);
+  int64_t at = 0;
+  for (const Place& place : places) {
+    const PartScratch& source = found[place.thread];
+    const size_t bytes = static_cast<size_t>(place.entries) * 4;
+    if (!bytes) continue;
+    std::memcpy(ids + at, source.ids.data() + place.entry, bytes);
+    std::memcpy(sums + at, source.sums.data() + place.entry, bytes);
+    at += place.entries;
+  }
+  return all;
+}
+
 PixelRows pixel_rows(View& view, const int64_t* pixels, int64_t count, int64_t k) {
   const Frame& frame = view.frame();
   // Pixels by tile, so that a tile is blended once however many of its pixels are asked for.

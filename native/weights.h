@@ -7,6 +7,15 @@
 
 namespace splatseg {
 
+// Weights summed over the pixels that a block and a part of the image share. Row r is of the part
+// `part[r]` and has the entries from indptr[r] on; parts come as often as they meet blocks.
+struct BlockSums {
+  std::vector<int32_t> part;
+  std::vector<int64_t> indptr;
+  Buffer<int32_t> ids;
+  Buffer<int32_t> sums;  // in units of 2^-24
+};
+
 class BlockMatrix {
  public:
   void build(View& view, int64_t gaussians);
@@ -27,6 +36,9 @@ class BlockMatrix {
   // Compressed sparse rows of all pixels; indptr has pixels + 1 entries.
   void count_rows(int64_t* indptr) const;
   void fill_rows(const int64_t* indptr, int32_t* ids, uint16_t* weights) const;
+
+  // `part` of every pixel; pixels of a negative part are left out.
+  BlockSums sums_of_parts(const int32_t* part) const;
 
  private:
   int width_ = 0, height_ = 0, tiles_x_ = 0, tiles_y_ = 0;

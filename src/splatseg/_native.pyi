@@ -4,6 +4,7 @@ Arrays are C-contiguous, on the CPU, and not checked here beyond what memory saf
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,6 +136,9 @@ class BlockMatrix:
     ) -> None: ...
     def count_rows(self, indptr: Tensor, /) -> None: ...
     def fill_rows(self, indptr: Tensor, ids: Tensor, weights: Tensor, /) -> None: ...
+    def sums_of_parts(
+        self, part: Tensor, /
+    ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]: ...
 
 def csr_render(
     indptr: Tensor, ids: Tensor, weights: Tensor, signal: Tensor, image: Tensor, /
@@ -148,6 +152,17 @@ def csr_back_project(
     weight_sums: Tensor,
     /,
 ) -> None: ...
+def sparse_product(
+    indptr: NDArray[np.int64],
+    columns: NDArray[np.int32],
+    values: NDArray[Any],
+    begin: NDArray[np.int64],
+    end: NDArray[np.int64],
+    of_columns: NDArray[np.int32],
+    of_values: NDArray[Any],
+    width: int,
+    /,
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]: ...
 def l1_dssim(
     image: Tensor,
     photograph: Tensor,

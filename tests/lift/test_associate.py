@@ -12,7 +12,8 @@ import torch
 from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import ConfusionOptions
-from splatseg.lift.segments.table import SegmentTable, _shared, segment_table
+from splatseg.lift.segments.shared import shared_masses
+from splatseg.lift.segments.table import SegmentTable, segment_table
 from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, _labels, associate
 
 from .conftest import camera_at, gaussians_at
@@ -225,7 +226,7 @@ def test_pairs_that_share_next_to_nothing_are_left_out() -> None:
 
     dense = np.zeros((402, 4))
     dense[0, 0] = dense[:400, 1] = dense[:401, 2] = dense[401, 3] = 1
-    found = _shared(scipy.sparse.csr_matrix(dense)).toarray()
+    found = shared_masses(scipy.sparse.csr_matrix(dense.T, dtype=np.float32)).toarray()
     whole = dense.T @ dense
     assert whole[0, 1] == 1
     assert whole[0, 2] == 1

@@ -3,6 +3,8 @@
 from splatseg.render._backend import Backend as Backend
 from splatseg.render._backend import BackProjected as BackProjected
 from splatseg.render._backend import Contributors as Contributors
+from splatseg.render._backend import ImageWeights as ImageWeights
+from splatseg.render._backend import PartSums as PartSums
 from splatseg.render._backend import Rendered as Rendered
 from splatseg.render._backend import SparseWeights as SparseWeights
 from splatseg.render._backend import ViewWeights as ViewWeights

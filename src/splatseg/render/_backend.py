@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from jaxtyping import Float, Float16, Int, Int32, Int64
+from jaxtyping import Float, Float16, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
@@ -88,6 +88,34 @@ class ViewWeights(ABC):
     @abstractmethod
     def back_project(self, image: Float[Tensor, "pixels channels"]) -> BackProjected:
         """``W.T @ image`` and ``W.T @ 1``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PartSums:
+    """Rows of W summed over parts of an image, as compressed sparse rows."""
+
+    indptr: Int64[Tensor, "parts_plus_1"]
+    """Where the entries of each part begin."""
+
+    ids: Int32[Tensor, "entries"]
+    """Gaussians, ascending in each part."""
+
+    sums: Float64[Tensor, "entries"]
+    """Their weights summed over the pixels of the part, above 0."""
+
+
+class ImageWeights(ViewWeights):
+    """W of a whole image, in blocks of 4 x 4 pixels."""
+
+    @abstractmethod
+    def part_sums(self, part: Int32[Tensor, "pixels"]) -> PartSums:
+        """Sum W over each part of the image.
+
+        Weights are half precision and sums double: they are exact.
+
+        Args:
+            part: The part of each pixel, row by row, from 0; negative where it is in none.
+        """
 
 
 class SparseWeights(ViewWeights):

@@ -1,11 +1,15 @@
-r"""How much of each Gaussian each segment of a view holds: one sparse product a view.
+r"""How much of each Gaussian each segment of a view holds: two sparse products a view.
 
-With the masks of a view as rows of a sparse 0/1 matrix M over its pixels, all their masses are
+With the pieces of the image that no segment divides (`lift.mass.pieces`) as rows of a sparse
+matrix P over its pixels, and the segments as rows of a sparse 0/1 matrix M over the pieces, all
+masses are
 
-.. math:: M W, \qquad m_{si} = \sum_{p \in s} w_{pi}
+.. math:: M (P W), \qquad m_{si} = \sum_{p \in s} w_{pi}
 
-whose cost is the entries of W once for each mask over their pixel, whatever the number of masks:
-a label map costs the same with three ids and with three thousand. Masks may overlap.
+The first product costs the entries of W once, however many segments there are and however many
+of them lie over each other; the second costs the few Gaussians of each piece once for each of
+the segments over it. Weights of pixels are half precision and sums double, so that a sum of
+weights is exact and rounded once: it depends neither on an order nor on how masks overlap.
 """
 
 from collections.abc import Iterator
@@ -18,13 +22,16 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, MaskSet
+from splatseg.core import Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.render import RenderOptions, SparseWeights, options_for, weights
+from splatseg.lift.mass.pieces import Pieces, pieces_of
+from splatseg.lift.mass.products import entries_of, sparse_product
+from splatseg.render import ImageWeights, RenderOptions, SparseWeights, options_for, weights
 from splatseg.render.warp import straightened, warp_into_photograph
 
-_BAND = 1 << 18
-"""Pixels whose rows of W are held at a time; a pixel of a dense scene has 150 entries."""
+_BAND = 1 << 19
+"""Pixels whose rows of W are held at a time; a pixel of a dense scene has 150 entries of 6 bytes.
+Rows of a whole image are made several times faster than those of a part of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,74 +83,106 @@ def view_masses(
             f"segments: expected {camera.width}x{camera.height} pixels, the camera's, "
             f"got {segments.width}x{segments.height}."
         )
-    from scipy import sparse
+    import scipy.sparse
 
-    names, members, pixels, values = _members(segments)
-    pinhole = straightened(camera)
-    counts = np.ones(pinhole.height * pinhole.width, np.float32)
-    if not camera.is_pinhole:
-        seen_at = _pinhole_pixels(camera)
-        counts = np.bincount(seen_at[seen_at >= 0], minlength=len(counts)).astype(np.float32)
-        there = seen_at[pixels] >= 0
-        members, pixels, values = members[there], seen_at[pixels][there], values[there]
-    shape = (len(names), len(counts))
-    table: Any = sparse.csr_matrix((values, (members, pixels)), shape=shape, dtype=np.float32)
-    found: Any = sparse.csr_matrix((len(names), len(gaussians)), dtype=np.float32)
-    visible = torch.zeros(len(gaussians))
+    pieces = pieces_of(segments)
     options = options or options_for(gaussians, backend)
-    for band in _bands(len(counts)):
-        rows = _rows(gaussians, pinhole, band, options=options, backend=backend)
-        matrix: Any = sparse.csr_matrix(
-            (
-                rows.weights.cpu().float().numpy(),
-                rows.ids.cpu().numpy(),
-                rows.indptr.cpu().to(torch.int32).numpy(),
-            ),
-            shape=rows.shape,
-        )
-        found = found + table[:, band] @ matrix
-        here = torch.from_numpy(counts[band]).unsqueeze(1)
-        visible += rows.back_project(here.to(rows.weights.device)).sums[:, 0].cpu()
-    found.eliminate_zeros()
-    found.sort_indices()
-    per_segment = np.diff(found.indptr)
+    sums, visible = _sums(pieces, gaussians, camera, options=options, backend=backend)
+    bands = scipy.sparse.hstack([pieces.segments] * len(sums), format="csr", dtype=np.float32)
+    of_pieces: Any = scipy.sparse.vstack(sums, format="csr")
+    found = sparse_product(bands, entries_of(of_pieces), len(gaussians))
+    if visible is None:
+        everything = np.bincount(of_pieces.indices, of_pieces.data, minlength=len(gaussians))
+        visible = torch.from_numpy(everything.astype(np.float32))
     return ViewMasses(
-        segment=torch.from_numpy(np.repeat(names, per_segment)),
+        segment=torch.from_numpy(np.repeat(pieces.names, np.diff(found.indptr))),
         gaussian=torch.from_numpy(found.indices.astype(np.int64)),
         weight=torch.from_numpy(found.data.astype(np.float32)),
         visible=visible,
     )
 
 
-def _members(
-    segments: LabelMap | MaskSet,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Names of the segments, and for each of their pixels: place of the name, pixel, weight."""
-    if isinstance(segments, LabelMap):
-        ids = segments.ids.cpu().reshape(-1).numpy()
-        names, place = np.unique(ids, return_inverse=True)
-        pixels = np.flatnonzero(ids != UNLABELLED)
-        confidence = segments.confidence
-        values = (
-            np.ones(len(pixels), np.float32)
-            if confidence is None
-            else confidence.cpu().float().reshape(-1).numpy()[pixels]
-        )
-        return names.astype(np.int64), place.reshape(-1)[pixels].astype(np.int64), pixels, values
-    # Run lengths go down the columns; pixels are counted along the rows.
-    height, width = segments.height, segments.width
-    found = [np.zeros(0, np.int64)]
-    for mask in segments.masks:
-        ends = np.cumsum(mask.counts, dtype=np.int64)
-        lengths = mask.counts[1::2].astype(np.int64)
-        starts = ends[1::2] - lengths
-        within = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-        down = np.repeat(starts, lengths) + within
-        found.append(down % height * width + down // height)
-    pixels = np.concatenate(found)
-    names = np.arange(len(segments), dtype=np.int64)
-    members = np.repeat(names, [len(part) for part in found[1:]])
-    return names, members, pixels, np.ones(len(pixels), np.float32)
+def _sums(
+    pieces: Pieces,
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    options: RenderOptions,
+    backend: str,
+) -> tuple[list[Any], Tensor | None]:
+    """Sparse (pieces, Gaussians) of each band, and what all pixels see where pieces do not tell."""
+    pinhole = straightened(camera)
+    bands = list(_bands(pinhole.height * pinhole.width))
+    if len(bands) == 1 and camera.is_pinhole and pieces.weight is None:
+        return [_image_sums(pieces, gaussians, camera, options=options, backend=backend)], None
+    seen_at = None if camera.is_pinhole else _pinhole_pixels(camera)
+    sums: list[Any] = []
+    visible = torch.zeros(len(gaussians))
+    for band in bands:
+        rows = _rows(gaussians, pinhole, band, options=options, backend=backend)
+        sums.append(_piece_sums(_band_pieces(pieces, band, seen_at), rows))
+        if pieces.weight is not None:
+            visible += _visible(rows, band, seen_at)
+    return sums, None if pieces.weight is None else visible
+
+
+def _image_sums(
+    pieces: Pieces,
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    options: RenderOptions,
+    backend: str,
+) -> Any:
+    """Sparse (pieces, Gaussians) of a whole image: the faster way, without rows of pixels."""
+    import scipy.sparse
+
+    image = weights(gaussians, camera, layout="blocks", options=options, backend=backend)
+    if not isinstance(image, ImageWeights):
+        raise TypeError(f"weights: expected those of an image, got {type(image).__name__}.")
+    part = torch.from_numpy(pieces.piece).to(gaussians.device)
+    found = image.part_sums(part)
+    return scipy.sparse.csr_matrix(
+        (found.sums.cpu().numpy(), found.ids.cpu().numpy(), found.indptr.cpu().numpy()),
+        shape=(pieces.segments.shape[1], len(gaussians)),
+    )
+
+
+def _band_pieces(pieces: Pieces, band: slice, seen_at: NDArray[np.int64] | None) -> Any:
+    """Sparse (pieces, pixels of the band): what each pixel of W counts for each piece."""
+    import scipy.sparse
+
+    if seen_at is None:
+        piece, column = pieces.piece[band], np.arange(band.stop - band.start)
+        weight = None if pieces.weight is None else pieces.weight[band]
+    else:
+        within = (seen_at >= band.start) & (seen_at < band.stop)
+        piece, column = pieces.piece[within], seen_at[within] - band.start
+        weight = None if pieces.weight is None else pieces.weight[within]
+    values = np.ones(len(piece), np.float32) if weight is None else weight
+    shape = (pieces.segments.shape[1], band.stop - band.start)
+    return scipy.sparse.csr_matrix((values, (piece, column)), shape=shape, dtype=np.float32)
+
+
+def _piece_sums(pixels: Any, rows: SparseWeights) -> Any:
+    """Sparse (pieces, Gaussians): weights summed over the pixels of each piece."""
+    weights = rows.weights.cpu()
+    values = weights.view(torch.uint16) if weights.dtype == torch.float16 else weights.float()
+    entries = rows.indptr.cpu().numpy(), rows.ids.cpu().numpy(), values.numpy()
+    return sparse_product(pixels, entries, rows.shape[1])
+
+
+def _visible(
+    rows: SparseWeights, band: slice, seen_at: NDArray[np.int64] | None
+) -> Float[Tensor, "n"]:
+    """Weights summed over all pixels of the photograph that fall into the band."""
+    count = band.stop - band.start
+    if seen_at is None:
+        pixels = torch.ones(count, 1)
+    else:
+        within = seen_at[(seen_at >= band.start) & (seen_at < band.stop)] - band.start
+        pixels = torch.from_numpy(np.bincount(within, minlength=count)).float().unsqueeze(1)
+    return rows.back_project(pixels.to(rows.weights.device)).sums[:, 0].cpu()
 
 
 def _pinhole_pixels(camera: Camera) -> NDArray[np.int64]:

@@ -4,8 +4,9 @@ Views are taken in the order of their names and segments in that of their first 
 neither the order in which views come nor what their segments are called has any influence.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,11 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.errors import InputError
-from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.mass.products import entries_of, sparse_product
+from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
 from splatseg.lift.segments.clustering import Agreement
+from splatseg.lift.segments.entries import SegmentEntries
+from splatseg.lift.segments.shared import shared_masses
 from splatseg.render import RenderOptions
 
 _LEAST_WEIGHT = 0.05
@@ -40,11 +44,8 @@ _LEAST_MASS = 1e-3
 _PAIRS = 4e9
 """Products of pairs of entries at most: about a minute. A sample of Gaussians does beyond it."""
 
-_LEAST_ALIKE = 0.05
-"""Least cosine of two segments' masses: of two sets one a 400th of the other's size reaches it."""
-
-_BLOCK = 512
-"""Segments that are compared with all others at a time."""
+_ENTRIES = 1 << 22
+"""Entries of the table that are looked at at a time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,24 +87,32 @@ class SegmentTable:
         """Sparse (Gaussians, groups): mass by group; segments of group -1 have no vote."""
         import scipy.sparse
 
-        of = group[self.segment]
-        there = of >= 0
-        values = self.mass[there] * weight[self.segment[there]]
-        shape = (self.gaussians, int(group.max(initial=-1)) + 1)
-        return scipy.sparse.csr_matrix((values, (self.gaussian[there], of[there])), shape=shape)
+        there = np.flatnonzero(group >= 0)
+        join: Any = scipy.sparse.csr_matrix(
+            (weight[there].astype(np.float64), (group[there], there)),
+            shape=(int(group.max(initial=-1)) + 1, len(group)),
+        )
+        rows = self._starts(), self.gaussian, self.mass
+        return sparse_product(join, rows, self.gaussians).T.tocsr()
 
     def sights(self) -> Any:
         """Sparse (Gaussians, views): the square root of what each view sees of each Gaussian."""
         import scipy.sparse
 
-        told = self.seen > _LEAST_WEIGHT
-        # Segments of one view repeat what that view sees of a Gaussian; it is wanted once.
-        place = self.view[self.segment[told]] * self.gaussians + self.gaussian[told]
-        places, first = np.unique(place, return_index=True)
+        bounds = self._starts()[np.searchsorted(self.view, np.arange(len(self.views) + 1))]
+        seen = np.zeros(self.gaussians, np.float32)
+        found: list[tuple[NDArray[np.int32], NDArray[np.float32]]] = []
+        for start, stop in pairwise(bounds.tolist()):
+            # Segments of one view repeat what that view sees of a Gaussian; it is wanted once.
+            seen[:] = 0
+            seen[self.gaussian[start:stop]] = self.seen[start:stop]
+            known = np.flatnonzero(seen > _LEAST_WEIGHT).astype(np.int32)
+            found.append((known, np.sqrt(seen[known])))
         return scipy.sparse.csc_matrix(
             (
-                np.sqrt(self.seen[told][first]),
-                (places % self.gaussians, places // self.gaussians),
+                np.concatenate([np.zeros(0, np.float32), *(values for _, values in found)]),
+                np.concatenate([np.zeros(0, np.int32), *(known for known, _ in found)]),
+                np.cumsum([0, *(len(known) for known, _ in found)]),
             ),
             shape=(self.gaussians, len(self.views)),
         )
@@ -115,23 +124,65 @@ class SegmentTable:
         segments share many Gaussians, a sample of them speaks for all (`_sample`). Pairs that
         share next to nothing are left out.
         """
+        held = np.zeros(self.gaussians, np.int64)
+        for entries in self._slices():
+            holds, _ = self._shares(entries)
+            held += np.bincount(self.gaussian[entries][holds], minlength=self.gaussians)
+        worth = self._sample(held)
+        masses = self._weighted_masses(held, worth)
+        seen = sparse_product(masses, entries_of(self._weighted_sights(worth)), len(self.views))
+        return Agreement(shared=shared_masses(masses), seen=seen, view=self.view)
+
+    def _weighted_sights(self, worth: NDArray[np.float64]) -> Any:
+        """Sparse (Gaussians, views): sights times the root of worth, where there is any."""
+        sights = self.sights().tocsr()
+        kept = np.repeat(worth > 0, np.diff(sights.indptr))
+        ends = np.append(0, np.cumsum(np.where(worth > 0, np.diff(sights.indptr), 0)))
+        root = np.repeat(np.sqrt(worth), np.diff(ends))
+        return type(sights)((root * sights.data[kept], sights.indices[kept], ends), sights.shape)
+
+    def _weighted_masses(self, held: NDArray[np.int64], worth: NDArray[np.float64]) -> Any:
+        """Sparse (segments, Gaussians): shares times the root of what the view sees and of worth.
+
+        Args:
+            held: Segments that hold each Gaussian.
+            worth: What each Gaussian counts; those of 0 are left out.
+        """
         import scipy.sparse
 
-        told = self.seen > _LEAST_WEIGHT
-        share = self.mass / np.maximum(self.seen, _LEAST_MASS)
-        root = np.sqrt(self.seen, dtype=np.float32)
-        holds = told & (share > _LEAST_SHARE)
-        worth = self._sample(np.bincount(self.gaussian[holds], minlength=self.gaussians))
-        root *= np.sqrt(worth, dtype=np.float32)[self.gaussian]
-        holds &= worth[self.gaussian] > 0
-        count = len(self.view)
-        masses: Any = scipy.sparse.csr_matrix(
-            ((root * share)[holds], (self.gaussian[holds], self.segment[holds])),
-            shape=(self.gaussians, count),
-        )
-        sights = scipy.sparse.diags(np.sqrt(worth)) @ self.sights()
-        seen = (masses.T @ sights).tocsr()
-        return Agreement(shared=_shared(masses), seen=seen, view=self.view)
+        size = int(held[worth > 0].sum())
+        values, columns = np.empty(size, np.float32), np.empty(size, np.int32)
+        counts = np.zeros(len(self.view), np.int64)
+        root_worth = np.sqrt(worth, dtype=np.float32)
+        end = 0
+        for entries in self._slices():
+            holds, share = self._shares(entries)
+            gaussian = self.gaussian[entries]
+            chosen = np.flatnonzero(holds & (worth[gaussian] > 0))
+            gaussian = gaussian[chosen]
+            root = np.sqrt(self.seen[entries][chosen], dtype=np.float32) * root_worth[gaussian]
+            values[end : end + len(chosen)] = root * share[chosen]
+            columns[end : end + len(chosen)] = gaussian
+            counts += np.bincount(self.segment[entries][chosen], minlength=len(counts))
+            end += len(chosen)
+        shape = (len(counts), self.gaussians)
+        return scipy.sparse.csr_matrix((values, columns, np.append(0, np.cumsum(counts))), shape)
+
+    def _shares(self, entries: slice) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Which entries are more than a touch, and each one's share of what its view sees."""
+        seen = self.seen[entries]
+        least = np.maximum(seen, _LEAST_MASS)
+        share: NDArray[np.float32] = np.divide(self.mass[entries], least, dtype=np.float32)
+        return (seen > _LEAST_WEIGHT) & (share > _LEAST_SHARE), share
+
+    def _slices(self) -> Iterator[slice]:
+        """All entries, a few at a time."""
+        for start in range(0, len(self.gaussian), _ENTRIES):
+            yield slice(start, start + _ENTRIES)
+
+    def _starts(self) -> NDArray[np.int64]:
+        """Where the entries of each segment begin, and where those of the last one end."""
+        return np.searchsorted(self.segment, np.arange(len(self.view) + 1)).astype(np.int64)
 
     def _sample(self, entries: NDArray[np.int64]) -> NDArray[np.float64]:
         """What each Gaussian counts, 0 for those left out, so that the pairs are affordable.
@@ -145,7 +196,9 @@ class SegmentTable:
         worth = np.ones(self.gaussians)
         if pairs.sum() <= _PAIRS:
             return worth
-        size = np.bincount(self.gaussian, self.seen, minlength=self.gaussians)
+        size = np.zeros(self.gaussians)
+        for part in self._slices():
+            size += np.bincount(self.gaussian[part], self.seen[part], minlength=self.gaussians)
         low, high = 0.0, float(1 / max(size[size > 0].min(), 1e-9))
         for _ in range(60):
             middle = (low + high) / 2
@@ -157,24 +210,6 @@ class SegmentTable:
         steps = np.floor(np.cumsum(chance) + 0.5)
         taken = np.diff(steps, prepend=0.0) > 0
         return np.where(taken, 1 / np.maximum(chance, 1e-12), 0.0)
-
-
-def _shared(masses: Any) -> Any:
-    """Products of the columns with each other, without those of nearly nothing, sparse."""
-    import scipy.sparse
-
-    turned = masses.T.tocsr()
-    length = np.sqrt(np.asarray(turned.multiply(turned).sum(axis=1)).ravel())
-    blocks: list[Any] = []
-    for start in range(0, turned.shape[0], _BLOCK):
-        block = (turned[start : start + _BLOCK] @ masses).tocoo()
-        kept = block.data > _LEAST_ALIKE * length[start + block.row] * length[block.col]
-        blocks.append(
-            scipy.sparse.csr_matrix(
-                (block.data[kept], (block.row[kept], block.col[kept])), shape=block.shape
-            )
-        )
-    return scipy.sparse.vstack(blocks).tocsr()
 
 
 def segment_table(
@@ -210,7 +245,7 @@ def segment_table(
         if view.name not in known:
             raise InputError(f"evidence: there are no segments of view {view.name!r}.")
     ordered = sorted(views, key=lambda view: view.name)
-    entries = _Entries(len(gaussians), most_views)
+    entries = SegmentEntries(len(gaussians), most_views)
     rows: list[tuple[int, int, int, float]] = []
     for place, view in enumerate(ordered):
         segments = source.segments_of(view.name)
@@ -225,28 +260,19 @@ def segment_table(
         worth /= segments.height * segments.width
         camera = camera_of_map(view, segments.height, segments.width)
         found = view_masses(gaussians, camera, segments, options=render_options, backend=backend)
-        row_of = {name: len(rows) + i for i, name in enumerate(names)}
         rows += [
             (place, name, categories.get(name, UNLABELLED), score)
             for name, score in zip(names, scores, strict=True)
         ]
-        kept = found.weight > _LEAST_MASS
-        used, compact = torch.unique(found.segment[kept], return_inverse=True)
-        segment = torch.tensor([row_of[int(i)] for i in used.tolist()])
-        gaussian, mass = found.gaussian[kept].numpy(), worth * found.weight[kept].numpy()
-        if isinstance(segments, LabelMap):
-            # Pixels without a label tell nothing; pixels outside all masks do.
-            sight = np.bincount(gaussian, mass, minlength=len(gaussians))
-        else:
-            sight = worth * found.visible.numpy()
-        number = segment[compact].numpy() if len(segment) else np.zeros(0, np.int64)
-        entries.add(gaussian, number, mass, sight[gaussian], place)
+        _add(entries, found, names, worth, outside=isinstance(segments, MaskSet))
         if progress is not None:
             progress(place + 1, len(ordered))
     if not rows:
         raise InputError(f"evidence: expected a segment in {len(views)} views, found none.")
     view_of, name_of, category, score = (np.array(column) for column in zip(*rows, strict=True))
     gaussian, segment, mass, seen = entries.result()
+    starts = np.searchsorted(segment, np.arange(len(rows) + 1)).tolist()
+    size = [float(mass[a:b].sum(dtype=np.float64)) for a, b in pairwise(starts)]
     return SegmentTable(
         gaussians=len(gaussians),
         gaussian=gaussian,
@@ -256,7 +282,7 @@ def segment_table(
         views=tuple(view.name for view in ordered),
         view=view_of.astype(np.int64),
         name=name_of.astype(np.int64),
-        size=np.bincount(segment, mass, minlength=len(rows)).astype(np.float64),
+        size=np.array(size),
         category=category.astype(np.int64),
         score=score.astype(np.float64),
     )
@@ -281,55 +307,34 @@ def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | M
     return replace(segments, height=h, width=w, masks=masks)
 
 
-class _Entries:
-    """Masses so far: of each Gaussian those in the views that see most of it."""
+def _add(
+    entries: SegmentEntries,
+    found: ViewMasses,
+    names: Sequence[int],
+    pixel: float,
+    *,
+    outside: bool,
+) -> None:
+    """Add a view's masses, segments in the order of their names.
 
-    def __init__(self, gaussians: int, most_views: int) -> None:
-        self._most = most_views
-        self._limit = max(2 * most_views * gaussians, 1 << 22)
-        self._parts: list[tuple[NDArray[Any], ...]] = []
-        self._count = 0
-
-    def add(
-        self,
-        gaussian: NDArray[Any],
-        segment: NDArray[Any],
-        mass: NDArray[Any],
-        seen: NDArray[Any],
-        view: int,
-    ) -> None:
-        self._parts.append(
-            (
-                gaussian.astype(np.int32),
-                segment.astype(np.int32),
-                mass.astype(np.float32),
-                seen.astype(np.float32),
-                np.full(len(gaussian), view, np.int32),
-            )
-        )
-        self._count += len(gaussian)
-        if self._count > self._limit:
-            self._parts = [self._best()]
-            self._count = len(self._parts[0][0])
-            # Where segments overlap, the views kept may hold more than was thought.
-            self._limit = max(self._limit, 2 * self._count)
-
-    def result(self) -> tuple[NDArray[Any], ...]:
-        return self._best()[:4]
-
-    def _best(self) -> tuple[NDArray[Any], ...]:
-        """Entries of each Gaussian's `most_views` views with most of it, by segment."""
-        columns = tuple(np.concatenate(column) for column in zip(*self._parts, strict=True))
-        gaussian, segment, _, seen, view = columns
-        order = np.lexsort((segment, view, -seen, gaussian))
-        sorted_gaussian, sorted_view = gaussian[order], view[order]
-        new = np.ones(len(order), bool)
-        new[1:] = (np.diff(sorted_gaussian) != 0) | (np.diff(sorted_view) != 0)
-        run = np.cumsum(new)
-        starts = np.flatnonzero(np.diff(sorted_gaussian, prepend=-1))
-        first = np.repeat(run[starts], np.diff(np.append(starts, len(order))))
-        kept = np.sort(order[run - first < self._most])
-        return tuple(column[kept] for column in columns)
+    Args:
+        entries: What they are added to.
+        found: The masses.
+        names: The segments in order.
+        pixel: Pixels of the segments as they came in one pixel of the masses.
+        outside: Whether pixels in no segment tell something: those outside all masks do, those
+            without a label do not.
+    """
+    count = len(found.visible)
+    segment, gaussian = found.segment.numpy(), found.gaussian.numpy()
+    kept = found.weight.numpy() > _LEAST_MASS
+    segment, gaussian = segment[kept], gaussian[kept].astype(np.int32)
+    mass = (pixel * found.weight.numpy()[kept]).astype(np.float32)
+    sight = pixel * found.visible.numpy() if outside else np.bincount(gaussian, mass, count)
+    bounds = np.searchsorted(segment, names), np.searchsorted(segment, names, side="right")
+    runs = [np.arange(first, last) for first, last in zip(*bounds, strict=True)]
+    order = np.concatenate([np.zeros(0, np.int64), *runs])
+    entries.add(bounds[1] - bounds[0], gaussian[order], mass[order], sight.astype(np.float32))
 
 
 def _in_order(segments: LabelMap | MaskSet) -> tuple[list[int], list[float]]:

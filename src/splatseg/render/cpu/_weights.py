@@ -1,12 +1,13 @@
 """W of one view, kept: blocks of 4 x 4 pixels, or rows of single pixels."""
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float16, Int32, Int64
 from torch import Tensor
 
 from splatseg import _native
 from splatseg._check import check_shape
-from splatseg.render._backend import BackProjected, SparseWeights, ViewWeights
+from splatseg.render._backend import BackProjected, ImageWeights, PartSums, SparseWeights
 from splatseg.render.cpu._view import padded_channels
 
 
@@ -14,7 +15,7 @@ def _float(tensor: Tensor) -> Tensor:
     return tensor.detach().to(torch.float32).contiguous()
 
 
-class CpuBlockWeights(ViewWeights):
+class CpuBlockWeights(ImageWeights):
     """Blocks of 4 x 4 pixels x Gaussians: an int32 id and 16 half-precision weights each."""
 
     def __init__(
@@ -55,6 +56,24 @@ class CpuBlockWeights(ViewWeights):
         if sums.shape[1] != channels:
             sums = sums[:, :channels].contiguous()
         return BackProjected(sums=sums, weights=weights)
+
+    def part_sums(self, part: Int32[Tensor, "pixels"]) -> PartSums:
+        """Sum W over each part of the image, block by block and then part by part."""
+        check_shape("part", part, (self._height * self._width,))
+        of, indptr, ids, sums = self._matrix.sums_of_parts(part.to(torch.int32).contiguous())
+        parts = max(0, int(part.max()) + 1) if len(part) else 0
+        # Within a part the blocks stay in their order.
+        order = np.argsort(of, kind="stable").astype(np.int32)
+        begin = np.searchsorted(of[order], np.arange(parts + 1))
+        ones = np.ones(len(order), np.float32)
+        found = _native.sparse_product(
+            begin, order, ones, indptr[:-1], indptr[1:], ids, sums, self._gaussians
+        )
+        return PartSums(
+            indptr=torch.from_numpy(found[0]),
+            ids=torch.from_numpy(found[1]),
+            sums=torch.from_numpy(found[2]),
+        )
 
 
 class CpuSparseWeights(SparseWeights):

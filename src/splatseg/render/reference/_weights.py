@@ -7,7 +7,12 @@ from jaxtyping import Float, Float16, Int32, Int64
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.render._backend import BackProjected, SparseWeights, ViewWeights
+from splatseg.render._backend import (
+    BackProjected,
+    ImageWeights,
+    PartSums,
+    SparseWeights,
+)
 
 BLOCK = 4
 """Side of a block of pixels."""
@@ -95,7 +100,7 @@ def csr_from_entries(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BlockWeights(ViewWeights):
+class BlockWeights(ImageWeights):
     """W in 4 x 4 blocks of pixels: for each Gaussian in a block one id and 16 weights."""
 
     blocks: Int64[Tensor, "b"]
@@ -153,6 +158,27 @@ class BlockWeights(ViewWeights):
         sums.index_add_(0, columns, torch.einsum("bp,bpc->bc", values, blocks[self.blocks]))
         seen = values.new_zeros(self.gaussians).index_add_(0, columns, values.sum(dim=1))
         return BackProjected(sums=sums, weights=seen)
+
+    def part_sums(self, part: Int32[Tensor, "pixels"]) -> PartSums:
+        """Sum W over each part of the image."""
+        check_shape("part", part, (self.shape[0],))
+        across, pixel = _blocks_of(self.width), torch.arange(BLOCK * BLOCK, device=part.device)
+        row = self.blocks[:, None] // across * BLOCK + pixel // BLOCK
+        column = self.blocks[:, None] % across * BLOCK + pixel % BLOCK
+        blended = self.values > 0
+        of = part.long()[(row * self.width + column)[blended]]
+        ids = self.columns.long()[:, None].expand(-1, BLOCK * BLOCK)[blended]
+        known = of >= 0
+        key, entry = torch.unique((of * self.gaussians + ids)[known], return_inverse=True)
+        sums = torch.zeros(len(key), dtype=torch.float64, device=part.device)
+        sums.index_add_(0, entry, self.values[blended][known].double())
+        parts = max(0, int(part.max()) + 1) if len(part) else 0
+        counts = torch.bincount(key // max(self.gaussians, 1), minlength=parts)
+        return PartSums(
+            indptr=torch.cat((counts.new_zeros(1), counts.cumsum(0))),
+            ids=(key % max(self.gaussians, 1)).to(torch.int32),
+            sums=sums,
+        )
 
 
 def blocks_from_csr(weights: CsrWeights, width: int, height: int) -> BlockWeights:

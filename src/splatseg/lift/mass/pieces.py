@@ -1,0 +1,115 @@
+"""The pixels of a view divided into pieces that lie in the same segments.
+
+Masks that are nested or overlap share most of their pixels. What is summed over pixels is summed
+over every piece once, and a segment is the sum of its pieces: the pixels are read once, however
+many segments they lie in.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core import UNLABELLED, LabelMap, MaskSet
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pieces:
+    """A partition of the pixels, and which segments each piece lies in."""
+
+    names: NDArray[np.int64]
+    """(segments,): id of a label map, or index of a mask in its set."""
+
+    piece: NDArray[np.int32]
+    """(pixels,): the piece of each pixel, row by row; pixels in no segment have one too."""
+
+    weight: NDArray[np.float32] | None
+    """(pixels,): what each pixel counts, or None where all count 1."""
+
+    segments: Any
+    """Sparse (segments, pieces): 1 where a piece lies in a segment."""
+
+
+def pieces_of(segments: LabelMap | MaskSet) -> Pieces:
+    """The pieces of a label map, which are its segments, or of masks that may overlap."""
+    import scipy.sparse
+
+    if isinstance(segments, MaskSet):
+        pixels = [_pixels_of(segments, i) for i in range(len(segments))]
+        piece = refined(pixels, segments.height * segments.width)
+        count = int(piece.max(initial=-1)) + 1
+        # Any one pixel of a piece tells which segments all of it lies in.
+        first = np.zeros(count, np.int64)
+        first[piece[::-1]] = np.arange(len(piece))[::-1]
+        is_first = np.zeros(len(piece), bool)
+        is_first[first] = True
+        within = [piece[part[is_first[part]]] for part in pixels]
+        indptr = np.cumsum([0, *map(len, within)])
+        columns = np.concatenate([np.zeros(0, np.int32), *within])
+        lies_in: Any = scipy.sparse.csr_matrix(
+            (np.ones(len(columns), np.float32), columns, indptr), shape=(len(pixels), count)
+        )
+        names = np.arange(len(segments), dtype=np.int64)
+        return Pieces(names=names, piece=piece, weight=None, segments=lies_in)
+    ids = segments.ids.cpu().reshape(-1).numpy()
+    found, piece = np.unique(ids, return_inverse=True)
+    confidence = segments.confidence
+    all_of: Any = scipy.sparse.identity(len(found), "f4", format="csr")
+    known = np.flatnonzero(found != UNLABELLED)
+    return Pieces(
+        names=found[known].astype(np.int64),
+        piece=piece.reshape(-1).astype(np.int32),
+        weight=None if confidence is None else confidence.cpu().float().reshape(-1).numpy(),
+        segments=all_of[known],
+    )
+
+
+def refined(sets: Sequence[NDArray[np.int64]], count: int) -> NDArray[np.int32]:
+    """Numbers of the coarsest partition of `count` items that no set of items divides.
+
+    One set after the other, what it holds of a part becomes a part of its own: each item is
+    touched once for each set that it is in.
+
+    Args:
+        sets: The items of each set, each once.
+        count: Number of items.
+    """
+    part = np.zeros(count, np.int32)
+    used = 1
+    number_of = np.zeros(max(1024, count), np.int32)
+    hit = np.zeros(len(number_of), bool)
+    for items in sets:
+        before = part[items]
+        hit[before] = True
+        parts = np.flatnonzero(hit[:used])
+        hit[parts] = False
+        number_of[parts] = np.arange(used, used + len(parts), dtype=np.int32)
+        part[items] = number_of[before]
+        used += len(parts)
+        if used > len(number_of) // 2:
+            part, used = _compact(part, used)
+            if used > len(number_of) // 4:
+                number_of = np.zeros(4 * used, np.int32)
+                hit = np.zeros(4 * used, bool)
+    return _compact(part, used)[0]
+
+
+def _compact(part: NDArray[np.int32], used: int) -> tuple[NDArray[np.int32], int]:
+    """Parts numbered without gaps in the order of their numbers, and how many there are."""
+    there = np.zeros(used, bool)
+    there[part] = True
+    rank = np.cumsum(there, dtype=np.int32) - 1
+    return rank[part], int(there.sum())
+
+
+def _pixels_of(segments: MaskSet, index: int) -> NDArray[np.int64]:
+    """The pixels of a mask counted along the rows; run lengths go down the columns."""
+    height, width = segments.height, segments.width
+    counts = segments.masks[index].counts
+    lengths = counts[1::2].astype(np.int64)
+    starts = np.cumsum(counts, dtype=np.int64)[1::2] - lengths
+    before = np.cumsum(lengths) - lengths
+    down = np.arange(int(lengths.sum())) + np.repeat(starts - before, lengths)
+    return down % height * width + down // height
