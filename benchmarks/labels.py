@@ -40,8 +40,8 @@ from splatseg.lift import (
     EvidenceSegments,
     UpliftOptions,
     complete,
+    correct_confusion,
     label_map,
-    reconsider,
     uplift,
 )
 from splatseg.methods.associate import associate
@@ -148,7 +148,7 @@ def semantic(bench: Bench) -> None:
         "semantic",
         lambda: complete(gaussians, soft, options=smooth),
     )
-    again = reconsider(soft)
+    again = correct_confusion(soft)
     hard = replace(again, candidates=None, shares=None)
     bench.row("labels_semantic, reconsidered", "semantic", lambda: complete(gaussians, hard))
     bench.row(
@@ -162,7 +162,7 @@ def tracked(bench: Bench) -> None:
     """Ids of a tracker that switches, splits and loses."""
     found, gaussians = bench.evidence("labels_tracked"), bench.scene.gaussians
     soft = uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8))
-    for title, labels in (("uplift", soft), ("uplift, reconsidered", reconsider(soft))):
+    for title, labels in (("uplift", soft), ("uplift, reconsidered", correct_confusion(soft))):
         hard = replace(labels, candidates=None, shares=None)
         bench.row(f"labels_tracked, {title}", "instance", lambda hard=hard: hard)
     _associated(bench, "labels_tracked", found)

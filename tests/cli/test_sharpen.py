@@ -14,7 +14,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 
-QUICK = ("--sharpen-steps", 60, "--decide-every", 30, "--rates-from", 0, "--no-reconsider")
+QUICK = ("--sharpen-steps", 60, "--decide-every", 30, "--rates-from", 0, "--no-correct-confusion")
 
 
 @pytest.fixture
