@@ -81,6 +81,26 @@ def test_a_scene_is_written_and_scored(folder: Path, tmp_path: Path, capsys) -> 
     assert set(record["versions"]) == {"splatseg", "torch"}
 
 
+def test_how_often_a_checkpoint_is_written_is_asked_for(
+    folder: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    """A billionth of a second passes in 20 steps, a billion seconds do not."""
+    from splatseg.fit import _resume
+
+    written: list[int] = []
+    monkeypatch.setattr(
+        _resume.CheckpointClock, "write", lambda self, *_, **__: written.append(1) or 0.0
+    )
+    scene = str(tmp_path / "scene")
+    for seconds, expected in (("1e-9", True), ("1e9", False)):
+        written.clear()
+        words = ["fit", str(folder), "-o", scene, "--steps", "20", "--checkpoint-every", seconds]
+        assert main([*words, "--max-gaussians", "80", "--overwrite"]) == 0
+        assert bool(written) is expected
+    assert main(["fit", str(folder), "-o", scene, "--checkpoint-every", "0"]) == 2
+    assert "checkpoints.seconds: expected a positive number" in capsys.readouterr().err
+
+
 def test_without_points_it_says_where_it_starts(folder: Path, tmp_path: Path, capsys) -> None:
     words = ["fit", str(folder), "-o", str(tmp_path / "scene"), "--steps", "5"]
     assert main([*words, "--start", "random", "--max-gaussians", "90"]) == 0

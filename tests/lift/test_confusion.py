@@ -117,18 +117,24 @@ def test_one_view_is_not_ten() -> None:
     assert correct_confusion(seen).ids[18:].tolist() == [2, 1]
 
 
-def test_the_majority_stays_where_errors_hold_over_ranges_of_views() -> None:
+def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
+    """Of a Gaussian half mouse, half desk three independent views are not enough to say mouse."""
     labels = desk_and_mouse()
-    for correlation, applied in ((None, True), (-0.1, True), (0.3, True), (0.31, False)):
-        found = correct_confusion(labels, view_correlation=correlation)
-        assert found.ids[18:].tolist() == ([2, 2] if applied else [2, 1])
-        assert torch.equal(found.shares, labels.shares) is not applied
+    for correlation, views in ((None, 10), (-0.1, 10), (0.22, 10), (0.23, 1.5)):
+        options = ConfusionOptions(correlated_views=1.5)
+        found = correct_confusion(labels, options=options, view_correlation=correlation)
+        expected = correct_confusion(labels, options=ConfusionOptions(effective_views=views))
+        assert torch.equal(found.shares, expected.shares)
+        assert (found.ids[19] == 2) == (views == 10)
         facts = found.metadata["confusion"]
-        assert (facts["applied"], facts["changed"]) == (applied, int(applied))
-        assert facts["view_correlation"] == correlation
-    always = ConfusionOptions(max_correlation=1.0)
-    found = correct_confusion(labels, options=always, view_correlation=1.0)
+        assert (facts["effective_views"], facts["view_correlation"]) == (views, correlation)
+    independent = ConfusionOptions(max_correlation=1.0, correlated_views=1.5)
+    found = correct_confusion(labels, options=independent, view_correlation=1.0)
     assert found.ids[18:].tolist() == [2, 2]
+    # Never more than there are at most.
+    few = ConfusionOptions(effective_views=2.0)
+    found = correct_confusion(labels, options=few, view_correlation=0.9)
+    assert found.metadata["confusion"]["effective_views"] == 2.0
 
 
 def test_evidence_counts_up_to_the_max_evidence() -> None:
@@ -201,6 +207,7 @@ def test_bad_input_is_refused() -> None:
         {"effective_views": 0.0},
         {"effective_views": math.inf},
         {"max_correlation": 1.1},
+        {"correlated_views": 0.0},
         {"diagonal_prior": -1.0},
         {"max_evidence": 0.0},
         {"min_confusion": 0.0},

@@ -21,9 +21,10 @@ rounds drift, because the votes are not as independent as the model takes them t
 The model takes every Gaussian of an id to be confused alike, and views to err independently. It
 harms where that is wrong: where one piece of a surface is called something else in many of its
 views (the wall between two windows), and where two ids are taken for each other about as often as
-not. Errors that hold over a range of views are told by `view_votes`, and then nothing is changed
-(`ConfusionOptions.max_correlation`); errors of one place that come and go from view to view, and
-swaps, cannot be told from votes.
+not. Errors that hold over ranges of views are told by `view_votes`, and then votes amount to few
+views (`ConfusionOptions.correlated_views`): with three of them the prior weighs against changes
+that the votes do not speak for strongly. Errors of one place that come and go from view to view,
+and swaps, cannot be told from votes.
 
 References:
     Dawid and Skene, Maximum Likelihood Estimation of Observer Error-Rates Using the EM
@@ -55,9 +56,12 @@ class ConfusionOptions:
     effective_views: float = 10.0
     """Most independent views that a Gaussian's votes amount to; fewer where fewer saw it."""
 
-    max_correlation: float = 0.3
-    """Highest correlation of neighbouring views, in [-1, 1], at which labels are changed. Above
-    it errors hold over ranges of views, and the majority is kept. 1 changes them always."""
+    max_correlation: float = 0.22
+    """Highest correlation of neighbouring views, in [-1, 1], at which views count as independent.
+    Above it errors hold over ranges of views."""
+
+    correlated_views: float = 3.0
+    """Most independent views that votes amount to above `max_correlation`."""
 
     min_confusion: float = 3e-3
     """Epsilon: every id is taken for every other at least this often, in (0, 0.5]."""
@@ -71,7 +75,7 @@ class ConfusionOptions:
     blending weight."""
 
     def __post_init__(self) -> None:
-        for name in ("effective_views", "diagonal_prior", "max_evidence"):
+        for name in ("effective_views", "correlated_views", "diagonal_prior", "max_evidence"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise RangeError(f"{name}: expected a positive number, got {value}.")
@@ -100,12 +104,12 @@ def correct_confusion(
         options: How the evidence errs.
         view_correlation: How much better the nearest view tells what a held-out view says than
             other views do, at most 1: `uplift` measures it on the training views and records it
-            in the metadata. None where that is not known; then labels are changed.
+            in the metadata. None where that is not known: views count as independent.
 
     Returns:
         The layer with ids, candidates and shares by probability, as many as before. Gaussians
-        without a label keep none. The metadata says how many labels changed, and whether
-        any could.
+        without a label keep none. The metadata says how many labels changed, and how
+        many independent views votes amounted to at most.
 
     Raises:
         InputError: If the layer is hard or has a single candidate.
@@ -134,12 +138,16 @@ def correct_confusion(
         check_finite("labels.evidence", labels.evidence)
     if labels.effective_views is not None:
         check_finite("labels.effective_views", labels.effective_views)
-    facts = {"options": asdict(options), "view_correlation": view_correlation}
+    most = options.effective_views
     if view_correlation is not None:
         check_range("view_correlation", view_correlation, -math.inf, 1.0)
         if view_correlation > options.max_correlation:
-            return _described(labels, facts | {"applied": False, "changed": 0})
-    facts |= {"applied": True}
+            most = min(most, options.correlated_views)
+    facts = {
+        "options": asdict(options),
+        "view_correlation": view_correlation,
+        "effective_views": most,
+    }
     known = (labels.ids != UNLABELLED).cpu()
     rows = torch.nonzero(known).squeeze(1)
     if not len(rows):
@@ -148,7 +156,7 @@ def correct_confusion(
     mass = np.ones(len(rows))
     if labels.evidence is not None:
         mass = labels.evidence.cpu()[rows].double().clamp(0, options.max_evidence).numpy()
-    views = np.full(len(rows), options.effective_views)
+    views = np.full(len(rows), most)
     if labels.effective_views is not None:
         # A Gaussian that has a vote was seen by a view.
         seen = labels.effective_views.cpu()[rows].double().clamp_min(1).numpy()
