@@ -157,7 +157,10 @@ def test_confusion_is_corrected_unless_told_not_to(small, splatseg) -> None:
     command = ("segment", small.scene, "--method", "uplift")
     assert splatseg(*command)[0] == 0
     layer = layer_of(small.scene, "labels_semantic")
-    assert layer.metadata["confusion"]["options"]["effective_views"] == 10
+    said = layer.metadata["confusion"]
+    assert said["options"]["effective_views"] == 10
+    assert said["view_correlation"] == layer.metadata["view_correlation"]
+    assert layer.effective_views is not None
     assert layer.candidates is None
     assert splatseg(*command, "--candidates", 3, "--effective-views", 4, "--layer", "soft")[0] == 0
     soft = layer_of(small.scene, "soft")

@@ -120,7 +120,7 @@ def test_one_view_is_not_ten() -> None:
 def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
     """Of a Gaussian half mouse, half desk three independent views are not enough to say mouse."""
     labels = desk_and_mouse()
-    for correlation, views in ((None, 10), (-0.1, 10), (0.22, 10), (0.23, 1.5)):
+    for correlation, views in ((None, 10), (-0.1, 10), (0.27, 10), (0.28, 1.5)):
         options = ConfusionOptions(correlated_views=1.5)
         found = correct_confusion(labels, options=options, view_correlation=correlation)
         expected = correct_confusion(labels, options=ConfusionOptions(effective_views=views))

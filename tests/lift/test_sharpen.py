@@ -242,9 +242,10 @@ def test_confusion_is_corrected_unless_told_not_to(scene) -> None:
     votes = uplift(
         gaussians, views, maps, options=UpliftOptions(candidates=8, slots=8), backend="cpu"
     )
+    measured = votes.metadata["view_correlation"]
     again = sharpen(gaussians, views, maps, options=none, backend="cpu").labels
     assert again.shares is not None
-    assert torch.equal(again.shares, correct_confusion(votes).shares)
+    assert torch.equal(again.shares, correct_confusion(votes, view_correlation=measured).shares)
     assert not torch.equal(again.shares[:, 0], votes.shares[:, 0])
 
 

@@ -56,7 +56,7 @@ class ConfusionOptions:
     effective_views: float = 10.0
     """Most independent views that a Gaussian's votes amount to; fewer where fewer saw it."""
 
-    max_correlation: float = 0.22
+    max_correlation: float = 0.27
     """Highest correlation of neighbouring views, in [-1, 1], at which views count as independent.
     Above it errors hold over ranges of views."""
 
