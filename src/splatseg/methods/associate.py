@@ -273,8 +273,8 @@ class AssociateMethodOptions:
     association: AssociateOptions = field(default_factory=AssociateOptions)
     """How segments become instances."""
 
-    reconsider: bool = True
-    """Decide anew under how often the evidence takes one instance for another, which finds small
+    correct_confusion: bool = True
+    """Relabel under how often the evidence takes one instance for another, which finds small
     things that most views miss."""
 
     confusion: ConfusionOptions = field(default_factory=ConfusionOptions)
@@ -288,7 +288,7 @@ def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels:
         inputs.views,
         EvidenceSegments(evidence=inputs.evidence),
         options=options.association,
-        confusion=options.confusion if options.reconsider else None,
+        confusion=options.confusion if options.correct_confusion else None,
         classes=inputs.categories,
         backend=inputs.backend,
         progress=inputs.progress,
