@@ -6,7 +6,7 @@ Rows, each a method on a folder of evidence (`splatseg segment` does the same):
 
 - `truth`: true class maps and true instance maps through `uplift`.
 - `semantic`: `labels_semantic` as they came (on the train views), voted for by centres, through
-  `uplift`, completed, smoothed, and reconsidered under how the evidence errs.
+  `uplift`, completed, smoothed, and relabelled under how the evidence errs.
 - `tracked`: `labels_tracked` through `uplift`, repaired by `associate`, and through `identity`.
 - `panoptic`: `labels_panoptic` with every segment given its true instance (the ceiling of
   association), and through `associate`.
@@ -40,8 +40,8 @@ from splatseg.lift import (
     EvidenceSegments,
     UpliftOptions,
     complete,
+    correct_confusion,
     label_map,
-    reconsider,
     uplift,
 )
 from splatseg.methods.associate import associate
@@ -148,11 +148,11 @@ def semantic(bench: Bench) -> None:
         "semantic",
         lambda: complete(gaussians, soft, options=smooth),
     )
-    again = reconsider(soft)
+    again = correct_confusion(soft, view_correlation=soft.metadata["view_correlation"])
     hard = replace(again, candidates=None, shares=None)
-    bench.row("labels_semantic, reconsidered", "semantic", lambda: complete(gaussians, hard))
+    bench.row("labels_semantic, relabelled", "semantic", lambda: complete(gaussians, hard))
     bench.row(
-        "labels_semantic, reconsidered and smoothed",
+        "labels_semantic, relabelled and smoothed",
         "semantic",
         lambda: complete(gaussians, again, options=smooth),
     )
@@ -162,7 +162,7 @@ def tracked(bench: Bench) -> None:
     """Ids of a tracker that switches, splits and loses."""
     found, gaussians = bench.evidence("labels_tracked"), bench.scene.gaussians
     soft = uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8))
-    for title, labels in (("uplift", soft), ("uplift, reconsidered", reconsider(soft))):
+    for title, labels in (("uplift", soft), ("uplift, relabelled", correct_confusion(soft))):
         hard = replace(labels, candidates=None, shares=None)
         bench.row(f"labels_tracked, {title}", "instance", lambda hard=hard: hard)
     _associated(bench, "labels_tracked", found)

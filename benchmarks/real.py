@@ -35,8 +35,8 @@ from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import (
     UpliftOptions,
     complete,
+    correct_confusion,
     label_map,
-    reconsider,
     uplift,
 )
 
@@ -79,7 +79,9 @@ def camvid(job: Job) -> None:
         begin = time.monotonic()
         soft = uplift(job.scene.gaussians, train, found, options=UpliftOptions(candidates=8))
         seconds = time.monotonic() - begin
-        for name, labels in (("uplift", soft), ("reconsidered", reconsider(soft))):
+        measured = soft.metadata["view_correlation"]
+        relabelled = correct_confusion(soft, view_correlation=measured)
+        for name, labels in (("uplift", soft), ("confusion corrected", relabelled)):
             hard = complete(job.scene.gaussians, replace(labels, candidates=None, shares=None))
             drawn = job.draw(hard, scored, name)
             _classes(f"{title}, {name}", _score("semantic", drawn, truth), seconds)

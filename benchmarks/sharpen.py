@@ -28,7 +28,7 @@ from splatseg.lift import (
     SharpenOptions,
     UpliftOptions,
     complete,
-    reconsider,
+    correct_confusion,
     sharpen,
     uplift,
 )
@@ -42,7 +42,7 @@ def layer(bench: Bench, found: Evidence) -> Labels:
         labels = associate(gaussians, bench.train, EvidenceSegments(evidence=found))
     else:
         votes = uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8, slots=8))
-        labels = replace(reconsider(votes), candidates=None, shares=None)
+        labels = replace(correct_confusion(votes), candidates=None, shares=None)
     return complete(gaussians, labels)
 
 

@@ -196,6 +196,18 @@ def test_a_copy_is_moved_and_a_thing_coloured(room, tmp_path) -> None:
     assert torch.equal(coloured.means[~chosen], before.means[~chosen])
 
 
+def test_colours_are_scaled_and_shifted(room, tmp_path) -> None:
+    before = load_scene(room).gaussians.colours
+    out = tmp_path / "tinted"
+    words = ["--colour-scale", "0.5", "1", "1", "--colour-shift", "0.125", "0", "-0.25"]
+    assert main(["edit", str(room), "-o", str(out), *words, "--split", "off"]) == 0
+    expected = before * torch.tensor([0.5, 1, 1]) + torch.tensor([0.125, 0, -0.25])
+    found = load_scene(out).gaussians.colours
+    inside = ((expected > 0) & (expected < 1)).all(dim=1)
+    assert int(inside.sum()) > 100
+    torch.testing.assert_close(found[inside], expected[inside], rtol=0, atol=1e-4)
+
+
 def test_scenes_are_joined(room, tmp_path) -> None:
     out = tmp_path / "out"
     assert (

@@ -153,18 +153,21 @@ def test_completion_marks_what_it_infers(small, splatseg) -> None:
     assert f"{int(blank.sum())} of them inferred from neighbours" in out
 
 
-def test_reconsidering(small, splatseg) -> None:
+def test_confusion_is_corrected_unless_told_not_to(small, splatseg) -> None:
     command = ("segment", small.scene, "--method", "uplift")
     assert splatseg(*command)[0] == 0
     layer = layer_of(small.scene, "labels_semantic")
-    assert layer.metadata["confusion"]["options"]["looks"] == 10
+    said = layer.metadata["confusion"]
+    assert said["options"]["effective_views"] == 10
+    assert said["view_correlation"] == layer.metadata["view_correlation"]
+    assert layer.effective_views is not None
     assert layer.candidates is None
-    assert splatseg(*command, "--candidates", 3, "--looks", 4, "--layer", "soft")[0] == 0
+    assert splatseg(*command, "--candidates", 3, "--effective-views", 4, "--layer", "soft")[0] == 0
     soft = layer_of(small.scene, "soft")
-    assert soft.metadata["confusion"]["options"]["looks"] == 4
+    assert soft.metadata["confusion"]["options"]["effective_views"] == 4
     assert soft.candidates is not None
     assert soft.candidates.shape[1] == 3
-    for words in (("--no-reconsider",), ("--label-rule", "flashsplat")):
+    for words in (("--no-correct-confusion",), ("--label-rule", "flashsplat")):
         assert splatseg(*command, *words, "--layer", "plain")[0] == 0
         assert "confusion" not in layer_of(small.scene, "plain").metadata
 

@@ -17,7 +17,7 @@ from splatseg.io.images import save_png
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.render import render
 
-QUICK = ("--sharpen-steps", 60, "--decide-every", 30, "--rates-from", 0, "--no-reconsider")
+QUICK = ("--sharpen-steps", 60, "--decide-every", 30, "--rates-from", 0, "--no-correct-confusion")
 
 
 @pytest.fixture

@@ -102,7 +102,15 @@ def test_masks_of_a_model_become_instances(room, run) -> None:
 
 
 def test_sharpened_gaussians_agree_more_with_their_labels(room, run, classes, tmp_path) -> None:
-    quick = ("--sharpen-steps", 40, "--decide-every", 20, "--rates-from", 0, "--no-reconsider")
+    quick = (
+        "--sharpen-steps",
+        40,
+        "--decide-every",
+        20,
+        "--rates-from",
+        0,
+        "--no-correct-confusion",
+    )
     run("sharpen", room, "-o", tmp_path / "sharp", "--layer", classes, *quick, *CPU)
     first, last = load_scene(tmp_path / "sharp").provenance["sharpened"]["agreement"]
     assert last > first

@@ -99,17 +99,22 @@ def test_layers_slice_in_step() -> None:
         candidates=torch.tensor([[3, 5], [-1, -1], [5, 3]], dtype=torch.int32),
         shares=torch.tensor([[0.9, 0.1], [0, 0], [0.6, 0.4]]),
         evidence=torch.tensor([4.0, 0.0, 2.5]),
+        effective_views=torch.tensor([3.0, 0.0, 1.5]),
         inferred=torch.tensor([False, True, False]),
         metadata={"method": "by hand"},
     )
     part = labels[torch.tensor([2, 0])]
     assert part.evidence is not None
     assert part.evidence.tolist() == [2.5, 4.0]
+    assert part.effective_views is not None
+    assert part.effective_views.tolist() == [1.5, 3.0]
     assert labels.inferred is not None
     assert part.inferred is not None
     assert labels[1:].inferred.tolist() == [True, False]
     with pytest.raises(ShapeError, match="evidence"):
         Labels(ids=labels.ids, confidence=labels.confidence, evidence=torch.zeros(2))
+    with pytest.raises(ShapeError, match="effective_views"):
+        Labels(ids=labels.ids, confidence=labels.confidence, effective_views=torch.zeros(2))
     with pytest.raises(InputError, match="inferred: expected booleans"):
         Labels(ids=labels.ids, confidence=labels.confidence, inferred=torch.zeros(3))
     assert part.ids.tolist() == [5, 3]

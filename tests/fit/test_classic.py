@@ -1,6 +1,7 @@
 """Classic densification: each rule on a scene of a few Gaussians."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -123,6 +124,32 @@ def test_large_ones_are_dropped_after_the_first_reset_only():
     assert len(_round(start, statistics)[0]) == 4
     grown, _, _ = _round(start, statistics, prune_large=True)
     assert torch.equal(grown.means, start.means[[1, 3]])
+
+
+def test_how_large_is_too_large_is_asked_for():
+    """In scene extents, of 10, and in pixels."""
+    start = _parameters([0.61, 0.59, 0.1, 0.1])
+    statistics = _statistics([0.0] * 4, radii=[0.0, 0.0, 5.1, 4.9])
+
+    def kept(**changes):
+        options = replace(OPTIONS, **changes)
+        grown, _, _ = _round(start, statistics, prune_large=True, options=options)
+        return [int(row) for row in (grown.means[:, None] == start.means).all(-1).nonzero()[:, 1]]
+
+    assert kept() == [0, 1, 2, 3]
+    assert kept(prune_scale=0.06) == [1, 2, 3]
+    assert kept(prune_radius=5.0) == [0, 1, 3]
+
+
+def test_how_low_a_reset_goes_is_asked_for():
+    options = FitOptions(strategy="classic", steps=100, minutes=None, reset_opacity=0.2)
+    options = replace(options, reset_every=15)
+    classic = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
+    start = _parameters([0.1, 0.1], opacities=[0.1, 0.9])
+    found, _, _ = classic.after(
+        (start, *_moments(start)), steps=15, progress=0.14, generator=torch.Generator()
+    )
+    assert found.logits.sigmoid().squeeze(1).tolist() == pytest.approx([0.1, 0.2])
 
 
 def test_a_scene_is_never_emptied():

@@ -93,6 +93,26 @@ def test_exposures_go_into_the_scene(folder: Path, tmp_path: Path) -> None:
     assert any(one.gain != (1.0, 1.0, 1.0) for one in found.values())
 
 
+def test_how_often_a_checkpoint_is_written_is_asked_for(
+    folder: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    """A billionth of a second passes in 20 steps, a billion seconds do not."""
+    from splatseg.fit import _resume
+
+    written: list[int] = []
+    monkeypatch.setattr(
+        _resume.CheckpointClock, "write", lambda self, *_, **__: written.append(1) or 0.0
+    )
+    scene = str(tmp_path / "scene")
+    for seconds, expected in (("1e-9", True), ("1e9", False)):
+        written.clear()
+        words = ["fit", str(folder), "-o", scene, "--steps", "20", "--checkpoint-every", seconds]
+        assert main([*words, "--max-gaussians", "80", "--overwrite"]) == 0
+        assert bool(written) is expected
+    assert main(["fit", str(folder), "-o", scene, "--checkpoint-every", "0"]) == 2
+    assert "checkpoints.seconds: expected a positive number" in capsys.readouterr().err
+
+
 def test_without_points_it_says_where_it_starts(folder: Path, tmp_path: Path, capsys) -> None:
     words = ["fit", str(folder), "-o", str(tmp_path / "scene"), "--steps", "5"]
     assert main([*words, "--start", "random", "--max-gaussians", "90"]) == 0
@@ -159,7 +179,7 @@ def test_what_cannot_be_done_is_said_before_the_work(folder: Path, tmp_path: Pat
         str(folder), "-o", str(file), "--steps", "2"
     )
     assert "no_such" in refused(str(tmp_path / "no_such"), "-o", scene)
-    assert "max_gaussians" in refused(str(folder), "-o", scene, "--max-gaussians", "0")
+    assert "--max-gaussians" in refused(str(folder), "-o", scene, "--max-gaussians", "0")
     (folder / "points.ply").unlink()
     content = json.loads((folder / "transforms.json").read_text())
     del content["ply_file_path"]
@@ -192,7 +212,7 @@ def test_a_stopped_fit_is_resumed_or_begun_again(folder: Path, tmp_path: Path, c
     assert main([*words, "--steps", str(steps + 9), "--resume", "--seed", "8"]) == 2
     assert "seed 0 instead of 8" in capsys.readouterr().err
     assert main([*words, "--resume", "--overwrite"]) == 2
-    assert "resume, overwrite: expected one of the two" in capsys.readouterr().err
+    assert "--resume, --overwrite: expected one of the two" in capsys.readouterr().err
 
     assert main([*words, "--steps", str(steps + 9), "--resume"]) == 0
     assert f"{scene}: going on from step {steps} (" in capsys.readouterr().out

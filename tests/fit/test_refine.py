@@ -53,6 +53,31 @@ def test_it_comes_nearer_to_the_photographs_row_by_row(make_capture, tiny) -> No
     assert float((moved < apart).float().mean()) > 0.9
 
 
+def test_steps_go_with_the_size_of_the_scene(make_capture, tiny) -> None:
+    """Everything four times as large: centres move four times as far, nothing else changes."""
+    views = make_capture().train_views
+    larger = [
+        replace(view, camera=replace(view.camera, cam_from_world=_scaled(view, 4)))
+        for view in views
+    ]
+    start = worse(tiny)
+    grown = start.replace(means=4 * start.means, scales=4 * start.scales)
+    small, large = (
+        refine(scene, seen, steps=4, start=0.0, options=QUICK, backend="cpu")
+        for scene, seen in ((start, views), (grown, larger))
+    )
+    moved = (small.means - start.means).abs().max()
+    assert float(moved) > 1e-4
+    torch.testing.assert_close(large.means, 4 * small.means, rtol=0, atol=0.04 * float(moved))
+    torch.testing.assert_close(large.opacities, small.opacities, rtol=0, atol=1e-3)
+
+
+def _scaled(view, factor: float) -> torch.Tensor:
+    pose = view.camera.cam_from_world.clone()
+    pose[:3, 3] *= factor
+    return pose
+
+
 def test_no_steps_change_nothing_but_rounding(make_capture, tiny) -> None:
     start = tiny.replace(opacities=tiny.opacities.clone().index_fill_(0, torch.tensor([0]), 1.0))
     found = refine(start, make_capture().train_views, steps=0, options=QUICK, backend="cpu")

@@ -10,6 +10,8 @@ OPTIONS = FitOptions(
     position_rate=1e-2,
     position_rate_end=1e-4,
     scale_rate=0.5,
+    rotation_rate=0.3,
+    opacity_rate=0.7,
     colour_rate=0.2,
     final_rate=0.25,
     quarter_until=0.1,
@@ -31,8 +33,8 @@ def test_rates_fall_exponentially() -> None:
     )
     assert begin.colour == pytest.approx(20 * begin.harmonics)
     assert end.colour == pytest.approx(0.05)
-    assert end.logits == pytest.approx(0.25 * begin.logits)
-    assert end.rotations == pytest.approx(0.25 * begin.rotations)
+    assert (begin.logits, end.logits) == pytest.approx((0.7, 0.25 * 0.7))
+    assert (begin.rotations, end.rotations) == pytest.approx((0.3, 0.25 * 0.3))
 
 
 def test_photographs_grow_to_full_size() -> None:

@@ -303,8 +303,8 @@ def test_votes_become_a_soft_layer() -> None:
     assert many.candidates.tolist() == [[10, 9, 8, 7, 6, 5, 4, 3]]
 
 
-def test_votes_are_reconsidered_unless_told_otherwise(monkeypatch) -> None:
-    """The soft votes go to `reconsider` with the options given, and its word is the last."""
+def test_confusion_is_corrected_unless_told_otherwise(monkeypatch) -> None:
+    """The soft votes go to `correct_confusion` with the options given, and its word is the last."""
     module = importlib.import_module("splatseg.methods.associate")
     asked = []
 
@@ -312,12 +312,12 @@ def test_votes_are_reconsidered_unless_told_otherwise(monkeypatch) -> None:
         asked.append((labels, options))
         return replace(labels, ids=labels.ids.flip(0), metadata={"confusion": "said"})
 
-    monkeypatch.setattr(module, "reconsider", turned)
-    looks = ConfusionOptions(looks=3)
-    told = run(clean(NAMES), confusion=looks)
+    monkeypatch.setattr(module, "correct_confusion", turned)
+    three = ConfusionOptions(effective_views=3)
+    told = run(clean(NAMES), confusion=three)
     plain = run(clean(NAMES), confusion=None)
     assert len(asked) == 1
-    assert asked[0][1] is looks
+    assert asked[0][1] is three
     assert torch.equal(asked[0][0].ids, plain.ids)
     assert asked[0][0].candidates is not None
     assert torch.equal(told.ids, plain.ids.flip(0))

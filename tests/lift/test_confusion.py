@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +10,10 @@ import torch
 
 from splatseg.core import Labels
 from splatseg.errors import InputError, RangeError
-from splatseg.lift import ConfusionOptions, reconsider
+from splatseg.lift import ConfusionOptions, correct_confusion
 
 
-def soft(candidates, shares, *, evidence=None, ids=None, **rest) -> Labels:
+def soft(candidates, shares, *, evidence=None, effective_views=None, ids=None, **rest) -> Labels:
     candidates, shares = torch.tensor(candidates), torch.tensor(shares, dtype=torch.float32)
     return Labels(
         ids=candidates[:, 0] if ids is None else torch.tensor(ids),
@@ -20,14 +21,17 @@ def soft(candidates, shares, *, evidence=None, ids=None, **rest) -> Labels:
         candidates=candidates,
         shares=shares,
         evidence=None if evidence is None else torch.tensor(evidence),
+        effective_views=None if effective_views is None else torch.tensor(effective_views),
         **rest,
     )
 
 
-def posterior(dense: np.ndarray, mass: np.ndarray, options: ConfusionOptions) -> np.ndarray:
+def posterior(
+    dense: np.ndarray, mass: np.ndarray, views: np.ndarray, options: ConfusionOptions
+) -> np.ndarray:
     """The module's equations, with loops over dense tables; impossible ids are left out."""
     rows, ids = dense.shape
-    counts = options.own_votes * np.eye(ids)
+    counts = options.diagonal_prior * np.eye(ids)
     prior = np.ones(ids)
     for i in range(rows):
         winner = dense[i].argmax()
@@ -37,15 +41,18 @@ def posterior(dense: np.ndarray, mass: np.ndarray, options: ConfusionOptions) ->
     result = np.zeros_like(dense)
     for i in range(rows):
         for t in range(ids):
-            if not (dense[i] * (theta[t] > options.least_confusion)).any():
+            if not (dense[i] * (theta[t] > options.min_confusion)).any():
                 continue
-            likelihood = np.maximum(theta[t], options.least_confusion) ** (options.looks * dense[i])
+            likelihood = np.maximum(theta[t], options.min_confusion) ** (views[i] * dense[i])
             result[i, t] = prior[t] * likelihood.prod()
     return result / result.sum(axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("options", [{}, {"looks": 2.0, "own_votes": 0.5, "loudest": 3.0}])
-def test_the_posterior_is_the_formula(rng, options) -> None:
+@pytest.mark.parametrize("seen", [False, True])
+@pytest.mark.parametrize(
+    "options", [{}, {"effective_views": 2.0, "diagonal_prior": 0.5, "max_evidence": 3.0}]
+)
+def test_the_posterior_is_the_formula(rng, options, seen) -> None:
     names = np.array([2, 5, 70, 900])
     # Id 900 never meets the others: no row's support may reach across.
     dense = np.zeros((40, 4))
@@ -57,11 +64,21 @@ def test_the_posterior_is_the_formula(rng, options) -> None:
     shares = np.take_along_axis(dense, order, axis=1)
     candidates = np.where(shares > 0, names[order], -1)
     # Shares that do not add up to 1 are taken as if they did.
-    labels = soft(candidates.tolist(), (0.8 * shares).tolist(), evidence=evidence.tolist())
-    expected = posterior(dense, np.minimum(evidence, chosen.loudest), chosen)
+    views = rng.uniform(0.5, 15, 40)
+    labels = soft(
+        candidates.tolist(),
+        (0.8 * shares).tolist(),
+        evidence=evidence.tolist(),
+        effective_views=views.tolist() if seen else None,
+    )
+    # As many views as saw it, one at least, and never more than the option says.
+    counted = np.full(40, chosen.effective_views)
+    if seen:
+        counted = np.minimum(chosen.effective_views, np.maximum(views, 1))
+    expected = posterior(dense, np.minimum(evidence, chosen.max_evidence), counted, chosen)
     assert (expected.argmax(axis=1) != dense.argmax(axis=1)).any()
 
-    result = reconsider(labels, options=chosen)
+    result = correct_confusion(labels, options=chosen)
 
     assert result.ids.tolist() == names[expected.argmax(axis=1)].tolist()
     torch.testing.assert_close(
@@ -85,19 +102,47 @@ def desk_and_mouse(*, evidence=20.0) -> Labels:
 
 def test_what_is_often_missed_needs_fewer_votes() -> None:
     labels = desk_and_mouse()
-    assert reconsider(labels).ids[18:].tolist() == [2, 2]
+    assert correct_confusion(labels).ids[18:].tolist() == [2, 2]
     # The other way round nothing changes: desks are never called mouse.
-    assert reconsider(labels).ids[:18].tolist() == [1] * 18
-    few = reconsider(labels, options=ConfusionOptions(looks=0.5))
+    assert correct_confusion(labels).ids[:18].tolist() == [1] * 18
+    few = correct_confusion(labels, options=ConfusionOptions(effective_views=0.5))
     assert few.ids[18:].tolist() == [1, 1]
 
 
-def test_evidence_has_a_say_up_to_the_loudest() -> None:
-    """A thousand pixels of desk are no more than the loudest: the prior stays the same."""
-    twenty = reconsider(desk_and_mouse(evidence=20.0))
-    thousand = reconsider(desk_and_mouse(evidence=1000.0))
+def test_one_view_is_not_ten() -> None:
+    """What a single view says of a Gaussian half desk, half mouse is one view's word."""
+    labels = desk_and_mouse()
+    seen = replace(labels, effective_views=torch.tensor([12.0] * 19 + [1.0]))
+    assert correct_confusion(labels).ids[18:].tolist() == [2, 2]
+    assert correct_confusion(seen).ids[18:].tolist() == [2, 1]
+
+
+def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
+    """Of a Gaussian half mouse, half desk three independent views are not enough to say mouse."""
+    labels = desk_and_mouse()
+    for correlation, views in ((None, 10), (-0.1, 10), (0.27, 10), (0.28, 1.5)):
+        options = ConfusionOptions(correlated_views=1.5)
+        found = correct_confusion(labels, options=options, view_correlation=correlation)
+        expected = correct_confusion(labels, options=ConfusionOptions(effective_views=views))
+        assert torch.equal(found.shares, expected.shares)
+        assert (found.ids[19] == 2) == (views == 10)
+        facts = found.metadata["confusion"]
+        assert (facts["effective_views"], facts["view_correlation"]) == (views, correlation)
+    independent = ConfusionOptions(max_correlation=1.0, correlated_views=1.5)
+    found = correct_confusion(labels, options=independent, view_correlation=1.0)
+    assert found.ids[18:].tolist() == [2, 2]
+    # Never more than there are at most.
+    few = ConfusionOptions(effective_views=2.0)
+    found = correct_confusion(labels, options=few, view_correlation=0.9)
+    assert found.metadata["confusion"]["effective_views"] == 2.0
+
+
+def test_evidence_counts_up_to_the_max_evidence() -> None:
+    """A thousand pixels of desk are no more than the max_evidence: the prior stays the same."""
+    twenty = correct_confusion(desk_and_mouse(evidence=20.0))
+    thousand = correct_confusion(desk_and_mouse(evidence=1000.0))
     assert torch.equal(twenty.shares, thousand.shares)
-    assert not torch.equal(twenty.shares, reconsider(desk_and_mouse(evidence=5.0)).shares)
+    assert not torch.equal(twenty.shares, correct_confusion(desk_and_mouse(evidence=5.0)).shares)
     # Without evidence every Gaussian counts one.
     labels = desk_and_mouse(evidence=1.0)
     without = Labels(
@@ -106,7 +151,7 @@ def test_evidence_has_a_say_up_to_the_loudest() -> None:
         candidates=labels.candidates,
         shares=labels.shares,
     )
-    assert torch.equal(reconsider(without).shares, reconsider(labels).shares)
+    assert torch.equal(correct_confusion(without).shares, correct_confusion(labels).shares)
 
 
 def test_gaussians_without_a_label_keep_none() -> None:
@@ -116,15 +161,15 @@ def test_gaussians_without_a_label_keep_none() -> None:
         ids=[1, -1, -1, 3],
         background=4,
     )
-    result = reconsider(labels)
+    result = correct_confusion(labels)
     assert result.ids.tolist() == [1, -1, -1, 3]
     assert result.confidence[1:].tolist() == [0.0, 0.0, 1.0]
     assert result.candidates[1].tolist() == [-1, -1]
     assert result.background == 4
     nobody = soft([[-1, -1]], [[0.0, 0.0]])
-    assert reconsider(nobody).ids.tolist() == [-1]
+    assert correct_confusion(nobody).ids.tolist() == [-1]
     assert nobody.metadata == {}
-    assert json.loads(json.dumps(reconsider(nobody).metadata))["confusion"]["changed"] == 0
+    assert json.loads(json.dumps(correct_confusion(nobody).metadata))["confusion"]["changed"] == 0
 
 
 def test_order_and_names_change_nothing(rng) -> None:
@@ -132,13 +177,15 @@ def test_order_and_names_change_nothing(rng) -> None:
     order = np.argsort(-dense, axis=1)
     shares = np.take_along_axis(dense, order, axis=1)
     evidence = rng.uniform(0, 30, 50).tolist()
-    here = reconsider(soft((order + 1).tolist(), shares.tolist(), evidence=evidence))
+    here = correct_confusion(soft((order + 1).tolist(), shares.tolist(), evidence=evidence))
     mixed = torch.from_numpy(rng.permutation(50))
     labels = soft((order + 1).tolist(), shares.tolist(), evidence=evidence)
-    there = reconsider(labels[mixed])
+    there = correct_confusion(labels[mixed])
     assert torch.equal(here.ids[mixed], there.ids)
     torch.testing.assert_close(here.shares[mixed], there.shares, rtol=0, atol=1e-6)
-    renamed = reconsider(soft((100 * (order + 1)).tolist(), shares.tolist(), evidence=evidence))
+    renamed = correct_confusion(
+        soft((100 * (order + 1)).tolist(), shares.tolist(), evidence=evidence)
+    )
     assert torch.equal(100 * here.ids, renamed.ids)
 
 
@@ -146,18 +193,25 @@ def test_bad_input_is_refused() -> None:
     hard = Labels(ids=torch.tensor([1]), confidence=torch.ones(1))
     for labels in (hard, soft([[1]], [[1.0]])):
         with pytest.raises(InputError, match="expected a soft layer with at least 2 candidates"):
-            reconsider(labels)
+            correct_confusion(labels)
     with pytest.raises(RangeError, match=r"labels\.shares: 1 of 2"):
-        reconsider(soft([[1, 2]], [[0.5, math.nan]]))
+        correct_confusion(soft([[1, 2]], [[0.5, math.nan]]))
     with pytest.raises(RangeError, match=r"labels\.evidence: 1 of 1"):
-        reconsider(soft([[1, 2]], [[0.5, 0.5]], evidence=[math.inf]))
+        correct_confusion(soft([[1, 2]], [[0.5, 0.5]], evidence=[math.inf]))
+    with pytest.raises(RangeError, match=r"labels\.effective_views: 1 of 1"):
+        correct_confusion(soft([[1, 2]], [[0.5, 0.5]], effective_views=[math.nan]))
+    for correlation in (math.nan, 1.1):
+        with pytest.raises(RangeError, match="view_correlation"):
+            correct_confusion(desk_and_mouse(), view_correlation=correlation)
     for wrong in (
-        {"looks": 0.0},
-        {"looks": math.inf},
-        {"own_votes": -1.0},
-        {"loudest": 0.0},
-        {"least_confusion": 0.0},
-        {"least_confusion": 0.9},
+        {"effective_views": 0.0},
+        {"effective_views": math.inf},
+        {"max_correlation": 1.1},
+        {"correlated_views": 0.0},
+        {"diagonal_prior": -1.0},
+        {"max_evidence": 0.0},
+        {"min_confusion": 0.0},
+        {"min_confusion": 0.9},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             ConfusionOptions(**wrong)

@@ -9,7 +9,7 @@ from splatseg.core import Gaussians, LabelMap, Labels, View
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
 from splatseg.io.images import save_png
-from splatseg.lift import SharpenOptions, UpliftOptions, reconsider, sharpen, uplift
+from splatseg.lift import SharpenOptions, UpliftOptions, correct_confusion, sharpen, uplift
 from splatseg.lift.boundaries.sharpen import _LabelTerm, _Papers
 from splatseg.render import back_project, render
 from splatseg.render.cpu import set_threads, threads
@@ -254,15 +254,16 @@ def test_steps_behind_the_last_decision_count_too(scene) -> None:
     assert found.agreement[0] != found.agreement[1]
 
 
-def test_labels_are_reconsidered_unless_told_not_to(scene) -> None:
+def test_confusion_is_corrected_unless_told_not_to(scene) -> None:
     gaussians, views, maps = scene
     none = replace(OPTIONS, sharpen_steps=0)
     votes = uplift(
         gaussians, views, maps, options=UpliftOptions(candidates=8, slots=8), backend="cpu"
     )
+    measured = votes.metadata["view_correlation"]
     again = sharpen(gaussians, views, maps, options=none, backend="cpu").labels
     assert again.shares is not None
-    assert torch.equal(again.shares, reconsider(votes).shares)
+    assert torch.equal(again.shares, correct_confusion(votes, view_correlation=measured).shares)
     assert not torch.equal(again.shares[:, 0], votes.shares[:, 0])
 
 

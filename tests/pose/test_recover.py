@@ -175,3 +175,26 @@ def test_photographs_of_different_things_are_refused(
     with pytest.raises(InputError, match=r"at least 3 can be placed, got 0 of 3; photograph the"):
         recover_poses(folder, folder=kept, options=OPTIONS)
     assert list(kept.iterdir()) == []
+
+
+@pytest.mark.parametrize(("most", "everything"), [(7, False), (8, True)])
+def test_all_pairs_are_compared_up_to_a_number_of_photographs(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, everything: bool
+) -> None:
+    """Of eight that can be read; the job goes as far as the choice of pairs."""
+    from splatseg.pose import _recover, _worker
+
+    compared: list[str] = []
+    monkeypatch.setattr(_worker.Job, "_match_pairs", lambda *_, **__: compared.append("all"))
+    monkeypatch.setattr(_worker.Job, "_match_likely", lambda *_: compared.append("likely"))
+    monkeypatch.setattr(_worker.Job, "_look_again", lambda _: None)
+
+    def match(job: dict[str, Any], *_: object, **__: object) -> None:
+        _worker.Job(job)._match()
+        raise InputError("far enough")
+
+    monkeypatch.setattr(_recover, "run_worker", match)
+    options = replace(OPTIONS, exhaustive_up_to=most)
+    with pytest.raises(InputError, match="far enough"):
+        recover_poses(folder, folder=tmp_path / "capture", options=options)
+    assert compared == ["all" if everything else "likely"]

@@ -67,8 +67,8 @@ class Command:
     """Name of the evidence that tells where boundaries are. None takes what the layer was made
     from. Segments with ids of each view's own take those of LAYER that they fit best."""
 
-    reconsider: bool = True
-    """Decide labels under how often the evidence takes one id for another, as segment does."""
+    correct_confusion: bool = True
+    """Relabel under how often the evidence takes one id for another, as segment does."""
 
     measure: int = 8
     """Held-out views in which the picture is compared with photographs before and after; 0 for
@@ -87,7 +87,7 @@ class Command:
     """How long, and how much labels count."""
 
     confusion: ConfusionOptions = field(default_factory=ConfusionOptions)
-    """How the evidence errs, for --reconsider."""
+    """How the evidence errs, for --correct-confusion."""
 
 
 def run(command: Command) -> None:
@@ -110,7 +110,7 @@ def run(command: Command) -> None:
             views,
             source,
             options=command.sharpen,
-            confusion=command.confusion if command.reconsider else None,
+            confusion=command.confusion if command.correct_confusion else None,
             fit_options=_fit_options(scene, views),
             exposures=exposures,
             seed=command.seed,
@@ -152,6 +152,9 @@ def merged(layer: Labels, found: Sharpened) -> Labels:
     evidence = new.evidence
     if evidence is not None and layer.evidence is not None:
         evidence = torch.where(told, evidence, layer.evidence)
+    views = new.effective_views
+    if views is not None and layer.effective_views is not None:
+        views = torch.where(told, views, layer.effective_views)
     return replace(
         layer,
         ids=torch.where(told, new.ids, layer.ids),
@@ -159,6 +162,7 @@ def merged(layer: Labels, found: Sharpened) -> Labels:
         candidates=None,
         shares=None,
         evidence=evidence,
+        effective_views=views,
         inferred=inferred if bool(inferred.any()) else None,
         metadata=dict(layer.metadata) | {"sharpened": new.metadata["sharpened"]},
     )

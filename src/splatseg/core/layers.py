@@ -36,6 +36,10 @@ class Labels:
     """How much spoke for any id: blending weight summed over voting pixels and views. One fully
     visible pixel counts 1; 0 where no view saw the Gaussian."""
 
+    effective_views: Float[Tensor, "n"] | None = None
+    """How many views that evidence comes from, each counted by how much of the Gaussian it shows
+    (Kish's effective sample size); 0 where no view saw it."""
+
     inferred: Bool[Tensor, "n"] | None = None
     """True where the id comes from neighbours and not from evidence of the Gaussian's own."""
 
@@ -56,6 +60,8 @@ class Labels:
             check_shape("shares", self.shares, tuple(self.candidates.shape))
         if self.evidence is not None:
             check_shape("evidence", self.evidence, (n,))
+        if self.effective_views is not None:
+            check_shape("effective_views", self.effective_views, (n,))
         if self.inferred is not None:
             check_shape("inferred", self.inferred, (n,))
             if self.inferred.dtype != torch.bool:
@@ -73,6 +79,7 @@ class Labels:
             candidates=None if self.candidates is None else self.candidates[index],
             shares=None if self.shares is None else self.shares[index],
             evidence=None if self.evidence is None else self.evidence[index],
+            effective_views=None if self.effective_views is None else self.effective_views[index],
             inferred=None if self.inferred is None else self.inferred[index],
             metadata=self.metadata,
         )

@@ -47,6 +47,8 @@ def save_layer(path: Path, layer: Layer) -> None:
                 }
             if layer.evidence is not None:
                 arrays |= {"evidence": _floats(layer.evidence.float())}
+            if layer.effective_views is not None:
+                arrays |= {"effective_views": _floats(layer.effective_views.float())}
             if layer.inferred is not None:
                 arrays |= {"inferred": layer.inferred.cpu().numpy()}
         case Features():
@@ -89,6 +91,11 @@ def load_layer(path: Path) -> Layer:
                 else None,
                 evidence=torch.from_numpy(_array(path, arrays, "evidence", "f4", (count,)))
                 if "evidence" in arrays
+                else None,
+                effective_views=torch.from_numpy(
+                    _array(path, arrays, "effective_views", "f4", (count,))
+                )
+                if "effective_views" in arrays
                 else None,
                 inferred=torch.from_numpy(_array(path, arrays, "inferred", "?", (count,)))
                 if "inferred" in arrays

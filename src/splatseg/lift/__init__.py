@@ -16,7 +16,7 @@ from splatseg.lift.completion.complete import CompletionOptions as CompletionOpt
 from splatseg.lift.completion.complete import complete as complete
 from splatseg.lift.label_maps import label_map as label_map
 from splatseg.lift.mass.confusion import ConfusionOptions as ConfusionOptions
-from splatseg.lift.mass.confusion import reconsider as reconsider
+from splatseg.lift.mass.confusion import correct_confusion as correct_confusion
 from splatseg.lift.mass.uplift import UpliftOptions as UpliftOptions
 from splatseg.lift.mass.uplift import uplift as uplift
 from splatseg.lift.segments.matching import MatchedMaps as MatchedMaps

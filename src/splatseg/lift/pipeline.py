@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, LabelSource, View
 from splatseg.lift.completion.complete import CompletionOptions, complete
-from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
+from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
 from splatseg.lift.mass.uplift import UpliftOptions, uplift
 from splatseg.render import RenderOptions
 
@@ -31,7 +31,7 @@ def lift_labels(
     """Label Gaussians by label maps as well as it is known how; what `segment` does by default.
 
     The votes of `uplift`, decided anew under how often the evidence takes one id for another
-    (`reconsider`), and completed where no view sees anything (`complete`).
+    (`correct_confusion`), and completed where no view sees anything (`complete`).
 
     Args:
         gaussians: The Gaussians of the scene.
@@ -69,7 +69,9 @@ def lift_labels(
         progress=progress,
     )
     if relabel:
-        labels = reconsider(labels, options=confusion)
+        labels = correct_confusion(
+            labels, options=confusion, view_correlation=labels.metadata["view_correlation"]
+        )
         if wanted < 2:
             labels = replace(labels, candidates=None, shares=None)
     if completion is not None and bool((labels.ids != UNLABELLED).any()):

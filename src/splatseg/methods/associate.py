@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, SegmentSource, View
 from splatseg.errors import RangeError
-from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
+from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
 from splatseg.lift.segments.clustering import cluster
 from splatseg.lift.segments.flatten import chosen_groups
 from splatseg.lift.segments.recorded import EvidenceSegments
@@ -38,7 +38,7 @@ from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import RenderOptions
 
 _CANDIDATES = 8
-"""Instances of a Gaussian that are reconsidered."""
+"""Instances of a Gaussian that relabelling chooses from."""
 
 _SURE_SEGMENTS = 3
 """Groups of fewer segments are too few to speak for a small thing: they may be accidents."""
@@ -55,7 +55,7 @@ class AssociateOptions:
 
     small_things: float = 0.0
     """Exponent with which small instances outweigh large ones where views contradict each other;
-    0 treats all alike. 0.25 does most of what reconsidering does, without it."""
+    0 treats all alike. 0.25 does most of what correcting confusion does, without it."""
 
     least_views: int = 2
     """An instance needs segments in so many views, or in all there are if they are fewer."""
@@ -104,7 +104,7 @@ def associate(
         views: Those whose segments count.
         source: Their segments.
         options: How segments become instances.
-        confusion: How segments err, see `reconsider`. None takes the majority of the votes.
+        confusion: How segments err, see `correct_confusion`. None takes the majority of the votes.
         classes: Names of the categories of segments; instances are named after theirs.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
@@ -140,7 +140,7 @@ def associate(
     rows = _instances(table, group, classes)
     labels = _labels(votes)
     if confusion is not None:
-        labels = reconsider(labels, options=confusion)
+        labels = correct_confusion(labels, options=confusion)
     return replace(
         labels,
         candidates=None,
@@ -273,8 +273,8 @@ class AssociateMethodOptions:
     association: AssociateOptions = field(default_factory=AssociateOptions)
     """How segments become instances."""
 
-    reconsider: bool = True
-    """Decide anew under how often the evidence takes one instance for another, which finds small
+    correct_confusion: bool = True
+    """Relabel under how often the evidence takes one instance for another, which finds small
     things that most views miss."""
 
     confusion: ConfusionOptions = field(default_factory=ConfusionOptions)
@@ -288,7 +288,7 @@ def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels:
         inputs.views,
         EvidenceSegments(evidence=inputs.evidence),
         options=options.association,
-        confusion=options.confusion if options.reconsider else None,
+        confusion=options.confusion if options.correct_confusion else None,
         classes=inputs.categories,
         backend=inputs.backend,
         progress=inputs.progress,

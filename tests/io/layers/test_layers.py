@@ -39,6 +39,7 @@ LAYERS = {
         candidates=torch.tensor([[-1, -1], [3, 1], [70000, -1], [1, 2], [9, 8]], dtype=torch.int32),
         shares=torch.rand(5, 2, generator=torch.Generator().manual_seed(1)),
         evidence=torch.tensor([3.0, 0.0, 1.5, 2.0, 1e6]),
+        effective_views=torch.tensor([1.0, 2.5, 0.0, 7.25, 3.0]),
         inferred=torch.tensor([False, True, False, False, True]),
     ),
     "features": Features(values=torch.randn(4, 3), weights=torch.rand(4), metadata=METADATA),

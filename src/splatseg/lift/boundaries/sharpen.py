@@ -46,12 +46,12 @@ from splatseg.errors import InputError, RangeError
 from splatseg.fit import Exposure, FitOptions, Refinement
 from splatseg.lift.label_maps import label_map
 from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, reconsider
+from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
 from splatseg.lift.mass.uplift import UpliftOptions, uplift
 from splatseg.render import render
 
 _CANDIDATES = 8
-"""Ids of a Gaussian that are reconsidered."""
+"""Ids of a Gaussian that relabelling chooses from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,9 +136,9 @@ def sharpen(
         evidence: Their label maps, with ids that mean the same in all views (`MatchedMaps` for
             segments); pixels at -1 say nothing.
         options: How long, and how much labels count.
-        uplift_options: How Gaussians get labels; candidates are at least 8 where labels are
-            reconsidered.
-        confusion: How the evidence errs, see `reconsider`; None takes the majority.
+        uplift_options: How Gaussians get labels; candidates are at least 8 where confusion
+            is corrected.
+        confusion: How the evidence errs, see `correct_confusion`; None takes the majority.
         fit_options: How the photographs are compared (see `refinement_options`), and rates. Its
             seed is not used, and the poses of the views stay as they are: the label maps are
             drawn with them.
@@ -164,7 +164,11 @@ def sharpen(
 
     def decided(now: Gaussians) -> tuple[Labels, float]:
         votes = uplift(now, ordered, papers, options=wanted, backend=backend)
-        labels = votes if confusion is None else reconsider(votes, options=confusion)
+        labels = votes
+        if confusion is not None:
+            labels = correct_confusion(
+                votes, options=confusion, view_correlation=votes.metadata["view_correlation"]
+            )
         return labels, _agreement(votes, labels)
 
     labels, before = decided(gaussians)

@@ -11,6 +11,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, View, ViewNames
 from splatseg.errors import InputError
 from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.lift.mass.view_votes import ViewVotes
 from splatseg.lift.mass.vote_table import VoteTable
 from splatseg.render import RenderOptions, back_project
 
@@ -94,6 +95,8 @@ class Engine:
     backend: str
     equal_views: float = 0.0
     """Power of a view's visible weight that its votes are divided by."""
+    by_view: ViewVotes | None = None
+    """Where a sample of the votes is kept view by view."""
 
     def cast(self, table: VoteTable, light: Light, camera: Camera, paper: LabelMap) -> Tensor:
         """Add a view's votes; returns how much of each Gaussian the view shows, (n,)."""
@@ -117,6 +120,8 @@ class Engine:
                 rows = torch.nonzero(visible > 0).squeeze(1)
                 sums = found[0][rows]
                 table.add(part, sums if say is None else sums * say[rows].unsqueeze(1), rows=rows)
+                if self.by_view is not None:
+                    self.by_view.add(part, sums, rows=rows)
                 caught = sums.sum(dim=0, dtype=torch.float64)
                 light.add(part, votes[start : start + len(part)], caught)
         say = self._say(visible)
@@ -144,6 +149,8 @@ class Engine:
         say = self._say(found.visible)
         weight = found.weight if say is None else found.weight * say[found.gaussian]
         table.add_sparse(found.segment, found.gaussian, weight)
+        if self.by_view is not None:
+            self.by_view.add_sparse(found.segment, found.gaussian, found.weight)
         ids, _, votes = pixel_votes(paper)
         place = torch.searchsorted(ids, found.segment)
         caught = torch.bincount(place, weights=found.weight.double(), minlength=len(ids))

@@ -1,22 +1,30 @@
-r"""Labels decided anew under how the evidence errs.
+r"""Confusion-aware relabelling: the labels that make the votes most likely (Dawid and Skene 1979).
 
 A 2D model misses a mouse on a desk in most views and calls it desk; it hardly ever calls a desk
 mouse. So a Gaussian with a third of its votes for mouse is part of a mouse, although desk has
-the majority. How often which id is taken for which is read off the layer itself: Gaussians of
-one winner t tell what else was said of them,
+the majority. How often which id is taken for which, the confusion matrix :math:`\theta`, is read
+off the layer itself: Gaussians of one winner t tell what else was said of them,
 
 .. math:: \theta_{tc} \propto d\,[t = c] + \sum_{i:\, \arg\max y_i = t} m_i\, y_{ic}, \qquad
           \pi_t \propto 1 + \sum_{i:\, \arg\max y_i = t} m_i
 
 with y the shares, :math:`m_i = \min(e_i, \bar m)` the evidence of a Gaussian, bounded so that
-what fills the pictures does not decide alone, and d a little that speaks for every id. Then
+what fills the images does not decide alone, and d a little that speaks for every id. Then
 
-.. math:: p_i(t) \propto \pi_t \prod_c \max(\theta_{tc}, \epsilon)^{k\, y_{ic}}
+.. math:: p_i(t) \propto \pi_t \prod_c \max(\theta_{tc}, \epsilon)^{k_i\, y_{ic}}
 
-where k is how many independent looks all views together amount to: a model errs alike in
-neighbouring views, so they are far fewer than there are views. This is one round of
-expectation maximisation from the majority; further rounds drift, because the evidence is not
-as independent as the model takes it to be.
+where :math:`k_i` is how many independent views the Gaussian's votes amount to: no more than saw
+it, and no more than `ConfusionOptions.effective_views`, because a model errs alike in
+neighbouring views. This is one round of expectation maximisation from the majority; further
+rounds drift, because the votes are not as independent as the model takes them to be.
+
+The model takes every Gaussian of an id to be confused alike, and views to err independently. It
+harms where that is wrong: where one piece of a surface is called something else in many of its
+views (the wall between two windows), and where two ids are taken for each other about as often as
+not. Errors that hold over ranges of views are told by `view_votes`, and then votes amount to few
+views (`ConfusionOptions.correlated_views`): with three of them the prior weighs against changes
+that the votes do not speak for strongly. Errors of one place that come and go from view to view,
+and swaps, cannot be told from votes.
 
 References:
     Dawid and Skene, Maximum Likelihood Estimation of Observer Error-Rates Using the EM
@@ -45,31 +53,45 @@ _ROWS = 65536
 class ConfusionOptions:
     """How the evidence errs."""
 
-    looks: float = 10.0
-    """k: independent looks that a Gaussian's evidence amounts to."""
+    effective_views: float = 10.0
+    """Most independent views that a Gaussian's votes amount to; fewer where fewer saw it."""
 
-    least_confusion: float = 3e-3
-    """Epsilon: every id is taken for every other at least this often, in (0, 1)."""
+    max_correlation: float = 0.27
+    """Highest correlation of neighbouring views, in [-1, 1], at which views count as independent.
+    Above it errors hold over ranges of views."""
 
-    own_votes: float = 5.0
-    """d: evidence for being taken for itself that every id starts with, in pixels' worth of
+    correlated_views: float = 3.0
+    """Most independent views that votes amount to above `max_correlation`."""
+
+    min_confusion: float = 3e-3
+    """Epsilon: every id is taken for every other at least this often, in (0, 0.5]."""
+
+    diagonal_prior: float = 5.0
+    """d: evidence on the diagonal of the confusion matrix that every id starts with, in pixels'
+    worth of blending weight."""
+
+    max_evidence: float = 20.0
+    """Most evidence that one Gaussian counts with in the confusion matrix, in pixels' worth of
     blending weight."""
 
-    loudest: float = 20.0
-    """The most evidence that one Gaussian has a say with, in pixels' worth of blending weight."""
-
     def __post_init__(self) -> None:
-        for name in ("looks", "own_votes", "loudest"):
+        for name in ("effective_views", "correlated_views", "diagonal_prior", "max_evidence"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise RangeError(f"{name}: expected a positive number, got {value}.")
-        check_range("least_confusion", self.least_confusion, 1e-9, 0.5)
+        check_range("max_correlation", self.max_correlation, -1.0, 1.0)
+        check_range("min_confusion", self.min_confusion, 1e-9, 0.5)
 
 
 DEFAULT_CONFUSION = ConfusionOptions()
 
 
-def reconsider(labels: Labels, *, options: ConfusionOptions | None = None) -> Labels:
+def correct_confusion(
+    labels: Labels,
+    *,
+    options: ConfusionOptions | None = None,
+    view_correlation: float | None = None,
+) -> Labels:
     """Decide a soft layer anew under how often its ids are taken for one another.
 
     Ids must mean the same in all views, as classes do. Only ids that are ever confused with what
@@ -77,16 +99,22 @@ def reconsider(labels: Labels, *, options: ConfusionOptions | None = None) -> La
 
     Args:
         labels: A soft layer: shares of two or more candidates, such as `uplift` gives with
-            ``candidates=8``. Where it says how much evidence there is, that is used.
+            ``candidates=8``. Where it says how much evidence there is and how many views it comes
+            from, that is used.
         options: How the evidence errs.
+        view_correlation: How much better the nearest view tells what a held-out view says than
+            other views do, at most 1: `uplift` measures it on the training views and records it
+            in the metadata. None where that is not known: views count as independent.
 
     Returns:
         The layer with ids, candidates and shares by probability, as many as before. Gaussians
-        without a label keep none. The metadata says how many labels changed.
+        without a label keep none. The metadata says how many labels changed, and how
+        many independent views votes amounted to at most.
 
     Raises:
         InputError: If the layer is hard or has a single candidate.
-        RangeError: If a share or an evidence is NaN or infinite.
+        RangeError: If a share, an evidence, a number of views or the correlation is NaN or
+            infinite.
 
     Example:
         Of 21 Gaussians 19 are surely desk (1) and one is surely mouse (2), though half of what
@@ -96,7 +124,7 @@ def reconsider(labels: Labels, *, options: ConfusionOptions | None = None) -> La
         >>> ids = torch.tensor([[1, -1]] * 19 + [[2, 1], [1, 2]])
         >>> soft = Labels(ids=ids[:, 0], confidence=shares[:, 0], candidates=ids, shares=shares,
         ...               evidence=torch.full((21,), 20.0))
-        >>> reconsider(soft).ids[-2:]
+        >>> correct_confusion(soft).ids[-2:]
         tensor([2, 2], dtype=torch.int32)
     """
     options = options or ConfusionOptions()
@@ -108,20 +136,37 @@ def reconsider(labels: Labels, *, options: ConfusionOptions | None = None) -> La
     check_finite("labels.shares", labels.shares)
     if labels.evidence is not None:
         check_finite("labels.evidence", labels.evidence)
+    if labels.effective_views is not None:
+        check_finite("labels.effective_views", labels.effective_views)
+    most = options.effective_views
+    if view_correlation is not None:
+        check_range("view_correlation", view_correlation, -math.inf, 1.0)
+        if view_correlation > options.max_correlation:
+            most = min(most, options.correlated_views)
+    facts = {
+        "options": asdict(options),
+        "view_correlation": view_correlation,
+        "effective_views": most,
+    }
     known = (labels.ids != UNLABELLED).cpu()
     rows = torch.nonzero(known).squeeze(1)
     if not len(rows):
-        return _described(labels, options, changed=0)
+        return _described(labels, facts | {"changed": 0})
     names, table = _shares(labels.ids.cpu(), labels.candidates.cpu(), labels.shares.cpu(), rows)
     mass = np.ones(len(rows))
     if labels.evidence is not None:
-        mass = labels.evidence.cpu()[rows].double().clamp(0, options.loudest).numpy()
+        mass = labels.evidence.cpu()[rows].double().clamp(0, options.max_evidence).numpy()
+    views = np.full(len(rows), most)
+    if labels.effective_views is not None:
+        # A Gaussian that has a vote was seen by a view.
+        seen = labels.effective_views.cpu()[rows].double().clamp_min(1).numpy()
+        views = np.minimum(views, seen)
     prior, gains = _model(table, mass, options)
     ids = torch.full_like(labels.candidates.cpu().int(), UNLABELLED)
     shares = torch.zeros(ids.shape)
     for start in range(0, len(rows), _ROWS):
         block = slice(start, start + _ROWS)
-        columns, values = ranked(_chances(table[block], prior, gains), ids.shape[1])
+        columns, values = ranked(_posterior(table[block], views[block], prior, gains), ids.shape[1])
         called = np.where(columns >= 0, names[np.maximum(columns, 0)], UNLABELLED)
         ids[rows[block]] = torch.from_numpy(called.astype(np.int32))
         shares[rows[block]] = torch.from_numpy(values).clamp(0, 1)
@@ -133,7 +178,7 @@ def reconsider(labels: Labels, *, options: ConfusionOptions | None = None) -> La
         candidates=ids,
         shares=shares,
     )
-    return _described(decided, options, changed=changed)
+    return _described(decided, facts | {"changed": changed})
 
 
 def _shares(
@@ -160,7 +205,7 @@ def _shares(
 def _model(
     table: Any, mass: NDArray[np.float64], options: ConfusionOptions
 ) -> tuple[NDArray[np.float64], Any]:
-    r"""Log of the prior, and :math:`k \log(\max(\theta, \epsilon) / \epsilon)`, sparse (c, t)."""
+    r"""Log of the prior, and :math:`\log(\max(\theta, \epsilon) / \epsilon)`, sparse (c, t)."""
     import scipy.sparse
 
     count = table.shape[1]
@@ -168,29 +213,29 @@ def _model(
     chosen = scipy.sparse.csr_matrix(
         (mass, (winner, np.arange(len(winner)))), shape=(count, len(winner))
     )
-    taken = chosen @ table + options.own_votes * scipy.sparse.identity(count, format="csr")
+    taken = chosen @ table + options.diagonal_prior * scipy.sparse.identity(count, format="csr")
     total = np.asarray(taken.sum(axis=1)).reshape(-1)
     taken = (scipy.sparse.diags(1 / total) @ taken).tocsr()
-    taken.data = options.looks * np.log(
-        np.maximum(taken.data, options.least_confusion) / options.least_confusion
-    )
+    taken.data = np.log(np.maximum(taken.data, options.min_confusion) / options.min_confusion)
     taken.eliminate_zeros()
     prior = 1 + np.asarray(chosen.sum(axis=1)).reshape(-1)
     return np.log(prior / prior.sum()), taken.T.tocsr()
 
 
-def _chances(table: Any, prior: NDArray[np.float64], gains: Any) -> Any:
+def _posterior(
+    table: Any, views: NDArray[np.float64], prior: NDArray[np.float64], gains: Any
+) -> Any:
     """Probabilities of ids, sparse; rows add up to 1."""
-    chances = (table @ gains).tocsr()
-    chances.data += prior[chances.indices]
+    posterior = (table @ gains).tocsr()
+    sizes = np.diff(posterior.indptr)
+    posterior.data *= np.repeat(views, sizes)
+    posterior.data += prior[posterior.indices]
     # Every row has its own candidates at least, so that none is empty.
-    sizes = np.diff(chances.indptr)
-    best = np.maximum.reduceat(chances.data, chances.indptr[:-1])
-    chances.data = np.exp(chances.data - np.repeat(best, sizes))
-    chances.data /= np.repeat(np.add.reduceat(chances.data, chances.indptr[:-1]), sizes)
-    return chances
+    best = np.maximum.reduceat(posterior.data, posterior.indptr[:-1])
+    posterior.data = np.exp(posterior.data - np.repeat(best, sizes))
+    posterior.data /= np.repeat(np.add.reduceat(posterior.data, posterior.indptr[:-1]), sizes)
+    return posterior
 
 
-def _described(labels: Labels, options: ConfusionOptions, *, changed: int) -> Labels:
-    facts = {"options": asdict(options), "changed": changed}
+def _described(labels: Labels, facts: dict[str, Any]) -> Labels:
     return replace(labels, metadata=dict(labels.metadata) | {"confusion": facts})

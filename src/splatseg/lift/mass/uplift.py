@@ -40,7 +40,8 @@ from splatseg.core import (
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import Engine, Light, near_an_edge, voting_views
 from splatseg.lift.mass.decision import LabelRule, decide
-from splatseg.lift.mass.vote_table import VoteTable
+from splatseg.lift.mass.view_votes import ViewVotes
+from splatseg.lift.mass.vote_table import Ranking, VoteTable
 from splatseg.render import RenderOptions, options_for
 
 
@@ -163,19 +164,25 @@ def uplift(
     """
     options = options or UpliftOptions()
     ordered = voting_views(views, evidence, "a label map")
+    by_view = ViewVotes(gaussians.means) if options.candidates > 1 else None
     engine = Engine(
         gaussians=gaussians,
         options=render_options or options_for(gaussians, backend),
         backend=backend,
         equal_views=options.equal_views,
+        by_view=by_view,
     )
     table = VoteTable(len(gaussians), memory=options.memory, slots=options.slots)
     light = Light()
-    visible = torch.zeros(len(gaussians))
+    visible, squares = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
     for done, view in enumerate(ordered):
         paper = evidence.label_map(view.name)
         camera = camera_of_map(view, paper.height, paper.width)
-        visible += engine.cast(table, light, camera, _without_edges(paper, options))
+        shown = engine.cast(table, light, camera, _without_edges(paper, options))
+        visible += shown
+        squares += shown**2
+        if by_view is not None:
+            by_view.end_view(view.camera)
         if progress is not None:
             progress(done + 1, len(ordered))
     if not light.cast:
@@ -200,6 +207,8 @@ def uplift(
         candidates=decision.candidates if soft else None,
         shares=decision.shares if soft else None,
         evidence=ranking.total,
+        # Kish's effective sample size: a view that shows hardly anything counts hardly anything.
+        effective_views=torch.where(squares > 0, visible**2 / squares, 0.0),
         metadata={
             "method": "uplift",
             "options": asdict(options),
@@ -207,8 +216,17 @@ def uplift(
             "names": _names(classes, light),
             "background_votes": facts,
             "largest_doubt": _largest_share(ranking.doubt, ranking.total),
-        },
+        }
+        | _correlation(by_view, ranking),
     )
+
+
+def _correlation(by_view: ViewVotes | None, ranking: Ranking) -> dict[str, float | None]:
+    """How alike neighbouring views err, where the layer is soft."""
+    if by_view is None:
+        return {}
+    shares = ranking.votes / ranking.total.clamp_min(1e-30).unsqueeze(1)
+    return {"view_correlation": by_view.correlation(ranking.ids, shares)}
 
 
 def _without_edges(paper: LabelMap, options: UpliftOptions) -> LabelMap:
