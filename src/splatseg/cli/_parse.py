@@ -34,8 +34,8 @@ def flowing(text: str) -> str:
     r"""Text without the line breaks of the source; blank lines between paragraphs stay.
 
     Example:
-        >>> flowing("one line,\\n    and its end.\\n\\n    Another.")
-        'one line, and its end.\\n\\nAnother.'
+        >>> flowing("one line,\n    and its end.\n\n    Another.")
+        'one line, and its end.\n\nAnother.'
     """
     paragraphs = inspect.cleandoc(text).split("\n\n")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
