@@ -17,6 +17,7 @@ namespace nb = nanobind;
 namespace splatseg {
 void register_loss(nb::module_& m);
 void register_adam(nb::module_& m);
+void register_csr(nb::module_& m);
 }  // namespace splatseg
 
 namespace splatseg {
@@ -313,25 +314,7 @@ NB_MODULE(_native, m) {
       .def_prop_ro("entries", &BlockMatrix::entries)
       .def_prop_ro("nbytes", &BlockMatrix::bytes);
 
-  m.def("csr_render", [](const Array<const int64_t>& indptr, const Array<const int32_t>& ids,
-                         const Array<const uint16_t>& weights, const In& signal, const Out& image) {
-    const int64_t rows = static_cast<int64_t>(indptr.size()) - 1;
-    require(signal.ndim() == 2 && image.size() == static_cast<size_t>(rows) * signal.shape(1), "signal");
-    nb::gil_scoped_release release;
-    csr_render(indptr.data(), ids.data(), weights.data(), rows, signal.data(),
-               static_cast<int>(signal.shape(1)), image.data());
-  });
-  m.def("csr_back_project", [](const Array<const int64_t>& indptr, const Array<const int32_t>& ids,
-                               const Array<const uint16_t>& weights, const In& image,
-                               const Out& sums, const Out& weight_sums) {
-    const int64_t rows = static_cast<int64_t>(indptr.size()) - 1;
-    require(image.ndim() == 2 && static_cast<int64_t>(image.shape(0)) == rows && sums.ndim() == 2 &&
-                sums.shape(1) == image.shape(1) && weight_sums.size() == sums.shape(0),
-            "image");
-    nb::gil_scoped_release release;
-    csr_back_project(indptr.data(), ids.data(), weights.data(), rows, image.data(),
-                     static_cast<int>(image.shape(1)), sums.data(), weight_sums.data());
-  });
   register_loss(m);
   register_adam(m);
+  register_csr(m);
 }

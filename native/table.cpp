@@ -22,12 +22,14 @@ SPLATSEG_KERNEL(block_weights)
 SPLATSEG_KERNEL(blocks_forward)
 SPLATSEG_KERNEL(blocks_adjoint)
 SPLATSEG_KERNEL(tile_weights)
+SPLATSEG_KERNEL(gather_rows)
+SPLATSEG_KERNEL(scatter_rows)
 
 const Kernels& table() {
   static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, find_tiles, forward_colour,
                                   forward_features, adjoint, backward_colour, backward_features,
                                   chain, block_weights, blocks_forward, blocks_adjoint,
-                                  tile_weights};
+                                  tile_weights, gather_rows, scatter_rows};
   return kernels;
 }
 

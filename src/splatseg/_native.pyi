@@ -136,16 +136,29 @@ class BlockMatrix:
     def count_rows(self, indptr: Tensor, /) -> None: ...
     def fill_rows(self, indptr: Tensor, ids: Tensor, weights: Tensor, /) -> None: ...
 
-def csr_render(
-    indptr: Tensor, ids: Tensor, weights: Tensor, signal: Tensor, image: Tensor, /
+def csr_product(
+    indptr: Tensor, ids: Tensor, weights: Tensor, table: Tensor, out: Tensor, /
 ) -> None: ...
-def csr_back_project(
+def csr_adjoint(
+    indptr: Tensor, ids: Tensor, weights: Tensor, table: Tensor, out: Tensor, /
+) -> None: ...
+def csr_transpose(
     indptr: Tensor,
     ids: Tensor,
     weights: Tensor,
-    image: Tensor,
-    sums: Tensor,
-    weight_sums: Tensor,
+    to_indptr: Tensor,
+    to_rows: Tensor,
+    to_weights: Tensor,
+    /,
+) -> None: ...
+def csr_select(
+    indptr: Tensor,
+    ids: Tensor,
+    weights: Tensor,
+    index: Tensor,
+    to_indptr: Tensor,
+    to_ids: Tensor,
+    to_weights: Tensor,
     /,
 ) -> None: ...
 def l1_dssim(

@@ -12,11 +12,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from jaxtyping import Float, Float16, Int, Int32, Int64
+from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.render._options import RenderOptions
+from splatseg.render._view_weights import ViewWeights
 
 Layout = Literal["csr", "blocks"]
 
@@ -66,51 +67,6 @@ class Contributors:
     median: Int32[Tensor, "p"]
     """The Gaussian at which the transmittance first falls to 0.5 or less; -1 where it never
     does."""
-
-
-class ViewWeights(ABC):
-    """W of one view, kept for reuse. Half-precision weights, float32 products."""
-
-    @property
-    @abstractmethod
-    def shape(self) -> tuple[int, int]:
-        """Pixels and Gaussians."""
-
-    @property
-    @abstractmethod
-    def nbytes(self) -> int:
-        """Memory it holds."""
-
-    @abstractmethod
-    def render(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
-        """``W @ signal``, row by row of the image (or of the pixels asked for)."""
-
-    @abstractmethod
-    def back_project(self, image: Float[Tensor, "pixels channels"]) -> BackProjected:
-        """``W.T @ image`` and ``W.T @ 1``."""
-
-
-class SparseWeights(ViewWeights):
-    """W as compressed sparse rows.
-
-    The ids and weights of pixel p are ``ids[indptr[p]:indptr[p + 1]]`` and ``weights[...]``,
-    front to back.
-    """
-
-    @property
-    @abstractmethod
-    def indptr(self) -> Int64[Tensor, "pixels_plus_1"]:
-        """Where each pixel's entries begin."""
-
-    @property
-    @abstractmethod
-    def ids(self) -> Int32[Tensor, "entries"]:
-        """Gaussians, front to back in each row."""
-
-    @property
-    @abstractmethod
-    def weights(self) -> Float16[Tensor, "entries"]:
-        """Blending weights."""
 
 
 class Backend(ABC):

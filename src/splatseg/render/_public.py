@@ -9,9 +9,10 @@ from torch import Tensor
 from splatseg._check import check_choice, check_finite, check_shape
 from splatseg.core import Camera, Gaussians
 from splatseg.errors import InputError, RangeError
-from splatseg.render._backend import BackProjected, Contributors, Layout, Rendered, ViewWeights
+from splatseg.render._backend import BackProjected, Contributors, Layout, Rendered
 from splatseg.render._options import RenderOptions
 from splatseg.render._registry import get_backend, options_for
+from splatseg.render._view_weights import ViewWeights
 from splatseg.render.views import (
     back_project_view,
     contributors_view,

@@ -17,9 +17,9 @@ from splatseg.render._backend import (
     Contributors,
     Layout,
     Rendered,
-    ViewWeights,
 )
 from splatseg.render._options import RenderOptions
+from splatseg.render._view_weights import ViewWeights
 from splatseg.render.warp import WarpMode, straightened, warp_into_photograph
 
 

@@ -103,7 +103,7 @@ def view_masses(
         )
         found = found + table[:, band] @ matrix
         here = torch.from_numpy(counts[band]).unsqueeze(1)
-        visible += rows.back_project(here.to(rows.weights.device)).sums[:, 0].cpu()
+        visible += rows.adjoint(here.to(rows.weights.device))[:, 0].cpu()
     found.eliminate_zeros()
     found.sort_indices()
     per_segment = np.diff(found.indptr)

@@ -13,11 +13,12 @@ from splatseg.render._backend import (
     Contributors,
     Layout,
     Rendered,
-    ViewWeights,
 )
 from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
+from splatseg.render._view_weights import ViewWeights
 from splatseg.render.cpu._view import NARROW, CpuView
-from splatseg.render.cpu._weights import CpuBlockWeights, CpuSparseWeights
+from splatseg.render.cpu._weights import CpuBlockWeights, rows_of_blocks
 
 _INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose", "screen")
 
@@ -186,13 +187,11 @@ class CpuBackend(Backend):
                     return CpuBlockWeights(
                         matrix, gaussians=n, height=camera.height, width=camera.width
                     )
-                return CpuSparseWeights.from_blocks(
-                    matrix, gaussians=n, pixels=camera.height * camera.width
-                )
+                return rows_of_blocks(matrix, gaussians=n, pixels=camera.height * camera.width)
             if pixels is None:
                 pixels = camera.pixel_centres().reshape(-1, 2).to(torch.int64)
             indptr, ids, weights, _, _ = view.pixel_rows(pixels, k or 0)
-        return CpuSparseWeights(indptr, ids, weights.to(torch.float16), gaussians=n)
+        return SparseWeights(indptr=indptr, ids=ids, weights=weights.to(torch.float16), gaussians=n)
 
 
 def _view(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> CpuView:

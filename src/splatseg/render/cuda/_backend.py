@@ -17,9 +17,9 @@ from splatseg.render._backend import (
     Contributors,
     Layout,
     Rendered,
-    ViewWeights,
 )
 from splatseg.render._options import RenderOptions
+from splatseg.render._view_weights import ViewWeights
 from splatseg.render.cuda._view import GSPLAT_ALPHA_MAX, CudaView, colours
 from splatseg.render.reference._backend import contributors_from_entries, weights_from_entries
 from splatseg.render.reference._composite import Entries

@@ -15,9 +15,9 @@ from splatseg.render._backend import (
     Contributors,
     Layout,
     Rendered,
-    ViewWeights,
 )
 from splatseg.render._options import RenderOptions
+from splatseg.render._view_weights import ViewWeights
 from splatseg.render.reference._composite import Entries, entries, tiles
 from splatseg.render.reference._project import Projected, project
 from splatseg.render.reference._weights import blocks_from_csr, csr_from_entries
