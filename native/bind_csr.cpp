@@ -60,10 +60,19 @@ void transpose(const Array<const int64_t>& indptr, const Array<const int32_t>& i
   require(to_indptr.size() >= 1, "indptr");
   const Csr csr = bind(indptr, ids, weights, static_cast<int64_t>(to_indptr.size()) - 1);
   require(to_rows.size() == ids.size() && to_weights.size() == ids.size() &&
-              is_half(to_weights) == csr.half && csr.rows < (int64_t{1} << 31),
+              is_half(to_weights) == csr.half && csr.rows < (int64_t{1} << 31) &&
+              ids.size() < (size_t{1} << 32),
           "out");
   nb::gil_scoped_release release;
   csr_transpose(csr, to_indptr.data(), to_rows.data(), to_weights.data());
+}
+
+void strong(const Array<const int64_t>& indptr, const Array<const int32_t>& ids, const Any& weights,
+            double min_weight, double share, const Array<uint8_t>& kept) {
+  const Csr csr = bind(indptr, ids, weights, int64_t{1} << 31);
+  require(kept.size() == ids.size(), "kept");
+  nb::gil_scoped_release release;
+  csr_strong(csr, min_weight, share, kept.data());
 }
 
 void select(const Array<const int64_t>& indptr, const Array<const int32_t>& ids, const Any& weights,
@@ -95,6 +104,7 @@ void register_csr(nb::module_& m) {
   m.def("csr_product", &product);
   m.def("csr_adjoint", &adjoint);
   m.def("csr_transpose", &transpose);
+  m.def("csr_strong", &strong);
   m.def("csr_select", &select);
 }
 

@@ -12,20 +12,85 @@ namespace {
 
 constexpr int64_t kRowsATime = 64;
 
+float float_of(float weight) { return weight; }
+float float_of(uint16_t half) {
+  const uint32_t sign = static_cast<uint32_t>(half & 0x8000u) << 16;
+  const uint32_t exponent = (half >> 10) & 31u, mantissa = half & 1023u;
+  float value = static_cast<float>(mantissa) * 5.9604644775390625e-8f;
+  if (!exponent) return sign ? -value : value;
+  const uint32_t bits = sign | ((exponent + 112u) << 23) | (mantissa << 13);
+  std::memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+// A counting sort. Parts of the rows are counted and moved by threads of their own; the order of
+// a column's entries is that of the rows, however many parts there are.
 template <class Weight>
 void transpose(const Csr& csr, int64_t* indptr, int32_t* rows, Weight* weights) {
   const Weight* from = static_cast<const Weight*>(csr.weights);
-  std::fill(indptr, indptr + csr.columns + 1, 0);
-  const int64_t entries = csr.entries();
-  for (int64_t e = 0; e < entries; ++e) ++indptr[csr.ids[e] + 1];
-  for (int64_t c = 0; c < csr.columns; ++c) indptr[c + 1] += indptr[c];
-  std::vector<int64_t> next(indptr, indptr + csr.columns);
-  for (int64_t row = 0; row < csr.rows; ++row)
-    for (int64_t e = csr.indptr[row]; e < csr.indptr[row + 1]; ++e) {
-      const int64_t to = next[static_cast<size_t>(csr.ids[e])]++;
-      rows[to] = static_cast<int32_t>(row);
-      weights[to] = from[e];
+  const int64_t entries = csr.entries(), columns = csr.columns;
+  const int64_t most = std::max<int64_t>(1, entries / std::max<int64_t>(columns, 65536));
+  const int parts = static_cast<int>(std::min<int64_t>(std::min(threads(), 8), most));
+  std::vector<std::vector<uint32_t>> next(static_cast<size_t>(parts));
+  std::vector<int64_t> first(static_cast<size_t>(parts) + 1, csr.rows);
+  for (int part = 0; part < parts; ++part)
+    first[static_cast<size_t>(part)] =
+        std::lower_bound(csr.indptr, csr.indptr + csr.rows, entries * part / parts) - csr.indptr;
+  run_on_threads(parts, [&](int part) {
+    auto& mine = next[static_cast<size_t>(part)];
+    mine.assign(static_cast<size_t>(columns), 0);
+    const int64_t end = csr.indptr[first[static_cast<size_t>(part) + 1]];
+    for (int64_t e = csr.indptr[first[static_cast<size_t>(part)]]; e < end; ++e)
+      ++mine[static_cast<size_t>(csr.ids[e])];
+  });
+  uint32_t total = 0;
+  for (int64_t c = 0; c < columns; ++c) {
+    indptr[c] = total;
+    for (auto& mine : next) {
+      const uint32_t count = mine[static_cast<size_t>(c)];
+      mine[static_cast<size_t>(c)] = total;
+      total += count;
     }
+  }
+  indptr[columns] = total;
+  run_on_threads(parts, [&](int part) {
+    uint32_t* mine = next[static_cast<size_t>(part)].data();
+    for (int64_t row = first[static_cast<size_t>(part)]; row < first[static_cast<size_t>(part) + 1];
+         ++row)
+      for (int64_t e = csr.indptr[row]; e < csr.indptr[row + 1]; ++e) {
+        const uint32_t to = mine[csr.ids[e]]++;
+        rows[to] = static_cast<int32_t>(row);
+        weights[to] = from[e];
+      }
+  });
+}
+
+template <class Weight>
+void strong(const Csr& csr, double min_weight, double share, uint8_t* kept) {
+  const Weight* weights = static_cast<const Weight*>(csr.weights);
+  parallel_for(csr.rows, 256, [&](int64_t begin, int64_t end) {
+    std::vector<std::pair<float, int64_t>> weak;  // from the weakest, the rear-most of equals first
+    for (int64_t row = begin; row < end; ++row) {
+      const int64_t first = csr.indptr[row], last = csr.indptr[row + 1];
+      if (first == last) continue;
+      weak.clear();
+      double sum = 0;
+      for (int64_t e = first; e < last; ++e) {
+        weak.emplace_back(float_of(weights[e]), -e);
+        sum += static_cast<double>(weak.back().first);
+      }
+      std::sort(weak.begin(), weak.end());
+      double until = 0;
+      bool dropping = true;
+      for (size_t i = 0; i < weak.size(); ++i) {
+        const double weight = static_cast<double>(weak[i].first);
+        until += weight;
+        dropping = dropping && i + 1 < weak.size() &&
+                   (min_weight > 0 ? weight < min_weight : until <= share * sum);
+        kept[-weak[i].second] = !dropping;
+      }
+    }
+  });
 }
 
 template <class Weight>
@@ -48,10 +113,7 @@ bool valid(const Csr& csr, int64_t entries) {
   if (csr.indptr[0] != 0 || csr.indptr[csr.rows] != entries) return false;
   for (int64_t row = 0; row < csr.rows; ++row)
     if (csr.indptr[row + 1] < csr.indptr[row]) return false;
-  uint32_t largest = 0;  // a negative id is a large one
-  for (int64_t e = 0; e < entries; ++e)
-    largest = std::max(largest, static_cast<uint32_t>(csr.ids[e]));
-  return entries == 0 || largest < static_cast<uint64_t>(csr.columns);
+  return kernels().ids_below(csr.ids, entries, csr.columns);
 }
 
 void csr_product(const Csr& csr, const float* table, int64_t channels, float* out) {
@@ -79,6 +141,13 @@ void csr_transpose(const Csr& csr, int64_t* indptr, int32_t* rows, void* weights
     transpose(csr, indptr, rows, static_cast<uint16_t*>(weights));
   else
     transpose(csr, indptr, rows, static_cast<float*>(weights));
+}
+
+void csr_strong(const Csr& csr, double min_weight, double share, uint8_t* kept) {
+  if (csr.half)
+    strong<uint16_t>(csr, min_weight, share, kept);
+  else
+    strong<float>(csr, min_weight, share, kept);
 }
 
 void csr_select(const Csr& csr, const int64_t* index, int64_t count, const int64_t* indptr,

@@ -26,6 +26,9 @@ void csr_adjoint(const Csr& csr, const float* table, int64_t channels, float* ou
 // The same matrix by columns: entries of a column in the order of rows. `weights` has the type of
 // csr.weights.
 void csr_transpose(const Csr& csr, int64_t* indptr, int32_t* rows, void* weights);
+// Which entries stay when the small weights of each row go: those below `min_weight`, or, where it
+// is 0, the smallest that are together at most `share` of the row. A row's strongest stays.
+void csr_strong(const Csr& csr, double min_weight, double share, uint8_t* kept);
 // Rows index[0], index[1], ... one after the other; `indptr` is given and fits them.
 void csr_select(const Csr& csr, const int64_t* index, int64_t count, const int64_t* indptr,
                 int32_t* ids, void* weights);

@@ -5,7 +5,7 @@
 namespace splatseg::SPLATSEG_ISA {
 namespace {
 
-constexpr int kAhead = 8;  // entries whose rows are asked for early
+constexpr int kAhead = 16;  // entries whose rows are asked for early
 
 inline float weight_of(const float* weights, int64_t entry) { return weights[entry]; }
 inline float weight_of(const uint16_t* weights, int64_t entry) {
@@ -19,12 +19,12 @@ inline float weight_of(const uint16_t* weights, int64_t entry) {
 // `Vectors` vectors of one row's sums stay in registers; the last one may be partly used.
 template <int Vectors, class Weight>
 inline void row_sums(const int32_t* ids, const Weight* weights, int64_t begin, int64_t end,
-                     const float* table, int64_t stride, int tail, float* out) {
+                     int64_t all, const float* table, int64_t stride, int tail, float* out) {
   Vec sum[Vectors];
   for (int v = 0; v < Vectors; ++v) sum[v] = set(0.0f);
   for (int64_t e = begin; e < end; ++e) {
     const float* value = table + stride * ids[e];
-    const float* ahead = table + stride * ids[e + kAhead < end ? e + kAhead : end - 1];
+    const float* ahead = table + stride * ids[e + kAhead < all ? e + kAhead : e];
     for (int v = 0; v < Vectors; ++v) __builtin_prefetch(ahead + v * kLanes);
     const Vec w = set(weight_of(weights, e));
     for (int v = 0; v + 1 < Vectors; ++v) sum[v] = fma(w, load(value + v * kLanes), sum[v]);
@@ -39,6 +39,7 @@ inline void row_sums(const int32_t* ids, const Weight* weights, int64_t begin, i
 template <class Weight>
 void gather(const int64_t* indptr, const int32_t* ids, const Weight* weights, int64_t begin,
             int64_t end, const float* table, int64_t channels, float* out) {
+  const int64_t all = indptr[end];
   for (int64_t row = begin; row < end; ++row) {
     const int64_t first = indptr[row], last = indptr[row + 1];
     float* to = out + row * channels;
@@ -49,10 +50,10 @@ void gather(const int64_t* indptr, const int32_t* ids, const Weight* weights, in
           static_cast<int>(left < vectors * kLanes ? left - (vectors - 1) * kLanes : kLanes);
       const float* from = table + c;
       switch (vectors) {
-        case 1: row_sums<1>(ids, weights, first, last, from, channels, tail, to + c); break;
-        case 2: row_sums<2>(ids, weights, first, last, from, channels, tail, to + c); break;
-        case 3: row_sums<3>(ids, weights, first, last, from, channels, tail, to + c); break;
-        default: row_sums<4>(ids, weights, first, last, from, channels, tail, to + c);
+        case 1: row_sums<1>(ids, weights, first, last, all, from, channels, tail, to + c); break;
+        case 2: row_sums<2>(ids, weights, first, last, all, from, channels, tail, to + c); break;
+        case 3: row_sums<3>(ids, weights, first, last, all, from, channels, tail, to + c); break;
+        default: row_sums<4>(ids, weights, first, last, all, from, channels, tail, to + c);
       }
     }
   }
@@ -61,13 +62,15 @@ void gather(const int64_t* indptr, const int32_t* ids, const Weight* weights, in
 template <class Weight>
 void scatter(const int64_t* indptr, const int32_t* ids, const Weight* weights, int64_t rows,
              const float* table, int64_t channels, int64_t from, int64_t to, float* out) {
+  const int64_t all = indptr[rows];
   for (int64_t row = 0; row < rows; ++row) {
     const float* value = table + row * channels;
     const int64_t last = indptr[row + 1];
     for (int64_t e = indptr[row]; e < last; ++e) {
       const float weight = weight_of(weights, e);
       float* sums = out + channels * ids[e];
-      __builtin_prefetch(out + channels * ids[e + kAhead < last ? e + kAhead : last - 1] + from, 1);
+      const float* ahead = out + channels * ids[e + kAhead < all ? e + kAhead : e];
+      for (int64_t c = from; c < to; c += kLanes) __builtin_prefetch(ahead + c, 1);
       const Vec w = set(weight);
       int64_t c = from;
       for (; c + kLanes <= to; c += kLanes)
@@ -98,6 +101,15 @@ void scatter_rows(const int64_t* indptr, const int32_t* ids, const void* weights
             out);
   else
     scatter(indptr, ids, static_cast<const float*>(weights), rows, table, channels, from, to, out);
+}
+
+bool ids_below(const int32_t* ids, int64_t count, int64_t columns) {
+  uint32_t largest = 0;  // a negative id is a large one
+  for (int64_t e = 0; e < count; ++e) {
+    const uint32_t id = static_cast<uint32_t>(ids[e]);
+    largest = largest < id ? id : largest;
+  }
+  return !count || static_cast<int64_t>(largest) < columns;
 }
 
 }  // namespace splatseg::SPLATSEG_ISA

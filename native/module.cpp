@@ -9,6 +9,7 @@
 #include <stdexcept>
 
 #include "pool.h"
+#include "segments.h"
 #include "view.h"
 #include "weights.h"
 
@@ -85,6 +86,14 @@ struct BoundView {
     nb::gil_scoped_release release;
     view.prepare(cloud, camera, {near, alpha_max, low_pass, antialiased, sh_degree});
     prepared = true;
+  }
+
+  void recolour(const CloudArrays& arrays, int sh_degree) {
+    const Cloud cloud = arrays.cloud();
+    require(prepared && cloud.count == gaussians, "recolour: other Gaussians than were prepared");
+    require(!cloud.sh || (sh_degree + 1) * (sh_degree + 1) <= cloud.sh_coefficients, "sh_degree");
+    nb::gil_scoped_release release;
+    view.recolour(cloud, sh_degree);
   }
 
   Planes planes(const Out& image, const Out& alpha, const Out& depth, const Out& median, int channels) const {
@@ -223,9 +232,11 @@ NB_MODULE(_native, m) {
            nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(),
            nb::arg("sh").noconvert().none(), nb::arg("signal").noconvert().none());
 
-  nb::class_<BoundView>(m, "View")
+  nb::class_<BoundView> view(m, "View");
+  view
       .def(nb::init<>())
       .def("prepare", &BoundView::prepare)
+      .def("recolour", &BoundView::recolour)
       .def("forward_colour", &BoundView::forward_colour)
       .def("forward_features", &BoundView::forward_features)
       .def("adjoint", &BoundView::adjoint)
@@ -257,6 +268,27 @@ NB_MODULE(_native, m) {
                               hand_over(std::move(rows.weights)), hand_over(std::move(rows.first)),
                               hand_over(std::move(rows.median)));
       });
+
+  view.def("sparse_adjoint", [](BoundView& self, const Array<const int64_t>& indptr,
+                                const Array<const int32_t>& columns, const In& values,
+                                const Out& weights) {
+    const size_t pixels = static_cast<size_t>(self.pixels());
+    require(self.prepared && indptr.size() == pixels + 1 && columns.size() == values.size() &&
+                static_cast<int64_t>(weights.size()) == self.gaussians,
+            "image");
+    require(indptr.data()[0] == 0 && indptr.data()[pixels] == static_cast<int64_t>(columns.size()),
+            "indptr");
+    for (size_t p = 0; p < pixels; ++p)
+      require(indptr.data()[p] <= indptr.data()[p + 1], "indptr");
+    SparseSums found;
+    {
+      nb::gil_scoped_release release;
+      found = sparse_adjoint(self.view, {indptr.data(), columns.data(), values.data()},
+                             self.gaussians, weights.data());
+    }
+    return nb::make_tuple(hand_over(std::move(found.gaussians)), hand_over(std::move(found.columns)),
+                          hand_over(std::move(found.sums)));
+  });
 
   nb::class_<BlockMatrix>(m, "BlockMatrix")
       .def(nb::init<>())

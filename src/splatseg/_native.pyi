@@ -114,6 +114,10 @@ class View:
     ) -> None: ...
     def narrow_signal_gradient(self, channels: int, v_signal: Tensor, /) -> None: ...
     def visible_ids(self, ids: Tensor, /) -> None: ...
+    def recolour(self, cloud: Cloud, sh_degree: int, /) -> None: ...
+    def sparse_adjoint(
+        self, indptr: Tensor, columns: Tensor, values: Tensor, weights: Tensor, /
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]: ...
     def pixel_rows(
         self, pixels: Tensor, k: int, /
     ) -> tuple[
@@ -149,6 +153,15 @@ def csr_transpose(
     to_indptr: Tensor,
     to_rows: Tensor,
     to_weights: Tensor,
+    /,
+) -> None: ...
+def csr_strong(
+    indptr: Tensor,
+    ids: Tensor,
+    weights: Tensor,
+    min_weight: float,
+    share: float,
+    kept: Tensor,
     /,
 ) -> None: ...
 def csr_select(

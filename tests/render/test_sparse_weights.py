@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatseg.errors import BackendError, InputError, RangeError, ShapeError
-from splatseg.render import CompactRows, SparseWeights, _products
+from splatseg.render import CompactRows, SparseWeights, _products, _rows
 from splatseg.render.cpu import isa, set_isa, set_threads
 
 GAUSSIANS = 40
@@ -15,7 +15,8 @@ GAUSSIANS = 40
 def device_path(request, monkeypatch):
     """Once with the native kernels and once as on a device that has none."""
     if request.param == "torch":
-        monkeypatch.setattr(_products, "_on_cpu", lambda _: False)
+        monkeypatch.setattr(_products, "on_cpu", lambda _: False)
+        monkeypatch.setattr(_rows, "on_cpu", lambda _: False)
     return request.param
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from splatseg import _native
@@ -73,7 +73,7 @@ class Csr:
 
     def transposed(self) -> "Csr":
         """The same matrix by columns: the entries of a column in the order of rows."""
-        if not _on_cpu(self.ids):
+        if not on_cpu(self.ids):
             return self._sorted_by_column()
         indptr = torch.empty(self.columns + 1, dtype=torch.int64)
         rows, weights = torch.empty_like(self.ids), torch.empty_like(self.weights)
@@ -102,7 +102,7 @@ class Csr:
         first = self.indptr[index]
         sizes = self.indptr[index + 1] - first
         indptr = starts_of(sizes)
-        if _on_cpu(self.ids):
+        if on_cpu(self.ids):
             ids = self.ids.new_empty(int(indptr[-1]))
             weights = self.weights.new_empty(len(ids))
             _native.csr_select(
@@ -115,18 +115,27 @@ class Csr:
         return Csr(indptr=indptr, ids=ids, weights=weights, columns=self.columns)
 
 
+def strong_entries(rows: Csr, min_weight: float, share: float) -> Bool[Tensor, "entries"]:
+    """Which entries are not among the small ones of their row, see `SparseWeights.truncated`."""
+    kept = torch.empty(len(rows.ids), dtype=torch.bool)
+    _native.csr_strong(
+        rows.indptr, rows.ids, _bits(rows.weights), min_weight, share, kept.view(torch.uint8)
+    )
+    return kept
+
+
 def starts_of(sizes: Tensor) -> Int64[Tensor, "rows_plus_1"]:
     """Where rows of these sizes begin, and where the last one ends."""
     return torch.cat((sizes.new_zeros(1), torch.cumsum(sizes, dim=0)))
 
 
-def _on_cpu(tensor: Tensor) -> bool:
+def on_cpu(tensor: Tensor) -> bool:
     """Whether the native kernels can read it."""
     return tensor.device.type == "cpu"
 
 
 def _is_native(values: Tensor) -> bool:
-    return _on_cpu(values) and values.dtype == torch.float32
+    return on_cpu(values) and values.dtype == torch.float32
 
 
 def _bits(weights: Tensor) -> Tensor:

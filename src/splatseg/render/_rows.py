@@ -1,4 +1,4 @@
-"""Rows of W as plain data: what a pixel sees, for training and for products of single pixels."""
+"""Rows of W as plain data: what pixels see, for training and for products of single pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.errors import InputError, RangeError
-from splatseg.render._products import Csr, LinearMap, starts_of
+from splatseg.render._products import Csr, LinearMap, on_cpu, starts_of, strong_entries
 from splatseg.render._view_weights import ViewWeights
 
 
@@ -207,7 +207,7 @@ class SparseWeights(ViewWeights):
         number[touched] = torch.arange(len(touched), dtype=torch.int32, device=self.device)
         return CompactRows(
             touched=touched,
-            rows=replace(self, ids=number[self.ids], gaussians=len(touched)),
+            rows=replace(self, ids=torch.index_select(number, 0, self.ids), gaussians=len(touched)),
             _columns=replace(columns, indptr=starts_of(sizes[touched])),
         )
 
@@ -354,6 +354,8 @@ def _strong_entries(
     rows: SparseWeights, min_weight: float | None, share: float | None
 ) -> Int64[Tensor, "kept"]:
     """Entries that stay, in their order."""
+    if on_cpu(rows.ids):
+        return torch.nonzero(strong_entries(rows._csr, min_weight or 0.0, share or 0.0)).squeeze(1)  # pyright: ignore[reportPrivateUsage]
     weights = rows.weights.double()
     row = torch.repeat_interleave(torch.arange(len(rows), device=rows.device), rows.indptr.diff())
     # By row, and in a row from the weakest to the strongest, the rear-most of equals first.
