@@ -21,7 +21,7 @@ bool valid(const Csr& csr, int64_t entries);
 
 // out (rows x channels) = W @ table (columns x channels).
 void csr_product(const Csr& csr, const float* table, int64_t channels, float* out);
-// out (columns x channels) = W^T @ table (rows x channels).
+// Adds W^T @ table (rows x channels) to out (columns x channels).
 void csr_adjoint(const Csr& csr, const float* table, int64_t channels, float* out);
 // The same matrix by columns: entries of a column in the order of rows. `weights` has the type of
 // csr.weights.

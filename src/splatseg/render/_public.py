@@ -51,6 +51,7 @@ def render(
         RangeError: If a value is NaN, infinite or out of range; it names the argument.
 
     Example:
+        >>> import torch
         >>> one = Gaussians(means=torch.tensor([[0.0, 0, 2]]), rotations=torch.eye(4)[:1],
         ...                 scales=torch.ones(1, 3), opacities=torch.ones(1),
         ...                 sh=torch.zeros(1, 1, 3))
