@@ -1,8 +1,9 @@
 """Rows of W and prepared views: time, memory and error, beside named references.
 
     python benchmarks/rows.py --repeats 9
+    python benchmarks/rows.py --scene SCENE
 
-Rows: 8 192 pixels drawn from 16 views of a room of 200 000 Gaussians. Products with 16 and 64
+Rows: 8 192 pixels drawn from 16 views of a room of 200 000 Gaussians, or of a scene. Products with 16 and 64
 channels against torch's `embedding_bag` and scipy's csr, on one thread and on two. A and B are
 alternated in one run; given are medians, milliseconds of CPU on one thread and of wall time on
 two (a shared machine's second core is seldom free). The share of memory bandwidth counts each
@@ -16,12 +17,14 @@ import argparse
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
 from lift import HEIGHT, WIDTH, camera
 from memory import room
 
+from splatseg import load_scene
 from splatseg import render as splat
 from splatseg.render import CompactRows, SparseImage, SparseWeights
 from splatseg.render.cpu import isa, set_threads
@@ -55,16 +58,23 @@ def bandwidth() -> float:
     return 2 * source.nbytes / best * 1e-6
 
 
-def drawn_rows() -> SparseWeights:
+def drawn_rows(folder: Path | None) -> SparseWeights:
     """Rows of pixels of all views, shuffled."""
-    scene, rng = room(GAUSSIANS, 0), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
+    if folder is None:
+        gaussians, cameras = room(GAUSSIANS, 0), [camera(index) for index in range(VIEWS)]
+    else:
+        scene = load_scene(folder)
+        step = max(1, len(scene.views) // VIEWS)
+        gaussians = scene.gaussians
+        cameras = [view.camera for view in scene.views[::step][:VIEWS]]
     parts: list[SparseWeights] = []
-    for index in range(VIEWS):
-        count = PIXELS // VIEWS
-        pixels = np.stack((rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count)), axis=1)
-        found = splat.weights(scene, camera(index), torch.from_numpy(pixels))
-        assert isinstance(found, SparseWeights)
-        parts.append(found)
+    for at in cameras:
+        count = PIXELS // len(cameras)
+        pixels = np.stack(
+            (rng.integers(0, at.width, count), rng.integers(0, at.height, count)), axis=1
+        )
+        parts.append(splat.weights(gaussians, at, torch.from_numpy(pixels)))
     rows = SparseWeights.concatenate(parts).to(dtype=torch.float32)
     return rows.select(torch.from_numpy(rng.permutation(len(rows))))
 
@@ -227,10 +237,11 @@ def views(repeats: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--scene", type=Path, help="rows of this scene's views")
     args = parser.parse_args()
     use_threads(1)
     limit = bandwidth()
-    rows = drawn_rows()
+    rows = drawn_rows(args.scene)
     touched = len(rows.compact().touched)
     print(
         f"{len(rows)} rows, {len(rows.ids)} entries, {touched} of {rows.gaussians} Gaussians; "

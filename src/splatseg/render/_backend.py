@@ -17,6 +17,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
     Contributors,
@@ -73,13 +74,12 @@ class BackendView(ABC):
         """The k strongest Gaussians of pixels (column, row), ties front to back."""
 
     @abstractmethod
-    def weights(
-        self, pixels: Int[Tensor, "p 2"] | None, k: int | None, *, layout: Layout
-    ) -> ViewWeights:
-        """W itself: all pixels or some, all entries or each pixel's k strongest.
+    def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
+        """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
 
-        ``layout="blocks"`` holds 4 x 4 pixel blocks, all pixels and entries only.
-        """
+    @abstractmethod
+    def blocks(self) -> ViewWeights:
+        """W in blocks of 4 x 4 pixels."""
 
     @property
     @abstractmethod
@@ -170,9 +170,9 @@ class Backend(ABC):
         layout: Layout,
         options: RenderOptions,
     ) -> ViewWeights:
-        """`BackendView.weights` of a view that is used once."""
+        """`BackendView.rows` or `blocks` of a view that is used once."""
         with self.prepare(gaussians, camera, options=options) as view:
-            return view.weights(pixels, k, layout=layout)
+            return view.rows(pixels, k) if layout == "csr" else view.blocks()
 
 
 def needs_graph(gaussians: Gaussians, camera: Camera, *others: Tensor | None) -> bool:

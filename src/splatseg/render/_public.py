@@ -1,11 +1,14 @@
 """The public functions of rendering: one view, used once. `prepare` is for more."""
 
+from typing import Literal, overload
+
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.render._backend import Layout
 from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
 from splatseg.render._values import BackProjected, Contributors, Rendered
 from splatseg.render._view_weights import ViewWeights
 from splatseg.render.prepared import prepare
@@ -125,6 +128,28 @@ def contributors(
         return view.contributors(pixels, k)
 
 
+@overload
+def weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    pixels: Int[Tensor, "p 2"] | None = None,
+    k: int | None = None,
+    *,
+    layout: Literal["csr"] = "csr",
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+) -> SparseWeights: ...
+@overload
+def weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    pixels: Int[Tensor, "p 2"] | None = None,
+    k: int | None = None,
+    *,
+    layout: Layout,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+) -> ViewWeights: ...
 def weights(
     gaussians: Gaussians,
     camera: Camera,

@@ -281,7 +281,7 @@ class CompactRows:
     """The Gaussians that occur, ascending."""
 
     rows: SparseWeights
-    """The rows; their `ids` are places in `touched`, their `gaussians` is its length."""
+    """The rows; their `ids` are indices into `touched`, their `gaussians` is its length."""
 
     _columns: Csr
     """The same entries by Gaussian."""

@@ -5,7 +5,7 @@ For a camera with distortion the view is the product of two sparse matrices, :ma
 identity and nothing is resampled. The warp depends on the lens alone and is kept by itself.
 """
 
-from typing import Self
+from typing import Literal, Self, overload
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +18,7 @@ from splatseg.render._backend import Backend, Layout
 from splatseg.render._checks import check_columns, check_k, check_pixels, check_scene
 from splatseg.render._options import RenderOptions
 from splatseg.render._registry import get_backend, options_for
+from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
     BackProjected,
     Contributors,
@@ -188,6 +189,22 @@ class PreparedView:
         check_k(k)
         return self._view.contributors(self._in_pinhole(pixels), k)
 
+    @overload
+    def weights(
+        self,
+        pixels: Int[Tensor, "p 2"] | None = None,
+        k: int | None = None,
+        *,
+        layout: Literal["csr"] = "csr",
+    ) -> SparseWeights: ...
+    @overload
+    def weights(
+        self,
+        pixels: Int[Tensor, "p 2"] | None = None,
+        k: int | None = None,
+        *,
+        layout: Layout,
+    ) -> ViewWeights: ...
     def weights(
         self,
         pixels: Int[Tensor, "p 2"] | None = None,
@@ -216,7 +233,7 @@ class PreparedView:
             if pixels is None:
                 pixels = self._camera.pixel_centres().reshape(-1, 2).floor().long()
             pixels = self._in_pinhole(pixels)
-        return self._view.weights(pixels, k, layout=layout)
+        return self._view.rows(pixels, k) if layout == "csr" else self._view.blocks()
 
     def _in_pinhole(self, pixels: Tensor) -> Tensor:
         if self._camera.is_pinhole:

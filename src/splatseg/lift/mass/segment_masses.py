@@ -167,7 +167,4 @@ def _rows(
     if (band.start, band.stop) != (0, camera.height * camera.width):
         flat = torch.arange(band.start, band.stop)
         pixels = torch.stack((flat % camera.width, flat // camera.width), dim=1)
-    rows = weights(gaussians, camera, pixels, options=options, backend=backend)
-    if not isinstance(rows, SparseWeights):
-        raise TypeError(f"weights: expected compressed rows, got {type(rows).__name__}.")
-    return rows
+    return weights(gaussians, camera, pixels, options=options, backend=backend)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.errors import InputError
-from splatseg.render._backend import Backend, BackendView, Layout, needs_graph
+from splatseg.render._backend import Backend, BackendView, needs_graph
 from splatseg.render._options import RenderOptions
 from splatseg.render._rows import SparseWeights
 from splatseg.render._values import (
@@ -204,23 +204,24 @@ class CpuBackendView(BackendView):
             median=median,
         )
 
-    def weights(
-        self, pixels: Int[Tensor, "p 2"] | None, k: int | None, *, layout: Layout
-    ) -> ViewWeights:
-        """W itself: all pixels or some, all entries or each pixel's k strongest."""
+    def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
+        """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
         count, view = len(self._gaussians), self._prepared()
         height, width = self.size
         if pixels is None and k is None:
-            matrix = view.block_matrix()
-            if layout == "blocks":
-                return CpuBlockWeights(matrix, gaussians=count, height=height, width=width)
-            return rows_of_blocks(matrix, gaussians=count, pixels=height * width)
+            return rows_of_blocks(view.block_matrix(), gaussians=count, pixels=height * width)
         if pixels is None:
             pixels = self._camera.pixel_centres().reshape(-1, 2).to(torch.int64)
         indptr, ids, weights, _, _ = view.pixel_rows(pixels, k or 0)
         return SparseWeights(
             indptr=indptr, ids=ids, weights=weights.to(torch.float16), gaussians=count
         )
+
+    def blocks(self) -> ViewWeights:
+        """W in blocks of 4 x 4 pixels."""
+        height, width = self.size
+        matrix = self._prepared().block_matrix()
+        return CpuBlockWeights(matrix, gaussians=len(self._gaussians), height=height, width=width)
 
     def _prepared(self, *, sh: Tensor | None = None, signal: Tensor | None = None) -> CpuView:
         if self._closed:

@@ -11,13 +11,15 @@ from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.errors import BackendError, InputError, MissingPackageError
-from splatseg.render._backend import Backend, BackendView, Layout, needs_graph
+from splatseg.render._backend import Backend, BackendView, needs_graph
 from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
 from splatseg.render._values import BackProjected, Contributors, Rendered
 from splatseg.render._view_weights import ViewWeights
 from splatseg.render.cuda._view import GSPLAT_ALPHA_MAX, CudaView, colours
-from splatseg.render.reference._backend import contributors_from_entries, weights_from_entries
+from splatseg.render.reference._backend import contributors_from_entries, rows_from_entries
 from splatseg.render.reference._composite import Entries
+from splatseg.render.reference._weights import blocks_from_csr
 
 
 class CudaBackend(Backend):
@@ -131,19 +133,19 @@ class CudaBackendView(BackendView):
     @torch.no_grad()
     def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
         """The k strongest Gaussians of pixels (column, row), ties front to back."""
-        found = self._rows(pixels)
+        found = self._entries(pixels)
         return contributors_from_entries(found, len(pixels), k, dtype=self._gaussians.dtype)
 
     @torch.no_grad()
-    def weights(
-        self, pixels: Int[Tensor, "p 2"] | None, k: int | None, *, layout: Layout
-    ) -> ViewWeights:
-        """W itself: all pixels or some, all entries or each pixel's k strongest."""
-        camera = self._camera
-        rows = camera.width * camera.height if pixels is None else len(pixels)
-        return weights_from_entries(
-            self._rows(pixels), camera, k, layout=layout, shape=(rows, len(self._gaussians))
-        )
+    def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
+        """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
+        count = self._camera.width * self._camera.height if pixels is None else len(pixels)
+        found = self._entries(pixels)
+        return rows_from_entries(found, k, shape=(count, len(self._gaussians)))
+
+    def blocks(self) -> ViewWeights:
+        """W in blocks of 4 x 4 pixels."""
+        return blocks_from_csr(self.rows(None, None), self._camera.width, self._camera.height)
 
     def _on_device(self, *, graph: bool = False) -> tuple[Gaussians, CudaView]:
         """The Gaussians and their projection; new ones for a graph."""
@@ -173,7 +175,7 @@ class CudaBackendView(BackendView):
             self._median = median
         return median
 
-    def _rows(self, pixels: Tensor | None) -> Entries:
+    def _entries(self, pixels: Tensor | None) -> Entries:
         """Entries of the rows asked for, renumbered, where the Gaussians are."""
         home = self._gaussians.device
         _, view = self._on_device()

@@ -10,8 +10,9 @@ from torch import Tensor
 from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
 from splatseg.errors import InputError
-from splatseg.render._backend import Backend, BackendView, Layout, needs_graph
+from splatseg.render._backend import Backend, BackendView, needs_graph
 from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
 from splatseg.render._values import BackProjected, Contributors, Rendered
 from splatseg.render._view_weights import ViewWeights
 from splatseg.render.reference._composite import Entries, entries, tiles
@@ -132,16 +133,16 @@ class ReferenceView(BackendView):
         return contributors_from_entries(found, len(pixels), k, dtype=self._gaussians.dtype)
 
     @torch.no_grad()
-    def weights(
-        self, pixels: Int[Tensor, "p 2"] | None, k: int | None, *, layout: Layout
-    ) -> ViewWeights:
-        """W itself: all pixels or some, all entries or each pixel's k strongest."""
+    def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
+        """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
         if pixels is None:
             pixels = all_pixels(self._camera).to(self._gaussians.device)
         found = entries(self._project(), pixels.long(), alpha_max=self._options.alpha_max)
-        return weights_from_entries(
-            found, self._camera, k, layout=layout, shape=(len(pixels), len(self._gaussians))
-        )
+        return rows_from_entries(found, k, shape=(len(pixels), len(self._gaussians)))
+
+    def blocks(self) -> ViewWeights:
+        """W in blocks of 4 x 4 pixels."""
+        return blocks_from_csr(self.rows(None, None), self._camera.width, self._camera.height)
 
 
 def _colours(
@@ -185,16 +186,13 @@ def contributors_from_entries(
     return Contributors(ids=ids, weights=weights, first=first, median=median)
 
 
-def weights_from_entries(
-    found: Entries, camera: Camera, k: int | None, *, layout: Layout, shape: tuple[int, int]
-) -> ViewWeights:
-    """Keep each pixel's k strongest entries (None: all), in the layout asked for."""
+def rows_from_entries(found: Entries, k: int | None, *, shape: tuple[int, int]) -> SparseWeights:
+    """Keep each pixel's k strongest entries (None: all)."""
     kept = torch.arange(len(found.ids), device=found.ids.device)
     if k is not None:
         order, rank = _strongest_first(found.pixels, found.weights)
         kept = order[rank < k].sort().values
-    csr = csr_from_entries(found.pixels[kept], found.ids[kept], found.weights[kept], shape=shape)
-    return csr if layout == "csr" else blocks_from_csr(csr, camera.width, camera.height)
+    return csr_from_entries(found.pixels[kept], found.ids[kept], found.weights[kept], shape=shape)
 
 
 def _strongest_first(pixels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
