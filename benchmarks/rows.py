@@ -3,9 +3,9 @@
     python benchmarks/rows.py --repeats 9
     python benchmarks/rows.py --scene SCENE
 
-Rows: 8 192 pixels drawn from 16 views of a room of 200 000 Gaussians, or of a scene. Products with 16 and 64
-channels against torch's `embedding_bag` and scipy's csr, on one thread and on two. A and B are
-alternated in one run; given are medians, milliseconds of CPU on one thread and of wall time on
+Rows: 8 192 pixels drawn from 16 views of a room of 200 000 Gaussians, or of a scene. Products
+with 16 and 64 channels against torch's `embedding_bag` and scipy's csr, on one thread and on two.
+A and B are alternated in one run; given are medians, milliseconds of CPU on one thread and of wall time on
 two (a shared machine's second core is seldom free). The share of memory bandwidth counts each
 entry's id, weight and row of the signal once, over what a copy of 256 MB reaches on one thread:
 above 1, rows came from a cache.
@@ -51,10 +51,10 @@ def use_threads(count: int) -> None:
 
 
 def bandwidth() -> float:
-    """GB/s that a large copy reads and writes on one thread."""
+    """GB/s that a large copy reads and writes in a second of one thread's CPU time."""
     source = torch.ones(64 << 20)
     target = torch.empty_like(source)
-    best = medians({"copy": lambda: target.copy_(source)}, 7, time.perf_counter)["copy"]
+    best = medians({"copy": lambda: target.copy_(source)}, 7, time.process_time)["copy"]
     return 2 * source.nbytes / best * 1e-6
 
 

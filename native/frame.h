@@ -155,11 +155,11 @@ struct Kernels {
                                     uint32_t lanes),
                        void* self);
 
-  // Rows [begin, end) of out (rows x channels) = W @ table, W as compressed sparse rows whose
-  // weights are halves or floats.
+  // Rows [begin, end) and channels [from, to) of out (rows x channels) = W @ table, W as compressed
+  // sparse rows whose weights are halves or floats.
   void (*gather_rows)(const int64_t* indptr, const int32_t* ids, const void* weights, bool half,
                       int64_t begin, int64_t end, const float* table, int64_t channels,
-                      float* out);
+                      int64_t from, int64_t to, float* out);
 
   // Adds channels [from, to) of W^T @ table (rows x channels) to out.
   void (*scatter_rows)(const int64_t* indptr, const int32_t* ids, const void* weights, bool half,

@@ -38,22 +38,23 @@ inline void row_sums(const int32_t* ids, const Weight* weights, int64_t begin, i
 
 template <class Weight>
 void gather(const int64_t* indptr, const int32_t* ids, const Weight* weights, int64_t begin,
-            int64_t end, const float* table, int64_t channels, float* out) {
+            int64_t end, const float* table, int64_t channels, int64_t from, int64_t to,
+            float* out) {
   const int64_t all = indptr[end];
   for (int64_t row = begin; row < end; ++row) {
     const int64_t first = indptr[row], last = indptr[row + 1];
-    float* to = out + row * channels;
-    for (int64_t c = 0; c < channels; c += 4 * kLanes) {
-      const int64_t left = channels - c;
+    float* sums = out + row * channels;
+    for (int64_t c = from; c < to; c += 4 * kLanes) {
+      const int64_t left = to - c;
       const int vectors = left >= 4 * kLanes ? 4 : static_cast<int>((left + kLanes - 1) / kLanes);
       const int tail =
           static_cast<int>(left < vectors * kLanes ? left - (vectors - 1) * kLanes : kLanes);
-      const float* from = table + c;
+      const float* values = table + c;
       switch (vectors) {
-        case 1: row_sums<1>(ids, weights, first, last, all, from, channels, tail, to + c); break;
-        case 2: row_sums<2>(ids, weights, first, last, all, from, channels, tail, to + c); break;
-        case 3: row_sums<3>(ids, weights, first, last, all, from, channels, tail, to + c); break;
-        default: row_sums<4>(ids, weights, first, last, all, from, channels, tail, to + c);
+        case 1: row_sums<1>(ids, weights, first, last, all, values, channels, tail, sums + c); break;
+        case 2: row_sums<2>(ids, weights, first, last, all, values, channels, tail, sums + c); break;
+        case 3: row_sums<3>(ids, weights, first, last, all, values, channels, tail, sums + c); break;
+        default: row_sums<4>(ids, weights, first, last, all, values, channels, tail, sums + c);
       }
     }
   }
@@ -86,11 +87,14 @@ void scatter(const int64_t* indptr, const int32_t* ids, const Weight* weights, i
 }  // namespace
 
 void gather_rows(const int64_t* indptr, const int32_t* ids, const void* weights, bool half,
-                 int64_t begin, int64_t end, const float* table, int64_t channels, float* out) {
+                 int64_t begin, int64_t end, const float* table, int64_t channels, int64_t from,
+                 int64_t to, float* out) {
   if (half)
-    gather(indptr, ids, static_cast<const uint16_t*>(weights), begin, end, table, channels, out);
+    gather(indptr, ids, static_cast<const uint16_t*>(weights), begin, end, table, channels, from,
+           to, out);
   else
-    gather(indptr, ids, static_cast<const float*>(weights), begin, end, table, channels, out);
+    gather(indptr, ids, static_cast<const float*>(weights), begin, end, table, channels, from, to,
+           out);
 }
 
 void scatter_rows(const int64_t* indptr, const int32_t* ids, const void* weights, bool half,

@@ -92,7 +92,7 @@ class CpuView:
         self._count = len(means)
         self._height, self._width = camera.height, camera.width
         self._degree_limit = options.sh_degree
-        self._geometry = tuple(_plain(t) for t in (means, rotations, scales, opacities))
+        self._geometry = (_plain(means), _plain(rotations), _plain(scales), _plain(opacities))
         degree = self._colour_with(sh, signal)
         # Views keep tens of megabytes of scratch; a fresh one would be paid for in page faults.
         self._view: _native.View = _free_views.pop() if _free_views else _native.View()
