@@ -5,10 +5,10 @@
 
 Rows: 8 192 pixels drawn from 16 views of a room of 200 000 Gaussians, or of a scene. Products
 with 16 and 64 channels against torch's `embedding_bag` and scipy's csr, on one thread and on two.
-A and B are alternated in one run; given are medians, milliseconds of CPU on one thread and of wall time on
-two (a shared machine's second core is seldom free). The share of memory bandwidth counts each
-entry's id, weight and row of the signal once, over what a copy of 256 MB reaches on one thread:
-above 1, rows came from a cache.
+A and B are alternated in one run; given are medians, milliseconds of CPU on one thread and of wall
+time on two (a shared machine's second core is seldom free). The share of memory bandwidth counts
+each entry's id, weight and row of the signal once, over what a copy of 256 MB reaches on one
+thread: above 1, rows came from a cache.
 
 Prepared views: what a loop over one view pays with and without `splatseg.render.prepare`.
 """

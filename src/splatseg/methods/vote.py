@@ -225,9 +225,7 @@ class _Booth:
         """The centres that pass the occlusion test, and their weights where they are needed."""
         how = self.options.occlusion
         if how == "depth":
-            front = in_front(
-                centres, self.gaussians, view, tolerance=self.options.depth_tolerance
-            )
+            front = in_front(centres, self.gaussians, view, tolerance=self.options.depth_tolerance)
             centres = centres[front]
         weight = torch.ones(len(centres.gaussians))
         if how == "weight" or self.options.weight == "transmittance":
