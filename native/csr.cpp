@@ -11,14 +11,6 @@ namespace splatseg {
 namespace {
 
 constexpr int64_t kRowsATime = 64;
-constexpr int64_t kCacheBytes = 1 << 20;  // of a table's channels that one core's cache keeps
-
-// Channels to go through at a time. Entries are read again for each of these spans, which is
-// cheap beside rows of the table that come from cache instead of memory. No sum depends on it.
-int64_t span_of(int64_t rows, int64_t channels) {
-  int64_t span = std::max<int64_t>(16, kCacheBytes / 4 / std::max<int64_t>(rows, 1) / 16 * 16);
-  return rows * span * 4 > kCacheBytes ? channels : span;  // it fits in no way: all at once
-}
 
 float float_of(float weight) { return weight; }
 float float_of(uint16_t half) {
@@ -190,12 +182,10 @@ bool valid(const Csr& csr, int64_t entries) {
 }
 
 void csr_product(const Csr& csr, const float* table, int64_t channels, float* out) {
-  const int64_t span = span_of(csr.columns, channels);
-  for (int64_t from = 0; from < channels; from += span)
-    parallel_for(csr.rows, kRowsATime, [&](int64_t begin, int64_t end) {
-      kernels().gather_rows(csr.indptr, csr.ids, csr.weights, csr.half, begin, end, table, channels,
-                            from, std::min(from + span, channels), out);
-    });
+  parallel_for(csr.rows, kRowsATime, [&](int64_t begin, int64_t end) {
+    kernels().gather_rows(csr.indptr, csr.ids, csr.weights, csr.half, begin, end, table, channels,
+                          0, channels, out);
+  });
 }
 
 void csr_adjoint(const Csr& csr, const float* table, int64_t channels, float* out) {
