@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from lift import HEIGHT, WIDTH, camera
 from memory import room
 
+from lift import HEIGHT, WIDTH, camera
 from splatseg import load_scene
 from splatseg import render as splat
 from splatseg.render import CompactRows, SparseImage, SparseWeights
