@@ -76,12 +76,24 @@ struct CloudGradients {
   float *means, *rotations, *scales, *opacities, *sh, *screen;
 };
 
+// A tile of an image with many channels of which a pixel has few: for each block its channels, as
+// positions among the tile's, and its values (16 pixels x channels rounded up to 16).
+struct TileImage {
+  int32_t used[16];
+  const int32_t* columns[16];
+  const float* values[16];
+};
+
 struct Kernels {
   const char* name;
 
   // Projects Gaussians [begin, end), writes the visible ones to `out`, returns how many.
   int64_t (*project)(const Cloud&, const Pinhole&, const Blending&, int64_t begin, int64_t end,
                      Splat* out);
+
+  // Gives projected Gaussians [begin, end) another colour.
+  void (*recolour)(const Cloud&, const Pinhole&, const Blending&, Splat*, int64_t begin,
+                   int64_t end);
 
   // Writes for each splat of [begin, end) its tile count and tiles; returns words written.
   // `out` must hold worst_case_tiles() words.
@@ -146,6 +158,25 @@ struct Kernels {
                        void (*take)(void*, int block, int32_t id, const float* weights,
                                     uint32_t lanes),
                        void* self);
+
+  // Rows [begin, end) and channels [from, to) of out (rows x channels) = W @ table, W as compressed
+  // sparse rows whose weights are halves or floats.
+  void (*gather_rows)(const int64_t* indptr, const int32_t* ids, const void* weights, bool half,
+                      int64_t begin, int64_t end, const float* table, int64_t channels,
+                      int64_t from, int64_t to, float* out);
+
+  // Adds channels [from, to) of W^T @ table (rows x channels) to out.
+  void (*scatter_rows)(const int64_t* indptr, const int32_t* ids, const void* weights, bool half,
+                       int64_t rows, const float* table, int64_t channels, int64_t from,
+                       int64_t to, float* out);
+
+  // Whether all ids are in [0, columns).
+  bool (*ids_below)(const int32_t* ids, int64_t count, int64_t columns);
+
+  // One tile's part of the adjoint of such an image: for each entry of the tile's list its sums,
+  // one a channel of the tile, and its weight. `chunk_rows` has kChunk times the widest block.
+  void (*sparse_adjoint)(const Frame&, int tile, void* scratch, const TileImage& image,
+                         float* chunk_rows, float* rows, int64_t row_stride);
 };
 
 // The kernels chosen for this machine, or by set_isa.

@@ -10,6 +10,7 @@
 #include <stdexcept>
 
 #include "pool.h"
+#include "segments.h"
 #include "view.h"
 #include "weights.h"
 
@@ -19,6 +20,7 @@ namespace splatseg {
 void register_loss(nb::module_& m);
 void register_adam(nb::module_& m);
 void register_product(nb::module_& m);
+void register_csr(nb::module_& m);
 }  // namespace splatseg
 
 namespace splatseg {
@@ -86,6 +88,14 @@ struct BoundView {
     nb::gil_scoped_release release;
     view.prepare(cloud, camera, {near, alpha_max, low_pass, antialiased, sh_degree});
     prepared = true;
+  }
+
+  void recolour(const CloudArrays& arrays, int sh_degree) {
+    const Cloud cloud = arrays.cloud();
+    require(prepared && cloud.count == gaussians, "recolour: other Gaussians than were prepared");
+    require(!cloud.sh || (sh_degree + 1) * (sh_degree + 1) <= cloud.sh_coefficients, "sh_degree");
+    nb::gil_scoped_release release;
+    view.recolour(cloud, sh_degree);
   }
 
   Planes planes(const Out& image, const Out& alpha, const Out& depth, const Out& median, int channels) const {
@@ -232,9 +242,11 @@ NB_MODULE(_native, m) {
            nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(),
            nb::arg("sh").noconvert().none(), nb::arg("signal").noconvert().none());
 
-  nb::class_<BoundView>(m, "View")
+  nb::class_<BoundView> view(m, "View");
+  view
       .def(nb::init<>())
       .def("prepare", &BoundView::prepare)
+      .def("recolour", &BoundView::recolour)
       .def("forward_colour", &BoundView::forward_colour)
       .def("forward_features", &BoundView::forward_features)
       .def("adjoint", &BoundView::adjoint)
@@ -266,6 +278,27 @@ NB_MODULE(_native, m) {
                               hand_over(std::move(rows.weights)), hand_over(std::move(rows.first)),
                               hand_over(std::move(rows.median)));
       });
+
+  view.def("sparse_adjoint", [](BoundView& self, const Array<const int64_t>& indptr,
+                                const Array<const int32_t>& columns, const In& values,
+                                const Out& weights) {
+    const size_t pixels = static_cast<size_t>(self.pixels());
+    require(self.prepared && indptr.size() == pixels + 1 && columns.size() == values.size() &&
+                static_cast<int64_t>(weights.size()) == self.gaussians,
+            "image");
+    require(indptr.data()[0] == 0 && indptr.data()[pixels] == static_cast<int64_t>(columns.size()),
+            "indptr");
+    for (size_t p = 0; p < pixels; ++p)
+      require(indptr.data()[p] <= indptr.data()[p + 1], "indptr");
+    SparseSums found;
+    {
+      nb::gil_scoped_release release;
+      found = sparse_adjoint(self.view, {indptr.data(), columns.data(), values.data()},
+                             self.gaussians, weights.data());
+    }
+    return nb::make_tuple(hand_over(std::move(found.gaussians)), hand_over(std::move(found.columns)),
+                          hand_over(std::move(found.sums)));
+  });
 
   nb::class_<BlockMatrix>(m, "BlockMatrix")
       .def(nb::init<>())
@@ -338,26 +371,8 @@ NB_MODULE(_native, m) {
       .def_prop_ro("entries", &BlockMatrix::entries)
       .def_prop_ro("nbytes", &BlockMatrix::bytes);
 
-  m.def("csr_render", [](const Array<const int64_t>& indptr, const Array<const int32_t>& ids,
-                         const Array<const uint16_t>& weights, const In& signal, const Out& image) {
-    const int64_t rows = static_cast<int64_t>(indptr.size()) - 1;
-    require(signal.ndim() == 2 && image.size() == static_cast<size_t>(rows) * signal.shape(1), "signal");
-    nb::gil_scoped_release release;
-    csr_render(indptr.data(), ids.data(), weights.data(), rows, signal.data(),
-               static_cast<int>(signal.shape(1)), image.data());
-  });
-  m.def("csr_back_project", [](const Array<const int64_t>& indptr, const Array<const int32_t>& ids,
-                               const Array<const uint16_t>& weights, const In& image,
-                               const Out& sums, const Out& weight_sums) {
-    const int64_t rows = static_cast<int64_t>(indptr.size()) - 1;
-    require(image.ndim() == 2 && static_cast<int64_t>(image.shape(0)) == rows && sums.ndim() == 2 &&
-                sums.shape(1) == image.shape(1) && weight_sums.size() == sums.shape(0),
-            "image");
-    nb::gil_scoped_release release;
-    csr_back_project(indptr.data(), ids.data(), weights.data(), rows, image.data(),
-                     static_cast<int>(image.shape(1)), sums.data(), weight_sums.data());
-  });
   register_loss(m);
   register_adam(m);
   register_product(m);
+  register_csr(m);
 }

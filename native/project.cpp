@@ -11,7 +11,32 @@ namespace {
 inline float clamp(float v, float low, float high) { return v > low ? (v < high ? v : high) : low; }
 inline float max3(float a, float b, float c) { return a > b ? (a > c ? a : c) : (b > c ? b : c); }
 
+// The signal where there is one, else the colour of the harmonics.
+inline void give_colour(const Cloud& cloud, const Pinhole& cam, const Blending& blending, int64_t i,
+                        Splat& s) {
+  s.red = s.green = s.blue = 0;
+  if (cloud.signal) {
+    const float* value = cloud.signal + cloud.signal_channels * i;
+    s.red = value[0];
+    if (cloud.signal_channels > 1) s.green = value[1];
+    if (cloud.signal_channels > 2) s.blue = value[2];
+  } else if (cloud.sh) {
+    float colour[3];
+    sh_colour(cloud.sh + 3 * static_cast<int64_t>(cloud.sh_coefficients) * i, blending.sh_degree,
+              cloud.means + 3 * i, cam.centre, colour);
+    s.red = colour[0] > 0 ? colour[0] : 0;
+    s.green = colour[1] > 0 ? colour[1] : 0;
+    s.blue = colour[2] > 0 ? colour[2] : 0;
+  }
+}
+
 }  // namespace
+
+void recolour(const Cloud& cloud, const Pinhole& cam, const Blending& blending, Splat* splats,
+              int64_t begin, int64_t end) {
+  for (int64_t at = begin; at < end; ++at)
+    give_colour(cloud, cam, blending, splats[at].id, splats[at]);
+}
 
 int64_t project(const Cloud& cloud, const Pinhole& cam, const Blending& blending, int64_t begin,
                 int64_t end, Splat* out) {
@@ -94,20 +119,7 @@ int64_t project(const Cloud& cloud, const Pinhole& cam, const Blending& blending
     s.extent_x = extent_x;
     s.extent_y = extent_y;
     s.id = static_cast<int32_t>(i);
-    s.red = s.green = s.blue = 0;
-    if (cloud.signal) {
-      const float* value = cloud.signal + cloud.signal_channels * i;
-      s.red = value[0];
-      if (cloud.signal_channels > 1) s.green = value[1];
-      if (cloud.signal_channels > 2) s.blue = value[2];
-    } else if (cloud.sh) {
-      float colour[3];
-      sh_colour(cloud.sh + 3 * static_cast<int64_t>(cloud.sh_coefficients) * i, blending.sh_degree,
-                mean, cam.centre, colour);
-      s.red = colour[0] > 0 ? colour[0] : 0;
-      s.green = colour[1] > 0 ? colour[1] : 0;
-      s.blue = colour[2] > 0 ? colour[2] : 0;
-    }
+    give_colour(cloud, cam, blending, i, s);
   }
   return written;
 }

@@ -76,6 +76,14 @@ inline Vec load_half(const uint16_t* p) {
   return {_mm512_cvtph_ps(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(p)))};
 }
 
+inline __mmask16 first_lanes(int count) { return static_cast<__mmask16>((1u << count) - 1); }
+inline Vec load_some(const float* p, int count) {
+  return {_mm512_maskz_loadu_ps(first_lanes(count), p)};
+}
+inline void store_some(float* p, Vec a, int count) {
+  _mm512_mask_storeu_ps(p, first_lanes(count), a.v);
+}
+
 #elif defined(__AVX2__)
 
 struct Vec { __m256 a, b; };
@@ -153,6 +161,17 @@ inline void store_half(uint16_t* p, Vec x) {
 inline Vec load_half(const uint16_t* p) {
   return {_mm256_cvtph_ps(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p))),
           _mm256_cvtph_ps(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p + 8)))};
+}
+
+inline Vec load_some(const float* p, int count) {
+  alignas(32) float lanes[16] = {};
+  std::memcpy(lanes, p, sizeof(float) * static_cast<size_t>(count));
+  return load(lanes);
+}
+inline void store_some(float* p, Vec x, int count) {
+  alignas(32) float lanes[16];
+  store(lanes, x);
+  std::memcpy(p, lanes, sizeof(float) * static_cast<size_t>(count));
 }
 
 #else  // plain loops, which compilers turn into what vectors they have
@@ -250,6 +269,14 @@ inline Vec load_half(const uint16_t* p) {
   Vec r;
   SPLATSEG_EACH r.v[i] = float_from_half(p[i]);
   return r;
+}
+inline Vec load_some(const float* p, int count) {
+  Vec r = set(0.0f);
+  std::memcpy(r.v, p, sizeof(float) * static_cast<size_t>(count));
+  return r;
+}
+inline void store_some(float* p, Vec a, int count) {
+  std::memcpy(p, a.v, sizeof(float) * static_cast<size_t>(count));
 }
 #undef SPLATSEG_EACH
 

@@ -11,6 +11,7 @@ namespace splatseg::SPLATSEG_ISA {
 // Declares a kernel with the signature the table asks for; the linker finds its body.
 #define SPLATSEG_KERNEL(name) std::remove_pointer_t<decltype(Kernels::name)> name;
 SPLATSEG_KERNEL(project)
+SPLATSEG_KERNEL(recolour)
 SPLATSEG_KERNEL(find_tiles)
 SPLATSEG_KERNEL(forward_colour)
 SPLATSEG_KERNEL(forward_features)
@@ -23,12 +24,17 @@ SPLATSEG_KERNEL(block_sums)
 SPLATSEG_KERNEL(blocks_forward)
 SPLATSEG_KERNEL(blocks_adjoint)
 SPLATSEG_KERNEL(tile_weights)
+SPLATSEG_KERNEL(gather_rows)
+SPLATSEG_KERNEL(scatter_rows)
+SPLATSEG_KERNEL(ids_below)
+SPLATSEG_KERNEL(sparse_adjoint)
 
 const Kernels& table() {
-  static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, find_tiles, forward_colour,
+  static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, recolour, find_tiles, forward_colour,
                                   forward_features, adjoint, backward_colour, backward_features,
                                   chain, block_weights, block_sums, blocks_forward, blocks_adjoint,
-                                  tile_weights};
+                                  tile_weights, gather_rows, scatter_rows, ids_below,
+                                  sparse_adjoint};
   return kernels;
 }
 

@@ -63,6 +63,13 @@ void View::prepare(const Cloud& cloud, const Pinhole& camera, const Blending& bl
   bin();
 }
 
+void View::recolour(const Cloud& cloud, int32_t sh_degree) {
+  blending_.sh_degree = sh_degree;
+  parallel_for(visible_, 4096, [&](int64_t begin, int64_t end) {
+    kernels().recolour(cloud, camera_, blending_, splats_.data(), begin, end);
+  });
+}
+
 // Least significant digit first. Depths are positive, so their bits order as they do.
 void View::sort_by_depth() {
   const int parts = visible_ > (1 << 15) ? threads() : 1;

@@ -30,6 +30,9 @@ class View {
 
   void prepare(const Cloud& cloud, const Pinhole& camera, const Blending& blending);
 
+  // Colours of what was prepared, of the same Gaussians with other harmonics or another signal.
+  void recolour(const Cloud& cloud, int32_t sh_degree);
+
   int64_t visible() const { return visible_; }
   int64_t tile_pairs() const { return frame_.tile_begin ? tile_begin_.back() : 0; }
   int64_t evaluated() const { return evaluated_; }

@@ -6,21 +6,6 @@
 #include "pool.h"
 
 namespace splatseg {
-namespace {
-
-float float_from_half(uint16_t h) {
-  const uint32_t sign = static_cast<uint32_t>(h & 0x8000u) << 16, e = (h >> 10) & 31u, m = h & 1023u;
-  float f;
-  if (!e) {
-    f = static_cast<float>(m) * 5.9604644775390625e-8f;
-    return sign ? -f : f;
-  }
-  const uint32_t bits = sign | ((e + 112u) << 23) | (m << 13);
-  std::memcpy(&f, &bits, 4);
-  return f;
-}
-
-}  // namespace
 
 void BlockMatrix::build(View& view, int64_t gaussians) {
   const Frame& frame = view.frame();
@@ -384,40 +369,6 @@ PixelRows pixel_rows(View& view, const int64_t* pixels, int64_t count, int64_t k
       out.weights.push_back(weight);
     }
   return out;
-}
-
-void csr_render(const int64_t* indptr, const int32_t* ids, const uint16_t* weights, int64_t rows,
-                const float* signal, int channels, float* out) {
-  parallel_for(rows, 256, [&](int64_t from, int64_t to) {
-    for (int64_t row = from; row < to; ++row) {
-      float* total = out + row * channels;
-      std::memset(total, 0, sizeof(float) * static_cast<size_t>(channels));
-      for (int64_t e = indptr[row]; e < indptr[row + 1]; ++e) {
-        const float w = float_from_half(weights[e]);
-        const float* value = signal + static_cast<int64_t>(ids[e]) * channels;
-        for (int c = 0; c < channels; ++c) total[c] += w * value[c];
-      }
-    }
-  });
-}
-
-void csr_back_project(const int64_t* indptr, const int32_t* ids, const uint16_t* weights,
-                      int64_t rows, const float* image, int channels, float* sums,
-                      float* weight_sums) {
-  // Threads share the channels, so that every sum runs over the pixels in order.
-  const int parts = std::min(threads(), std::max(1, channels / 8));
-  run_on_threads(parts, [&](int part) {
-    const int begin = channels * part / parts, end = channels * (part + 1) / parts;
-    for (int64_t row = 0; row < rows; ++row) {
-      const float* value = image + row * channels;
-      for (int64_t e = indptr[row]; e < indptr[row + 1]; ++e) {
-        const float w = float_from_half(weights[e]);
-        float* to = sums + static_cast<int64_t>(ids[e]) * channels;
-        for (int c = begin; c < end; ++c) to[c] += w * value[c];
-        if (part == 0) weight_sums[ids[e]] += w;
-      }
-    }
-  });
 }
 
 }  // namespace splatseg

@@ -57,11 +57,4 @@ struct PixelRows {
 };
 PixelRows pixel_rows(View& view, const int64_t* pixels, int64_t count, int64_t k);
 
-// Products with compressed sparse rows; deterministic for any number of threads.
-void csr_render(const int64_t* indptr, const int32_t* ids, const uint16_t* weights, int64_t rows,
-                const float* signal, int channels, float* out);
-void csr_back_project(const int64_t* indptr, const int32_t* ids, const uint16_t* weights,
-                      int64_t rows, const float* image, int channels, float* sums,
-                      float* weight_sums);
-
 }  // namespace splatseg

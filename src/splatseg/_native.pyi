@@ -115,6 +115,10 @@ class View:
     ) -> None: ...
     def narrow_signal_gradient(self, channels: int, v_signal: Tensor, /) -> None: ...
     def visible_ids(self, ids: Tensor, /) -> None: ...
+    def recolour(self, cloud: Cloud, sh_degree: int, /) -> None: ...
+    def sparse_adjoint(
+        self, indptr: Tensor, columns: Tensor, values: Tensor, weights: Tensor, /
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]: ...
     def pixel_rows(
         self, pixels: Tensor, k: int, /
     ) -> tuple[
@@ -140,16 +144,38 @@ class BlockMatrix:
         self, part: Tensor, /
     ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]: ...
 
-def csr_render(
-    indptr: Tensor, ids: Tensor, weights: Tensor, signal: Tensor, image: Tensor, /
+def csr_product(
+    indptr: Tensor, ids: Tensor, weights: Tensor, table: Tensor, out: Tensor, /
 ) -> None: ...
-def csr_back_project(
+def csr_adjoint(
+    indptr: Tensor, ids: Tensor, weights: Tensor, table: Tensor, out: Tensor, /
+) -> None: ...
+def csr_transpose(
     indptr: Tensor,
     ids: Tensor,
     weights: Tensor,
-    image: Tensor,
-    sums: Tensor,
-    weight_sums: Tensor,
+    to_indptr: Tensor,
+    to_rows: Tensor,
+    to_weights: Tensor,
+    /,
+) -> None: ...
+def csr_strong(
+    indptr: Tensor,
+    ids: Tensor,
+    weights: Tensor,
+    min_weight: float,
+    share: float,
+    kept: Tensor,
+    /,
+) -> None: ...
+def csr_select(
+    indptr: Tensor,
+    ids: Tensor,
+    weights: Tensor,
+    index: Tensor,
+    to_indptr: Tensor,
+    to_ids: Tensor,
+    to_weights: Tensor,
     /,
 ) -> None: ...
 def sparse_product(

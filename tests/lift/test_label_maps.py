@@ -5,8 +5,8 @@ import torch
 
 from splatseg.core import Labels
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift import label_map, label_maps
-from splatseg.render import render
+from splatseg.lift import label_map
+from splatseg.render import PreparedView
 from splatseg.render.warp import warp_into_photograph
 
 from .conftest import BACKEND, BARREL, camera_at, gaussians_at, matrix_of, random_gaussians
@@ -123,11 +123,13 @@ def test_many_ids_draw_only_those_in_view(rng, monkeypatch) -> None:
     ids = torch.arange(1, 75)
     widths = []
 
-    def counting(gaussians, camera, signal, **options):
-        widths.append(signal.shape[1])
-        return render(gaussians, camera, signal, **options)
+    drawn = PreparedView.render
 
-    monkeypatch.setattr(label_maps, "render", counting)
+    def counting(view, signal, **options):
+        widths.append(signal.shape[1])
+        return drawn(view, signal, **options)
+
+    monkeypatch.setattr(PreparedView, "render", counting)
     shown = label_map(both, camera_at(), hard(ids), backend=BACKEND, channels=8)
     assert max(widths) <= 8
     assert sum(widths) <= 15

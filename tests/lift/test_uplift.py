@@ -242,3 +242,56 @@ def test_bad_input_is_refused(rng, views) -> None:
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             UpliftOptions(**wrong)
+
+
+class TestNumberOfIds:
+    """Layers do not change with how many ids there are, or what they are called."""
+
+    @pytest.mark.parametrize("backend", [BACKEND, "cpu"])
+    @pytest.mark.parametrize("lens", [{}, BARREL])
+    def test_new_names_change_nothing(self, rng, lens, backend) -> None:
+        views = [View(name=f"v{i}", camera=camera_at(x, **lens)) for i, x in enumerate((-0.2, 0.1))]
+        gaussians = random_gaussians(rng, 40)
+        few = random_maps(rng, views, range(4))
+        confidence = {name: torch.from_numpy(rng.random((12, 16))).float() for name in few.maps}
+        named, renamed = {}, {}
+        for name, label_map in few.maps.items():
+            seen = label_map.ids
+            named[name] = LabelMap(ids=seen, confidence=confidence[name])
+            renamed[name] = LabelMap(
+                ids=torch.where(seen >= 0, 1000 + 7 * seen, -1), confidence=confidence[name]
+            )
+        options = UpliftOptions(candidates=3)
+        found = uplift(gaussians, views, Maps(named), options=options, backend=backend)
+        again = uplift(gaussians, views, Maps(renamed), options=options, backend=backend)
+        assert torch.equal(found.shares, again.shares)
+        assert torch.equal(found.confidence, again.confidence)
+        for ids, new in ((found.ids, again.ids), (found.candidates, again.candidates)):
+            assert torch.equal(torch.where(ids >= 0, 1000 + 7 * ids, -1), new)
+        assert int((found.ids >= 0).sum()) > 5
+
+    @pytest.mark.parametrize("extra", [100, 124, 125, 300])
+    def test_a_row_of_further_ids_changes_nothing_above_it(self, rng, extra) -> None:
+        """The lower rows of pixels hold ids that no Gaussian of the upper ones is shown by."""
+        view = View(name="v", camera=camera_at(width=64, height=48))
+        # Small ones above the middle, and one below that catches the further ids.
+        means = rng.uniform((-0.5, -0.6, 1.5), (0.5, -0.3, 3.0), (60, 3))
+        gaussians = gaussians_at([*means.tolist(), [0.0, 0.6, 2.0]], scale=0.02, opacity=0.7)
+        top = torch.from_numpy(rng.integers(-1, 4, (48, 64)))
+        top[24:] = -1
+        wide = top.clone()
+        wide[36:] = 10 + torch.arange(12 * 64).reshape(12, 64) % extra
+        few, many = (
+            uplift(
+                gaussians,
+                [view],
+                Maps({"v": LabelMap(ids=ids)}),
+                options=UpliftOptions(candidates=3),
+                backend="cpu",
+            )
+            for ids in (top, wide)
+        )
+        for name in ("ids", "confidence", "candidates", "shares"):
+            assert torch.equal(getattr(few, name)[:60], getattr(many, name)[:60]), name
+        assert int((few.ids[:60] >= 0).sum()) > 20
+        assert int(many.ids[60]) >= 10

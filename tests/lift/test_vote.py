@@ -11,7 +11,7 @@ from splatseg.core import Camera, ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.mass.centres import centres_in, majority_map, own_weights
 from splatseg.methods.vote import VoteOptions, vote
-from splatseg.render import RenderOptions, weights
+from splatseg.render import RenderOptions, prepare, weights
 
 from .conftest import (
     BACKEND,
@@ -166,7 +166,8 @@ def test_transmittance_weighs_the_votes(rng, views) -> None:
 def test_own_weights_are_entries_of_w(rng) -> None:
     gaussians, camera = random_gaussians(rng, 40), camera_at(**BARREL)
     centres = centres_in(gaussians.means, camera, near=0.01)
-    found = own_weights(centres, gaussians, camera, options=RenderOptions(), backend=BACKEND)
+    with prepare(gaussians, camera, options=RenderOptions(), backend=BACKEND) as view:
+        found = own_weights(centres, gaussians, view)
     rows = weights(gaussians, camera, centres.pixels, backend=BACKEND)
     for m, i in enumerate(centres.gaussians.tolist()):
         span = slice(int(rows.indptr[m]), int(rows.indptr[m + 1]))

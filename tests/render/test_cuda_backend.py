@@ -173,13 +173,13 @@ def test_rows_are_those_of_w(cuda, rng, scene, camera):
     some = cuda.weights(scene, camera, pixels, None, layout="csr", options=OPTIONS)
     wanted = dense[pixels[:, 1] * camera.width + pixels[:, 0]]
     signal = float32(rng.normal(size=(COUNT, 4)))
-    torch.testing.assert_close(some.render(signal), wanted @ signal, atol=5e-3, rtol=0)
+    torch.testing.assert_close(some.product(signal), wanted @ signal, atol=5e-3, rtol=0)
 
     ranked = cuda.contributors(scene, camera, pixels, 3, options=OPTIONS)
     strongest = wanted.sort(dim=1, descending=True).values[:, :3]
     torch.testing.assert_close(ranked.weights, strongest, atol=1e-5, rtol=1e-4)
     blocks = cuda.weights(scene, camera, None, None, layout="blocks", options=OPTIONS)
-    torch.testing.assert_close(blocks.render(signal), every.render(signal), atol=1e-5, rtol=0)
+    torch.testing.assert_close(blocks.product(signal), every.product(signal), atol=1e-5, rtol=0)
 
 
 def test_gradients_reach_everything(cuda, reference, rng, scene, camera, inside):

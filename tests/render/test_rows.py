@@ -103,14 +103,15 @@ def test_kept_weights_render_and_back_project(backend, rng, camera, scene, layou
     drawn = backend.render(scene, camera, signal).image.reshape(-1, channels)
     back = backend.back_project(scene, camera, image)
     bound = float(signal.abs().max()) * 2**-10
-    torch.testing.assert_close(kept.render(signal), drawn, atol=bound, rtol=0)
-    found = kept.back_project(image.reshape(-1, channels))
-    error = torch.linalg.vector_norm(found.sums - back.sums)
+    torch.testing.assert_close(kept.product(signal), drawn, atol=bound, rtol=0)
+    sums = kept.adjoint(image.reshape(-1, channels))
+    error = torch.linalg.vector_norm(sums - back.sums)
     assert error < 1e-3 * torch.linalg.vector_norm(back.sums)
-    torch.testing.assert_close(found.weights, back.weights, atol=1e-4, rtol=1e-3)
+    seen = kept.adjoint(torch.ones(WIDTH * HEIGHT, 1))[:, 0]
+    torch.testing.assert_close(seen, back.weights, atol=1e-4, rtol=1e-3)
     # Whatever the weights were rounded to, the two products are each other's transpose.
-    left = (kept.render(signal).double() * image.reshape(-1, channels)).sum()
-    right = (signal.double() * found.sums).sum()
+    left = (kept.product(signal).double() * image.reshape(-1, channels)).sum()
+    right = (signal.double() * sums).sum()
     scale = (drawn.double() * image.reshape(-1, channels)).abs().sum()
     assert abs(left - right) < 1e-5 * scale
 
@@ -161,17 +162,17 @@ def test_csr_can_keep_the_strongest_only(backend, rng, camera, scene, of_pixels)
 def test_an_empty_scene_has_an_empty_matrix(backend, rng, camera, layout):
     kept = backend.weights(random_gaussians(rng, 0), camera, layout=layout)
     assert kept.shape == (WIDTH * HEIGHT, 0)
-    assert not kept.render(torch.zeros(0, 4)).any()
-    assert kept.back_project(torch.ones(WIDTH * HEIGHT, 4)).sums.shape == (0, 4)
+    assert not kept.product(torch.zeros(0, 4)).any()
+    assert kept.adjoint(torch.ones(WIDTH * HEIGHT, 4)).shape == (0, 4)
 
 
 @pytest.mark.parametrize("layout", ["csr", "blocks"])
 def test_kept_weights_refuse_other_shapes(backend, camera, scene, layout):
     kept = backend.weights(scene, camera, layout=layout)
     with pytest.raises(InputError, match="signal"):
-        kept.render(torch.zeros(COUNT + 1, 2))
+        kept.product(torch.zeros(COUNT + 1, 2))
     with pytest.raises(InputError, match="image"):
-        kept.back_project(torch.zeros(WIDTH * HEIGHT - 1, 2))
+        kept.adjoint(torch.zeros(WIDTH * HEIGHT - 1, 2))
 
 
 def test_what_cannot_be_asked_for(backend, camera, scene):

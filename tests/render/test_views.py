@@ -116,10 +116,10 @@ def test_contributors_and_w_read_the_nearest_straight_pixel(gaussians) -> None:
     alpha = render(gaussians, camera, backend=BACKEND, warp="nearest").alpha.float()
     whole = weights(gaussians, camera, backend=BACKEND)
     assert whole.shape == (15 * 11, 12)
-    torch.testing.assert_close(whole.render(ones)[:, 0], alpha.reshape(-1), rtol=0, atol=2e-3)
+    torch.testing.assert_close(whole.product(ones)[:, 0], alpha.reshape(-1), rtol=0, atol=2e-3)
     some = weights(gaussians, camera, pixels, backend=BACKEND)
     torch.testing.assert_close(
-        some.render(ones)[:, 0], alpha[pixels[:, 1], pixels[:, 0]], rtol=0, atol=2e-3
+        some.product(ones)[:, 0], alpha[pixels[:, 1], pixels[:, 0]], rtol=0, atol=2e-3
     )
     with pytest.raises(InputError, match="blocks"):
         weights(gaussians, camera, layout="blocks", backend=BACKEND)

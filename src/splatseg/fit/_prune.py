@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, Gaussians, View
 from splatseg.fit._photographs import Photographs
-from splatseg.render import back_project, render
+from splatseg.render import prepare
 
 # Blending weight, summed over pixels and training views, that a Gaussian needs. One fully
 # visible pixel of one photograph counts 1.
@@ -107,11 +107,11 @@ def _seen(
     gaussians: Gaussians, view: ViewOfPixels, backend: str
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """Weight of each Gaussian in a view, and the mean median depth of the pixels it is in."""
-    with torch.no_grad():
-        depth = render(gaussians, view.camera, backend=backend).median_depth
+    with torch.no_grad(), prepare(gaussians, view.camera, backend=backend) as prepared:
+        depth = prepared.render().median_depth
         used = torch.ones_like(depth) if view.mask is None else view.mask.to(depth)
         # Nothing opaque is behind: whatever is there floats before something far away.
         behind = torch.where(depth > 0, depth, depth.max())
         image = torch.stack((used, used * behind), dim=-1)
-        sums = back_project(gaussians, view.camera, image, backend=backend).sums.cpu()
+        sums = prepared.back_project(image).sums.cpu()
     return sums[:, 0], sums[:, 1] / sums[:, 0].clamp_min(1e-12)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, Labels
 from splatseg.errors import RangeError, ShapeError
-from splatseg.render import RenderOptions, back_project, options_for, render
+from splatseg.render import PreparedView, RenderOptions, prepare
 from splatseg.render.warp import straightened, warp_into_photograph
 
 
@@ -60,9 +60,17 @@ def label_map(
         )
     if channels < 1:
         raise RangeError(f"channels: expected at least 1, got {channels}.")
-    options = options or options_for(gaussians, backend)
-    draw = _Drawing(gaussians, straightened(camera), options, backend)
-    ids = _ids_to_draw(draw, labels, channels)
+    pinhole = straightened(camera)
+    with prepare(gaussians, pinhole, options=options, backend=backend) as view:
+        draw = _Drawing(gaussians, view)
+        winner, best = _strongest(draw, labels, _ids_to_draw(draw, labels, channels), channels)
+    return _in_photograph(camera, winner, best.clamp(0, 1))
+
+
+def _strongest(
+    draw: "_Drawing", labels: Labels, ids: Sequence[int], channels: int
+) -> tuple[Tensor, Tensor]:
+    """The id with the highest score of each pixel, and the score."""
     best = torch.full(draw.size, -1.0)
     winner = torch.full(draw.size, UNLABELLED, dtype=torch.int32)
     residual: Tensor | None = None
@@ -77,43 +85,27 @@ def label_map(
         better = score > best
         best = torch.where(better, score, best)
         winner = torch.where(better, torch.tensor(part, dtype=torch.int32)[column], winner)
-    return _in_photograph(camera, winner, best.clamp(0, 1))
+    return winner, best
 
 
 class _Drawing:
     """One pinhole view, drawn with one signal after another."""
 
-    def __init__(
-        self, gaussians: Gaussians, camera: Camera, options: RenderOptions, backend: str
-    ) -> None:
-        self._gaussians = gaussians
-        self._camera = camera
-        self._options = options
-        self._backend = backend
-        self.size = (camera.height, camera.width)
+    def __init__(self, gaussians: Gaussians, view: PreparedView) -> None:
+        self._like = gaussians.means
+        self._view = view
+        self.size = (view.camera.height, view.camera.width)
 
     def scores(self, signal: Float[Tensor, "n ids"]) -> tuple[Tensor, Tensor]:
         """Scores (H, W, ids) and alpha (H, W) of the view."""
         with torch.no_grad():
-            drawn = render(
-                self._gaussians,
-                self._camera,
-                signal.to(self._gaussians.means),
-                options=self._options,
-                backend=self._backend,
-            )
+            drawn = self._view.render(signal.to(self._like))
         return drawn.image.float().cpu(), drawn.alpha.float().cpu()
 
     def visible(self) -> Bool[Tensor, "n"]:
         """Which Gaussians have any weight in the view."""
         with torch.no_grad():
-            seen = back_project(
-                self._gaussians,
-                self._camera,
-                self._gaussians.means.new_zeros(*self.size, 1),
-                options=self._options,
-                backend=self._backend,
-            )
+            seen = self._view.back_project(self._like.new_zeros(*self.size, 1))
         return seen.weights.cpu() > 0
 
 

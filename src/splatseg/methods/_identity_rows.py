@@ -9,8 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelSource, View, camera_of_map
-from splatseg.errors import InputError
-from splatseg.render import RenderOptions, SparseWeights, weights
+from splatseg.render import RenderOptions, weights
 
 _ENTRY = 16
 """Bytes of an entry in a batch: id and weight, by pixel and by Gaussian."""
@@ -167,8 +166,6 @@ class Sampler:
             found = weights(
                 self.gaussians, camera, asked, options=self.options, backend=self.backend
             )
-        if not isinstance(found, SparseWeights):
-            raise InputError(f"backend: expected one with sparse rows, got {self.backend!r}.")
         starts = found.indptr.cpu()
         most = max(1, self.memory // (_ENTRY * len(self.views)))
         # Pixels were drawn in no order, so the first ones are a sample as good as all.

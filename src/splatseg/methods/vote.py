@@ -46,7 +46,7 @@ from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.mass.centres import Centres, centres_in, in_front, majority_map, own_weights
 from splatseg.lift.mass.vote_table import VoteTable
 from splatseg.methods._method import Method, MethodInputs
-from splatseg.render import RenderOptions, options_for
+from splatseg.render import PreparedView, RenderOptions, options_for, prepare
 
 VoteRule = Literal["visible", "published"]
 VoteOcclusion = Literal["none", "depth", "weight"]
@@ -210,7 +210,8 @@ class _Booth:
 
     def cast(self, camera: Camera, paper: LabelMap) -> _Cast:
         centres = centres_in(self.gaussians.means, camera, near=self.drawing.near)
-        centres, weight = self._seen(centres, camera)
+        with prepare(self.gaussians, camera, options=self.drawing, backend=self.backend) as view:
+            centres, weight = self._seen(centres, view)
         column, row = centres.pixels.unbind(dim=1)
         say = torch.ones(len(weight))
         if self.options.weight == "transmittance":
@@ -220,24 +221,15 @@ class _Booth:
         ids = majority_map(paper.ids.cpu(), self.options.region)
         return _Cast(gaussians=centres.gaussians, ids=ids[row, column].long(), weights=say)
 
-    def _seen(self, centres: Centres, camera: Camera) -> tuple[Centres, Tensor]:
+    def _seen(self, centres: Centres, view: PreparedView) -> tuple[Centres, Tensor]:
         """The centres that pass the occlusion test, and their weights where they are needed."""
         how = self.options.occlusion
         if how == "depth":
-            front = in_front(
-                centres,
-                self.gaussians,
-                camera,
-                tolerance=self.options.depth_tolerance,
-                options=self.drawing,
-                backend=self.backend,
-            )
+            front = in_front(centres, self.gaussians, view, tolerance=self.options.depth_tolerance)
             centres = centres[front]
         weight = torch.ones(len(centres.gaussians))
         if how == "weight" or self.options.weight == "transmittance":
-            weight = own_weights(
-                centres, self.gaussians, camera, options=self.drawing, backend=self.backend
-            )
+            weight = own_weights(centres, self.gaussians, view)
             least = self.options.min_weight if how == "weight" else 0.0
             seen = (weight > 0) & (weight >= least)
             centres, weight = centres[seen], weight[seen]

@@ -1,13 +1,6 @@
 """W of a view and its adjoint: one rasteriser with one signal argument of any width."""
 
 from splatseg.render._backend import Backend as Backend
-from splatseg.render._backend import BackProjected as BackProjected
-from splatseg.render._backend import Contributors as Contributors
-from splatseg.render._backend import ImageWeights as ImageWeights
-from splatseg.render._backend import PartSums as PartSums
-from splatseg.render._backend import Rendered as Rendered
-from splatseg.render._backend import SparseWeights as SparseWeights
-from splatseg.render._backend import ViewWeights as ViewWeights
 from splatseg.render._options import RenderOptions as RenderOptions
 from splatseg.render._public import back_project as back_project
 from splatseg.render._public import contributors as contributors
@@ -17,3 +10,15 @@ from splatseg.render._registry import BackendName as BackendName
 from splatseg.render._registry import default_options as default_options
 from splatseg.render._registry import get_backend as get_backend
 from splatseg.render._registry import options_for as options_for
+from splatseg.render._rows import CompactRows as CompactRows
+from splatseg.render._rows import SparseWeights as SparseWeights
+from splatseg.render._values import BackProjected as BackProjected
+from splatseg.render._values import Contributors as Contributors
+from splatseg.render._values import Rendered as Rendered
+from splatseg.render._values import SparseBackProjected as SparseBackProjected
+from splatseg.render._values import SparseImage as SparseImage
+from splatseg.render._view_weights import ImageWeights as ImageWeights
+from splatseg.render._view_weights import PartSums as PartSums
+from splatseg.render._view_weights import ViewWeights as ViewWeights
+from splatseg.render.prepared import PreparedView as PreparedView
+from splatseg.render.prepared import prepare as prepare

@@ -1,4 +1,4 @@
-"""What a backend does, and what it gives back: the matrix W of a view and its adjoint.
+"""What a backend does: the matrix W of a view and its adjoint.
 
 With the geometry frozen a view is a sparse linear map (docs/architecture.md):
 
@@ -9,136 +9,106 @@ and `weights` keeps W.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
-from jaxtyping import Float, Float16, Float64, Int, Int32, Int64
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
+from splatseg.render._values import (
+    BackProjected,
+    Contributors,
+    Rendered,
+    SparseBackProjected,
+    SparseImage,
+)
+from splatseg.render._view_weights import ImageWeights, ViewWeights
 
 Layout = Literal["csr", "blocks"]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rendered:
-    """What a view shows."""
-
-    image: Float[Tensor, "height width channels"]
-    """``W @ signal``, over black: a pixel that nothing covers is 0."""
-
-    alpha: Float[Tensor, "height width"]
-    """Sum of the weights, ``W @ 1``; 1 minus it is the light that passes everything."""
-
-    depth: Float[Tensor, "height width"]
-    """Expected z-depth, sum(w z) / sum(w), scene units; 0 where alpha is 0."""
-
-    median_depth: Float[Tensor, "height width"]
-    """z of the Gaussian at which the transmittance first falls to 0.5 or less; 0 where it
-    never does. Not differentiable."""
+_CHANNELS = 64
+"""Channels of a sparse image that are spelt out at a time, where no kernel takes it as it is."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BackProjected:
-    """What an image says of each Gaussian."""
+class BackendView(ABC):
+    """One pinhole view on a backend: projected and sorted at first use, then used again.
 
-    sums: Float[Tensor, "n channels"]
-    """``W.T @ image``: the image summed over pixels with the blending weights."""
-
-    weights: Float[Tensor, "n"]
-    """``W.T @ 1``: how much each Gaussian was seen; one fully visible pixel counts 1."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Contributors:
-    """Which Gaussians make some pixels."""
-
-    ids: Int32[Tensor, "p k"]
-    """The strongest Gaussians of each pixel, strongest first; -1 where there are fewer."""
-
-    weights: Float[Tensor, "p k"]
-    """Their blending weights, 0 where there are fewer."""
-
-    first: Int32[Tensor, "p"]
-    """The front-most Gaussian with a weight; -1 where there is none."""
-
-    median: Int32[Tensor, "p"]
-    """The Gaussian at which the transmittance first falls to 0.5 or less; -1 where it never
-    does."""
-
-
-class ViewWeights(ABC):
-    """W of one view, kept for reuse. Half-precision weights, float32 products."""
-
-    @property
-    @abstractmethod
-    def shape(self) -> tuple[int, int]:
-        """Pixels and Gaussians."""
-
-    @property
-    @abstractmethod
-    def nbytes(self) -> int:
-        """Memory it holds."""
-
-    @abstractmethod
-    def render(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
-        """``W @ signal``, row by row of the image (or of the pixels asked for)."""
-
-    @abstractmethod
-    def back_project(self, image: Float[Tensor, "pixels channels"]) -> BackProjected:
-        """``W.T @ image`` and ``W.T @ 1``."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PartSums:
-    """Rows of W summed over parts of an image, as compressed sparse rows."""
-
-    indptr: Int64[Tensor, "parts_plus_1"]
-    """Where the entries of each part begin."""
-
-    ids: Int32[Tensor, "entries"]
-    """Gaussians, ascending in each part."""
-
-    sums: Float64[Tensor, "entries"]
-    """Their weights summed over the pixels of the part, above 0."""
-
-
-class ImageWeights(ViewWeights):
-    """W of a whole image, in blocks of 4 x 4 pixels."""
-
-    @abstractmethod
-    def part_sums(self, part: Int32[Tensor, "pixels"]) -> PartSums:
-        """Sum W over each part of the image.
-
-        Weights are half precision and sums double: they are exact.
-
-        Args:
-            part: The part of each pixel, row by row, from 0; negative where it is in none.
-        """
-
-
-class SparseWeights(ViewWeights):
-    """W as compressed sparse rows.
-
-    The ids and weights of pixel p are ``ids[indptr[p]:indptr[p + 1]]`` and ``weights[...]``,
-    front to back.
+    Inputs were checked by the caller. What needs gradients towards the geometry is projected
+    anew each time, because it becomes part of a graph.
     """
 
-    @property
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     @abstractmethod
-    def indptr(self) -> Int64[Tensor, "pixels_plus_1"]:
-        """Where each pixel's entries begin."""
+    def close(self) -> None:
+        """Give back what it holds. The view cannot be used afterwards."""
+
+    @abstractmethod
+    def render(
+        self,
+        signal: Float[Tensor, "n channels"] | None = None,
+        *,
+        screen: Float[Tensor, "n 2"] | None = None,
+    ) -> Rendered:
+        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+
+        Args:
+            signal: One row a Gaussian.
+            screen: Zeros, added to the projected centres, pixels: a leaf whose gradient is that
+                towards the centres on the image, which densification looks at.
+        """
+
+    @abstractmethod
+    def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:
+        """``W.T @ image`` and ``W.T @ 1``. No gradient."""
+
+    @abstractmethod
+    def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
+        """The k strongest Gaussians of pixels (column, row), ties front to back."""
+
+    @abstractmethod
+    def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
+        """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
+
+    @abstractmethod
+    def blocks(self) -> ImageWeights:
+        """W in blocks of 4 x 4 pixels."""
 
     @property
     @abstractmethod
-    def ids(self) -> Int32[Tensor, "entries"]:
-        """Gaussians, front to back in each row."""
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
 
-    @property
-    @abstractmethod
-    def weights(self) -> Float16[Tensor, "entries"]:
-        """Blending weights."""
+    def back_project_sparse(self, image: SparseImage) -> SparseBackProjected:
+        """``W.T @ image`` and ``W.T @ 1`` of an image of many channels. On the CPU."""
+        gaussians: list[Tensor] = []
+        channels: list[Tensor] = []
+        sums: list[Tensor] = []
+        weights: Tensor | None = None
+        for start in range(0, max(image.count, 1), _CHANNELS):
+            # One channel of nothing where there are none: the view still shows Gaussians.
+            stop = max(min(start + _CHANNELS, image.count), start + 1)
+            found = self.back_project(image.dense(start, stop).reshape(*self.size, -1))
+            weights = found.weights.float().cpu()
+            part = found.sums.float().cpu()
+            row, column = torch.nonzero(part, as_tuple=True)
+            gaussians.append(row)
+            channels.append(column + start)
+            sums.append(part[row, column])
+        order = torch.argsort(torch.cat(gaussians), stable=True)
+        return SparseBackProjected(
+            gaussians=torch.cat(gaussians)[order],
+            channels=torch.cat(channels)[order],
+            sums=torch.cat(sums)[order],
+            weights=torch.zeros(0) if weights is None else weights,
+        )
 
 
 class Backend(ABC):
@@ -147,6 +117,11 @@ class Backend(ABC):
     name: ClassVar[str]
 
     @abstractmethod
+    def prepare(
+        self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
+    ) -> BackendView:
+        """A view, for any number of products."""
+
     def render(
         self,
         gaussians: Gaussians,
@@ -156,18 +131,10 @@ class Backend(ABC):
         options: RenderOptions,
         screen: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+        """`BackendView.render` of a view that is used once."""
+        with self.prepare(gaussians, camera, options=options) as view:
+            return view.render(signal, screen=screen)
 
-        Args:
-            gaussians: The scene.
-            camera: A pinhole camera.
-            signal: One row a Gaussian.
-            options: Switches of the blending model.
-            screen: Zeros, added to the projected centres, pixels: a leaf whose gradient is that
-                towards the centres on the image, which densification looks at.
-        """
-
-    @abstractmethod
     def back_project(
         self,
         gaussians: Gaussians,
@@ -176,9 +143,10 @@ class Backend(ABC):
         *,
         options: RenderOptions,
     ) -> BackProjected:
-        """``W.T @ image`` and ``W.T @ 1``. No gradient."""
+        """`BackendView.back_project` of a view that is used once."""
+        with self.prepare(gaussians, camera, options=options) as view:
+            return view.back_project(image)
 
-    @abstractmethod
     def contributors(
         self,
         gaussians: Gaussians,
@@ -188,9 +156,10 @@ class Backend(ABC):
         *,
         options: RenderOptions,
     ) -> Contributors:
-        """The k strongest Gaussians of pixels (column, row), ties front to back."""
+        """`BackendView.contributors` of a view that is used once."""
+        with self.prepare(gaussians, camera, options=options) as view:
+            return view.contributors(pixels, k)
 
-    @abstractmethod
     def weights(
         self,
         gaussians: Gaussians,
@@ -201,7 +170,20 @@ class Backend(ABC):
         layout: Layout,
         options: RenderOptions,
     ) -> ViewWeights:
-        """W itself: all pixels or some, all entries or each pixel's k strongest.
+        """`BackendView.rows` or `blocks` of a view that is used once."""
+        with self.prepare(gaussians, camera, options=options) as view:
+            return view.rows(pixels, k) if layout == "csr" else view.blocks()
 
-        ``layout="blocks"`` holds 4 x 4 pixel blocks, all pixels and entries only.
-        """
+
+def needs_graph(gaussians: Gaussians, camera: Camera, *others: Tensor | None) -> bool:
+    """Whether a render must be part of a graph of autograd."""
+    leaves = (
+        gaussians.means,
+        gaussians.rotations,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        camera.cam_from_world,
+        *others,
+    )
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in leaves)

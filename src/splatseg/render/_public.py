@@ -1,27 +1,18 @@
-"""The public functions of rendering: they check, choose a backend and handle any lens."""
+"""The public functions of rendering: one view, used once. `prepare` is for more."""
 
-from weakref import WeakKeyDictionary
+from typing import Literal, overload
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape
 from splatseg.core import Camera, Gaussians
-from splatseg.errors import InputError, RangeError
-from splatseg.render._backend import BackProjected, Contributors, Layout, Rendered, ViewWeights
+from splatseg.render._backend import Layout
 from splatseg.render._options import RenderOptions
-from splatseg.render._registry import get_backend, options_for
-from splatseg.render.views import (
-    back_project_view,
-    contributors_view,
-    render_view,
-    weights_view,
-)
+from splatseg.render._rows import SparseWeights
+from splatseg.render._values import BackProjected, Contributors, Rendered
+from splatseg.render._view_weights import ViewWeights
+from splatseg.render.prepared import prepare
 from splatseg.render.warp import WarpMode
-
-MAX_CHANNELS = 1024
-_checked: "WeakKeyDictionary[Gaussians, tuple[int, ...]]" = WeakKeyDictionary()
 
 
 def render(
@@ -63,6 +54,7 @@ def render(
         RangeError: If a value is NaN, infinite or out of range; it names the argument.
 
     Example:
+        >>> import torch
         >>> one = Gaussians(means=torch.tensor([[0.0, 0, 2]]), rotations=torch.eye(4)[:1],
         ...                 scales=torch.ones(1, 3), opacities=torch.ones(1),
         ...                 sh=torch.zeros(1, 1, 3))
@@ -72,12 +64,8 @@ def render(
         >>> [round(float(v), 4) for v in (drawn.alpha[4, 4], drawn.depth[4, 4])]
         [0.99, 2.0]
     """
-    _check_scene(gaussians)
-    if signal is not None:
-        _check_columns("signal", signal, (len(gaussians), None))
-    chosen = get_backend(backend, like=gaussians.means)
-    options = options or options_for(gaussians, backend)
-    return render_view(gaussians, camera, signal, options=options, backend=chosen, warp=warp)
+    with prepare(gaussians, camera, options=options, backend=backend) as view:
+        return view.render(signal, warp=warp)
 
 
 def back_project(
@@ -109,11 +97,8 @@ def back_project(
         ShapeError: If the image has not the camera's size.
         RangeError: If a value is NaN, infinite or out of range.
     """
-    _check_scene(gaussians)
-    _check_columns("image", image, (camera.height, camera.width, None))
-    chosen = get_backend(backend, like=gaussians.means)
-    options = options or options_for(gaussians, backend)
-    return back_project_view(gaussians, camera, image, options=options, backend=chosen, warp=warp)
+    with prepare(gaussians, camera, options=options, backend=backend) as view:
+        return view.back_project(image, warp=warp)
 
 
 def contributors(
@@ -139,15 +124,32 @@ def contributors(
     Raises:
         RangeError: If a pixel lies outside the image or k is less than 1.
     """
-    _check_scene(gaussians)
-    _check_pixels(pixels, camera)
-    if k < 1:
-        raise RangeError(f"k: expected at least 1, got {k}.")
-    chosen = get_backend(backend, like=gaussians.means)
-    options = options or options_for(gaussians, backend)
-    return contributors_view(gaussians, camera, pixels, k, options=options, backend=chosen)
+    with prepare(gaussians, camera, options=options, backend=backend) as view:
+        return view.contributors(pixels, k)
 
 
+@overload
+def weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    pixels: Int[Tensor, "p 2"] | None = None,
+    k: int | None = None,
+    *,
+    layout: Literal["csr"] = "csr",
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+) -> SparseWeights: ...
+@overload
+def weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    pixels: Int[Tensor, "p 2"] | None = None,
+    k: int | None = None,
+    *,
+    layout: Layout,
+    options: RenderOptions | None = None,
+    backend: str = "auto",
+) -> ViewWeights: ...
 def weights(
     gaussians: Gaussians,
     camera: Camera,
@@ -181,57 +183,5 @@ def weights(
     Raises:
         InputError: If ``blocks`` is asked for with pixels, with k or with a distorted camera.
     """
-    _check_scene(gaussians)
-    check_choice("layout", layout, ("csr", "blocks"))
-    if pixels is not None:
-        _check_pixels(pixels, camera)
-    if k is not None and k < 1:
-        raise RangeError(f"k: expected at least 1, got {k}.")
-    if layout == "blocks" and (pixels is not None or k is not None or not camera.is_pinhole):
-        raise InputError(
-            "layout: blocks hold the whole image of a pinhole camera, with all entries; "
-            "use csr for pixels, k or a distorted camera."
-        )
-    chosen = get_backend(backend, like=gaussians.means)
-    options = options or options_for(gaussians, backend)
-    return weights_view(
-        gaussians, camera, pixels, k, layout=layout, options=options, backend=chosen
-    )
-
-
-def _check_scene(gaussians: Gaussians) -> None:
-    """Scan the values once; again only after somebody wrote into the tensors."""
-    columns = (
-        gaussians.means,
-        gaussians.rotations,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-    )
-    versions = tuple(-1 if t.is_inference() else t._version for t in columns)  # pyright: ignore[reportPrivateUsage]
-    if -1 in versions or _checked.get(gaussians) != versions:
-        gaussians.check_values()
-        _checked[gaussians] = versions
-
-
-def _check_columns(name: str, tensor: Tensor, shape: tuple[int | None, ...]) -> None:
-    check_shape(name, tensor, shape)
-    if not 1 <= tensor.shape[-1] <= MAX_CHANNELS:
-        raise RangeError(f"{name}: expected 1 to {MAX_CHANNELS} channels, got {tensor.shape[-1]}.")
-    if not tensor.is_floating_point():
-        raise InputError(f"{name}: expected floating-point values, got {tensor.dtype}.")
-    check_finite(name, tensor)
-
-
-def _check_pixels(pixels: Tensor, camera: Camera) -> None:
-    check_shape("pixels", pixels, (None, 2))
-    if pixels.is_floating_point() or pixels.dtype == torch.bool:
-        raise InputError(f"pixels: expected integers (column, row), got {pixels.dtype}.")
-    size = torch.tensor([camera.width, camera.height], device=pixels.device)
-    outside = ((pixels < 0) | (pixels >= size)).any(dim=1)
-    if bool(outside.any()):
-        first = pixels[outside][0].tolist()
-        raise RangeError(
-            f"pixels: expected columns in [0, {camera.width}) and rows in "
-            f"[0, {camera.height}), got {first}."
-        )
+    with prepare(gaussians, camera, options=options, backend=backend) as view:
+        return view.weights(pixels, k, layout=layout)

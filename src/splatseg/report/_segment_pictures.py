@@ -22,7 +22,7 @@ from splatseg.evaluate.overlaps import Overlaps, instance_score
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import image_camera, load_image, reduced_size
 from splatseg.lift import label_map
-from splatseg.render import render
+from splatseg.render import prepare
 from splatseg.report.pictures import (
     Gallery,
     Picture,
@@ -84,11 +84,9 @@ def look(
     size = (camera.height, camera.width)
     shown = label_map(scene.gaussians, camera, labels, backend=backend).ids
     sure = labels.confidence.to(scene.gaussians.means)[:, None]
-    with torch.no_grad():
-        drawn = render(scene.gaussians, camera, sure, backend=backend)
-        colours = None
-        if view.image is None:
-            colours = render(scene.gaussians, camera, backend=backend)
+    with torch.no_grad(), prepare(scene.gaussians, camera, backend=backend) as prepared:
+        drawn = prepared.render(sure)
+        colours = prepared.render() if view.image is None else None
     alpha = drawn.alpha.float().cpu()
     mean = drawn.image[..., 0].float().cpu() / alpha.clamp_min(1e-6)
     if colours is None:

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelSource, View, camera_of_map
 from splatseg.lift.boundaries.geometry import axes_of
-from splatseg.render import RenderOptions, back_project
+from splatseg.render import RenderOptions, prepare
 
 _IDS = 10
 """Ids that one back-projection carries, with three channels each."""
@@ -101,25 +101,19 @@ def sides_of(
         seen = torch.zeros(count)
         plane = _plane(camera)
         ids = [int(i) for i in torch.unique(paper.ids).tolist() if i != UNLABELLED]
-        for start in range(0, len(ids), _IDS):
-            part = torch.tensor(ids[start : start + _IDS], dtype=torch.int32)
-            image = (paper.ids.unsqueeze(-1) == part).float() * votes.unsqueeze(-1)
-            image = (image.unsqueeze(-1) * plane.unsqueeze(2)).flatten(2)
-            with torch.no_grad():
-                sums = back_project(
-                    gaussians,
-                    camera,
-                    image.to(gaussians.means),
-                    options=options,
-                    backend=backend,
-                    warp="nearest",
-                ).sums.cpu()
-            sums = sums.reshape(count, len(part), 3)
-            seen += sums[:, :, 0].sum(dim=1)
-            for side, wanted in enumerate((first, second)):
-                for column, id in enumerate(part.tolist()):
-                    rows = wanted == id
-                    moments[rows, 3 * side : 3 * side + 3] = sums[rows, column]
+        with prepare(gaussians, camera, options=options, backend=backend) as prepared:
+            for start in range(0, len(ids), _IDS):
+                part = torch.tensor(ids[start : start + _IDS], dtype=torch.int32)
+                image = (paper.ids.unsqueeze(-1) == part).float() * votes.unsqueeze(-1)
+                image = (image.unsqueeze(-1) * plane.unsqueeze(2)).flatten(2)
+                with torch.no_grad():
+                    sums = prepared.back_project(image.to(gaussians.means), warp="nearest").sums
+                sums = sums.cpu().reshape(count, len(part), 3)
+                seen += sums[:, :, 0].sum(dim=1)
+                for side, wanted in enumerate((first, second)):
+                    for column, id in enumerate(part.tolist()):
+                        rows = wanted == id
+                        moments[rows, 3 * side : 3 * side + 3] = sums[rows, column]
         totals[:, 0] += moments[:, 0]
         totals[:, 1] += moments[:, 3]
         totals[:, 2] += seen - moments[:, 0] - moments[:, 3]

@@ -10,17 +10,9 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, View, ViewNames
 from splatseg.errors import InputError
-from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.lift.mass.view_votes import ViewVotes
 from splatseg.lift.mass.vote_table import VoteTable
-from splatseg.render import RenderOptions, back_project
-
-_CHANNELS = 64
-"""Ids or feature channels that one back-projection carries; bounds the memory of images."""
-
-_DENSE_IDS = 128
-"""Ids in a view above which the sparse product is faster than back-projecting one-hot images:
-they take 0.5 and 0.004 CPU seconds an id at 512x384 and 30 million entries of W."""
+from splatseg.render import PreparedView, RenderOptions, SparseImage, prepare
 
 
 def voting_views(views: Sequence[View], evidence: ViewNames, what: str) -> list[View]:
@@ -99,63 +91,42 @@ class Engine:
     """Where a sample of the votes is kept view by view."""
 
     def cast(self, table: VoteTable, light: Light, camera: Camera, paper: LabelMap) -> Tensor:
-        """Add a view's votes; returns how much of each Gaussian the view shows, (n,)."""
-        ids, place, votes = pixel_votes(paper)
-        if len(ids) > _DENSE_IDS:
-            return self._cast_sparse(table, light, camera, paper)
-        visible = torch.zeros(len(self.gaussians))
-        names = ids.tolist()
-        for start in range(0, max(len(names), 1), _CHANNELS):
-            part = names[start : start + _CHANNELS]
-            # One channel of nothing where no pixel has an id: the view still shows Gaussians.
-            columns = torch.arange(start, start + max(len(part), 1))
-            image = (place.unsqueeze(-1) == columns).float()
-            if paper.confidence is not None:
-                image = image * paper.confidence.cpu().float().unsqueeze(-1)
-            found = self.collect(camera, image)
-            visible = found[1]
-            if part:
-                say = self._say(visible)
-                # A view shows a small part of a scene: what it does not show need not be touched.
-                rows = torch.nonzero(visible > 0).squeeze(1)
-                sums = found[0][rows]
-                table.add(part, sums if say is None else sums * say[rows].unsqueeze(1), rows=rows)
-                if self.by_view is not None:
-                    self.by_view.add(part, sums, rows=rows)
-                caught = sums.sum(dim=0, dtype=torch.float64)
-                light.add(part, votes[start : start + len(part)], caught)
-        say = self._say(visible)
-        return visible if say is None else visible * say
+        """Add a view's votes; returns how much of each Gaussian the view shows, (n,).
 
-    def collect(self, camera: Camera, image: Float[Tensor, "h w c"]) -> tuple[Tensor, Tensor]:
+        One pass over the view, whatever the number of ids.
+        """
+        ids, place, votes = pixel_votes(paper)
+        place = place.reshape(-1)
+        labelled = place >= 0
+        values = torch.ones(int(labelled.sum()))
+        if paper.confidence is not None:
+            values = paper.confidence.cpu().float().reshape(-1)[labelled]
+        image = SparseImage(
+            indptr=torch.cat((torch.zeros(1, dtype=torch.int64), labelled.cumsum(0))),
+            channels=place[labelled].to(torch.int32),
+            values=values,
+            count=len(ids),
+        )
+        with torch.no_grad(), self.prepared(camera) as view:
+            found = view.back_project_sparse(image)
+        say = self._say(found.weights)
+        sums = found.sums if say is None else found.sums * say[found.gaussians]
+        table.add_sparse(ids[found.channels], found.gaussians, sums)
+        if self.by_view is not None:
+            self.by_view.add_sparse(ids[found.channels], found.gaussians, found.sums)
+        caught = torch.bincount(found.channels, weights=found.sums.double(), minlength=len(ids))
+        light.add(ids.tolist(), votes, caught)
+        return found.weights if say is None else found.weights * say
+
+    def prepared(self, camera: Camera) -> PreparedView:
+        """A view, to be used more than once."""
+        return prepare(self.gaussians, camera, options=self.options, backend=self.backend)
+
+    def collect(self, view: PreparedView, image: Float[Tensor, "h w c"]) -> tuple[Tensor, Tensor]:
         """Sums (n, c) and weights (n,) of an image, on the CPU, by the nearest warp."""
         with torch.no_grad():
-            found = back_project(
-                self.gaussians,
-                camera,
-                image.to(self.gaussians.means),
-                options=self.options,
-                backend=self.backend,
-                warp="nearest",
-            )
+            found = view.back_project(image.to(self.gaussians.means), warp="nearest")
         return found.sums.float().cpu(), found.weights.float().cpu()
-
-    def _cast_sparse(
-        self, table: VoteTable, light: Light, camera: Camera, paper: LabelMap
-    ) -> Tensor:
-        found = view_masses(
-            self.gaussians, camera, paper, options=self.options, backend=self.backend
-        )
-        say = self._say(found.visible)
-        weight = found.weight if say is None else found.weight * say[found.gaussian]
-        table.add_sparse(found.segment, found.gaussian, weight)
-        if self.by_view is not None:
-            self.by_view.add_sparse(found.segment, found.gaussian, found.weight)
-        ids, _, votes = pixel_votes(paper)
-        place = torch.searchsorted(ids, found.segment)
-        caught = torch.bincount(place, weights=found.weight.double(), minlength=len(ids))
-        light.add(ids.tolist(), votes, caught)
-        return found.visible if say is None else found.visible * say
 
     def _say(self, visible: Float[Tensor, "n"]) -> Float[Tensor, "n"] | None:
         """What a unit of this view's light on each Gaussian counts; None is 1 everywhere."""

@@ -7,8 +7,7 @@ from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Camera, Gaussians
-from splatseg.errors import InputError
-from splatseg.render import RenderOptions, SparseWeights, render, weights
+from splatseg.render import PreparedView
 
 _FOLD_TOLERANCE = 1e-2
 """A point whose pixel straightens to elsewhere, in pixels, lies beyond the fold of the lens."""
@@ -56,13 +55,7 @@ def centres_in(means: Float[Tensor, "n 3"], camera: Camera, *, near: float) -> C
 
 
 def in_front(
-    centres: Centres,
-    gaussians: Gaussians,
-    camera: Camera,
-    *,
-    tolerance: float,
-    options: RenderOptions,
-    backend: str,
+    centres: Centres, gaussians: Gaussians, view: PreparedView, *, tolerance: float
 ) -> Tensor:
     """Which centres are not behind what the view shows, bool (m,).
 
@@ -71,30 +64,22 @@ def in_front(
     """
     with torch.no_grad():
         signal = gaussians.means.new_zeros(len(gaussians), 1)
-        drawn = render(gaussians, camera, signal, options=options, backend=backend, warp="nearest")
+        drawn = view.render(signal, warp="nearest")
     surface = drawn.median_depth.cpu().double()[centres.pixels[:, 1], centres.pixels[:, 0]]
     return (surface <= 0) | (centres.depth <= surface * (1 + tolerance))
 
 
-def own_weights(
-    centres: Centres,
-    gaussians: Gaussians,
-    camera: Camera,
-    *,
-    options: RenderOptions,
-    backend: str,
-) -> Float[Tensor, "m"]:
+def own_weights(centres: Centres, gaussians: Gaussians, view: PreparedView) -> Float[Tensor, "m"]:
     """Blending weight of each Gaussian at the pixel of its centre, float32."""
-    flat = centres.pixels[:, 1] * camera.width + centres.pixels[:, 0]
+    width = view.camera.width
+    flat = centres.pixels[:, 1] * width + centres.pixels[:, 0]
     wanted = torch.unique(flat)
     home = torch.full((len(gaussians),), -1, dtype=torch.int64)
     home[centres.gaussians] = flat
     found = torch.zeros(len(gaussians))
     for part in torch.split(wanted, _PIXELS):
-        asked = torch.stack((part % camera.width, part // camera.width), dim=-1)
-        rows = weights(gaussians, camera, asked, options=options, backend=backend)
-        if not isinstance(rows, SparseWeights):
-            raise InputError(f"backend: expected one with sparse rows, got {backend!r}.")
+        asked = torch.stack((part % width, part // width), dim=-1)
+        rows = view.weights(asked)
         ids = rows.ids.cpu().long()
         pixel = torch.repeat_interleave(part, torch.diff(rows.indptr.cpu()))
         own = home[ids] == pixel

@@ -154,16 +154,17 @@ def _collect(
             )
     features = _normalised(grid.features.float().cpu(), options.norm)
     weights = torch.zeros(len(values))
-    for start in range(0, grid.channels, options.channels):
-        part = slice(start, start + options.channels)
-        image = read_grid(
-            features[..., part],
-            cells=(covered[0] / grid.stride, covered[1] / grid.stride),
-            size=(camera.height, camera.width),
-            resampling=options.resampling,
-        )
-        sums, weights = engine.collect(camera, image)
-        values[:, part] += sums
+    with engine.prepared(camera) as prepared:
+        for start in range(0, grid.channels, options.channels):
+            part = slice(start, start + options.channels)
+            image = read_grid(
+                features[..., part],
+                cells=(covered[0] / grid.stride, covered[1] / grid.stride),
+                size=(camera.height, camera.width),
+                resampling=options.resampling,
+            )
+            sums, weights = engine.collect(prepared, image)
+            values[:, part] += sums
     return weights
 
 

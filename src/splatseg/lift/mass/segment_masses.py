@@ -182,7 +182,7 @@ def _visible(
     else:
         within = seen_at[(seen_at >= band.start) & (seen_at < band.stop)] - band.start
         pixels = torch.from_numpy(np.bincount(within, minlength=count)).float().unsqueeze(1)
-    return rows.back_project(pixels.to(rows.weights.device)).sums[:, 0].cpu()
+    return rows.adjoint(pixels.to(rows.weights.device))[:, 0].cpu()
 
 
 def _pinhole_pixels(camera: Camera) -> NDArray[np.int64]:
@@ -206,7 +206,4 @@ def _rows(
     if (band.start, band.stop) != (0, camera.height * camera.width):
         flat = torch.arange(band.start, band.stop)
         pixels = torch.stack((flat % camera.width, flat // camera.width), dim=1)
-    rows = weights(gaussians, camera, pixels, options=options, backend=backend)
-    if not isinstance(rows, SparseWeights):
-        raise TypeError(f"weights: expected compressed rows, got {type(rows).__name__}.")
-    return rows
+    return weights(gaussians, camera, pixels, options=options, backend=backend)

@@ -7,17 +7,20 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
-from splatseg.render._backend import (
-    Backend,
+from splatseg.errors import InputError
+from splatseg.render._backend import Backend, BackendView, needs_graph
+from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
+from splatseg.render._values import (
     BackProjected,
     Contributors,
-    Layout,
     Rendered,
-    ViewWeights,
+    SparseBackProjected,
+    SparseImage,
 )
-from splatseg.render._options import RenderOptions
+from splatseg.render._view_weights import ImageWeights
 from splatseg.render.cpu._view import NARROW, CpuView
-from splatseg.render.cpu._weights import CpuBlockWeights, CpuSparseWeights
+from splatseg.render.cpu._weights import CpuBlockWeights, rows_of_blocks
 
 _INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose", "screen")
 
@@ -94,20 +97,65 @@ class CpuBackend(Backend):
 
     name: ClassVar[str] = "cpu"
 
+    def prepare(
+        self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
+    ) -> "CpuBackendView":
+        """A view, for any number of products."""
+        return CpuBackendView(gaussians, camera, options)
+
+
+class CpuBackendView(BackendView):
+    """One view on the kernels."""
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, options: RenderOptions) -> None:
+        self._gaussians, self._camera, self._options = gaussians, camera, options
+        self._view: CpuView | None = None
+        self._closed = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self._camera.height, self._camera.width
+
+    def close(self) -> None:
+        """Give the kernels' memory back."""
+        self._closed = True
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
     def render(
         self,
-        gaussians: Gaussians,
-        camera: Camera,
-        signal: Float[Tensor, "n channels"] | None,
+        signal: Float[Tensor, "n channels"] | None = None,
         *,
-        options: RenderOptions,
         screen: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
 
         `screen` is not added, only given its gradient: expected are zeros.
         """
-        image, alpha, depth_sum, median = cast(
+        if needs_graph(self._gaussians, self._camera, signal, screen):
+            found = self._render_in_graph(signal, screen)
+        elif signal is not None and signal.shape[1] > NARROW:
+            found = self._prepared().render(signal)
+        else:
+            # Colours ride in the projected Gaussians: the first ones are projected with them.
+            fresh = self._view is None
+            sh = self._gaussians.sh if signal is None else None
+            view = self._prepared(sh=sh, signal=signal)
+            if not fresh:
+                view.recolour(sh=sh, signal=signal)
+            found = view.render()
+        image, alpha, depth_sum, median = found
+        covered = alpha > 0
+        depth = torch.where(covered, depth_sum / torch.where(covered, alpha, 1.0), 0.0)
+        return Rendered(image=image, alpha=alpha, depth=depth, median_depth=median)
+
+    def _render_in_graph(
+        self, signal: Tensor | None, screen: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        gaussians = self._gaussians
+        return cast(
             tuple[Tensor, Tensor, Tensor, Tensor],
             _Render.apply(
                 gaussians.means,
@@ -116,41 +164,30 @@ class CpuBackend(Backend):
                 gaussians.opacities,
                 gaussians.sh if signal is None else None,
                 signal,
-                camera.cam_from_world,
+                self._camera.cam_from_world,
                 screen,
-                camera,
-                options,
+                self._camera,
+                self._options,
             ),
         )
-        covered = alpha > 0
-        depth = torch.where(covered, depth_sum / torch.where(covered, alpha, 1.0), 0.0)
-        return Rendered(image=image, alpha=alpha, depth=depth, median_depth=median)
 
-    def back_project(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        image: Float[Tensor, "height width channels"],
-        *,
-        options: RenderOptions,
-    ) -> BackProjected:
+    def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:
         """``W.T @ image`` and ``W.T @ 1``. No gradient."""
-        with _view(gaussians, camera, options) as view:
-            sums, weights = view.back_project(image)
+        sums, weights = self._prepared().back_project(image)
         return BackProjected(sums=sums, weights=weights)
 
-    def contributors(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        pixels: Int[Tensor, "p 2"],
-        k: int,
-        *,
-        options: RenderOptions,
-    ) -> Contributors:
+    def back_project_sparse(self, image: SparseImage) -> SparseBackProjected:
+        """``W.T @ image`` and ``W.T @ 1`` in one pass, however many channels there are."""
+        gaussians, channels, sums, weights = self._prepared().back_project_sparse(
+            image.indptr, image.channels, image.values
+        )
+        return SparseBackProjected(
+            gaussians=gaussians, channels=channels, sums=sums, weights=weights
+        )
+
+    def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
         """The k strongest Gaussians of pixels (column, row), ties front to back."""
-        with _view(gaussians, camera, options) as view:
-            indptr, ids, weights, first, median = view.pixel_rows(pixels, k)
+        indptr, ids, weights, first, median = self._prepared().pixel_rows(pixels, k)
         count = len(pixels)
         lengths = indptr[1:] - indptr[:-1]
         row = torch.repeat_interleave(torch.arange(count), lengths)
@@ -167,40 +204,38 @@ class CpuBackend(Backend):
             median=median,
         )
 
-    def weights(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        pixels: Int[Tensor, "p 2"] | None,
-        k: int | None,
-        *,
-        layout: Layout,
-        options: RenderOptions,
-    ) -> ViewWeights:
-        """W itself: all pixels or some, all entries or each pixel's k strongest."""
-        n = len(gaussians)
-        with _view(gaussians, camera, options) as view:
-            if pixels is None and k is None:
-                matrix = view.block_matrix()
-                if layout == "blocks":
-                    return CpuBlockWeights(
-                        matrix, gaussians=n, height=camera.height, width=camera.width
-                    )
-                return CpuSparseWeights.from_blocks(
-                    matrix, gaussians=n, pixels=camera.height * camera.width
-                )
-            if pixels is None:
-                pixels = camera.pixel_centres().reshape(-1, 2).to(torch.int64)
-            indptr, ids, weights, _, _ = view.pixel_rows(pixels, k or 0)
-        return CpuSparseWeights(indptr, ids, weights.to(torch.float16), gaussians=n)
+    def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
+        """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
+        count, view = len(self._gaussians), self._prepared()
+        height, width = self.size
+        if pixels is None and k is None:
+            return rows_of_blocks(view.block_matrix(), gaussians=count, pixels=height * width)
+        if pixels is None:
+            pixels = self._camera.pixel_centres().reshape(-1, 2).to(torch.int64)
+        indptr, ids, weights, _, _ = view.pixel_rows(pixels, k or 0)
+        return SparseWeights(
+            indptr=indptr, ids=ids, weights=weights.to(torch.float16), gaussians=count
+        )
 
+    def blocks(self) -> ImageWeights:
+        """W in blocks of 4 x 4 pixels."""
+        height, width = self.size
+        matrix = self._prepared().block_matrix()
+        return CpuBlockWeights(matrix, gaussians=len(self._gaussians), height=height, width=width)
 
-def _view(gaussians: Gaussians, camera: Camera, options: RenderOptions) -> CpuView:
-    return CpuView(
-        gaussians.means,
-        gaussians.rotations,
-        gaussians.scales,
-        gaussians.opacities,
-        camera=camera,
-        options=options,
-    )
+    def _prepared(self, *, sh: Tensor | None = None, signal: Tensor | None = None) -> CpuView:
+        if self._closed:
+            raise InputError("view: expected one that is open, this one was closed.")
+        if self._view is None:
+            gaussians = self._gaussians
+            self._view = CpuView(
+                gaussians.means,
+                gaussians.rotations,
+                gaussians.scales,
+                gaussians.opacities,
+                camera=self._camera,
+                options=self._options,
+                sh=sh,
+                signal=signal,
+            )
+        return self._view

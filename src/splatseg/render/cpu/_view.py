@@ -91,20 +91,9 @@ class CpuView:
     ) -> None:
         self._count = len(means)
         self._height, self._width = camera.height, camera.width
-        self._narrow = 3 if signal is None else signal.shape[1]
-        self._sh = None if sh is None else _plain(sh)
-        self._cloud = _native.Cloud(
-            _plain(means),
-            _plain(rotations),
-            _plain(scales),
-            _plain(opacities),
-            self._sh,
-            None if signal is None else _plain(signal),
-        )
-        degree = 0
-        if self._sh is not None:
-            held = {1: 0, 4: 1, 9: 2, 16: 3}[self._sh.shape[1]]
-            degree = held if options.sh_degree is None else min(held, options.sh_degree)
+        self._degree_limit = options.sh_degree
+        self._geometry = (_plain(means), _plain(rotations), _plain(scales), _plain(opacities))
+        degree = self._colour_with(sh, signal)
         # Views keep tens of megabytes of scratch; a fresh one would be paid for in page faults.
         self._view: _native.View = _free_views.pop() if _free_views else _native.View()
         self._pose = camera.cam_from_world.detach()
@@ -125,6 +114,32 @@ class CpuView:
         )
         self._forward: tuple[Tensor, Tensor, Tensor] | None = None
         self._wide: Tensor | None = None
+
+    def _colour_with(self, sh: Tensor | None, signal: Tensor | None) -> int:
+        """What the Gaussians' colours are made of; gives the degree of the harmonics in use."""
+        self._narrow = 3 if signal is None else signal.shape[1]
+        self._sh = None if sh is None else _plain(sh)
+        self._cloud = _native.Cloud(
+            *self._geometry, self._sh, None if signal is None else _plain(signal)
+        )
+        if self._sh is None:
+            return 0
+        held = {1: 0, 4: 1, 9: 2, 16: 3}[self._sh.shape[1]]
+        return held if self._degree_limit is None else min(held, self._degree_limit)
+
+    def recolour(
+        self,
+        *,
+        sh: Float[Tensor, "n coefficients 3"] | None = None,
+        signal: Float[Tensor, "n channels"] | None = None,
+    ) -> None:
+        """Take other harmonics or another narrow signal; the projection stays as it is.
+
+        Only for renders without a record: the backward pass knows the colours of the start.
+        """
+        degree = self._colour_with(sh, signal)
+        self._forward = None
+        self._view.recolour(self._cloud, degree)
 
     def __enter__(self) -> Self:
         return self
@@ -192,6 +207,17 @@ class CpuView:
         sums, weights = _zeros(self._count, channels), _zeros(self._count)
         self._view.adjoint(_plain(image), channels, sums, weights)
         return sums, weights
+
+    def back_project_sparse(
+        self, indptr: Tensor, channels: Tensor, values: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The sums that are not 0 of a `SparseImage`, by Gaussian, and ``W.T @ 1`` (n,)."""
+        weights = _zeros(self._count)
+        found = self._view.sparse_adjoint(
+            indptr.contiguous(), channels.contiguous(), values.contiguous(), weights
+        )
+        gaussians, names, sums = (torch.from_numpy(array) for array in found)
+        return gaussians, names, sums, weights
 
     def backward(
         self,

@@ -2,17 +2,15 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Int32, Int64
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from splatseg import _native
 from splatseg._check import check_shape
-from splatseg.render._backend import BackProjected, ImageWeights, PartSums, SparseWeights
+from splatseg.render._products import LinearMap
+from splatseg.render._rows import SparseWeights
+from splatseg.render._view_weights import ImageWeights, PartSums
 from splatseg.render.cpu._view import padded_channels
-
-
-def _float(tensor: Tensor) -> Tensor:
-    return tensor.detach().to(torch.float32).contiguous()
 
 
 class CpuBlockWeights(ImageWeights):
@@ -34,28 +32,34 @@ class CpuBlockWeights(ImageWeights):
         """Memory it holds."""
         return self._matrix.nbytes
 
-    def render(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
+    def product(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
         """``W @ signal``, row by row of the image."""
         check_shape("signal", signal, (self._gaussians, None))
+        return LinearMap(forward=self._product, adjoint=self._adjoint)(signal)
+
+    def adjoint(self, image: Float[Tensor, "pixels channels"]) -> Float[Tensor, "n channels"]:
+        """``W.T @ image``."""
+        check_shape("image", image, (self._height * self._width, None))
+        return LinearMap(forward=self._adjoint, adjoint=self._product)(image)
+
+    def _product(self, signal: Tensor) -> Tensor:
         channels = signal.shape[1]
-        wide = _float(signal)
+        wide = signal.float()
         if channels % 16:
             wide = torch.zeros(self._gaussians, padded_channels(channels))
-            wide[:, :channels] = signal.detach()
+            wide[:, :channels] = signal
         image = torch.empty(self._height * self._width, channels)
         self._matrix.render(wide, channels, image)
-        return image
+        return image.to(signal.dtype)
 
-    def back_project(self, image: Float[Tensor, "pixels channels"]) -> BackProjected:
-        """``W.T @ image`` and ``W.T @ 1``."""
-        check_shape("image", image, (self._height * self._width, None))
+    def _adjoint(self, image: Tensor) -> Tensor:
         channels = image.shape[1]
         sums = torch.zeros(self._gaussians, padded_channels(channels))
         weights = torch.zeros(self._gaussians)
-        self._matrix.back_project(_float(image), channels, sums, weights)
+        self._matrix.back_project(image.float(), channels, sums, weights)
         if sums.shape[1] != channels:
             sums = sums[:, :channels].contiguous()
-        return BackProjected(sums=sums, weights=weights)
+        return sums.to(image.dtype)
 
     def part_sums(self, part: Int32[Tensor, "pixels"]) -> PartSums:
         """Sum W over each part of the image, block by block and then part by part."""
@@ -76,71 +80,14 @@ class CpuBlockWeights(ImageWeights):
         )
 
 
-class CpuSparseWeights(SparseWeights):
-    """Compressed sparse rows, one a pixel."""
-
-    def __init__(self, indptr: Tensor, ids: Tensor, weights: Tensor, *, gaussians: int) -> None:
-        self._indptr, self._ids, self._weights = indptr, ids, weights
-        self._gaussians = gaussians
-
-    @classmethod
-    def from_blocks(
-        cls, matrix: _native.BlockMatrix, *, gaussians: int, pixels: int
-    ) -> "CpuSparseWeights":
-        """The rows of all pixels."""
-        indptr = torch.empty(pixels + 1, dtype=torch.int64)
-        matrix.count_rows(indptr)
-        entries = int(indptr[-1])
-        ids = torch.empty(entries, dtype=torch.int32)
-        weights = torch.empty(entries, dtype=torch.int16)
-        matrix.fill_rows(indptr, ids, weights.view(torch.uint16))
-        return cls(indptr, ids, weights.view(torch.float16), gaussians=gaussians)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Pixels and Gaussians."""
-        return len(self._indptr) - 1, self._gaussians
-
-    @property
-    def nbytes(self) -> int:
-        """Memory it holds."""
-        return sum(t.nbytes for t in (self._indptr, self._ids, self._weights))
-
-    @property
-    def indptr(self) -> Int64[Tensor, "pixels_plus_1"]:
-        """Where each pixel's entries begin."""
-        return self._indptr
-
-    @property
-    def ids(self) -> Int32[Tensor, "entries"]:
-        """Gaussians, front to back in each row."""
-        return self._ids
-
-    @property
-    def weights(self) -> Float16[Tensor, "entries"]:
-        """Blending weights."""
-        return self._weights
-
-    def render(self, signal: Float[Tensor, "n channels"]) -> Float[Tensor, "pixels channels"]:
-        """``W @ signal``."""
-        check_shape("signal", signal, (self._gaussians, None))
-        image = torch.empty(self.shape[0], signal.shape[1])
-        _native.csr_render(
-            self._indptr, self._ids, self._weights.view(torch.uint16), _float(signal), image
-        )
-        return image
-
-    def back_project(self, image: Float[Tensor, "pixels channels"]) -> BackProjected:
-        """``W.T @ image`` and ``W.T @ 1``."""
-        check_shape("image", image, (self.shape[0], None))
-        sums = torch.zeros(self._gaussians, image.shape[1])
-        weights = torch.zeros(self._gaussians)
-        _native.csr_back_project(
-            self._indptr,
-            self._ids,
-            self._weights.view(torch.uint16),
-            _float(image),
-            sums,
-            weights,
-        )
-        return BackProjected(sums=sums, weights=weights)
+def rows_of_blocks(matrix: _native.BlockMatrix, *, gaussians: int, pixels: int) -> SparseWeights:
+    """The rows of all pixels."""
+    indptr = torch.empty(pixels + 1, dtype=torch.int64)
+    matrix.count_rows(indptr)
+    entries = int(indptr[-1])
+    ids = torch.empty(entries, dtype=torch.int32)
+    weights = torch.empty(entries, dtype=torch.int16)
+    matrix.fill_rows(indptr, ids, weights.view(torch.uint16))
+    return SparseWeights(
+        indptr=indptr, ids=ids, weights=weights.view(torch.float16), gaussians=gaussians
+    )

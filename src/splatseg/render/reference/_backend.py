@@ -9,15 +9,12 @@ from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
 from splatseg.core.sh import evaluate_sh
-from splatseg.render._backend import (
-    Backend,
-    BackProjected,
-    Contributors,
-    Layout,
-    Rendered,
-    ViewWeights,
-)
+from splatseg.errors import InputError
+from splatseg.render._backend import Backend, BackendView, needs_graph
 from splatseg.render._options import RenderOptions
+from splatseg.render._rows import SparseWeights
+from splatseg.render._values import BackProjected, Contributors, Rendered
+from splatseg.render._view_weights import ImageWeights
 from splatseg.render.reference._composite import Entries, entries, tiles
 from splatseg.render.reference._project import Projected, project
 from splatseg.render.reference._weights import blocks_from_csr, csr_from_entries
@@ -32,17 +29,50 @@ class ReferenceBackend(Backend):
 
     name: ClassVar[str] = "reference"
 
+    def prepare(
+        self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
+    ) -> "ReferenceView":
+        """A view, for any number of products."""
+        return ReferenceView(gaussians, camera, options)
+
+
+class ReferenceView(BackendView):
+    """One view, spelt out."""
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, options: RenderOptions) -> None:
+        self._gaussians, self._camera, self._options = gaussians, camera, options
+        self._projected: Projected | None = None
+        self._closed = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self._camera.height, self._camera.width
+
+    def close(self) -> None:
+        """Forget the projection."""
+        self._projected, self._closed = None, True
+
+    def _project(self, *, graph: bool = False) -> Projected:
+        """The projection; a new one for a graph."""
+        if self._closed:
+            raise InputError("view: expected one that is open, this one was closed.")
+        if graph:
+            return project(self._gaussians, self._camera, options=self._options)
+        if self._projected is None:
+            with torch.no_grad():
+                self._projected = project(self._gaussians, self._camera, options=self._options)
+        return self._projected
+
     def render(
         self,
-        gaussians: Gaussians,
-        camera: Camera,
-        signal: Float[Tensor, "n channels"] | None,
+        signal: Float[Tensor, "n channels"] | None = None,
         *,
-        options: RenderOptions,
         screen: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
-        projected = project(gaussians, camera, options=options)
+        gaussians, camera, options = self._gaussians, self._camera, self._options
+        projected = self._project(graph=needs_graph(gaussians, camera, signal, screen))
         if screen is not None:
             moved = projected.centres + screen[projected.ids].double()
             projected = replace(projected, centres=moved)
@@ -80,60 +110,39 @@ class ReferenceBackend(Backend):
         )
 
     @torch.no_grad()
-    def back_project(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        image: Float[Tensor, "height width channels"],
-        *,
-        options: RenderOptions,
-    ) -> BackProjected:
+    def back_project(self, image: Float[Tensor, "height width channels"]) -> BackProjected:
         """``W.T @ image`` and ``W.T @ 1``. No gradient."""
-        projected = project(gaussians, camera, options=options)
+        projected, camera = self._project(), self._camera
+        count, dtype = len(self._gaussians), self._gaussians.dtype
         image = image.double()
-        sums = image.new_zeros(len(gaussians), image.shape[2])
-        seen = image.new_zeros(len(gaussians))
-        for tile in tiles(projected, camera.width, camera.height, alpha_max=options.alpha_max):
+        sums = image.new_zeros(count, image.shape[2])
+        seen = image.new_zeros(count)
+        for tile in tiles(
+            projected, camera.width, camera.height, alpha_max=self._options.alpha_max
+        ):
             weights, ids = tile.matrix.weights, tile.projected.ids
             pixels = image[tile.rows, tile.columns].reshape(-1, image.shape[2])
             sums.index_add_(0, ids, weights.T @ pixels)
             seen.index_add_(0, ids, weights.sum(dim=0))
-        return BackProjected(sums=sums.to(gaussians.dtype), weights=seen.to(gaussians.dtype))
+        return BackProjected(sums=sums.to(dtype), weights=seen.to(dtype))
 
     @torch.no_grad()
-    def contributors(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        pixels: Int[Tensor, "p 2"],
-        k: int,
-        *,
-        options: RenderOptions,
-    ) -> Contributors:
+    def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
         """The k strongest Gaussians of pixels (column, row), ties front to back."""
-        projected = project(gaussians, camera, options=options)
-        found = entries(projected, pixels.long(), alpha_max=options.alpha_max)
-        return contributors_from_entries(found, len(pixels), k, dtype=gaussians.dtype)
+        found = entries(self._project(), pixels.long(), alpha_max=self._options.alpha_max)
+        return contributors_from_entries(found, len(pixels), k, dtype=self._gaussians.dtype)
 
     @torch.no_grad()
-    def weights(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        pixels: Int[Tensor, "p 2"] | None,
-        k: int | None,
-        *,
-        layout: Layout,
-        options: RenderOptions,
-    ) -> ViewWeights:
-        """W itself: all pixels or some, all entries or each pixel's k strongest."""
+    def rows(self, pixels: Int[Tensor, "p 2"] | None, k: int | None) -> SparseWeights:
+        """Rows of W: all pixels or some, all entries or each pixel's k strongest."""
         if pixels is None:
-            pixels = all_pixels(camera).to(gaussians.device)
-        projected = project(gaussians, camera, options=options)
-        found = entries(projected, pixels.long(), alpha_max=options.alpha_max)
-        return weights_from_entries(
-            found, camera, k, layout=layout, shape=(len(pixels), len(gaussians))
-        )
+            pixels = all_pixels(self._camera).to(self._gaussians.device)
+        found = entries(self._project(), pixels.long(), alpha_max=self._options.alpha_max)
+        return rows_from_entries(found, k, shape=(len(pixels), len(self._gaussians)))
+
+    def blocks(self) -> ImageWeights:
+        """W in blocks of 4 x 4 pixels."""
+        return blocks_from_csr(self.rows(None, None), self._camera.width, self._camera.height)
 
 
 def _colours(
@@ -177,16 +186,13 @@ def contributors_from_entries(
     return Contributors(ids=ids, weights=weights, first=first, median=median)
 
 
-def weights_from_entries(
-    found: Entries, camera: Camera, k: int | None, *, layout: Layout, shape: tuple[int, int]
-) -> ViewWeights:
-    """Keep each pixel's k strongest entries (None: all), in the layout asked for."""
+def rows_from_entries(found: Entries, k: int | None, *, shape: tuple[int, int]) -> SparseWeights:
+    """Keep each pixel's k strongest entries (None: all)."""
     kept = torch.arange(len(found.ids), device=found.ids.device)
     if k is not None:
         order, rank = _strongest_first(found.pixels, found.weights)
         kept = order[rank < k].sort().values
-    csr = csr_from_entries(found.pixels[kept], found.ids[kept], found.weights[kept], shape=shape)
-    return csr if layout == "csr" else blocks_from_csr(csr, camera.width, camera.height)
+    return csr_from_entries(found.pixels[kept], found.ids[kept], found.weights[kept], shape=shape)
 
 
 def _strongest_first(pixels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

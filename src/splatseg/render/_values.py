@@ -1,0 +1,124 @@
+"""What a view gives back: images, sums and contributors."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from splatseg._check import check_shape
+from splatseg.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rendered:
+    """What a view shows."""
+
+    image: Float[Tensor, "height width channels"]
+    """``W @ signal``, over black: a pixel that nothing covers is 0."""
+
+    alpha: Float[Tensor, "height width"]
+    """Sum of the weights, ``W @ 1``; 1 minus it is the light that passes everything."""
+
+    depth: Float[Tensor, "height width"]
+    """Expected z-depth, sum(w z) / sum(w), scene units; 0 where alpha is 0."""
+
+    median_depth: Float[Tensor, "height width"]
+    """z of the Gaussian at which the transmittance first falls to 0.5 or less; 0 where it
+    never does. Not differentiable."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BackProjected:
+    """What an image says of each Gaussian."""
+
+    sums: Float[Tensor, "n channels"]
+    """``W.T @ image``: the image summed over pixels with the blending weights."""
+
+    weights: Float[Tensor, "n"]
+    """``W.T @ 1``: how much each Gaussian was seen; one fully visible pixel counts 1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SparseImage:
+    """An image of many channels of which each pixel has few: segments, labels, masks.
+
+    Pixel p, row by row of the image, has ``values[indptr[p]:indptr[p + 1]]`` in
+    ``channels[...]``, each channel at most once, and 0 in all others.
+    """
+
+    indptr: Int64[Tensor, "pixels_plus_1"]
+    """Where each pixel's values begin."""
+
+    channels: Int32[Tensor, "entries"]
+    """Channels, from 0."""
+
+    values: Float[Tensor, "entries"]
+    """Their values, float32."""
+
+    count: int
+    """Number of channels."""
+
+    def __post_init__(self) -> None:
+        check_shape("indptr", self.indptr, (None,))
+        check_shape("channels", self.channels, (None,))
+        check_shape("values", self.values, (len(self.channels),))
+        types = (self.indptr.dtype, self.channels.dtype, self.values.dtype)
+        if types != (torch.int64, torch.int32, torch.float32):
+            raise InputError(
+                f"image: expected indptr int64, channels int32 and values float32, got {types}."
+            )
+        if len(self.indptr) < 1 or int(self.indptr[-1]) != len(self.channels):
+            raise InputError(
+                f"indptr: expected one number more than pixels, the last of them "
+                f"{len(self.channels)}, the entries."
+            )
+        if len(self.channels):
+            low, high = (int(end) for end in torch.aminmax(self.channels))
+            if low < 0 or high >= self.count:
+                raise InputError(
+                    f"channels: expected values in [0, {self.count}), got {low} to {high}."
+                )
+
+    def dense(self, start: int, stop: int) -> Float[Tensor, "pixels part"]:
+        """Channels from `start` to before `stop`, spelt out."""
+        row = torch.repeat_interleave(torch.arange(len(self.indptr) - 1), self.indptr.diff())
+        mine = (self.channels >= start) & (self.channels < stop)
+        image = torch.zeros(len(self.indptr) - 1, stop - start)
+        image[row[mine], self.channels[mine].long() - start] = self.values[mine]
+        return image
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SparseBackProjected:
+    """What a `SparseImage` says of each Gaussian: the sums that are not 0."""
+
+    gaussians: Int64[Tensor, "m"]
+    """Gaussians, ascending."""
+
+    channels: Int64[Tensor, "m"]
+    """Channels, ascending within a Gaussian."""
+
+    sums: Float[Tensor, "m"]
+    """``(W.T @ image)[gaussian, channel]``, float32."""
+
+    weights: Float[Tensor, "n"]
+    """``W.T @ 1`` of every Gaussian, float32."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Contributors:
+    """Which Gaussians make some pixels."""
+
+    ids: Int32[Tensor, "p k"]
+    """The strongest Gaussians of each pixel, strongest first; -1 where there are fewer."""
+
+    weights: Float[Tensor, "p k"]
+    """Their blending weights, 0 where there are fewer."""
+
+    first: Int32[Tensor, "p"]
+    """The front-most Gaussian with a weight; -1 where there is none."""
+
+    median: Int32[Tensor, "p"]
+    """The Gaussian at which the transmittance first falls to 0.5 or less; -1 where it never
+    does."""

@@ -1,0 +1,33 @@
+"""Checks of values, where the fast way must not change the answer."""
+
+import pytest
+import torch
+
+from splatseg._check import check_finite
+from splatseg.errors import RangeError
+
+LARGEST = torch.finfo(torch.float32).max
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        torch.full((4,), LARGEST),
+        torch.tensor([65504.0, 65504.0], dtype=torch.float16),
+        torch.zeros(0),
+        torch.arange(5),
+    ],
+)
+def test_finite_values_whose_sum_overflows_are_finite(values) -> None:
+    check_finite("values", values)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_one_value_that_is_not_finite_is_found(bad) -> None:
+    values = torch.ones(3, 4)
+    values[1, 2] = bad
+    with pytest.raises(RangeError, match=r"values: 1 of 12 .* at \(1, 2\)"):
+        check_finite("values", values)
+    values[2, 3] = -bad
+    with pytest.raises(RangeError, match="values: 2 of 12"):
+        check_finite("values", values)
