@@ -76,6 +76,10 @@ struct CloudGradients {
   float *means, *rotations, *scales, *opacities, *sh, *screen;
 };
 
+struct CellTree;    // neighbours.h
+struct Bundle;
+struct Candidates;
+
 struct Kernels {
   const char* name;
 
@@ -142,6 +146,16 @@ struct Kernels {
                        void (*take)(void*, int block, int32_t id, const float* weights,
                                     uint32_t lanes),
                        void* self);
+
+  // Neighbours of queries [begin, end) of a bundle's order, see neighbours.h.
+  void (*nearest_points)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
+                         int64_t k, double max_squared, Candidates&, int64_t* indices,
+                         double* squared);
+  void (*count_points)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
+                       double max_squared, int64_t* counts);
+  void (*points_within)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
+                        double max_squared, const int64_t* starts, Candidates&, int64_t* indices,
+                        double* squared);
 };
 
 // The kernels chosen for this machine, or by set_isa.

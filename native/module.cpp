@@ -17,6 +17,7 @@ namespace nb = nanobind;
 namespace splatseg {
 void register_loss(nb::module_& m);
 void register_adam(nb::module_& m);
+void register_neighbours(nb::module_& m);
 }  // namespace splatseg
 
 namespace splatseg {
@@ -334,4 +335,5 @@ NB_MODULE(_native, m) {
   });
   register_loss(m);
   register_adam(m);
+  register_neighbours(m);
 }

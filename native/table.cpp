@@ -22,12 +22,15 @@ SPLATSEG_KERNEL(block_weights)
 SPLATSEG_KERNEL(blocks_forward)
 SPLATSEG_KERNEL(blocks_adjoint)
 SPLATSEG_KERNEL(tile_weights)
+SPLATSEG_KERNEL(nearest_points)
+SPLATSEG_KERNEL(count_points)
+SPLATSEG_KERNEL(points_within)
 
 const Kernels& table() {
   static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, find_tiles, forward_colour,
                                   forward_features, adjoint, backward_colour, backward_features,
                                   chain, block_weights, blocks_forward, blocks_adjoint,
-                                  tile_weights};
+                                  tile_weights, nearest_points, count_points, points_within};
   return kernels;
 }
 
