@@ -79,9 +79,9 @@ void register_neighbours(nb::module_& module) {
                         squared.shape(1) == indices.shape(1) && indices.shape(1) >= 1,
                     "neighbours: output size");
              nb::gil_scoped_release released;
-             self.nearest(asked.queries, asked.points, asked.count,
-                          static_cast<int64_t>(indices.shape(1)), max_squared, indices.data(),
-                          squared.data());
+             return self.nearest(asked.queries, asked.points, asked.count,
+                                 static_cast<int64_t>(indices.shape(1)), max_squared,
+                                 indices.data(), squared.data());
            },
            nb::arg("queries").none(), nb::arg("rows").none(), nb::arg("max_squared"),
            nb::arg("indices"), nb::arg("squared"))

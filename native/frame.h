@@ -147,10 +147,11 @@ struct Kernels {
                                     uint32_t lanes),
                        void* self);
 
-  // Neighbours of queries [begin, end) of a bundle's order, see neighbours.h.
-  void (*nearest_points)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
-                         int64_t k, double max_squared, Candidates&, int64_t* indices,
-                         double* squared);
+  // Neighbours of queries [begin, end) of a bundle's order, see neighbours.h. The first returns
+  // how many distances to points were computed.
+  int64_t (*nearest_points)(const CellTree&, int dimensions, const Bundle&, int64_t begin,
+                            int64_t end, int64_t k, double max_squared, Candidates&,
+                            int64_t* indices, double* squared);
   void (*count_points)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
                        double max_squared, int64_t* counts);
   void (*points_within)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,

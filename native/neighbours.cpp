@@ -215,6 +215,7 @@ int64_t NeighbourIndex::cell_of(const double* query) const {
 void NeighbourIndex::in_blocks(
     const double* queries, const int64_t* points, int64_t m,
     const std::function<void(const Bundle&, int64_t, int64_t)>& answer) const {
+  if (!m) return;  // arrays of no rows may be null, which means all points
   if (!queries && !points) {
     answer({nullptr, nullptr, position_.data(), ids_.data()}, 0, count_);
     return;
@@ -240,18 +241,21 @@ void NeighbourIndex::in_blocks(
   }
 }
 
-void NeighbourIndex::nearest(const double* queries, const int64_t* points, int64_t m, int64_t k,
-                             double max_squared, int64_t* indices, double* squared) const {
+int64_t NeighbourIndex::nearest(const double* queries, const int64_t* points, int64_t m, int64_t k,
+                                double max_squared, int64_t* indices, double* squared) const {
   const CellTree cells = tree();
   const Kernels& use = kernels();
   std::vector<Candidates> scratch(static_cast<size_t>(threads()));
   in_blocks(queries, points, m, [&](const Bundle& bundle, int64_t first, int64_t rows) {
     parallel_for_thread(rows, kGrain, [&](int thread, int64_t begin, int64_t end) {
-      use.nearest_points(cells, dimensions_, bundle, begin, end, k, max_squared,
-                         scratch[static_cast<size_t>(thread)], indices + first * k,
-                         squared + first * k);
+      Candidates& mine = scratch[static_cast<size_t>(thread)];
+      mine.compared += use.nearest_points(cells, dimensions_, bundle, begin, end, k, max_squared,
+                                          mine, indices + first * k, squared + first * k);
     });
   });
+  int64_t compared = 0;
+  for (const Candidates& mine : scratch) compared += mine.compared;
+  return compared;
 }
 
 void NeighbourIndex::count_within(const double* queries, const int64_t* points, int64_t m,

@@ -56,6 +56,7 @@ struct Candidates {
   Buffer<double> squared;
   Buffer<int32_t> ids;
   std::vector<unsigned __int128> keys;  // squared distance above, index below
+  int64_t compared = 0;
 };
 
 template <int D>
@@ -73,8 +74,9 @@ class NeighbourIndex {
   // The k nearest of each query within sqrt(max_squared): indices (m, k), -1 where there are
   // fewer, and squared distances, infinite there. With `queries` null, m points of the index
   // by `points` (null: all of them), each of which leaves itself out.
-  void nearest(const double* queries, const int64_t* points, int64_t m, int64_t k,
-               double max_squared, int64_t* indices, double* squared) const;
+  // Returns how many distances to points were computed.
+  int64_t nearest(const double* queries, const int64_t* points, int64_t m, int64_t k,
+                  double max_squared, int64_t* indices, double* squared) const;
 
   // How many points lie within sqrt(max_squared) of each query.
   void count_within(const double* queries, const int64_t* points, int64_t m, double max_squared,

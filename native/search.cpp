@@ -219,12 +219,13 @@ inline Key* first_of(Candidates& all, int64_t count, int64_t kept, bool sorted) 
 inline int64_t room_for(int64_t k) { return k + std::clamp<int64_t>(k, 4, 64); }
 
 template <int D>
-void nearest(const CellTree& tree, const Bundle& bundle, int64_t begin, int64_t end, int64_t k,
+int64_t nearest(const CellTree& tree, const Bundle& bundle, int64_t begin, int64_t end, int64_t k,
              double max_squared, Candidates& all, int64_t* indices, double* squared) {
   const int64_t wanted = std::min(k, tree.count), room = room_for(wanted);
   double* held = all.squared.resize(room + 3 * kCell + kBlock);
   int32_t* held_ids = all.ids.resize(room + 3 * kCell + kBlock);
   double last[D] = {}, last_far = kInfinity;
+  int64_t compared = 0;
   for (int64_t i = begin; i < end; ++i) {
     const Query<D> query(tree, bundle, i);
     Bound bound{max_squared};
@@ -240,6 +241,7 @@ void nearest(const CellTree& tree, const Bundle& bundle, int64_t begin, int64_t 
     search<D>(tree, query.at, bound, [&](int64_t cell) {
       const int64_t stop = tree.cell_begin(cell + 1);
       for (int64_t at = tree.cell_begin(cell); at < stop; at += kBlock) {
+        compared += kBlock;
         const Eight distances = to_points<D>(tree.columns + at, tree.stride, query.at);
         const uint32_t near = up_to(distances, bound.squared) & query.others(at);
         if (near) count = append(held, held_ids, count, distances, tree.ids + at, near);
@@ -268,6 +270,7 @@ void nearest(const CellTree& tree, const Bundle& bundle, int64_t begin, int64_t 
     last_far = found == k ? out_squared[k - 1] : kInfinity;
     for (int axis = 0; axis < D; ++axis) last[axis] = query.at[axis];
   }
+  return compared;
 }
 
 template <int D>
@@ -321,7 +324,7 @@ void all_near(const CellTree& tree, const Bundle& bundle, int64_t begin, int64_t
 
 // Calls f with the number of dimensions as a constant.
 template <class Call>
-void with_dimensions(int dimensions, Call&& call) {
+auto with_dimensions(int dimensions, Call&& call) {
   switch (dimensions) {
     case 1: return call(std::integral_constant<int, 1>());
     case 2: return call(std::integral_constant<int, 2>());
@@ -336,11 +339,11 @@ void with_dimensions(int dimensions, Call&& call) {
 
 }  // namespace
 
-void nearest_points(const CellTree& tree, int dimensions, const Bundle& bundle, int64_t begin,
-                    int64_t end, int64_t k, double max_squared, Candidates& all, int64_t* indices,
-                    double* squared) {
-  with_dimensions(dimensions, [&](auto d) {
-    nearest<d()>(tree, bundle, begin, end, k, max_squared, all, indices, squared);
+int64_t nearest_points(const CellTree& tree, int dimensions, const Bundle& bundle, int64_t begin,
+                       int64_t end, int64_t k, double max_squared, Candidates& all,
+                       int64_t* indices, double* squared) {
+  return with_dimensions(dimensions, [&](auto d) {
+    return nearest<d()>(tree, bundle, begin, end, k, max_squared, all, indices, squared);
   });
 }
 
