@@ -57,20 +57,6 @@ def test_work_hardly_grows_with_the_number_of_points() -> None:
     assert large < 1.2 * small
 
 
-def test_a_search_knows_of_the_one_before_it() -> None:
-    """Queries near each other start from the last one's reach."""
-    points = hostile("normal", 8000)
-    together = compared(points, 16)
-    index = _native.NeighbourIndex(points)
-    indices = torch.empty(1, 16, dtype=torch.int64)
-    squared = torch.empty(1, 16, dtype=torch.float64)
-    alone = [
-        index.nearest(None, torch.tensor([row]), math.inf, indices, squared)
-        for row in range(0, 8000, 20)
-    ]
-    assert together < sum(alone) / len(alone)
-
-
 @pytest.mark.usefixtures("every_isa")
 @pytest.mark.parametrize("shape", ["equal", "two positions", "dense and sparse"])
 def test_threads_change_nothing(shape: str) -> None:
