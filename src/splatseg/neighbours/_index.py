@@ -10,7 +10,7 @@ from splatseg._check import check_shape, check_values
 from splatseg._native import NeighbourIndex as NativeIndex
 from splatseg.core import Gaussians
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.neighbours._results import NeighbourLists, Neighbours
+from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
 
 MAX_DIMENSIONS = 8
 """Columns that points may have."""
@@ -213,7 +213,7 @@ class NeighbourIndex:
         indices = torch.empty(count, k, dtype=torch.int64)
         squared = torch.empty(count, k, dtype=torch.float64)
         self._native.nearest(queries, rows, max_distance * max_distance, indices, squared)
-        return Neighbours(indices=indices.to(device), distances=squared.sqrt_().to(device))
+        return Neighbours(indices=indices.to(device), distances=square_root(squared).to(device))
 
     def _count(self, queries: Tensor | None, rows: Tensor | None, radius: float) -> Tensor:
         _check_distance("radius", radius)
@@ -246,7 +246,7 @@ class NeighbourIndex:
         indices = torch.empty(pairs, dtype=torch.int64)
         squared = torch.empty(pairs, dtype=torch.float64)
         self._native.within(queries, rows, radius * radius, starts, indices, squared)
-        return NeighbourLists(starts=starts, indices=indices, distances=squared.sqrt_())
+        return NeighbourLists(starts=starts, indices=indices, distances=square_root(squared))
 
     def _asked(self, queries: Tensor | None, rows: Tensor | None) -> int:
         if queries is not None:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
-from splatseg.neighbours._results import NeighbourLists, Neighbours
+from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
 
 
 def squared_distances(
@@ -40,7 +40,9 @@ def nearest(
     short = max(0, k - len(points))
     squared = torch.nn.functional.pad(squared, (0, short), value=math.inf)[:, :k]
     order = torch.nn.functional.pad(order, (0, short), value=-1)[:, :k]
-    return Neighbours(indices=torch.where(squared.isinf(), -1, order), distances=squared.sqrt())
+    return Neighbours(
+        indices=torch.where(squared.isinf(), -1, order), distances=square_root(squared)
+    )
 
 
 def within(
@@ -58,7 +60,9 @@ def within(
     found = squared.isfinite()
     starts = torch.zeros(len(queries) + 1, dtype=torch.int64)
     starts[1:] = found.sum(dim=1).cumsum(dim=0)
-    return NeighbourLists(starts=starts, indices=order[found], distances=squared[found].sqrt())
+    return NeighbourLists(
+        starts=starts, indices=order[found], distances=square_root(squared[found])
+    )
 
 
 def _ordered(
