@@ -83,6 +83,9 @@ struct TileImage {
   const int32_t* columns[16];
   const float* values[16];
 };
+struct CellTree;    // neighbours.h
+struct Bundle;
+struct Candidates;
 
 struct Kernels {
   const char* name;
@@ -177,6 +180,17 @@ struct Kernels {
   // one a channel of the tile, and its weight. `chunk_rows` has kChunk times the widest block.
   void (*sparse_adjoint)(const Frame&, int tile, void* scratch, const TileImage& image,
                          float* chunk_rows, float* rows, int64_t row_stride);
+
+  // Neighbours of queries [begin, end) of a bundle's order, see neighbours.h. The first returns
+  // how many distances to points were computed.
+  int64_t (*nearest_points)(const CellTree&, int dimensions, const Bundle&, int64_t begin,
+                            int64_t end, int64_t k, double max_squared, Candidates&,
+                            int64_t* indices, double* squared);
+  void (*count_points)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
+                       double max_squared, int64_t* counts);
+  void (*points_within)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
+                        double max_squared, const int64_t* starts, Candidates&, int64_t* indices,
+                        double* squared);
 };
 
 // The kernels chosen for this machine, or by set_isa.

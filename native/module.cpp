@@ -21,6 +21,7 @@ void register_loss(nb::module_& m);
 void register_adam(nb::module_& m);
 void register_product(nb::module_& m);
 void register_csr(nb::module_& m);
+void register_neighbours(nb::module_& m);
 }  // namespace splatseg
 
 namespace splatseg {
@@ -375,4 +376,5 @@ NB_MODULE(_native, m) {
   register_adam(m);
   register_product(m);
   register_csr(m);
+  register_neighbours(m);
 }

@@ -28,13 +28,16 @@ SPLATSEG_KERNEL(gather_rows)
 SPLATSEG_KERNEL(scatter_rows)
 SPLATSEG_KERNEL(ids_below)
 SPLATSEG_KERNEL(sparse_adjoint)
+SPLATSEG_KERNEL(nearest_points)
+SPLATSEG_KERNEL(count_points)
+SPLATSEG_KERNEL(points_within)
 
 const Kernels& table() {
   static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, recolour, find_tiles, forward_colour,
                                   forward_features, adjoint, backward_colour, backward_features,
                                   chain, block_weights, block_sums, blocks_forward, blocks_adjoint,
                                   tile_weights, gather_rows, scatter_rows, ids_below,
-                                  sparse_adjoint};
+                                  sparse_adjoint, nearest_points, count_points, points_within};
   return kernels;
 }
 

@@ -226,3 +226,27 @@ def update_rows(
     noise: float,
     seed: int,
 ) -> None: ...
+
+class NeighbourIndex:
+    nbytes: int
+    def __init__(self, points: Tensor, /) -> None: ...
+    def nearest(
+        self,
+        queries: Tensor | None,
+        rows: Tensor | None,
+        max_squared: float,
+        indices: Tensor,
+        squared: Tensor,
+    ) -> int: ...
+    def count_within(
+        self, queries: Tensor | None, rows: Tensor | None, max_squared: float, counts: Tensor
+    ) -> None: ...
+    def within(
+        self,
+        queries: Tensor | None,
+        rows: Tensor | None,
+        max_squared: float,
+        starts: Tensor,
+        indices: Tensor,
+        squared: Tensor,
+    ) -> None: ...

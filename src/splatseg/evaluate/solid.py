@@ -23,6 +23,7 @@ from splatseg.core import UNLABELLED, Gaussians
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
+from splatseg.neighbours import NeighbourIndex
 
 GaussianWeight = Literal["count", "opacity", "volume"]
 """What a Gaussian counts in a score."""
@@ -115,15 +116,13 @@ def labels_of_points(
         raise RangeError(f"neighbours: expected at least 1, got {neighbours}.")
     if len(ids) != len(gaussians):
         raise ShapeError(f"ids: expected {len(gaussians)} rows, one a Gaussian, got {len(ids)}.")
-    from scipy.spatial import KDTree
-
     solid = gaussians.opacities.detach().cpu() >= min_opacity
     count = int(solid.sum())
     if not count:
         raise InputError(f"gaussians: expected one with an opacity of {min_opacity:g} or more.")
     there = gaussians[solid.to(gaussians.means.device)].to(device="cpu", dtype=torch.float64)
     kept = ids.cpu().int()[solid]
-    tree = KDTree(there.means.detach().numpy())
+    index = NeighbourIndex(there)
     near = 1 if rule == "nearest" else min(neighbours, count)
     # Rows of whitening matrices: |S^-1 R^T (x - mean)| is the Mahalanobis distance.
     rotations = rotation_from_quaternion(there.rotations)
@@ -131,15 +130,14 @@ def labels_of_points(
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)
     for start in range(0, len(points), _POINTS):
         part = points[start : start + _POINTS].detach().cpu().double()
-        _, found = tree.query(part.numpy(), k=near)
-        index = torch.from_numpy(found).long().reshape(len(part), near)
-        at = kept[index]
+        found = index.nearest(part, near).indices
+        at = kept[found]
         if rule == "nearest":
             out[start : start + _POINTS] = at[:, 0]
             continue
-        offsets = part[:, None] - there.means[index]
-        local = torch.einsum("pkji,pkj->pki", rotations[index], offsets) / scales[index]
-        density = there.opacities[index] * torch.exp(-0.5 * local.square().sum(dim=-1))
+        offsets = part[:, None] - there.means[found]
+        local = torch.einsum("pkji,pkj->pki", rotations[found], offsets) / scales[found]
+        density = there.opacities[found] * torch.exp(-0.5 * local.square().sum(dim=-1))
         out[start : start + _POINTS] = _winners(at, density)
     return out
 
@@ -174,12 +172,9 @@ def labels_from_points(
         raise RangeError(f"reach: expected a distance above 0, got {reach}.")
     if not len(points):
         raise InputError("points: expected at least one point, got none.")
-    from scipy.spatial import KDTree
-
-    tree = KDTree(points.detach().cpu().double().numpy())
-    distances, found = tree.query(gaussians.means.detach().cpu().double().numpy())
-    near = torch.from_numpy(distances) <= reach
-    return torch.where(near, ids.cpu().int()[torch.from_numpy(found).long()], UNLABELLED).int()
+    found = NeighbourIndex(points.cpu()).nearest(gaussians.means.cpu(), 1)
+    near = found.distances[:, 0] <= reach
+    return torch.where(near, ids.cpu().int()[found.indices[:, 0]], UNLABELLED).int()
 
 
 def _winners(ids: Int[Tensor, "p k"], votes: Float[Tensor, "p k"]) -> Int[Tensor, "p"]:

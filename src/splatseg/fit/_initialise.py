@@ -11,6 +11,7 @@ from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters
+from splatseg.neighbours import NeighbourIndex
 
 _NEIGHBOURS = 3
 # Points alone in space would start as balls that fill the view: none is larger than this share
@@ -74,7 +75,8 @@ def initial_parameters(
 
     spacing = _spacing(points)
     centres = torch.stack([view.camera.centre for view in capture.train_views]).float()
-    distance = _nearest(points, centres, 1)[:, 0].clamp_min(1e-6)
+    to_camera = NeighbourIndex(centres).nearest(points, 1).distances[:, 0]
+    distance = to_camera.float().clamp_min(1e-6)
     scales = torch.maximum(
         torch.minimum(spacing, _LARGEST_SHARE * distance), _SMALLEST_SHARE * distance
     )
@@ -98,12 +100,4 @@ def _spacing(points: Tensor) -> Tensor:
     neighbours = min(_NEIGHBOURS, len(points) - 1)
     if neighbours == 0:
         return torch.full((len(points),), math.inf)
-    return _nearest(points, points, neighbours + 1)[:, 1:].mean(dim=1)
-
-
-def _nearest(points: Tensor, others: Tensor, k: int) -> Float[Tensor, "n k"]:
-    """Distances of each point to its k nearest of `others`, nearest first."""
-    from scipy.spatial import KDTree
-
-    distances, _ = KDTree(others.numpy()).query(points.numpy(), k=k)
-    return torch.from_numpy(distances).float().view(len(points), k)
+    return NeighbourIndex(points).nearest_others(neighbours).distances.float().mean(dim=1)

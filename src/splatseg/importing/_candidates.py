@@ -8,6 +8,7 @@ from torch import Tensor
 
 from splatseg.core import Camera
 from splatseg.importing._extent import Extent
+from splatseg.neighbours import NeighbourIndex
 
 OUTSIDE_VIEW = 50.0
 """Horizontal field of view of cameras that look in, degrees."""
@@ -93,16 +94,14 @@ def inside(extent: Extent, frame: Frame) -> list[Camera]:
 
 def free_places(extent: Extent) -> list[Tensor]:
     """Points of a grid within the bounds that are away from all solid Gaussians, spread out."""
-    from scipy.spatial import KDTree
-
     axes = [
         torch.linspace(-_INNER, _INNER, n, dtype=torch.float64) * extent.half[k]
         for k, n in enumerate(_GRID)
     ]
     grid = torch.cartesian_prod(*axes) + extent.middle
-    distance, _ = KDTree(extent.solid.numpy()).query(grid.numpy())
-    clear = torch.from_numpy(distance) > _CLEARANCE * extent.radius
-    free, room = grid[clear], torch.from_numpy(distance)[clear]
+    distance = NeighbourIndex(extent.solid).nearest(grid, 1).distances[:, 0]
+    clear = distance > _CLEARANCE * extent.radius
+    free, room = grid[clear], distance[clear]
     if not len(free):
         return []
     # Farthest points first, beginning with the one that has most room.

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from splatseg.neighbours import NeighbourIndex
+
 _TINY = 1e-10
 """Added to probabilities before their logarithm, as published."""
 
@@ -57,28 +59,26 @@ class NeighbourLoss:
         points: int,
         rng: np.random.Generator,
     ) -> None:
-        from scipy.spatial import KDTree
-
         kept = np.arange(len(means))
         if len(means) > points:
             kept = np.sort(rng.choice(len(means), points, replace=False))
         self._kept = kept
-        self._places = means.double().numpy()[kept]
-        self._tree = KDTree(self._places)
+        self._index = NeighbourIndex(means[torch.from_numpy(kept)])
         self._neighbours = min(neighbours, len(kept))
 
     def draw(self, samples: int, rng: np.random.Generator) -> Int64[Tensor, "samples k"]:
-        """Some Gaussians' neighbours, nearest first: each itself, unless others share its place.
+        """Some Gaussians' neighbours, nearest first: each itself, then the nearest others.
 
         Fewer than asked for are drawn where there are fewer.
         """
         count = min(samples, len(self._kept))
         drawn = rng.choice(len(self._kept), count, replace=False)
-        near = np.asarray(self._tree.query(self._places[drawn], k=self._neighbours)[1])
-        near = near.reshape(count, self._neighbours)
-        # Where many share a place a Gaussian may not be its own nearest.
-        near[:, 0] = drawn
-        return torch.from_numpy(self._kept[near])
+        rows = torch.from_numpy(drawn)
+        near = rows[:, None]
+        if self._neighbours > 1:
+            others = self._index.nearest_others(self._neighbours - 1, rows=rows)
+            near = torch.cat((near, others.indices), dim=1)
+        return torch.from_numpy(self._kept)[near]
 
     def loss(
         self,

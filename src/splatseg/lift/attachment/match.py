@@ -15,6 +15,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splatseg.lift.attachment.rows import (
@@ -24,8 +25,8 @@ from splatseg.lift.attachment.rows import (
     Rows,
     extent_of,
     shapes_of,
-    threads,
 )
+from splatseg.neighbours import NeighbourIndex
 
 NEAREST = 8
 """Candidates of a row at first."""
@@ -138,12 +139,10 @@ class _Nearby:
 
     @classmethod
     def search(cls, edited: Rows, source: Rows, wanted: Indices, count: int) -> "_Nearby":
-        from scipy.spatial import KDTree
-
         count = min(count, len(source))
-        tree = KDTree(source.means)
-        _, indices = tree.query(edited.means[wanted], k=count, workers=threads())
-        indices = np.sort(indices.reshape(len(wanted), count), axis=1).astype(np.int64)
+        index = NeighbourIndex(torch.from_numpy(source.means))
+        found = index.nearest(torch.from_numpy(edited.means[wanted]), count)
+        indices = np.sort(found.indices.numpy(), axis=1)
         residuals = np.empty((*indices.shape, len(_VALUES)), np.float32)
         source_shapes, edited_shapes = shapes_of(source), shapes_of(edited[wanted])
         for part in _blocks(len(wanted), _BLOCK):

@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Similarity
-from splatseg.lift.attachment.rows import Floats, Indices, Rows, extent_of, threads
+from splatseg.lift.attachment.rows import Floats, Indices, Rows, extent_of
+from splatseg.neighbours import NeighbourIndex
 
 _SAMPLE = 6000
 _TRIPLES = 60_000
@@ -88,13 +89,12 @@ def fit_similarity(origin: Floats, target: Floats) -> Similarity | None:
 
 def _pairs(edited: Rows, source: Rows, rng: np.random.Generator) -> tuple[Indices, Indices]:
     """Edited rows and the source rows like them, of the one change of size that most have."""
-    from scipy.spatial import KDTree
-
     rows = np.arange(len(edited))
     if len(rows) > _SAMPLE:
         rows = np.sort(rng.permutation(len(rows))[:_SAMPLE])
-    _, found = KDTree(_descriptors(source)).query(_descriptors(edited[rows]), workers=threads())
-    found = np.asarray(found, np.int64)
+    index = NeighbourIndex(torch.from_numpy(_descriptors(source)))
+    nearest = index.nearest(torch.from_numpy(_descriptors(edited[rows])), 1)
+    found = nearest.indices[:, 0].numpy()
     logs = (edited.logs[rows] - source.logs[found]).mean(axis=1)
     order = np.sort(logs)
     count = np.searchsorted(order, order + _WINDOW, side="right") - np.arange(len(order))

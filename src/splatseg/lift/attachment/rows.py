@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Gaussians, Similarity
@@ -95,8 +94,3 @@ def extent_of(rows: Rows) -> float:
     low, high = np.quantile(rows.means, (0.01, 0.99), axis=0)
     wide = float((high - low).max()) / 2
     return wide if wide > 0 else max(float(np.abs(rows.means).max()), 1e-6)
-
-
-def threads() -> int:
-    """How many threads a search may take: as many as torch does."""
-    return torch.get_num_threads()

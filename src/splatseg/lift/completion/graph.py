@@ -23,7 +23,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+
+from splatseg.neighbours import NeighbourIndex
 
 _ROWS = 65536
 """Nodes handled at a time."""
@@ -88,24 +91,15 @@ def neighbour_graph(
 def _nearest(
     positions: NDArray[np.float64], neighbours: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Each node's nearest others (n, k) and how far they are, near ones first.
-
-    The tree's answer does not depend on how many threads ask it.
-    """
-    from scipy.spatial import KDTree
-
+    """Each node's nearest others (n, k) and how far they are, near ones first."""
     count = len(positions)
-    tree: Any = KDTree(positions)
+    index = NeighbourIndex(torch.from_numpy(positions))
     near = np.empty((count, neighbours), dtype=np.int32)
     distance = np.empty((count, neighbours), dtype=np.float32)
     for rows in _blocks(count):
-        far, found = tree.query(positions[rows], k=neighbours + 1, workers=-1)
-        own = np.arange(rows.start, rows.start + len(found))[:, None]
-        # Where many share a place, a node may not be among its own nearest.
-        other = found != own
-        other[other.all(axis=1), -1] = False
-        near[rows] = found[other].reshape(-1, neighbours)
-        distance[rows] = far[other].reshape(-1, neighbours)
+        found = index.nearest_others(neighbours, rows=torch.arange(rows.start, rows.stop))
+        near[rows] = found.indices.numpy()
+        distance[rows] = found.distances.numpy()
     return near, distance
 
 

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels
 from splatseg.errors import InputError, ShapeError
+from splatseg.neighbours import NeighbourIndex
 
 _NEIGHBOURS = 12
 """Labelled Gaussians that a stray one asks."""
@@ -134,18 +135,15 @@ def _adopted(
     things: set[int],
 ) -> Int64[Tensor, "n"]:
     """Gaussians of things without an instance join the one of their class that is around them."""
-    from scipy.spatial import KDTree
-
     stray = (ids == UNLABELLED) & torch.isin(kinds, torch.tensor(sorted(things)))
     asked = torch.nonzero(stray).squeeze(1)
     known = torch.nonzero(ids != UNLABELLED).squeeze(1)
     if not len(asked) or not len(known):
         return ids
-    places = gaussians.means.detach().cpu().double().numpy()
-    tree = KDTree(places[known.numpy()])
+    means = gaussians.means.cpu()
     count = min(_NEIGHBOURS, len(known))
-    near = np.asarray(tree.query(places[asked.numpy()], k=count)[1]).reshape(len(asked), count)
-    names = ids[known].numpy()[near]
+    near = NeighbourIndex(means[known]).nearest(means[asked], count).indices
+    names = ids[known][near].numpy()
     fits = _kinds_of(names, class_of) == kinds[asked].numpy()[:, None]
     # The commonest among the neighbours that fit; of equals the one that came nearest.
     votes = ((names[:, :, None] == names[:, None, :]) & fits[:, :, None]).sum(axis=1)

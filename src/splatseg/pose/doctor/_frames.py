@@ -4,9 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Camera, PointCloud
+from splatseg.neighbours import NeighbourIndex
 from splatseg.pose.doctor._corrections import PointCorrection, axis_rotations
 from splatseg.pose.doctor._points import (
     Photographs,
@@ -123,13 +125,11 @@ def _polished(evidence: PointEvidence, cloud: PointCloud, start: ScoredPoints) -
 def _by_place(
     evidence: PointEvidence, cloud: PointCloud, *, mirrored: bool
 ) -> list[PointCorrection]:
-    from scipy.spatial import KDTree
-
     rng = np.random.default_rng(0)
-    index = rng.permutation(len(evidence.triangulated))[:_FEW]
-    places, near = evidence.triangulated[index], _COARSE * evidence.depth[index]
+    chosen = rng.permutation(len(evidence.triangulated))[:_FEW]
+    places, near = evidence.triangulated[chosen], _COARSE * evidence.depth[chosen]
     points = sample_points(cloud, 20000).points.double().numpy()
-    tree = KDTree(points)
+    index = NeighbourIndex(torch.from_numpy(points))
     middle_places, middle_points = np.median(places, axis=0), np.median(points, axis=0)
     ratio = _extent(places, middle_places) / max(_extent(points, middle_points), 1e-12)
     scales = (*_SCALES, *(float(ratio * a) for a in _AROUND))
@@ -139,7 +139,9 @@ def _by_place(
             for centred in (False, True):
                 offset = middle_places - scale * matrix @ middle_points if centred else np.zeros(3)
                 moved = (places - offset) @ matrix / scale
-                distance, _ = tree.query(moved, distance_upper_bound=near.max() / scale)
+                reach = float(near.max()) / scale
+                found = index.nearest(torch.from_numpy(moved), 1, max_distance=reach)
+                distance = found.distances[:, 0].numpy()
                 share = float((distance * scale < near).mean())
                 correction = PointCorrection(
                     matrix=matrix,
@@ -174,12 +176,10 @@ def _fitted(
     evidence: PointEvidence, cloud: PointCloud, start: PointCorrection
 ) -> tuple[PointCorrection, PointCorrection]:
     """Corrections fitted to the triangulated places: of scale alone, and any similarity."""
-    from scipy.spatial import KDTree
-
     points = sample_points(cloud, 20000).points.double().numpy()
-    tree = KDTree(points)
-    index = np.random.default_rng(0).permutation(len(evidence.triangulated))[:_FITTED_TO]
-    places, depth = evidence.triangulated[index], evidence.depth[index]
+    index = NeighbourIndex(torch.from_numpy(points))
+    chosen = np.random.default_rng(0).permutation(len(evidence.triangulated))[:_FITTED_TO]
+    places, depth = evidence.triangulated[chosen], evidence.depth[chosen]
     plain, free = replace(start, offset=(0.0, 0.0, 0.0)), start
     for k in range(_ROUNDS):
         tolerance = _COARSE * max(0.3, 1 - k / 8)
@@ -187,11 +187,11 @@ def _fitted(
             now = free if fit_offset else plain
             moved = (places - np.array(now.offset)) @ now.matrix / now.scale
             reach = float(tolerance * depth.max() / now.scale)
-            distance, nearest = tree.query(moved, distance_upper_bound=reach)
-            good = distance * now.scale < tolerance * depth
+            found = index.nearest(torch.from_numpy(moved), 1, max_distance=reach)
+            good = found.distances[:, 0].numpy() * now.scale < tolerance * depth
             if good.sum() < _FEWEST:
                 continue
-            source, target = points[np.asarray(nearest)[good]], places[good]
+            source, target = points[found.indices[:, 0].numpy()[good]], places[good]
             if fit_offset:
                 free = _umeyama(source, target, start)
             else:

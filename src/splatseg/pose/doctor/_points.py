@@ -16,6 +16,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, PointCloud, View
 from splatseg.io.images import load_image
+from splatseg.neighbours import NeighbourIndex
 
 Array = NDArray[np.float64]
 
@@ -124,12 +125,12 @@ def colour_score(
 
 def place_score(triangulated: Array, depth: Array, points: Array) -> float | None:
     """Share of triangulated places with a start point nearer than 2 % of their depth."""
-    from scipy.spatial import KDTree
-
     if len(triangulated) < 50 or len(points) == 0:
         return None
     if len(triangulated) > _PLACES:
         index = np.random.default_rng(0).permutation(len(triangulated))[:_PLACES]
         triangulated, depth = triangulated[index], depth[index]
-    distance, _ = KDTree(points).query(triangulated, distance_upper_bound=_NEAR * depth.max())
-    return float((distance < _NEAR * depth).mean())
+    found = NeighbourIndex(torch.from_numpy(points)).nearest(
+        torch.from_numpy(triangulated), 1, max_distance=_NEAR * float(depth.max())
+    )
+    return float((found.distances[:, 0].numpy() < _NEAR * depth).mean())

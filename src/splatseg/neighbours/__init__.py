@@ -1,0 +1,9 @@
+"""Radius and k nearest neighbour search over points and centres of Gaussians, exact.
+
+The native search (``native/neighbours.h``) and its readable twin, `neighbours.reference`, which
+compares everything with everything.
+"""
+
+from splatseg.neighbours._index import NeighbourIndex as NeighbourIndex
+from splatseg.neighbours._results import NeighbourLists as NeighbourLists
+from splatseg.neighbours._results import Neighbours as Neighbours

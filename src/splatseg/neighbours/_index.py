@@ -1,0 +1,291 @@
+"""The index that searches are made in."""
+
+import math
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from splatseg._check import check_shape, check_values
+from splatseg._native import NeighbourIndex as NativeIndex
+from splatseg.core import Gaussians
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
+
+MAX_DIMENSIONS = 8
+"""Columns that points may have."""
+
+MAX_COORDINATE = 1e150
+"""Largest magnitude of a coordinate: squares of differences must not overflow float64."""
+
+MAX_PAIRS = 100_000_000
+"""Pairs that a radius search returns unless told otherwise: 1.6 GB."""
+
+
+class NeighbourIndex:
+    r"""Points, arranged to be searched: the k nearest, and all within a radius.
+
+    Answers are those of comparing a query q with every point p. Distances are computed in float64
+    from coordinates as they are (float32 and narrower types are widened, which is exact),
+
+    .. math:: d^2 = ((q_0 - p_0)^2 + (q_1 - p_1)^2) + (q_2 - p_2)^2 + \ldots
+
+    in this order of additions, and points are ordered by :math:`d^2`, equal ones by index. A
+    radius includes its border: :math:`d^2 \le r^2`, both in float64. So answers do not depend on
+    the number of threads, nor on what else is asked for.
+
+    Points are copied. Besides them and the answer, memory is needed for about 60 bytes a point
+    (three columns) and, while a search runs, 20 MB at most.
+
+    Args:
+        points: (n, d) with d from 1 to 8, any n, or Gaussians, of which the centres are meant.
+
+    Raises:
+        ShapeError: If the points are not (n, d).
+        RangeError: If a coordinate is not finite, or beyond 1e150.
+        InputError: If they are not of a floating-point type.
+
+    Example:
+        >>> index = NeighbourIndex(torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [5, 0, 0]]))
+        >>> index.nearest(torch.tensor([[0.9, 0.0, 0.0]]), 2).indices
+        tensor([[1, 2]])
+        >>> index.nearest_others(1).indices[:, 0]
+        tensor([1, 2, 1, 1])
+        >>> index.others_within(1.0).counts
+        tensor([2, 2, 2, 0])
+    """
+
+    def __init__(self, points: Float[Tensor, "n d"] | Gaussians) -> None:
+        given = points.means if isinstance(points, Gaussians) else points
+        if given.ndim != 2 or not 1 <= given.shape[1] <= MAX_DIMENSIONS:
+            raise ShapeError(
+                f"points: expected shape (any, 1 to {MAX_DIMENSIONS}), got {tuple(given.shape)}."
+            )
+        self._device = given.device
+        self._shape = tuple(given.shape)
+        self._native = NativeIndex(_coordinates("points", given))
+
+    def __len__(self) -> int:
+        return self._shape[0]
+
+    @property
+    def dimensions(self) -> int:
+        """How many coordinates a point has."""
+        return self._shape[1]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the index takes, bytes."""
+        return self._native.nbytes
+
+    def nearest(
+        self, queries: Float[Tensor, "m d"], k: int, *, max_distance: float = math.inf
+    ) -> Neighbours:
+        """The k nearest points of each query.
+
+        Args:
+            queries: Positions, in the unit and frame of the points. One of the points finds
+                itself; see `nearest_others`.
+            k: How many, at least 1; may be more than there are points.
+            max_distance: Points farther than this are not found; at least 0.
+
+        Returns:
+            Indices and distances (m, k) on the device of `queries`.
+
+        Raises:
+            ShapeError: If `queries` is not (m, d).
+            RangeError: If `k` or `max_distance` is out of range, or a query is not finite.
+            InputError: If the queries are not of a floating-point type.
+        """
+        return self._nearest(self._queries(queries), None, k, max_distance, queries.device)
+
+    def nearest_others(
+        self,
+        k: int,
+        *,
+        rows: Int64[Tensor, "m"] | None = None,
+        max_distance: float = math.inf,
+    ) -> Neighbours:
+        """The k nearest other points of points of the index.
+
+        A point leaves itself out by its index: others in the same position are found.
+
+        Args:
+            k: How many, at least 1; may be more than there are other points.
+            rows: Indices of the points that ask; None for all, in their order.
+            max_distance: Points farther than this are not found; at least 0.
+
+        Returns:
+            Indices and distances (m, k) on the device of the points.
+
+        Raises:
+            ShapeError: If `rows` is not (m,).
+            RangeError: If `k`, `max_distance` or a row is out of range.
+            InputError: If `rows` are no integers.
+        """
+        return self._nearest(None, self._rows(rows), k, max_distance, self._device)
+
+    def count_within(self, queries: Float[Tensor, "m d"], radius: float) -> Int64[Tensor, "m"]:
+        """How many points lie within a radius of each query.
+
+        Args:
+            queries: Positions, in the unit and frame of the points. One of the points counts
+                itself.
+            radius: In the unit of the points, at least 0.
+
+        Raises:
+            ShapeError: If `queries` is not (m, d).
+            RangeError: If `radius` is negative or NaN, or a query is not finite.
+            InputError: If the queries are not of a floating-point type.
+        """
+        return self._count(self._queries(queries), None, radius).to(queries.device)
+
+    def within(
+        self,
+        queries: Float[Tensor, "m d"],
+        radius: float,
+        *,
+        max_neighbours: int | None = None,
+        max_pairs: int = MAX_PAIRS,
+    ) -> NeighbourLists:
+        """All points within a radius of each query.
+
+        Args:
+            queries: Positions, in the unit and frame of the points. One of the points finds
+                itself; see `others_within`.
+            radius: In the unit of the points, at least 0.
+            max_neighbours: Only the nearest so many of each query, at least 1; None for all.
+            max_pairs: More than so many pairs of a query and a point, 16 bytes each, are
+                refused before memory is taken for them. Ask in blocks of queries then.
+
+        Returns:
+            Sparse rows on the device of `queries`.
+
+        Raises:
+            ShapeError: If `queries` is not (m, d).
+            RangeError: If an argument is out of range, or a query is not finite.
+            InputError: If the queries are not of a floating-point type, or there are more than
+                `max_pairs` pairs.
+        """
+        asked = self._queries(queries)
+        return self._within(asked, None, radius, max_neighbours, max_pairs).to(queries.device)
+
+    def others_within(
+        self,
+        radius: float,
+        *,
+        rows: Int64[Tensor, "m"] | None = None,
+        max_neighbours: int | None = None,
+        max_pairs: int = MAX_PAIRS,
+    ) -> NeighbourLists:
+        """All other points within a radius of points of the index.
+
+        A point leaves itself out by its index: others in the same position are found.
+
+        Args:
+            radius: In the unit of the points, at least 0.
+            rows: Indices of the points that ask; None for all, in their order.
+            max_neighbours: Only the nearest so many of each point, at least 1; None for all.
+            max_pairs: As in `within`.
+
+        Returns:
+            Sparse rows on the device of the points.
+
+        Raises:
+            ShapeError: If `rows` is not (m,).
+            RangeError: If an argument is out of range.
+            InputError: If `rows` are no integers, or there are more than `max_pairs` pairs.
+        """
+        asked = self._rows(rows)
+        return self._within(None, asked, radius, max_neighbours, max_pairs).to(self._device)
+
+    def _nearest(
+        self,
+        queries: Tensor | None,
+        rows: Tensor | None,
+        k: int,
+        max_distance: float,
+        device: torch.device,
+    ) -> Neighbours:
+        _check_count("k", k)
+        _check_distance("max_distance", max_distance)
+        count = self._asked(queries, rows)
+        indices = torch.empty(count, k, dtype=torch.int64)
+        squared = torch.empty(count, k, dtype=torch.float64)
+        self._native.nearest(queries, rows, max_distance * max_distance, indices, squared)
+        return Neighbours(indices=indices.to(device), distances=square_root(squared).to(device))
+
+    def _count(self, queries: Tensor | None, rows: Tensor | None, radius: float) -> Tensor:
+        _check_distance("radius", radius)
+        counts = torch.empty(self._asked(queries, rows), dtype=torch.int64)
+        self._native.count_within(queries, rows, radius * radius, counts)
+        return counts
+
+    def _within(
+        self,
+        queries: Tensor | None,
+        rows: Tensor | None,
+        radius: float,
+        max_neighbours: int | None,
+        max_pairs: int,
+    ) -> NeighbourLists:
+        if max_neighbours is not None:
+            _check_count("max_neighbours", max_neighbours)
+        counts = self._count(queries, rows, radius)
+        if max_neighbours is not None:
+            counts = counts.clamp_max(max_neighbours)
+        starts = torch.zeros(len(counts) + 1, dtype=torch.int64)
+        torch.cumsum(counts, dim=0, out=starts[1:])
+        pairs = int(starts[-1])
+        if pairs > max_pairs:
+            raise InputError(
+                f"radius: expected at most {max_pairs} pairs of a query and a point within it "
+                f"(max_pairs), got {pairs} within {radius:g}; ask for a smaller radius, or give "
+                "max_neighbours."
+            )
+        indices = torch.empty(pairs, dtype=torch.int64)
+        squared = torch.empty(pairs, dtype=torch.float64)
+        self._native.within(queries, rows, radius * radius, starts, indices, squared)
+        return NeighbourLists(starts=starts, indices=indices, distances=square_root(squared))
+
+    def _asked(self, queries: Tensor | None, rows: Tensor | None) -> int:
+        if queries is not None:
+            return len(queries)
+        return len(self) if rows is None else len(rows)
+
+    def _queries(self, queries: Tensor) -> Tensor:
+        check_shape("queries", queries, (None, self.dimensions))
+        return _coordinates("queries", queries)
+
+    def _rows(self, rows: Tensor | None) -> Tensor | None:
+        if rows is None:
+            return None
+        check_shape("rows", rows, (None,))
+        if rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool:
+            raise InputError(f"rows: expected integers, got {rows.dtype}.")
+        chosen = rows.detach().cpu().long().contiguous()
+        if len(chosen) and not 0 <= int(chosen.min()) <= int(chosen.max()) < len(self):
+            raise RangeError(
+                f"rows: expected indices in [0, {len(self)}), got "
+                f"[{int(chosen.min())}, {int(chosen.max())}]."
+            )
+        return chosen
+
+
+def _coordinates(name: str, values: Tensor) -> Tensor:
+    """Checked, as rows of float64 on the CPU."""
+    if not values.is_floating_point():
+        raise InputError(f"{name}: expected a floating-point type, got {values.dtype}.")
+    wide = values.detach().cpu().double().contiguous()
+    check_values(name, wide, -MAX_COORDINATE, MAX_COORDINATE)
+    return wide
+
+
+def _check_count(name: str, count: int) -> None:
+    if count < 1:
+        raise RangeError(f"{name}: expected at least 1, got {count}.")
+
+
+def _check_distance(name: str, distance: float) -> None:
+    if not distance >= 0:
+        raise RangeError(f"{name}: expected a distance of at least 0, got {distance}.")

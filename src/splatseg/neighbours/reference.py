@@ -1,0 +1,77 @@
+"""The readable twin: every query against every point, in torch."""
+
+import math
+
+import torch
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+
+from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
+
+
+def squared_distances(
+    queries: Float[Tensor, "m d"], points: Float[Tensor, "n d"]
+) -> Float64[Tensor, "m n"]:
+    """Squared distances in float64, a column after the other added up."""
+    total = torch.zeros(len(queries), len(points), dtype=torch.float64)
+    for query, point in zip(queries.double().T, points.double().T, strict=True):
+        total += (query[:, None] - point) ** 2
+    return total
+
+
+def nearest(
+    points: Float[Tensor, "n d"],
+    queries: Float[Tensor, "m d"],
+    k: int,
+    *,
+    max_distance: float = math.inf,
+    own: Int64[Tensor, "m"] | None = None,
+) -> Neighbours:
+    """What `NeighbourIndex.nearest` finds, and with `own` `nearest_others`.
+
+    Args:
+        points: What is searched.
+        queries: What asks.
+        k: How many.
+        max_distance: How far they may be.
+        own: The point that each query leaves out.
+    """
+    squared, order = _ordered(points, queries, max_distance, own)
+    short = max(0, k - len(points))
+    squared = torch.nn.functional.pad(squared, (0, short), value=math.inf)[:, :k]
+    order = torch.nn.functional.pad(order, (0, short), value=-1)[:, :k]
+    return Neighbours(
+        indices=torch.where(squared.isinf(), -1, order), distances=square_root(squared)
+    )
+
+
+def within(
+    points: Float[Tensor, "n d"],
+    queries: Float[Tensor, "m d"],
+    radius: float,
+    *,
+    max_neighbours: int | None = None,
+    own: Int64[Tensor, "m"] | None = None,
+) -> NeighbourLists:
+    """What `NeighbourIndex.within` finds, and with `own` `others_within`."""
+    squared, order = _ordered(points, queries, radius, own)
+    if max_neighbours is not None:
+        squared, order = squared[:, :max_neighbours], order[:, :max_neighbours]
+    found = squared.isfinite()
+    starts = torch.zeros(len(queries) + 1, dtype=torch.int64)
+    starts[1:] = found.sum(dim=1).cumsum(dim=0)
+    return NeighbourLists(
+        starts=starts, indices=order[found], distances=square_root(squared[found])
+    )
+
+
+def _ordered(
+    points: Tensor, queries: Tensor, radius: float, own: Tensor | None
+) -> tuple[Float64[Tensor, "m n"], Int64[Tensor, "m n"]]:
+    """Squared distances, least first, and whose they are; infinite of what is not found."""
+    squared = squared_distances(queries, points)
+    squared[squared > radius * radius] = math.inf
+    if own is not None:
+        squared[torch.arange(len(own)), own] = math.inf
+    ordered = squared.sort(dim=1, stable=True)
+    return ordered.values, ordered.indices
