@@ -86,7 +86,7 @@ def test_a_private_import_is_found(tmp_path) -> None:
         ("core/sh.py", "import scipy", "The core needs torch and numpy"),
         ("evaluate/metrics.py", "import splatseg.report", "Packages import downwards only"),
         ("tasks/segment.py", "import splatseg.cli", "Packages import downwards only"),
-        ("render/views.py", "import splatseg.models", "Packages import downwards only"),
+        ("render/paths.py", "import splatseg.models", "Packages import downwards only"),
     ],
 )
 def test_a_broken_contract_is_noticed(tmp_path, module, line, contract) -> None:

@@ -52,6 +52,7 @@ PACKAGES = {
     "lift",
     "methods",
     "models",
+    "neighbours",
     "pose",
     "render",
     "report",

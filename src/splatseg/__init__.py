@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from splatseg import lift as lift
     from splatseg import methods as methods
     from splatseg import models as models
+    from splatseg import neighbours as neighbours
     from splatseg import pose as pose
     from splatseg import render as render
     from splatseg import report as report
@@ -87,6 +88,7 @@ _PACKAGES = frozenset(
         "lift",
         "methods",
         "models",
+        "neighbours",
         "pose",
         "render",
         "report",

@@ -64,7 +64,7 @@ def test_gaussians_are_drawn_as_they_are_meant() -> None:
     assert float(render(meant, camera).alpha[1, 1]) == pytest.approx(expected, rel=1e-4)
     assert float(contributors(meant, camera, pixel, 1).weights) == pytest.approx(expected, rel=1e-4)
     rows = weights(meant, camera, pixel)
-    assert float(rows.render(torch.ones(1, 1))) == pytest.approx(expected, rel=1e-3)
+    assert float(rows.product(torch.ones(1, 1))) == pytest.approx(expected, rel=1e-3)
     image = torch.zeros(3, 3, 1)
     image[1, 1] = 1
     assert float(back_project(meant, camera, image).sums) == pytest.approx(expected, rel=1e-4)

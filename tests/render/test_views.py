@@ -136,7 +136,7 @@ def test_rows_of_w_sum_to_the_alpha_of_the_nearest_warp(lens) -> None:
         sh=torch.zeros(1, 1, 3),
     )
     camera = camera_of(lens)
-    rows = weights(thing, camera, backend="cpu").render(torch.ones(1, 1))[:, 0].reshape(11, 15)
+    rows = weights(thing, camera, backend="cpu").product(torch.ones(1, 1))[:, 0].reshape(11, 15)
     alpha = {
         mode: render(thing, camera, backend="cpu", warp=mode).alpha
         for mode in ("nearest", "bilinear")
