@@ -61,6 +61,7 @@ def layers_of(rng: np.random.Generator, count: int):
             candidates=torch.stack((ids, other), dim=1),
             shares=torch.stack((share, 1 - share), dim=1),
             evidence=torch.from_numpy(rng.uniform(0, 9, count).astype(np.float32)),
+            effective_views=torch.from_numpy(rng.uniform(1, 9, count).astype(np.float32)),
             inferred=torch.from_numpy(rng.random(count) < 0.5),
             metadata={"names": {"3": "chair"}},
         ),

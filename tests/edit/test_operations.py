@@ -154,7 +154,13 @@ def test_new_rows_know_nothing(rng, some) -> None:
     objects = apply_rows(layers["objects"], edited)
     assert objects.ids[24:].tolist() == [-1] * 3
     assert objects.candidates[24:].tolist() == [[-1, -1]] * 3
-    for column in (objects.confidence, objects.shares, objects.evidence, objects.inferred):
+    for column in (
+        objects.confidence,
+        objects.shares,
+        objects.evidence,
+        objects.effective_views,
+        objects.inferred,
+    ):
         assert not column[24:].any()
     assert not apply_rows(layers["colours"], edited).values[24:].any()
     assert not apply_rows(layers["picked"], edited).mask[24:].any()

@@ -203,6 +203,7 @@ def test_layers_go_along() -> None:
         candidates=torch.arange(80).reshape(40, 2),
         shares=torch.full((40, 2), 0.5),
         evidence=torch.arange(40.0) + 1,
+        effective_views=torch.arange(40.0) + 2,
         inferred=torch.ones(40, dtype=torch.bool),
         metadata={"names": {"1": "chair"}},
     )
@@ -220,6 +221,8 @@ def test_layers_go_along() -> None:
     assert got.shares[2].tolist() == [0, 0]
     assert got.evidence is not None
     assert got.evidence.tolist() == [6, 7, 0]
+    assert got.effective_views is not None
+    assert got.effective_views.tolist() == [7, 8, 0]
     assert got.inferred is not None
     assert got.inferred.tolist() == [True, True, False]
     assert found.carry(features).values.tolist() == [[11, 12], [13, 14], [0, 0]]

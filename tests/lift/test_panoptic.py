@@ -102,10 +102,14 @@ def test_what_has_no_class_and_what_lies_behind() -> None:
 def test_columns_come_from_where_the_label_does() -> None:
     both = {"evidence": torch.tensor([3.0, 4.0]), "inferred": torch.tensor([True, False])}
     other = {"evidence": torch.tensor([5.0, 6.0]), "inferred": torch.tensor([False, False])}
+    both |= {"effective_views": torch.tensor([1.0, 2.0])}
+    other |= {"effective_views": torch.tensor([7.0, 8.0])}
     found = merged(labels([1, -1], [0.2, 0.3], **both), labels([CUP, WALL], [0.6, 0.7], **other))
     torch.testing.assert_close(found.confidence, torch.tensor([0.2, 0.7]))
     assert found.evidence is not None
     assert found.evidence.tolist() == [3.0, 6.0]
+    assert found.effective_views is not None
+    assert found.effective_views.tolist() == [1.0, 8.0]
     assert found.inferred is not None
     assert found.inferred.tolist() == [True, False]
     assert merged(labels([1, -1]), labels([CUP, WALL], **other)).evidence is None

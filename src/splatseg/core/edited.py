@@ -132,6 +132,7 @@ def apply_rows(layer: Layer, edited: Edited) -> Layer:
                 candidates=_filled_or_none(taken.candidates, new, UNLABELLED),
                 shares=_filled_or_none(taken.shares, new, 0),
                 evidence=_shared(_filled_or_none(taken.evidence, new, 0), fractions),
+                effective_views=_filled_or_none(taken.effective_views, new, 0),
                 inferred=_filled_or_none(taken.inferred, new, 0),
             )
         case Features():

@@ -86,6 +86,7 @@ def _joined_labels(own: Labels, other: Labels, edited: Edited, behind: Edited) -
         candidates=_either(first.candidates, second.candidates, new),
         shares=_either(first.shares, second.shares, new),
         evidence=_either(first.evidence, second.evidence, new),
+        effective_views=_either(first.effective_views, second.effective_views, new),
         inferred=_either(first.inferred, second.inferred, new),
         metadata=metadata,
     )

@@ -328,6 +328,7 @@ def _carried(layer: Labels | Features | Selection, rows: Tensor) -> Labels | Fea
                 candidates=_taken_if(layer.candidates, rows, UNLABELLED),
                 shares=_taken_if(layer.shares, rows, 0.0),
                 evidence=_taken_if(layer.evidence, rows, 0.0),
+                effective_views=_taken_if(layer.effective_views, rows, 0.0),
                 inferred=_taken_if(layer.inferred, rows, False),  # noqa: FBT003  (a value)
             )
         case Features():

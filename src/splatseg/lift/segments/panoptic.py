@@ -91,6 +91,7 @@ def merge_panoptic(
         candidates=None,
         shares=None,
         evidence=_either(is_thing, instances.evidence, classes.evidence),
+        effective_views=_either(is_thing, instances.effective_views, classes.effective_views),
         inferred=_either(is_thing, instances.inferred, classes.inferred),
         background=numbered.get(classes.background, UNLABELLED),
         metadata=dict(instances.metadata)
