@@ -13,9 +13,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_choice
-from splatseg.core import Camera, Gaussians, View
+from splatseg.core import Camera, Gaussians, View, camera_of_map
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.mass.adjoint import camera_of_map, voting_views
+from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training._pixels import Sampling, draw_by_group, draw_uniformly
 from splatseg.lift.training._store import DrawnView, RowStore
 from splatseg.lift.training._targets import Ragged, Target, Targets, TargetSource
