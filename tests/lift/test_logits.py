@@ -10,6 +10,7 @@ from splatseg.core import LabelMap, View
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.heads import ClassifierHead
 from splatseg.lift.training import LabelTargets, RowSampler
+from splatseg.methods import _own_probability
 from splatseg.methods._label_losses import LabelCounts, logit_loss, probability_loss
 from splatseg.methods._own_probability import linear_own_probability, own_probability
 from splatseg.methods.logits import LogitOptions, TrainingContext, train_logits

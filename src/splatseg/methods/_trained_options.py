@@ -17,10 +17,10 @@ class LabelTrainingOptions:
     """hard: the layer has each Gaussian's id. rendered: it has what was trained, with the
     classifier that reads it, by which views are rendered first and decided then."""
 
-    steps: int = 2000
+    steps: int = 1000
     """Steps of Adam at most."""
 
-    batch: int = 8192
+    batch: int = 4096
     """Pixels a step, from all views."""
 
     pixels: int = 4000
@@ -29,16 +29,16 @@ class LabelTrainingOptions:
     sampling: Sampling = "uniform"
     """uniform: all labelled pixels alike. groups: equally many of each id in a view."""
 
-    passes: int = 1
+    passes: int = 4
     """How often drawn pixels are gone through before new ones are drawn; 0 draws once."""
 
-    min_weight: float = 0.0
+    min_weight: float = 0.01
     """Blending weight in [0, 1] below which a Gaussian is left out of a pixel; 0 keeps all."""
 
     memory: int = 1 << 30
     """Bytes of drawn rows kept in memory; more go to temporary files."""
 
-    schedule: Schedule = "constant"
+    schedule: Schedule = "cosine"
     """How rates fall: constant, exponential or cosine."""
 
     final_rate: float = 0.1

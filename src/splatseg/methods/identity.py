@@ -82,10 +82,10 @@ class IdentityOptions(LabelTrainingOptions):
     channels: int = PUBLISHED_CHANNELS
     """Width of the identity feature."""
 
-    rate: float = 0.02
+    rate: float = 0.1
     """Adam's rate for features."""
 
-    classifier_rate: float = 0.01
+    classifier_rate: float = 0.05
     """Adam's rate for the classifier."""
 
     kl_weight: float = PUBLISHED_KL_WEIGHT
@@ -121,6 +121,7 @@ class IdentityOptions(LabelTrainingOptions):
         """
         return cls(
             steps=steps,
+            batch=8192,
             blend="features",
             rate=PUBLISHED_FEATURE_RATE,
             classifier_rate=PUBLISHED_CLASSIFIER_RATE,
