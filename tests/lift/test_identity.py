@@ -13,6 +13,7 @@ from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift import label_map
 from splatseg.lift.heads import ClassifierHead
 from splatseg.lift.training import LabelTargets, RowSampler, SamplingOptions, Values
+from splatseg.methods import MethodInputs, find_method
 from splatseg.methods._identity_loss import NeighbourLoss
 from splatseg.methods._label_models import IdentityModel
 from splatseg.methods.identity import (
@@ -293,6 +294,7 @@ def test_published_is_the_published_setting() -> None:
     assert (options.kl_samples, options.kl_points) == (1000, 200_000)
     assert (options.held_out, options.patience, options.schedule) == (0.0, 0, "constant")
     assert (options.min_weight, options.sampling) == (0.0, "uniform")
+    assert find_method("identity").published == IdentityOptions.published()
 
 
 def test_every_option_is_heeded(rng) -> None:
@@ -300,7 +302,8 @@ def test_every_option_is_heeded(rng) -> None:
     views = [View(name=f"v{i}", camera=camera_at(0.1 * i)) for i in range(10)]
     gaussians, maps = random_gaussians(rng, 40), random_maps(rng, views, IDS)
     base = {"steps": 12, "batch": 60, "pixels": 40, "score_every": 2, "kl_samples": 9}
-    base |= {"kl_every": 2, "patience": 0}
+    base |= {"kl_every": 2, "patience": 0, "passes": 1, "min_weight": 0.0}
+    base |= {"schedule": "constant"}
 
     def values(**changes) -> torch.Tensor:
         options = IdentityOptions(**base | changes)
@@ -320,7 +323,7 @@ def test_every_option_is_heeded(rng) -> None:
         {"held_out": 0.3},
         {"blend": "features"},
         {"channels": 3},
-        {"rate": 0.1},
+        {"rate": 0.3},
         {"classifier_rate": 0.1},
         {"kl_weight": 0.0},
         {"kl_every": 3},
@@ -344,6 +347,43 @@ def test_every_option_is_heeded(rng) -> None:
     steps, stopped = scored(patience=1, steps=400, rate=0.5, score_every=1)
     assert stopped == "patience"
     assert len(steps) < 400
+
+
+class Recorded(Maps):
+    """Label maps as a method gets them."""
+
+    kind = "labels"
+    classes = None
+
+
+@pytest.mark.parametrize("name", ["identity", "logits", "probabilities"])
+def test_the_readout_is_that_asked_for(name) -> None:
+    """What the command runs: labels, or features with the head that reads the same labels."""
+    gaussians, views, maps, _ = walls()
+    method, told = find_method(name), []
+    options = {"steps": 150, "batch": 150, "pixels": 100, "rate": 0.1}
+    inputs = MethodInputs(
+        gaussians=gaussians,
+        views=tuple(views),
+        evidence=Recorded(maps.maps),
+        backend=BACKEND,
+        seed=5,
+        progress=lambda done, total: told.append((done, total)),
+    )
+    hard = method.run(inputs, method.options(**options))
+    assert hard.ids.tolist() == [40] * 9 + [7] * 9 + [-1]
+    assert hard.metadata["method"] == name
+    assert "head" not in hard.metadata
+    assert told == [(step + 1, 150) for step in range(150)]
+    rendered = method.run(inputs, method.options(**options, readout="rendered"))
+    head = ClassifierHead.of(rendered)
+    assert torch.equal(head.labels(rendered, metadata={}).ids, hard.ids)
+    least = float(hard.confidence[:18].median())
+    sure = method.run(inputs, method.options(**options, min_share=least))
+    assert -1 in sure.ids[:18].tolist()
+    with pytest.raises(InputError, match="readout"):
+        method.options(readout="soft")
+    assert (method.seeded, method.keeps_ids, method.evidence) == (True, True, ("labels", "tracked"))
 
 
 def test_neighbours_pull_together(rng, views) -> None:
