@@ -204,7 +204,7 @@ def test_spilled_rows_are_the_same_bit_for_bit(rng, views, tmp_path, source) -> 
         with sampler.draw(np.random.default_rng(4), batch=40) as drawn:
             files = len(list(tmp_path.rglob("*.npy")))
             found = [drawn.batch(i) for i in range(len(drawn))]
-            assert drawn.spilled <= drawn.nbytes
+            assert drawn.nbytes - drawn.spilled <= memory  # no more than that is in memory
             spilled = drawn.spilled
         return found, files, spilled
 
@@ -230,6 +230,16 @@ def test_spilled_rows_are_the_same_bit_for_bit(rng, views, tmp_path, source) -> 
                     assert torch.equal(target.values, twin.values)
                 else:
                     assert torch.equal(target, twin)
+
+
+def test_what_does_not_divide_is_spread_over_batches(rng) -> None:
+    """Twelve views of 5 pixels in 4 batches: one of each view's batches gets two."""
+    views = [View(name=f"v{i:02d}", camera=camera_at(0.01 * i)) for i in range(12)]
+    sampler = sampler_of(random_gaussians(rng), views, random_maps(rng, views, IDS), pixels=5)
+    sizes = [len(batch) for batch in batches(sampler, rng, 15)]
+    assert sum(sizes) == 60
+    assert len(sizes) == 4
+    assert max(sizes) < 24  # not the same batch for all views
 
 
 def test_files_go_when_a_draw_fails(rng, views, tmp_path) -> None:
