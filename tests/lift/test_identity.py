@@ -36,7 +36,12 @@ from .conftest import (
 )
 
 IDS = (3, 8, 900)
-HERE = TrainingContext(backend=BACKEND)
+
+
+def here() -> TrainingContext:
+    return TrainingContext(backend=BACKEND)
+
+
 QUICK = {"steps": 120, "batch": 150, "pixels": 100}
 FAST = QUICK | {"rate": 0.05, "classifier_rate": 0.02}
 
@@ -268,7 +273,7 @@ def test_same_seed_same_output(rng, views) -> None:
 def test_an_interrupted_training_goes_on(rng, views, tmp_path) -> None:
     gaussians, maps = random_gaussians(rng, 40), random_maps(rng, views, IDS)
     options, path = IdentityOptions(**QUICK | {"steps": 20}), tmp_path / "identity.npz"
-    whole = train_identity(gaussians, views, maps, options=options, context=HERE)
+    whole = train_identity(gaussians, views, maps, options=options, context=here())
     asked = []
     stopping = TrainingContext(
         backend=BACKEND, checkpoint=path, cancelled=lambda: asked.append(1) or len(asked) == 7
@@ -307,7 +312,7 @@ def test_every_option_is_heeded(rng) -> None:
 
     def values(**changes) -> torch.Tensor:
         options = IdentityOptions(**base | changes)
-        return train_identity(gaussians, views, maps, options=options, context=HERE).values
+        return train_identity(gaussians, views, maps, options=options, context=here()).values
 
     first = values()
     assert torch.equal(first, values())
@@ -339,7 +344,7 @@ def test_every_option_is_heeded(rng) -> None:
 
     def scored(**changes) -> tuple[list[int], str]:
         options = IdentityOptions(**base | changes)
-        found = train_identity(gaussians, views, maps, options=options, context=HERE).metadata
+        found = train_identity(gaussians, views, maps, options=options, context=here()).metadata
         return [step for step, _ in found["scores"]], found["stopped"]
 
     assert scored() == ([2, 4, 6, 8, 10, 12], "steps")
@@ -392,7 +397,7 @@ def test_neighbours_pull_together(rng, views) -> None:
 
     def spread(weight: float) -> float:
         options = IdentityOptions(**FAST, kl_weight=weight, kl_every=1)
-        trained = train_identity(gaussians, views, maps, options=options, context=HERE)
+        trained = train_identity(gaussians, views, maps, options=options, context=here())
         head = ClassifierHead.of(trained)
         return float(head.probabilities(trained.values).std(dim=0).mean())
 
@@ -455,7 +460,7 @@ def test_bad_input_is_refused(rng, views) -> None:
     with pytest.raises(RangeError, match="means"):
         identity(broken, views[:2], maps, backend=BACKEND)
     options = IdentityOptions(**QUICK | {"steps": 1})
-    trained = train_identity(gaussians, views[:2], maps, options=options, context=HERE)
+    trained = train_identity(gaussians, views[:2], maps, options=options, context=here())
     with pytest.raises(ShapeError, match="gaussians: expected 14, one a feature, got 3"):
         ClassifierHead.of(trained).label_map(gaussians[:3], views[0].camera, trained)
     for wrong in (

@@ -18,7 +18,11 @@ from splatseg.methods.probabilities import train_probabilities
 
 from .conftest import BACKEND, Maps, camera_at, gaussians_at, random_gaussians, random_maps
 
-HERE = TrainingContext(backend=BACKEND)
+
+def here() -> TrainingContext:
+    return TrainingContext(backend=BACKEND)
+
+
 QUICK = {"steps": 200, "batch": 150, "pixels": 100, "held_out": 0.0, "patience": 0}
 
 
@@ -102,7 +106,7 @@ def wall_of(votes: dict[int, int]):
 @pytest.mark.parametrize("train", [train_logits, train_probabilities])
 def test_contradictions_are_settled_by_majority(train) -> None:
     gaussians, views, maps = wall_of({40: 3, 7: 1})
-    layer = train(gaussians, views, maps, options=LogitOptions(**QUICK), context=HERE)
+    layer = train(gaussians, views, maps, options=LogitOptions(**QUICK), context=here())
     head = ClassifierHead.of(layer)
     assert (head.weight, head.bias, head.ids.tolist()) == (None, None, [7, 40])
     labels = head.labels(layer, metadata={})
@@ -118,16 +122,18 @@ def test_contradictions_are_settled_by_majority(train) -> None:
 
 def test_options_are_heeded(rng, views) -> None:
     gaussians, maps = random_gaussians(rng), random_maps(rng, views, (3, 8))
-    base = train_logits(gaussians, views, maps, options=LogitOptions(**QUICK), context=HERE)
+    base = train_logits(gaussians, views, maps, options=LogitOptions(**QUICK), context=here())
     fast = LogitOptions(**QUICK, rate=0.5)
-    other = train_logits(gaussians, views, maps, options=fast, context=HERE)
+    other = train_logits(gaussians, views, maps, options=fast, context=here())
     assert not torch.equal(base.values, other.values)
     size = 14 * 2 * 16
     tight = LogitOptions(**QUICK, max_bytes=size)
-    again = train_logits(gaussians, views, maps, options=tight, context=HERE)
+    again = train_logits(gaussians, views, maps, options=tight, context=here())
     assert torch.equal(base.values, again.values)
     with pytest.raises(InputError, match=f"at least {size} for 14 Gaussians and 2 ids"):
-        train_logits(gaussians, views, maps, options=LogitOptions(max_bytes=size - 1), context=HERE)
+        train_logits(
+            gaussians, views, maps, options=LogitOptions(max_bytes=size - 1), context=here()
+        )
     for wrong in ({"rate": -1.0}, {"max_bytes": 0}, {"steps": 0}):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             LogitOptions(**wrong)
