@@ -119,6 +119,32 @@ void update(const Columns<float>& raw, const Columns<float>& first, const Column
   }
 }
 
+void row_adam(const RowAdam& a, int64_t begin, int64_t end) {
+  AdamFactors factors = {};
+  factors.keep1 = a.beta1;
+  factors.add1 = 1.0f - a.beta1;
+  factors.keep2 = a.beta2;
+  factors.add2 = 1.0f - a.beta2;
+  factors.epsilon = a.epsilon;
+  constexpr int64_t kBlock = 16;  // columns that share one array of rates
+  float rates[kBlock];
+  for (int64_t j = begin; j < end; j++) {
+    const int64_t i = a.rows[j];
+    const int32_t step = a.steps[i] + 1;
+    a.steps[i] = step;
+    const int64_t at = step < a.last ? step : a.last;
+    factors.correction2 = a.correction2[at];
+    for (float& rate : rates) rate = a.rate * a.correction1[at];
+    const int64_t to = i * a.columns, from = j * a.columns;
+    int64_t c = 0;
+    for (; c + kBlock <= a.columns; c += kBlock)
+      adam(a.value + to + c, a.gradient + from + c, a.first + to + c, a.second + to + c, rates,
+           kBlock, factors);
+    adam(a.value + to + c, a.gradient + from + c, a.first + to + c, a.second + to + c, rates,
+         a.columns - c, factors);
+  }
+}
+
 // Declared with the signature the table asks for; loss.cpp and gather.cpp have their bodies.
 #define SPLATSEG_KERNEL(name) std::remove_pointer_t<decltype(FitKernels::name)> name;
 SPLATSEG_KERNEL(ssim_rows)
@@ -128,7 +154,7 @@ SPLATSEG_KERNEL(gather)
 
 const FitKernels& fit_table() {
   static const FitKernels table = {SPLATSEG_TEXT(SPLATSEG_ISA), ssim_rows, gradient_rows,
-                                   find_rows, gather, update};
+                                   find_rows, gather, update, row_adam};
   return table;
 }
 

@@ -120,6 +120,32 @@ void bound_update_rows(Parts raw, Parts first, Parts second, ConstParts gradient
   update_rows(value, one, two, slope, rows.data(), static_cast<int64_t>(rows.shape(0)), settings);
 }
 
+void bound_adam_rows(Array<float, 2> value, Array<float, 2> first, Array<float, 2> second,
+                     Array<int32_t, 1> steps, Array<const int64_t, 1> rows,
+                     Array<const float, 2> gradient, Array<const float, 1> correction1,
+                     Array<const float, 1> correction2, float rate, float beta1, float beta2,
+                     float epsilon) {
+  const char* what = "adam_rows: shapes or rows do not fit";
+  const size_t count = value.shape(0), columns = value.shape(1);
+  for (const auto& moment : {first, second})
+    expect(moment.shape(0) == count && moment.shape(1) == columns, what);
+  expect(steps.shape(0) == count && gradient.shape(0) == rows.shape(0) &&
+             gradient.shape(1) == columns && correction1.shape(0) >= 2 &&
+             correction2.shape(0) == correction1.shape(0),
+         what);
+  expect_rows(rows, count, what);
+  const RowAdam adam = {value.data(),       first.data(),
+                        second.data(),      steps.data(),
+                        gradient.data(),    rows.data(),
+                        static_cast<int64_t>(columns),
+                        correction1.data(), correction2.data(),
+                        static_cast<int64_t>(correction1.shape(0)) - 1,
+                        rate,               beta1,
+                        beta2,              epsilon};
+  nb::gil_scoped_release released;
+  adam_rows(adam, static_cast<int64_t>(rows.shape(0)));
+}
+
 }  // namespace
 
 void register_loss(nb::module_& module) {
@@ -138,6 +164,10 @@ void register_adam(nb::module_& module) {
              nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("step"),
              nb::arg("opacity_penalty"), nb::arg("scale_penalty"), nb::arg("noise"),
              nb::arg("seed"));
+  module.def("adam_rows", bound_adam_rows, nb::arg("value"), nb::arg("first"), nb::arg("second"),
+             nb::arg("steps"), nb::arg("rows"), nb::arg("gradient"), nb::arg("correction1"),
+             nb::arg("correction2"), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"),
+             nb::arg("epsilon"));
 }
 
 }  // namespace splatseg

@@ -151,4 +151,10 @@ void update_rows(const Columns<float>& raw, const Columns<float>& first,
   });
 }
 
+void adam_rows(const RowAdam& adam, int64_t count) {
+  const FitKernels& run = fit_kernels();
+  parallel_for(count, kUpdateRows,
+               [&](int64_t begin, int64_t end) { run.row_adam(adam, begin, end); });
+}
+
 }  // namespace splatseg

@@ -57,6 +57,22 @@ void update_rows(const Columns<float>& raw, const Columns<float>& first,
                  const Columns<float>& second, const Columns<const float>& gradients,
                  const int64_t* rows, int64_t count, const UpdateSettings& settings);
 
+// Adam on some rows of one array, each on its own clock: row i has taken steps[i] steps so far, and
+// only the rows named take one now. Rates and corrections are those of the row's own step.
+struct RowAdam {
+  float *value, *first, *second;  // (n, columns)
+  int32_t* steps;                 // (n,)
+  const float* gradient;          // (count, columns), row j for row rows[j]
+  const int64_t* rows;            // distinct
+  int64_t columns;
+  const float *correction1, *correction2;  // of step s: 1 / (1 - beta1^s), 1 / sqrt(1 - beta2^s)
+  int64_t last;                            // later steps take the corrections of this one
+  float rate, beta1, beta2, epsilon;
+};
+
+// Takes a step on `count` rows.
+void adam_rows(const RowAdam& adam, int64_t count);
+
 // One loss under way, for the kernels. `n` is 3 * width floats, a row.
 struct LossPass {
   const float *image, *photograph;
@@ -91,6 +107,7 @@ struct FitKernels {
                  const Columns<float>& second, const Columns<const float>& gradients,
                  const int64_t* rows, int64_t begin, int64_t end, const UpdateSettings&,
                  const AdamFactors&);
+  void (*row_adam)(const RowAdam&, int64_t begin, int64_t end);
 };
 
 // Zeroed floats of scratch that one thread needs in either pass over the loss.

@@ -226,6 +226,20 @@ def update_rows(
     noise: float,
     seed: int,
 ) -> None: ...
+def adam_rows(
+    value: Tensor,
+    first: Tensor,
+    second: Tensor,
+    steps: Tensor,
+    rows: Tensor,
+    gradient: Tensor,
+    correction1: Tensor,
+    correction2: Tensor,
+    rate: float,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+) -> None: ...
 
 class NeighbourIndex:
     nbytes: int

@@ -68,9 +68,9 @@ def panoptic(small):
 
 @pytest.mark.parametrize("method", ["uplift", "vote", "identity"])
 def test_labels_that_mean_the_same_in_all_views(small, splatseg, method) -> None:
-    quick = ("--identity-steps", 300, "--identity-batch", 400) if method == "identity" else ()
+    quick = ("--steps", 300, "--batch", 400) if method == "identity" else ()
     if method == "identity":
-        quick += ("--identity-rate", 0.05, "--identity-classifier-rate", 0.02)
+        quick += ("--rate", 0.05, "--classifier-rate", 0.02)
     status, out, err = splatseg("segment", small.scene, "--method", method, *quick)
     assert (status, err.strip()) == (0, ""), err
     layer = layer_of(small.scene, "labels_semantic")

@@ -1,4 +1,4 @@
-"""Identity features: the losses, their gradients through cached rows, and training."""
+"""Identity features: the losses, training, and both readouts."""
 
 import json
 import math
@@ -9,21 +9,24 @@ import torch
 
 from splatseg.core import ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.methods._identity_loss import NeighbourLoss, pixel_loss
-from splatseg.methods._identity_rows import Batch, Rows, Sampler, batches_of
+from splatseg.io.layers import load_layer, save_layer
+from splatseg.lift import label_map
+from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.training import LabelTargets, RowSampler, SamplingOptions, Values
+from splatseg.methods import MethodInputs, find_method
+from splatseg.methods._identity_loss import NeighbourLoss
+from splatseg.methods._label_models import IdentityModel
 from splatseg.methods.identity import (
-    IdentityField,
+    PUBLISHED_CLASSIFIER_RATE,
+    PUBLISHED_FEATURE_RATE,
     IdentityOptions,
-    _Trainer,
+    TrainingContext,
     identity,
-    identity_features,
     train_identity,
 )
-from splatseg.render import RenderOptions
 
 from .conftest import (
     BACKEND,
-    BARREL,
     Maps,
     camera_at,
     gaussians_at,
@@ -33,182 +36,103 @@ from .conftest import (
 )
 
 IDS = (3, 8, 900)
-QUICK = {"identity_steps": 120, "identity_batch": 150, "identity_pixels": 100}
-FAST = QUICK | {"identity_rate": 0.05, "identity_classifier_rate": 0.02}
 
 
-def sampler_of(gaussians, views, maps, *, pixels=1000, memory=1 << 30) -> Sampler:
-    return Sampler(
-        gaussians=gaussians,
-        views=views,
-        evidence=maps,
-        ids=torch.tensor(IDS),
-        pixels=pixels,
-        memory=memory,
-        options=RenderOptions(),
-        backend=BACKEND,
-    )
+def here() -> TrainingContext:
+    return TrainingContext(backend=BACKEND)
 
 
-def all_rows(gaussians, views, maps) -> tuple[torch.Tensor, torch.Tensor]:
-    """W of all labelled pixels, dense, and their classes."""
-    matrix = torch.cat([matrix_of(gaussians, view.camera).flatten(0, 1) for view in views])
-    ids = torch.cat([maps.label_map(view.name).ids.flatten() for view in views])
-    place = torch.searchsorted(torch.tensor(IDS), ids.clamp_min(0).long())
-    return matrix[ids >= 0], place[ids >= 0]
+QUICK = {"steps": 120, "batch": 150, "pixels": 100}
+FAST = QUICK | {"rate": 0.05, "classifier_rate": 0.02}
 
 
-def dense(rows: Rows, count: int) -> torch.Tensor:
-    matrix = torch.zeros(len(rows), count)
-    for p in range(len(rows)):
-        span = slice(int(rows.starts[p]), int(rows.starts[p + 1]))
-        matrix[p, rows.gaussians[span].long()] = rows.weights[span]
-    return matrix
-
-
-def test_all_pixels_are_all_rows(rng, views) -> None:
+@pytest.mark.parametrize("blend", ["features", "probabilities"])
+def test_the_gradient_is_that_of_the_dense_loss(rng, views, blend) -> None:
+    """Both terms, against autograd through dense matrices in float64."""
     gaussians = random_gaussians(rng)
-    maps = random_maps(rng, views, IDS)
-    rows, evidence = sampler_of(gaussians, views, maps).draw(rng)
-    matrix, classes = all_rows(gaussians, views, maps)
-    assert len(rows) == len(classes)
-    # Rows were drawn in any order: sums over them are the same.
-    half = 1e-3  # weights are kept in half precision
-    mine = dense(rows, len(gaussians)).double()
-    for c in range(len(IDS)):
-        torch.testing.assert_close(
-            mine[rows.classes == c].sum(dim=0),
-            matrix[classes == c].sum(dim=0),
-            rtol=half,
-            atol=0.01,
+    maps = {
+        name: LabelMap(ids=found.ids, confidence=torch.rand(12, 16))
+        for name, found in random_maps(rng, views, IDS).maps.items()
+    }
+    source = LabelTargets(Maps(maps), [view.name for view in views])
+    sampler = RowSampler(
+        gaussians, views, source, options=SamplingOptions(pixels=90), backend=BACKEND
+    )
+    with sampler.draw(rng, batch=1000) as drawn:
+        batch = drawn.batch(0)
+    start = [
+        torch.from_numpy(rng.normal(size=shape).astype(np.float32))
+        for shape in ((len(gaussians), 5), (3, 5), (3,))
+    ]
+    neighbours = NeighbourLoss(gaussians.means, neighbours=3, points=100, rng=rng)
+    model = IdentityModel(
+        *start, blend=blend, feature_rate=1.0, classifier_rate=1.0, neighbours=neighbours,
+        neighbour_weight=2.5, neighbour_every=4, neighbour_samples=9,
+    )  # fmt: skip
+    for step in (3, 4):  # the neighbour term comes in the fourth
+        values = Values(
+            {"features": start[0]},
+            {"weight": start[1], "bias": start[2]},
+            rng=np.random.default_rng(3),
+            step=step,
+            differentiable=True,
         )
-    torch.testing.assert_close(evidence.double(), matrix.sum(dim=0), rtol=half, atol=0.01)
+        loss = model.loss(batch, values)
+        loss.backward()
+        leaves = [t.double().requires_grad_() for t in start]
+        expected = dense_loss(batch, leaves, blend, len(gaussians))
+        if step == 4:
+            pairs = neighbours.draw(9, np.random.default_rng(3))
+            expected = expected + 2.5 * divergence_of(pairs, leaves) / 3
+        expected.backward()
+        mine = torch.zeros(len(gaussians), 5)
+        rows, gradient = values.row_gradients("features")
+        mine[rows] = gradient
+        assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
+        torch.testing.assert_close(mine.double(), leaves[0].grad, rtol=2e-3, atol=1e-6)
+        for name, leaf in zip(("weight", "bias"), leaves[1:], strict=True):
+            torch.testing.assert_close(
+                values.shared[name].grad.double(), leaf.grad, rtol=2e-3, atol=1e-6
+            )
 
 
-def test_a_sample_stands_for_all_labelled_pixels(rng) -> None:
-    """The estimate of evidence is right on average, and for reduced maps and lenses too."""
-    gaussians = random_gaussians(rng)
-    view = View(name="v", camera=camera_at(width=32, height=24, **BARREL))
-    small = View(name="v", camera=camera_at(**BARREL))
-    confidence = torch.from_numpy(rng.random((12, 16), dtype=np.float32))
-    ids = random_maps(rng, [small], IDS).label_map("v").ids
-    maps = Maps({"v": LabelMap(ids=ids, confidence=confidence)})
-    _, whole = sampler_of(gaussians, [view], maps).draw(rng)
-    assert float(whole.sum()) > 5
-    estimates = [sampler_of(gaussians, [view], maps, pixels=20).draw(rng)[1] for _ in range(300)]
-    mean = torch.stack(estimates).mean(dim=0)
-    error = (mean - whole).abs().sum() / whole.sum()
-    assert float(error) < 0.1
-
-
-def test_memory_bounds_the_rows(rng, views) -> None:
-    gaussians = random_gaussians(rng, 60)
-    maps = random_maps(rng, views, IDS)
-    whole, _ = sampler_of(gaussians, views, maps).draw(np.random.default_rng(1))
-    memory = 16 * len(whole.weights) // 2
-    part, evidence = sampler_of(gaussians, views, maps, memory=memory).draw(
-        np.random.default_rng(1)
-    )
-    assert 0 < len(part) < len(whole)
-    assert 16 * len(part.weights) <= memory
-    # The first pixels of each view's draw, and the same light on the whole, about.
-    assert float(evidence.sum()) == pytest.approx(float(whole.weights.sum()), rel=0.4)
-    least, _ = sampler_of(gaussians, views, maps, memory=1).draw(np.random.default_rng(1))
-    assert len(least) == len(views)
-
-
-def test_selected_rows_and_batches(rng, views) -> None:
-    gaussians = random_gaussians(rng)
-    rows, _ = sampler_of(gaussians, views, random_maps(rng, views, IDS)).draw(rng)
-    matrix = dense(rows, len(gaussians))
-    some = torch.tensor([5, 0, 5, 77])
-    assert torch.equal(dense(rows.select(some), len(gaussians)), matrix[some])
-    assert torch.equal(rows.select(some).classes, rows.classes[some])
-    batches = batches_of(rows, 60, rng)
-    assert len(batches) == round(len(rows) / 60)
-    assert sum(len(batch.rows) for batch in batches) == len(rows)
-    whole = sum(dense(batch.rows, len(gaussians)).sum(dim=0) for batch in batches)
-    torch.testing.assert_close(whole, matrix.sum(dim=0))
-    for batch in batches:
-        mine = dense(batch.rows, len(gaussians))
-        signal, image = torch.randn(len(gaussians), 5), torch.randn(len(batch.rows), 5)
-        torch.testing.assert_close(batch.render(signal), mine @ signal, rtol=1e-4, atol=1e-5)
-        adjoint = torch.zeros(len(gaussians), 5)
-        adjoint[batch.touched] = batch.back_project(image)
-        torch.testing.assert_close(adjoint, mine.T @ image, rtol=1e-4, atol=1e-5)
-
-
-def test_pixels_that_show_nothing() -> None:
-    rows = Rows(
-        starts=torch.zeros(3, dtype=torch.int64),
-        gaussians=torch.zeros(0, dtype=torch.int32),
-        weights=torch.zeros(0),
-        classes=torch.zeros(2, dtype=torch.int64),
-        says=torch.ones(2),
-    )
-    batch = Batch.of(rows)
-    assert batch.render(torch.ones(4, 3)).tolist() == [[0.0] * 3] * 2
-    assert batch.back_project(torch.ones(2, 3)).shape == (0, 3)
-
-
-def test_the_gradient_is_that_of_the_dense_loss(rng, views) -> None:
-    """Both terms, against autograd through dense matrices."""
-    gaussians = random_gaussians(rng)
-    rows, _ = sampler_of(gaussians, views, random_maps(rng, views, IDS)).draw(rng)
-    rows = Rows(
-        starts=rows.starts,
-        gaussians=rows.gaussians,
-        weights=rows.weights,
-        classes=rows.classes,
-        says=torch.rand(len(rows)),
-    )
-    matrix = dense(rows, len(gaussians)).double()
-    options = IdentityOptions(identity_kl_every=1, identity_kl_samples=9, identity_rate=0.0)
-    trainer = _Trainer(gaussians, len(IDS), options, np.random.default_rng(3))
-    before = [t.detach().double() for t in (trainer.features, trainer.weight, trainer.bias)]
-    leaves = [t.clone().requires_grad_() for t in before]
+def dense_loss(batch, leaves, blend, count):
     features, weight, bias = leaves
-    # The same draw as the trainer's: its generator's state is copied.
-    copy = np.random.default_rng(3)
-    copy.bit_generator.state = trainer._rng.bit_generator.state
-    pairs = trainer._neighbours.draw(9, copy)
-    logits = (matrix @ features) @ weight.T + bias
-    picked = torch.log_softmax(logits, dim=-1)[torch.arange(len(rows)), rows.classes]
-    loss = -(rows.says * picked).mean() / math.log(3)
-    chances = torch.softmax(features @ weight.T + bias, dim=-1)
-    divergence = 0.0
+    matrix = torch.zeros(len(batch), count, dtype=torch.float64)
+    touched = batch.weights.touched
+    matrix[:, touched] = batch.weights.product(torch.eye(len(touched))).double()
+    if blend == "features":
+        seen = torch.log_softmax(matrix @ features @ weight.T + bias, dim=-1)
+    else:
+        each = torch.softmax(features @ weight.T + bias, dim=-1)
+        alpha = matrix.sum(dim=1, keepdim=True)
+        seen = torch.log((matrix @ each + 1e-10) / (alpha + 1e-10))
+    picked = seen[torch.arange(len(batch)), batch.target("label")]
+    return -(batch.target("confidence").double() * picked).mean() / math.log(3)
+
+
+def divergence_of(pairs, leaves):
+    features, weight, bias = leaves
+    each = torch.softmax(features @ weight.T + bias, dim=-1)
+    total = 0.0
     for row in pairs.tolist():
         for other in row:
-            first, second = chances[row[0]], chances[other]
-            divergence += (first * (first.log() - second.log())).sum() / pairs.numel()
-    (loss + 2.0 * divergence / 3).backward()
-
-    trainer.step(Batch.of(rows))
-
-    for mine, leaf in zip((trainer.features, trainer.weight, trainer.bias), leaves, strict=True):
-        torch.testing.assert_close(mine.grad.double(), leaf.grad, rtol=1e-3, atol=1e-6)
-    assert trainer.losses == [pytest.approx(float(loss.detach()), rel=1e-5)]
+            first, second = each[row[0]], each[other]
+            total += (first * (first.log() - second.log())).sum() / pairs.numel()
+    return total
 
 
-def test_the_terms_are_scaled_as_published() -> None:
-    """Even logits cost log C / log C = 1; two Gaussians sure of different ids are far apart."""
-    drawn = torch.zeros(7, 4)
-    weight, bias = torch.zeros(5, 4), torch.zeros(5)
-    classes, says = torch.arange(7) % 5, torch.ones(7)
-    assert float(pixel_loss(drawn, weight, bias, classes, says)) == pytest.approx(1.0)
-    assert float(pixel_loss(drawn, weight, bias, classes, says / 2)) == pytest.approx(0.5)
-    one = pixel_loss(drawn, weight[:1], bias[:1], classes * 0, says)
-    assert float(one) == 0.0
-
+def test_the_neighbour_term_is_scaled_as_published() -> None:
+    """Two Gaussians sure of different ids are far apart."""
     means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [10.0, 0, 0]])
     rng = np.random.default_rng(0)
     near = NeighbourLoss(means, neighbours=2, points=10, rng=rng)
     pairs = near.draw(3, rng)
     assert sorted(pairs.tolist()) == [[0, 1], [1, 0], [2, 1]]
     features = torch.tensor([[2.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    chance = 1 / (1 + math.exp(-2.0))
+    sure = 1 / (1 + math.exp(-2.0))
     even = [0.5, 0.5]
-    there = [chance, 1 - chance]
+    there = [sure, 1 - sure]
 
     def divergence(p, q) -> float:
         return sum(a * math.log(a / b) for a, b in zip(p, q, strict=True))
@@ -221,7 +145,7 @@ def test_the_terms_are_scaled_as_published() -> None:
     assert few.shape == (2, 2)
 
 
-def test_training_finds_what_is_where(rng) -> None:
+def walls():
     """Two walls side by side, seen by two cameras, and one Gaussian that nobody sees."""
     left = [[x, y, 2.0] for x in (-0.7, -0.4, -0.15) for y in (-0.4, 0.0, 0.4)]
     right = [[-x, y, z] for x, y, z in left]
@@ -229,8 +153,13 @@ def test_training_finds_what_is_where(rng) -> None:
     views = [View(name=f"v{i}", camera=camera_at(x)) for i, x in enumerate((0.0, 0.05))]
     ids = torch.full((12, 16), 40)
     ids[:, 8:] = 7
-    maps = Maps({view.name: LabelMap(ids=ids) for view in views})
-    options = IdentityOptions(**FAST)
+    return gaussians, views, Maps({view.name: LabelMap(ids=ids) for view in views}), ids
+
+
+@pytest.mark.parametrize("blend", ["features", "probabilities"])
+def test_training_finds_what_is_where(blend) -> None:
+    gaussians, views, maps, _ = walls()
+    options = IdentityOptions(**FAST, blend=blend)
     calls = []
     labels = identity(
         gaussians,
@@ -252,23 +181,11 @@ def test_training_finds_what_is_where(rng) -> None:
     assert metadata["method"] == "identity"
     assert metadata["names"] == {"7": "door"}
     assert metadata["seed"] == 5
-    assert metadata["loss"] < 0.2
-
-    field = train_identity(gaussians, views, maps, options=options, backend=BACKEND, seed=5)
-    assert len(field.losses) == 120
-    assert field.losses[-1] < 0.5 * field.losses[0]
-    shown = field.label_map(gaussians, views[0].camera, backend=BACKEND)
-    covered = matrix_of(gaussians, views[0].camera).sum(dim=-1) > 0.8
-    assert float((shown.ids == ids)[covered].float().mean()) > 0.95
-    assert shown.confidence is not None
-    layer = identity_features(field)
-    assert layer.values.shape == (19, 16)
-    assert json.loads(json.dumps(dict(layer.metadata)))["ids"] == [7, 40]
-    weight = torch.tensor(layer.metadata["weight"])
-    place = (layer.values @ weight.T + torch.tensor(layer.metadata["bias"])).argmax(dim=1)
-    assert torch.tensor([7, 40])[place][:18].tolist() == labels.ids[:18].tolist()
+    assert metadata["loss"] < 0.3
+    assert metadata["options"]["blend"] == blend
+    assert (metadata["steps"], metadata["stopped"]) == (120, "steps")
     least = float(labels.confidence[:18].median())
-    sure = IdentityOptions(**FAST, identity_min_share=least)
+    sure = IdentityOptions(**FAST, blend=blend, min_share=least)
     some = identity(gaussians, views, maps, options=sure, backend=BACKEND, seed=5)
     unsure = labels.confidence < least
     assert 1 < int(unsure.sum()) < 18
@@ -276,31 +193,202 @@ def test_training_finds_what_is_where(rng) -> None:
     assert torch.equal(some.confidence, torch.where(unsure, 0.0, labels.confidence))
 
 
+@pytest.mark.parametrize("blend", ["features", "probabilities"])
+def test_the_rendered_readout_and_its_file(tmp_path, blend) -> None:
+    """Features and head go through one file, and both readouts come out of it."""
+    gaussians, views, maps, ids = walls()
+    options = IdentityOptions(**FAST, blend=blend)
+    context = TrainingContext(backend=BACKEND, seed=5)
+    trained = train_identity(gaussians, views, maps, options=options, context=context)
+    save_layer(tmp_path / "identity.npz", trained)
+    layer = load_layer(tmp_path / "identity.npz")
+    head = ClassifierHead.of(layer)
+    assert head.blend == blend
+    assert layer.values.shape == (19, 16)
+    assert head.ids.tolist() == [7, 40]
+    hard = identity(gaussians, views, maps, options=options, backend=BACKEND, seed=5)
+    assert torch.equal(head.labels(layer, metadata={}).ids, hard.ids)
+    shown = head.label_map(gaussians, views[0].camera, layer, backend=BACKEND)
+    covered = matrix_of(gaussians, views[0].camera).sum(dim=-1)
+    assert float((shown.ids == ids)[covered > 0.8].float().mean()) > 0.95
+    assert shown.confidence is not None
+    assert float(shown.confidence.max()) <= 1
+    matrix = matrix_of(gaussians, views[0].camera).float()
+    if blend == "features":
+        logits = head.logits(matrix @ layer.values)
+        assert torch.equal(shown.ids.long(), head.ids[logits.argmax(dim=-1)])
+        return
+    each = head.probabilities(layer.values) * (layer.weights > 0)[:, None]
+    seen = matrix @ each
+    best, index = seen.max(dim=-1)
+    expected = torch.where(best >= 1 - seen.sum(dim=-1), head.ids[index], -1)
+    assert float((shown.ids == expected).float().mean()) > 0.99
+    assert bool((shown.ids == -1)[covered < 0.3].all())
+    # The soft layer that it stands for says the same, and more ids than are drawn at a time do.
+    many = torch.zeros(70, 16)
+    many[-2:] = head.weight
+    bias = torch.full((70,), -99.0)
+    bias[-2:] = head.bias
+    wide = ClassifierHead(ids=torch.arange(70), weight=many, bias=bias, blend="probabilities")
+    other = wide.label_map(gaussians, views[0].camera, layer, backend=BACKEND)
+    renamed = torch.where(other.ids >= 0, head.ids[(other.ids - 68).clamp_min(0).long()], -1)
+    assert torch.equal(renamed.to(torch.int32), shown.ids)
+
+
+def test_probabilities_settle_contradictions_by_majority(rng) -> None:
+    """One wall, called 40 by three views and 7 by one: rendered probabilities are 3 to 1."""
+    gaussians = gaussians_at(
+        [[x, y, 2.0] for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4)], opacity=0.95
+    )
+    views = [View(name=f"v{i}", camera=camera_at(0.02 * i)) for i in range(4)]
+    maps = Maps(
+        {
+            view.name: LabelMap(ids=torch.full((12, 16), 7 if i == 3 else 40))
+            for i, view in enumerate(views)
+        }
+    )
+    options = IdentityOptions(
+        **FAST | {"steps": 600}, held_out=0.0, patience=0, schedule="cosine", passes=0
+    )
+    labels = identity(gaussians, views, maps, options=options, backend=BACKEND)
+    assert labels.ids.tolist() == [40] * 9
+    torch.testing.assert_close(labels.confidence[4], torch.tensor(0.75), rtol=0, atol=0.08)
+
+
 def test_same_seed_same_output(rng, views) -> None:
     gaussians = random_gaussians(rng, 40)
     maps = random_maps(rng, views, IDS)
-    options = IdentityOptions(**QUICK, identity_rounds=2)
+    options = IdentityOptions(**QUICK)
 
-    def train(seed: int, order=1) -> IdentityField:
-        return train_identity(
-            gaussians, views[::order], maps, options=options, backend=BACKEND, seed=seed
-        )
+    def fit(seed: int, order=1):
+        context = TrainingContext(backend=BACKEND, seed=seed)
+        return train_identity(gaussians, views[::order], maps, options=options, context=context)
 
-    first, again, other = train(1), train(1, order=-1), train(2)
-    assert torch.equal(first.features, again.features)
-    assert torch.equal(first.weight, again.weight)
-    assert first.losses == again.losses
-    assert not torch.equal(first.features, other.features)
+    first, again, other = fit(1), fit(1, order=-1), fit(2)
+    assert torch.equal(first.values, again.values)
+    assert first.metadata == again.metadata
+    assert not torch.equal(first.values, other.values)
 
 
-def test_steps_and_rounds_are_counted(rng, views) -> None:
-    gaussians, maps = random_gaussians(rng), random_maps(rng, views, IDS)
-    for steps, rounds in ((7, 1), (7, 3), (2, 5)):
-        options = IdentityOptions(
-            **(QUICK | {"identity_steps": steps}), identity_rounds=rounds, identity_kl_weight=0.0
-        )
-        field = train_identity(gaussians, views, maps, options=options, backend=BACKEND)
-        assert len(field.losses) == steps
+def test_an_interrupted_training_goes_on(rng, views, tmp_path) -> None:
+    gaussians, maps = random_gaussians(rng, 40), random_maps(rng, views, IDS)
+    options, path = IdentityOptions(**QUICK | {"steps": 20}), tmp_path / "identity.npz"
+    whole = train_identity(gaussians, views, maps, options=options, context=here())
+    asked = []
+    stopping = TrainingContext(
+        backend=BACKEND, checkpoint=path, cancelled=lambda: asked.append(1) or len(asked) == 7
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train_identity(gaussians, views, maps, options=options, context=stopping)
+    resuming = TrainingContext(backend=BACKEND, checkpoint=path, resume=True)
+    other = IdentityOptions(**QUICK | {"steps": 20}, kl_every=3)
+    with pytest.raises(InputError, match="with kl_every 3, got one with 5"):
+        train_identity(gaussians, views, maps, options=other, context=resuming)
+    again = train_identity(gaussians, views, maps, options=options, context=resuming)
+    assert torch.equal(whole.values, again.values)
+    assert whole.metadata == again.metadata
+
+
+def test_published_is_the_published_setting() -> None:
+    options = IdentityOptions.published(steps=7)
+    assert options.steps == 7
+    assert (options.blend, options.channels) == ("features", 16)
+    assert (options.rate, options.classifier_rate) == (2.5e-3, 5e-4)
+    assert (PUBLISHED_FEATURE_RATE, PUBLISHED_CLASSIFIER_RATE) == (2.5e-3, 5e-4)
+    assert (options.kl_weight, options.kl_every, options.kl_neighbours) == (2.0, 5, 5)
+    assert (options.kl_samples, options.kl_points) == (1000, 200_000)
+    assert (options.held_out, options.patience, options.schedule) == (0.0, 0, "constant")
+    assert (options.min_weight, options.sampling) == (0.0, "uniform")
+    assert find_method("identity").published == IdentityOptions.published()
+
+
+def test_every_option_is_heeded(rng) -> None:
+    """Each gives other features than the defaults, or other drawn pixels."""
+    views = [View(name=f"v{i}", camera=camera_at(0.1 * i)) for i in range(10)]
+    gaussians, maps = random_gaussians(rng, 40), random_maps(rng, views, IDS)
+    base = {"steps": 12, "batch": 60, "pixels": 40, "score_every": 2, "kl_samples": 9}
+    base |= {"kl_every": 2, "patience": 0, "passes": 1, "min_weight": 0.0}
+    base |= {"schedule": "constant"}
+
+    def values(**changes) -> torch.Tensor:
+        options = IdentityOptions(**base | changes)
+        return train_identity(gaussians, views, maps, options=options, context=here()).values
+
+    first = values()
+    assert torch.equal(first, values())
+    for change in (
+        {"steps": 11},
+        {"batch": 30},
+        {"pixels": 30},
+        {"sampling": "groups"},
+        {"passes": 2},
+        {"min_weight": 0.1},
+        {"schedule": "cosine"},
+        {"schedule": "exponential", "final_rate": 0.2},
+        {"held_out": 0.3},
+        {"blend": "features"},
+        {"channels": 3},
+        {"rate": 0.3},
+        {"classifier_rate": 0.1},
+        {"kl_weight": 0.0},
+        {"kl_every": 3},
+        {"kl_neighbours": 2},
+        {"kl_samples": 5},
+        {"kl_points": 20},
+    ):
+        other = values(**change)
+        assert other.shape != first.shape or not torch.equal(other, first), change
+    falling = {"schedule": "cosine"}
+    assert not torch.equal(values(**falling), values(**falling, final_rate=0.5))
+    assert torch.equal(first, values(memory=0))  # spilled: nothing else changes
+
+    def scored(**changes) -> tuple[list[int], str]:
+        options = IdentityOptions(**base | changes)
+        found = train_identity(gaussians, views, maps, options=options, context=here()).metadata
+        return [step for step, _ in found["scores"]], found["stopped"]
+
+    assert scored() == ([2, 4, 6, 8, 10, 12], "steps")
+    assert scored(score_every=5) == ([5, 10, 12], "steps")
+    steps, stopped = scored(patience=1, steps=400, rate=0.5, score_every=1)
+    assert stopped == "patience"
+    assert len(steps) < 400
+
+
+class Recorded(Maps):
+    """Label maps as a method gets them."""
+
+    kind = "labels"
+    classes = None
+
+
+@pytest.mark.parametrize("name", ["identity", "logits", "probabilities"])
+def test_the_readout_is_that_asked_for(name) -> None:
+    """What the command runs: labels, or features with the head that reads the same labels."""
+    gaussians, views, maps, _ = walls()
+    method, told = find_method(name), []
+    options = {"steps": 150, "batch": 150, "pixels": 100, "rate": 0.1}
+    inputs = MethodInputs(
+        gaussians=gaussians,
+        views=tuple(views),
+        evidence=Recorded(maps.maps),
+        backend=BACKEND,
+        seed=5,
+        progress=lambda done, total: told.append((done, total)),
+    )
+    hard = method.run(inputs, method.options(**options))
+    assert hard.ids.tolist() == [40] * 9 + [7] * 9 + [-1]
+    assert hard.metadata["method"] == name
+    assert "head" not in hard.metadata
+    assert told == [(step + 1, 150) for step in range(150)]
+    rendered = method.run(inputs, method.options(**options, readout="rendered"))
+    head = ClassifierHead.of(rendered)
+    assert torch.equal(head.labels(rendered, metadata={}).ids, hard.ids)
+    least = float(hard.confidence[:18].median())
+    sure = method.run(inputs, method.options(**options, min_share=least))
+    assert -1 in sure.ids[:18].tolist()
+    with pytest.raises(InputError, match="readout"):
+        method.options(readout="soft")
+    assert (method.seeded, method.keeps_ids, method.evidence) == (True, True, ("labels", "tracked"))
 
 
 def test_neighbours_pull_together(rng, views) -> None:
@@ -308,11 +396,52 @@ def test_neighbours_pull_together(rng, views) -> None:
     gaussians, maps = random_gaussians(rng), random_maps(rng, views, IDS)
 
     def spread(weight: float) -> float:
-        options = IdentityOptions(**FAST, identity_kl_weight=weight, identity_kl_every=1)
-        field = train_identity(gaussians, views, maps, options=options, backend=BACKEND)
-        return float(field.probabilities(field.features).std(dim=0).mean())
+        options = IdentityOptions(**FAST, kl_weight=weight, kl_every=1)
+        trained = train_identity(gaussians, views, maps, options=options, context=here())
+        head = ClassifierHead.of(trained)
+        return float(head.probabilities(trained.values).std(dim=0).mean())
 
     assert spread(500.0) < 0.3 * spread(0.0)
+
+
+def test_heads_without_a_classifier_read_logits() -> None:
+    head = ClassifierHead(ids=torch.tensor([4, 9]), weight=None, bias=None, blend="probabilities")
+    again = ClassifierHead.of(
+        train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), {"head": head.metadata()})
+    )
+    assert (again.weight, again.bias, again.ids.tolist()) == (None, None, [4, 9])
+    layer = train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), {})
+    found = again.labels(layer, metadata={"method": "m"})
+    assert found.ids.tolist() == [9, 4]
+    assert found.confidence.tolist() == pytest.approx([1 / (1 + math.exp(-2))] * 2)
+    assert found.metadata["method"] == "m"
+    with pytest.raises(InputError, match="a layer with a classifier head"):
+        ClassifierHead.of(layer)
+    with pytest.raises(InputError, match="blend"):
+        ClassifierHead(ids=torch.tensor([1]), weight=None, bias=None, blend="colours")
+    with pytest.raises(ShapeError, match="weight"):
+        ClassifierHead(ids=torch.tensor([1]), weight=torch.zeros(2, 3), bias=None, blend="features")
+
+
+def train_layer(values, metadata):
+    from splatseg.core import Features
+
+    return Features(values=values, metadata=metadata)
+
+
+def test_the_rendered_readout_equals_the_hard_one_where_gaussians_are_sure(rng) -> None:
+    gaussians = random_gaussians(rng, 25)
+    camera = camera_at()
+    logits = torch.zeros(25, 2)
+    logits[torch.arange(25), torch.arange(25) % 2] = 60.0
+    layer = train_layer(logits, {})
+    head = ClassifierHead(ids=torch.tensor([4, 9]), weight=None, bias=None, blend="probabilities")
+    soft = head.label_map(gaussians, camera, layer, backend=BACKEND)
+    hard = label_map(gaussians, camera, head.labels(layer, metadata={}), backend=BACKEND)
+    different = soft.ids != hard.ids
+    # Where a pixel is as much covered as not, -1 wins in one and a single id in the other.
+    assert float(different.float().mean()) < 0.2
+    assert not bool((different & (soft.ids >= 0) & (hard.ids >= 0)).any())
 
 
 def test_bad_input_is_refused(rng, views) -> None:
@@ -330,25 +459,27 @@ def test_bad_input_is_refused(rng, views) -> None:
     broken = gaussians.replace(means=torch.full_like(gaussians.means, math.nan))
     with pytest.raises(RangeError, match="means"):
         identity(broken, views[:2], maps, backend=BACKEND)
-    options = IdentityOptions(**(QUICK | {"identity_steps": 1}))
-    field = train_identity(gaussians, views[:2], maps, options=options, backend=BACKEND)
+    options = IdentityOptions(**QUICK | {"steps": 1})
+    trained = train_identity(gaussians, views[:2], maps, options=options, context=here())
     with pytest.raises(ShapeError, match="gaussians: expected 14, one a feature, got 3"):
-        field.label_map(gaussians[:3], views[0].camera)
+        ClassifierHead.of(trained).label_map(gaussians[:3], views[0].camera, trained)
     for wrong in (
-        {"identity_channels": 0},
-        {"identity_steps": 0},
-        {"identity_batch": 0},
-        {"identity_pixels": 0},
-        {"identity_rounds": 0},
-        {"identity_rate": -1.0},
-        {"identity_classifier_rate": math.nan},
-        {"identity_kl_weight": math.inf},
-        {"identity_kl_every": 0},
-        {"identity_kl_neighbours": 0},
-        {"identity_kl_samples": 0},
-        {"identity_kl_points": 0},
-        {"identity_min_share": 2.0},
-        {"identity_memory": 0},
+        {"channels": 0},
+        {"steps": 0},
+        {"batch": 0},
+        {"pixels": 0},
+        {"passes": -1},
+        {"rate": -1.0},
+        {"classifier_rate": math.nan},
+        {"kl_weight": math.inf},
+        {"kl_every": 0},
+        {"kl_neighbours": 0},
+        {"kl_samples": 0},
+        {"kl_points": 0},
+        {"min_share": 2.0},
+        {"memory": -1},
+        {"held_out": 1.0},
+        {"patience": -1},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             IdentityOptions(**wrong)

@@ -1,6 +1,4 @@
-"""The two terms that identities are trained with, see `methods.identity`."""
-
-import math
+"""The neighbour term that identities are trained with, see `lift.identity`."""
 
 import numpy as np
 import torch
@@ -11,31 +9,6 @@ from splatseg.neighbours import NeighbourIndex
 
 _TINY = 1e-10
 """Added to probabilities before their logarithm, as published."""
-
-
-def pixel_loss(
-    drawn: Float[Tensor, "pixels channels"],
-    weight: Float[Tensor, "classes channels"],
-    bias: Float[Tensor, "classes"],
-    classes: Int64[Tensor, "pixels"],
-    says: Float[Tensor, "pixels"],
-) -> Float[Tensor, ""]:
-    r"""Mean cross-entropy of the logits of rendered features, over the log of the classes.
-
-    .. math:: \frac{1}{P \log C} \sum_p s_p \, \mathrm{CE}(A F_p + b, c_p)
-
-    With a single class there is nothing to learn, and the loss is 0.
-
-    Args:
-        drawn: Rendered identity features F.
-        weight: A.
-        bias: b.
-        classes: Place of each pixel's id.
-        says: Confidence of each pixel's label.
-    """
-    logits = drawn @ weight.T + bias
-    each = torch.nn.functional.cross_entropy(logits, classes, reduction="none")
-    return (each * says).mean() / math.log(max(len(bias), 2))
 
 
 class NeighbourLoss:
@@ -88,8 +61,8 @@ class NeighbourLoss:
         bias: Float[Tensor, "classes"],
     ) -> Float[Tensor, ""]:
         """The term, for rows `pairs` of `features`: each row's first against all of it."""
-        chances = torch.softmax(features @ weight.T + bias, dim=-1)
-        logs = torch.log(chances + _TINY)
+        probabilities = torch.softmax(features @ weight.T + bias, dim=-1)
+        logs = torch.log(probabilities + _TINY)
         own = pairs[:, :1]
-        apart = (chances[own] * (logs[own] - logs[pairs])).sum(dim=-1)
-        return apart.mean() / len(bias)
+        divergence = (probabilities[own] * (logs[own] - logs[pairs])).sum(dim=-1)
+        return divergence.mean() / len(bias)

@@ -12,7 +12,7 @@ from splatseg.methods._method import Method
 
 ENTRY_POINT_GROUP = "splatseg.methods"
 
-_OWN = ("uplift", "features", "vote", "associate", "identity")
+_OWN = ("uplift", "features", "vote", "associate", "identity", "logits", "probabilities")
 
 
 def method_names() -> tuple[str, ...]:

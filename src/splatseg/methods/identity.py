@@ -1,183 +1,135 @@
-r"""Identity: the Gaussian Grouping baseline on frozen geometry.
+r"""Identity: Gaussian Grouping on frozen geometry.
 
-Every Gaussian has an identity feature :math:`f_i` of 16 channels, which is rendered like colour;
-one linear classifier turns the rendered feature of a pixel into logits of ids. Both are trained
-so that pixels get the ids of their label maps, and Gaussians that are neighbours the same ids:
+Every Gaussian has an identity feature :math:`f_i`, and one linear classifier A, b turns features
+into logits of ids. Both are trained so that pixels get the ids of their label maps, and
+Gaussians that are neighbours the same ids:
 
-.. math:: \mathcal{L} = \frac{1}{\log C} \, \mathrm{mean}_p \,
-              \mathrm{CE}\Bigl(A \sum_i w_{pi} f_i + b, \; \mathrm{id}(p)\Bigr)
+.. math:: \mathcal{L} = \frac{1}{\log C} \, \mathrm{mean}_p \, \ell_p
           + \frac{\lambda}{C} \, \mathrm{mean}_{i, j \in N_k(i)} \,
               \mathrm{KL}\bigl(q_i \,\|\, q_j\bigr),
           \qquad q_i = \mathrm{softmax}(A f_i + b)
 
-with C the number of ids; the second term is added every fifth step. Gaussian Grouping trains
-geometry, colour and identity together on whole pictures; here geometry is frozen, so that rows
-of W never change and training runs on cached rows of sampled pixels (`methods._identity_rows`).
-Rates, weights and counts are the published code's unless an option says otherwise.
+with C the number of ids; the second term is added every so many steps. As published, the feature
+is rendered like colour and what is seen is classified
+(:math:`\ell_p = \mathrm{CE}(A \sum_i w_{pi} f_i + b, \mathrm{id}(p))`); by default here Gaussians
+are classified and their probabilities rendered
+(:math:`\ell_p = -\log \sum_i w_{pi} q_{i, \mathrm{id}(p)}` over the pixel's weights). Rendered
+logits are unbounded, so that labels which contradict each other are learnt by heart in different
+views; rendered probabilities settle for their majority. Decision 0018.
+
+Gaussian Grouping trains geometry, colour and identity together on whole pictures; here geometry
+is frozen, so that rows of W never change, and training runs on rows of sampled pixels
+(`splatseg.lift.training`).
 
 References:
-    Ye et al., Gaussian Grouping: Segment and Edit Anything in 3D Scenes (2024), eq. 3 to 5.
+    Ye et al., Gaussian Grouping: Segment and Edit Anything in 3D Scenes (ECCV 2024), eq. 3 to 5,
+    and its published code for rates and counts.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
-from torch import Tensor
 
-from splatseg._check import check_range
-from splatseg.core import (
-    UNLABELLED,
-    Camera,
-    ClassTable,
-    Features,
-    Gaussians,
-    LabelMap,
-    Labels,
-    LabelSource,
-    View,
-)
+from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, Layer, View
 from splatseg.core.sh import SH_C0
-from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.adjoint import voting_views
-from splatseg.methods._identity_loss import NeighbourLoss, pixel_loss
-from splatseg.methods._identity_rows import Batch, Sampler, batches_of
+from splatseg.errors import RangeError
+from splatseg.lift.heads import Blend, ClassifierHead
+from splatseg.lift.training import TrainingProgress
+from splatseg.methods._identity_loss import NeighbourLoss
+from splatseg.methods._label_models import IdentityModel, linear_start
 from splatseg.methods._method import Method, MethodInputs
-from splatseg.render import RenderOptions, options_for, render
+from splatseg.methods._trained_labels import (
+    LabelData,
+    context_of,
+    features_layer,
+    hard_labels,
+    label_data,
+    layer_metadata,
+    layer_of,
+    train_labels,
+)
+from splatseg.methods._trained_labels import TrainingContext as TrainingContext
+from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
+from splatseg.render import RenderOptions
 
-_ROWS = 65536
-"""Gaussians classified at a time."""
+# Ye et al. 2024, sections 3.2 and 4.1 and the published code: what `published` is made of.
+PUBLISHED_CHANNELS = 16
+PUBLISHED_FEATURE_RATE = 2.5e-3
+PUBLISHED_CLASSIFIER_RATE = 5e-4
+PUBLISHED_KL_WEIGHT = 2.0
+PUBLISHED_KL_EVERY = 5
+PUBLISHED_KL_NEIGHBOURS = 5
+PUBLISHED_KL_SAMPLES = 1000
+PUBLISHED_KL_POINTS = 200_000
+PUBLISHED_STEPS = 30_000
+"""Each with one whole picture."""
+
+_START = 0xF
+"""What the generator of first values is seeded with besides the seed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IdentityOptions:
+class IdentityOptions(LabelTrainingOptions):
     """How identities are trained."""
 
-    identity_channels: int = 16
+    blend: Blend = "probabilities"
+    """features: features are rendered and what is seen is classified, as published.
+    probabilities: Gaussians are classified and their probabilities rendered."""
+
+    channels: int = PUBLISHED_CHANNELS
     """Width of the identity feature."""
 
-    identity_steps: int = 2000
-    """Steps of Adam. The published code takes 30000, with whole pictures."""
-
-    identity_batch: int = 8192
-    """Pixels a step, from all views."""
-
-    identity_pixels: int = 1500
-    """Labelled pixels of each view whose rows are kept."""
-
-    identity_rounds: int = 1
-    """How often the pixels are drawn anew, in equal parts of the steps."""
-
-    identity_rate: float = 2.5e-3
+    rate: float = 0.1
     """Adam's rate for features."""
 
-    identity_classifier_rate: float = 5e-4
+    classifier_rate: float = 0.05
     """Adam's rate for the classifier."""
 
-    identity_kl_weight: float = 2.0
+    kl_weight: float = PUBLISHED_KL_WEIGHT
     """Lambda, the weight of the neighbour term; 0 is without."""
 
-    identity_kl_every: int = 5
+    kl_every: int = PUBLISHED_KL_EVERY
     """Steps from one neighbour term to the next."""
 
-    identity_kl_neighbours: int = 5
+    kl_neighbours: int = PUBLISHED_KL_NEIGHBOURS
     """Neighbours of a Gaussian, itself counted."""
 
-    identity_kl_samples: int = 1000
+    kl_samples: int = PUBLISHED_KL_SAMPLES
     """Gaussians that are compared with their neighbours in a step."""
 
-    identity_kl_points: int = 200_000
+    kl_points: int = PUBLISHED_KL_POINTS
     """Gaussians that take part in the neighbour term at most."""
 
-    identity_min_share: float = 0.0
-    """Least probability in [0, 1] that the winner needs; below it there is no label."""
-
-    identity_memory: int = 1 << 30
-    """Bytes of kept rows, 16 for each pixel and Gaussian it shows; more are not kept, and the
-    views give fewer pixels."""
-
     def __post_init__(self) -> None:
-        for name in (
-            "identity_channels",
-            "identity_steps",
-            "identity_batch",
-            "identity_pixels",
-            "identity_rounds",
-            "identity_kl_every",
-            "identity_kl_neighbours",
-            "identity_kl_samples",
-            "identity_kl_points",
-            "identity_memory",
-        ):
+        LabelTrainingOptions.__post_init__(self)
+        for name in ("channels", "kl_every", "kl_neighbours", "kl_samples", "kl_points"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        for name in ("identity_rate", "identity_classifier_rate", "identity_kl_weight"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise RangeError(f"{name}: expected 0 or more, got {value}.")
-        check_range("identity_min_share", self.identity_min_share, 0.0, 1.0)
+        for name in ("rate", "classifier_rate", "kl_weight"):
+            check_rate(name, getattr(self, name))
 
+    @classmethod
+    def published(cls, *, steps: int = 2000) -> "IdentityOptions":
+        """The published setting: its loss, rates, schedule and neighbour term.
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IdentityField:
-    """Trained identities: features of Gaussians and the classifier that reads them."""
-
-    features: Float[Tensor, "n channels"]
-    weight: Float[Tensor, "classes channels"]
-    """A."""
-
-    bias: Float[Tensor, "classes"]
-    """b."""
-
-    ids: Int64[Tensor, "classes"]
-    """The id of each class, ascending."""
-
-    evidence: Float[Tensor, "n"]
-    """Labelled light that each Gaussian got, estimated from the sampled pixels."""
-
-    losses: tuple[float, ...]
-    """The pixel term of each step."""
-
-    def probabilities(self, features: Float[Tensor, "m channels"]) -> Float[Tensor, "m classes"]:
-        """What the classifier says of features, rendered or of Gaussians."""
-        return torch.softmax(features @ self.weight.T + self.bias, dim=-1)
-
-    def label_map(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        *,
-        options: RenderOptions | None = None,
-        backend: str = "auto",
-    ) -> LabelMap:
-        """The label map of a view as published: the feature is rendered, then classified.
-
-        Pixels that nothing covers have the label that the classifier gives to nothing, its
-        largest bias.
-
-        Raises:
-            ShapeError: If `gaussians` has another number of rows than `features`.
+        Nothing is held out and all steps are done. Steps are of sampled pixels of all views
+        where the published code takes whole pictures, and fewer (`PUBLISHED_STEPS` there), so
+        that it ends within minutes.
         """
-        if len(gaussians) != len(self.features):
-            raise ShapeError(
-                f"gaussians: expected {len(self.features)}, one a feature, got {len(gaussians)}."
-            )
-        with torch.no_grad():
-            drawn = render(
-                gaussians,
-                camera,
-                self.features.to(gaussians.means),
-                options=options,
-                backend=backend,
-                warp="nearest",
-            )
-        chances = self.probabilities(drawn.image.float().cpu())
-        best, place = chances.max(dim=-1)
-        return LabelMap(ids=self.ids[place].to(torch.int32), confidence=best.clamp(0, 1))
+        return cls(
+            steps=steps,
+            batch=8192,
+            blend="features",
+            rate=PUBLISHED_FEATURE_RATE,
+            classifier_rate=PUBLISHED_CLASSIFIER_RATE,
+            schedule="constant",
+            min_weight=0.0,
+            held_out=0.0,
+            patience=0,
+        )
 
 
 def identity(
@@ -192,10 +144,10 @@ def identity(
     progress: Callable[[int, int], None] | None = None,
     seed: int = 0,
 ) -> Labels:
-    """Label Gaussians by identity features trained on label maps.
+    """Label Gaussians by identity features trained on label maps: the hard readout.
 
-    Ids must mean the same in all views. Same seed, same result; the order of the views does not
-    matter.
+    Ids must mean the same in all views. Same seed, same result, whatever the number of threads;
+    the order of the views does not matter.
 
     Args:
         gaussians: The Gaussians of the scene; their geometry stays as it is.
@@ -210,56 +162,30 @@ def identity(
 
     Returns:
         Each Gaussian's most likely id, with its probability as the confidence. Gaussians that no
-        sampled pixel shows have the id -1. The metadata holds the loss in the end.
+        sampled pixel shows have the id -1. The metadata holds the loss in the end, and the
+        scores on held-out views.
 
     Raises:
         InputError: If there are no views, if one has no label map, or no pixel has a label.
         ShapeError: If a label map does not have its photograph's proportions.
     """
     options = options or IdentityOptions()
-    ordered = voting_views(views, evidence, "a label map")
-    field = train_identity(
+
+    def tell(state: TrainingProgress) -> None:
+        if progress is not None:
+            progress(state.step, state.steps)
+
+    features = train_identity(
         gaussians,
-        ordered,
+        views,
         evidence,
         options=options,
-        render_options=render_options,
-        backend=backend,
-        progress=progress,
-        seed=seed,
+        classes=classes,
+        context=TrainingContext(
+            render_options=render_options, backend=backend, progress=tell, seed=seed
+        ),
     )
-    place = torch.zeros(len(gaussians), dtype=torch.int64)
-    share = torch.zeros(len(gaussians))
-    for start in range(0, len(gaussians), _ROWS):
-        rows = slice(start, start + _ROWS)
-        share[rows], place[rows] = field.probabilities(field.features[rows]).max(dim=-1)
-    sure = (field.evidence > 0) & (share >= options.identity_min_share)
-    known = () if classes is None else classes.rows
-    present = set(field.ids.tolist())
-    return Labels(
-        ids=torch.where(sure, field.ids[place], UNLABELLED),
-        confidence=torch.where(sure, share.clamp(0, 1), 0.0),
-        evidence=field.evidence,
-        metadata={
-            "method": "identity",
-            "options": asdict(options),
-            "views": [view.name for view in ordered],
-            "names": {str(row.id): row.name for row in known if row.id in present},
-            "seed": seed,
-            "loss": float(np.mean(field.losses[-20:])),
-        },
-    )
-
-
-def identity_features(field: IdentityField) -> Features:
-    """Trained identity features as a layer; its metadata holds the classifier."""
-    metadata: dict[str, Any] = {
-        "method": "identity",
-        "ids": field.ids.tolist(),
-        "weight": field.weight.tolist(),
-        "bias": field.bias.tolist(),
-    }
-    return Features(values=field.features, weights=field.evidence, metadata=metadata)
+    return hard_labels(features, options)
 
 
 def train_identity(
@@ -268,149 +194,86 @@ def train_identity(
     evidence: LabelSource,
     *,
     options: IdentityOptions | None = None,
-    render_options: RenderOptions | None = None,
-    backend: str = "auto",
-    progress: Callable[[int, int], None] | None = None,
-    seed: int = 0,
-) -> IdentityField:
-    """Train identity features and their classifier, see `identity`."""
-    options = options or IdentityOptions()
-    ordered = voting_views(views, evidence, "a label map")
-    gaussians.check_values()
-    ids = _all_ids(ordered, evidence)
-    rng = np.random.default_rng(seed)
-    sampler = Sampler(
-        gaussians=gaussians,
-        views=ordered,
-        evidence=evidence,
-        ids=ids,
-        pixels=options.identity_pixels,
-        memory=options.identity_memory,
-        options=render_options or options_for(gaussians, backend),
-        backend=backend,
+    classes: ClassTable | None = None,
+    context: TrainingContext | None = None,
+) -> Features:
+    """Train identity features and their classifier, see `identity`.
+
+    Returns:
+        The features, with `ClassifierHead.of` to read them: ``labels`` is the hard readout,
+        ``label_map`` the rendered one.
+
+    Raises:
+        InputError: As `identity`; also if a checkpoint is of another training.
+        KeyboardInterrupt: If it was cancelled.
+    """
+    options, context = options or IdentityOptions(), context or TrainingContext()
+    data = label_data(gaussians, views, evidence, options=options, context=context)
+    settings: dict[str, Any] = {"method": "identity"} | asdict(options)
+    model = _model(gaussians, data, options, context.seed)
+    result = train_labels(data, model, options=options, settings=settings, context=context)
+    head = ClassifierHead(
+        ids=data.ids,
+        weight=result.shared["weight"],
+        bias=result.shared["bias"],
+        blend=options.blend,
     )
-    trainer = _Trainer(gaussians, len(ids), options, rng)
-    seen = torch.zeros(len(gaussians))
-    done = 0
-    for round in range(options.identity_rounds):
-        rows, light = sampler.draw(rng)
-        seen += light / options.identity_rounds
-        batches = batches_of(rows, options.identity_batch, rng)
-        del rows
-        last = options.identity_steps * (round + 1) // options.identity_rounds
-        while done < last:
-            for place in rng.permutation(len(batches))[: last - done].tolist():
-                trainer.step(batches[place])
-                done += 1
-                if progress is not None:
-                    progress(done, options.identity_steps)
-    return IdentityField(
-        features=trainer.features.detach(),
-        weight=trainer.weight.detach(),
-        bias=trainer.bias.detach(),
-        ids=ids,
-        evidence=seen,
-        losses=tuple(trainer.losses),
+    metadata = layer_metadata(
+        "identity", asdict(options), data, result, classes=classes, seed=context.seed
     )
+    return features_layer(result.rows["features"], result, metadata | {"head": head.metadata()})
 
 
-def _all_ids(views: Sequence[View], evidence: LabelSource) -> Int64[Tensor, "classes"]:
-    found: set[int] = set()
-    for view in views:
-        found.update(torch.unique(evidence.label_map(view.name).ids).tolist())
-    found.discard(UNLABELLED)
-    if not found:
-        raise InputError(f"evidence: expected a labelled pixel in {len(views)} views, found none.")
-    return torch.tensor(sorted(found))
-
-
-class _Trainer:
-    """Features, classifier and their optimiser."""
-
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        classes: int,
-        options: IdentityOptions,
-        rng: np.random.Generator,
-    ) -> None:
-        channels = options.identity_channels
-        # As published, features start like colours: uniform in [0, 1], as a harmonic.
-        start = (rng.random((len(gaussians), channels), dtype=np.float32) - 0.5) / SH_C0
-        bound = 1 / math.sqrt(channels)  # what a linear layer starts with
-        self.features = torch.from_numpy(start).requires_grad_()
-        self.weight = torch.from_numpy(
-            rng.uniform(-bound, bound, (classes, channels)).astype(np.float32)
-        ).requires_grad_()
-        self.bias = torch.from_numpy(
-            rng.uniform(-bound, bound, classes).astype(np.float32)
-        ).requires_grad_()
-        self.losses: list[float] = []
-        self._options = options
-        self._rng = rng
-        self._gradient = torch.zeros_like(self.features)
-        self._neighbours = NeighbourLoss(
+def _model(
+    gaussians: Gaussians, data: LabelData, options: IdentityOptions, seed: int
+) -> IdentityModel:
+    rng = np.random.default_rng((seed, _START))
+    # As published, features start like colours: uniform in [0, 1], as a harmonic.
+    start = (rng.random((len(gaussians), options.channels), dtype=np.float32) - 0.5) / SH_C0
+    weight, bias = linear_start(options.channels, len(data.ids), rng)
+    neighbours = None
+    if options.kl_weight > 0:
+        neighbours = NeighbourLoss(
             gaussians.means.detach().cpu(),
-            neighbours=options.identity_kl_neighbours,
-            points=options.identity_kl_points,
+            neighbours=options.kl_neighbours,
+            points=options.kl_points,
             rng=rng,
         )
-        self._adam = torch.optim.Adam(
-            [
-                {"params": [self.features], "lr": options.identity_rate},
-                {"params": [self.weight, self.bias], "lr": options.identity_classifier_rate},
-            ],
-            fused=True,
-        )
-
-    def step(self, batch: Batch) -> None:
-        """One step of Adam on one batch."""
-        self._adam.zero_grad()
-        self._gradient.zero_()
-        drawn = batch.render(self.features.detach()).requires_grad_()
-        loss = pixel_loss(drawn, self.weight, self.bias, batch.rows.classes, batch.rows.says)
-        loss.backward()
-        self.losses.append(float(loss.detach()))
-        if drawn.grad is not None:
-            self._gradient[batch.touched] = batch.back_project(drawn.grad)
-        options = self._options
-        if options.identity_kl_weight > 0 and len(self.losses) % options.identity_kl_every == 0:
-            self._listen()
-        self.features.grad = self._gradient
-        self._adam.step()
-
-    def _listen(self) -> None:
-        """Add the neighbour term's gradient."""
-        pairs = self._neighbours.draw(self._options.identity_kl_samples, self._rng)
-        names, place = torch.unique(pairs, return_inverse=True)
-        told = self.features.detach()[names].requires_grad_()
-        loss = self._neighbours.loss(told, place, self.weight, self.bias)
-        (self._options.identity_kl_weight * loss).backward()
-        if told.grad is not None:
-            self._gradient[names] += told.grad
+    return IdentityModel(
+        torch.from_numpy(start),
+        weight,
+        bias,
+        blend=options.blend,
+        feature_rate=options.rate,
+        classifier_rate=options.classifier_rate,
+        neighbours=neighbours,
+        neighbour_weight=options.kl_weight,
+        neighbour_every=options.kl_every,
+        neighbour_samples=options.kl_samples,
+    )
 
 
-def run(inputs: MethodInputs, options: IdentityOptions) -> Labels:
-    """Train identities, see `identity`."""
-    return identity(
+def run(inputs: MethodInputs, options: IdentityOptions) -> Layer:
+    """Train identities, and read them as the options say."""
+    features = train_identity(
         inputs.gaussians,
         inputs.views,
         inputs.evidence,
         options=options,
         classes=inputs.label_names,
-        backend=inputs.backend,
-        progress=inputs.progress,
-        seed=inputs.seed,
+        context=context_of(inputs),
     )
+    return layer_of(features, options)
 
 
 METHOD = Method(
     name="identity",
-    summary="features of 16 channels and a classifier are trained; for comparison",
+    summary="features of 16 channels and a classifier are trained, with a term for neighbours",
     reference="Gaussian Grouping (Ye et al. 2024), eq. 3 to 5",
     evidence=("labels", "tracked"),
     options=IdentityOptions,
     run=run,
     keeps_ids=True,
     seeded=True,
+    published=IdentityOptions.published(),
 )

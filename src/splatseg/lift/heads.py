@@ -1,0 +1,197 @@
+r"""A layer of features with the classifier that reads it: labels of Gaussians and of views.
+
+There are two ways from features :math:`f_i` to the ids of a pixel (`ClassifierHead.blend`):
+render the features and classify what is seen, or classify every Gaussian and render that,
+
+.. math:: \arg\max_c \; \Bigl(A \sum_i w_{pi} f_i + b\Bigr)_c \qquad \text{or} \qquad
+          \arg\max_c \sum_i w_{pi} \, \mathrm{softmax}(A f_i + b)_c .
+
+Sums of logits are unbounded: one Gaussian that is very sure outvotes all others of a pixel.
+Probabilities are not.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from splatseg._check import check_choice, check_shape
+from splatseg.core import UNLABELLED, Camera, Features, Gaussians, LabelMap, Labels
+from splatseg.errors import InputError, ShapeError
+from splatseg.render import RenderOptions, options_for, render
+
+Blend = Literal["features", "probabilities"]
+_ROWS = 65536
+"""Gaussians classified at a time."""
+_CHANNELS = 32
+"""Classes drawn at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ClassifierHead:
+    """Reads ids out of features."""
+
+    ids: Int64[Tensor, "classes"]
+    """The id of each class."""
+
+    weight: Float[Tensor, "classes channels"] | None
+    """A; None where features are logits of the classes."""
+
+    bias: Float[Tensor, "classes"] | None
+    """b; None is 0."""
+
+    blend: Blend
+    """What is rendered: features, or the probabilities of Gaussians."""
+
+    def __post_init__(self) -> None:
+        check_shape("ids", self.ids, (None,))
+        if self.weight is not None:
+            check_shape("weight", self.weight, (len(self.ids), None))
+        if self.bias is not None:
+            check_shape("bias", self.bias, (len(self.ids),))
+        check_choice("blend", self.blend, get_args(Blend))
+
+    def logits(self, features: Float[Tensor, "m channels"]) -> Float[Tensor, "m classes"]:
+        """``A f + b`` of features, rendered or of Gaussians."""
+        found = features if self.weight is None else features @ self.weight.T
+        return found if self.bias is None else found + self.bias
+
+    def probabilities(self, features: Float[Tensor, "m channels"]) -> Float[Tensor, "m classes"]:
+        """The softmax of the logits."""
+        return torch.softmax(self.logits(features), dim=-1)
+
+    def labels(
+        self, features: Features, *, min_share: float = 0.0, metadata: Mapping[str, Any]
+    ) -> Labels:
+        """The hard readout: each Gaussian's most likely id, with its probability as confidence.
+
+        Gaussians with a weight of 0 and those below `min_share` have the id -1.
+        """
+        count = len(features)
+        seen = torch.ones(count) if features.weights is None else features.weights
+        index = torch.zeros(count, dtype=torch.int64)
+        share = torch.zeros(count)
+        for start in range(0, count, _ROWS):
+            rows = slice(start, start + _ROWS)
+            share[rows], index[rows] = self.probabilities(features.values[rows]).max(dim=-1)
+        sure = (seen > 0) & (share >= min_share)
+        return Labels(
+            ids=torch.where(sure, self.ids[index], UNLABELLED),
+            confidence=torch.where(sure, share.clamp(0, 1), 0.0),
+            evidence=seen,
+            metadata=metadata,
+        )
+
+    def label_map(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        features: Features,
+        *,
+        options: RenderOptions | None = None,
+        backend: str = "auto",
+    ) -> LabelMap:
+        """The rendered readout: the label map of a view.
+
+        Where features are rendered, pixels that nothing covers have the label that the
+        classifier gives to nothing, its largest bias. Where probabilities are, the light that
+        passes, and that of Gaussians with a weight of 0, stands for no label and competes.
+
+        Raises:
+            ShapeError: If `gaussians` has another number of rows than `features`.
+        """
+        if len(gaussians) != len(features):
+            raise ShapeError(
+                f"gaussians: expected {len(features)}, one a feature, got {len(gaussians)}."
+            )
+        view = _View(gaussians, camera, options or options_for(gaussians, backend), backend)
+        if self.blend == "features":
+            rendered, _ = view.render(features.values)
+            best, index = self.probabilities(rendered).max(dim=-1)
+            return LabelMap(ids=self.ids[index].to(torch.int32), confidence=best.clamp(0, 1))
+        return self._blended(view, features)
+
+    def _blended(self, view: "_View", features: Features) -> LabelMap:
+        probabilities = torch.empty(len(features), len(self.ids))
+        for start in range(0, len(features), _ROWS):
+            rows = slice(start, start + _ROWS)
+            probabilities[rows] = self.probabilities(features.values[rows])
+        if features.weights is not None:
+            probabilities[features.weights <= 0] = 0
+        best, index, claimed = None, None, None
+        for start in range(0, len(self.ids), _CHANNELS):
+            rendered, _ = view.render(probabilities[:, start : start + _CHANNELS])
+            score, column = rendered.max(dim=-1)
+            part = rendered.sum(dim=-1)
+            if best is None or index is None or claimed is None:
+                best, index, claimed = score, column, part
+                continue
+            claimed = claimed + part
+            index = torch.where(score > best, column + start, index)
+            best = torch.maximum(score, best)
+        if best is None or index is None or claimed is None:
+            raise InputError("ids: expected at least one class, got none.")
+        # No label loses ties.
+        labelled = best >= 1 - claimed
+        return LabelMap(
+            ids=torch.where(labelled, self.ids[index], UNLABELLED).to(torch.int32),
+            confidence=torch.where(labelled, best, 1 - claimed).clamp(0, 1),
+        )
+
+    def metadata(self) -> dict[str, Any]:
+        """The head in values that JSON holds, for the metadata of a layer of features."""
+        return {
+            "blend": self.blend,
+            "ids": self.ids.tolist(),
+            "weight": None if self.weight is None else self.weight.tolist(),
+            "bias": None if self.bias is None else self.bias.tolist(),
+        }
+
+    @classmethod
+    def of(cls, features: Features) -> "ClassifierHead":
+        """The head that a layer of features holds in its metadata. Inverse of `metadata`.
+
+        Raises:
+            InputError: If it holds none.
+        """
+        found = features.metadata.get("head")
+        if not isinstance(found, Mapping) or not {"ids", "blend"} <= set(found):
+            raise InputError("features: expected a layer with a classifier head, got one without.")
+        return cls(
+            ids=torch.tensor(_numbers(found["ids"]), dtype=torch.int64),
+            weight=None if found.get("weight") is None else torch.tensor(found["weight"]),
+            bias=None if found.get("bias") is None else torch.tensor(found["bias"]),
+            blend=found["blend"],
+        )
+
+
+def _numbers(values: Any) -> Sequence[int]:
+    return [int(value) for value in values]
+
+
+class _View:
+    """One view, drawn with one signal after another; ids by the nearest warp."""
+
+    def __init__(
+        self, gaussians: Gaussians, camera: Camera, options: RenderOptions, backend: str
+    ) -> None:
+        self._gaussians = gaussians
+        self._camera = camera
+        self._options = options
+        self._backend = backend
+
+    def render(self, signal: Float[Tensor, "n channels"]) -> tuple[Tensor, Tensor]:
+        """The image and alpha, on the CPU."""
+        with torch.no_grad():
+            drawn = render(
+                self._gaussians,
+                self._camera,
+                signal.to(self._gaussians.means),
+                options=self._options,
+                backend=self._backend,
+                warp="nearest",
+            )
+        return drawn.image.float().cpu(), drawn.alpha.float().cpu()

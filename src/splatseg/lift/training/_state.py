@@ -1,0 +1,207 @@
+"""Everything a training is made of between two steps, and its file.
+
+The file is an npz (a ZIP archive of NumPy arrays, uncompressed, nothing pickled) with a header of
+JSON. It is written under a second name and takes the place of the one before when it is complete.
+"""
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
+from splatseg.lift.training._adam import RowMoments
+
+FORMAT = "splatseg-training"
+VERSION = 1
+"""Version of the files written. No other is read: a training is resumed by the program it began
+in."""
+
+_HEADER = "header"
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class TrainingState:
+    """Values, moments and history."""
+
+    rows: dict[str, Tensor]
+    """Arrays with a row a Gaussian."""
+
+    shared: dict[str, Tensor]
+    """All others."""
+
+    row_moments: dict[str, RowMoments]
+    shared_moments: dict[str, RowMoments]
+    """Of each shared array as a single row."""
+
+    visibility: Tensor
+    """float32 (n,), summed over draws, see `DrawnRows.visibility`."""
+
+    step: int = 0
+    """Steps done."""
+
+    draw: int = 0
+    """Draws of pixels begun."""
+
+    draw_began: int = 0
+    """Steps that were done when the last one began."""
+
+    losses: list[float] = field(default_factory=list[float])
+    scores: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])
+    """Steps done, and the score then."""
+
+    best_rows: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
+    best_shared: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
+    """Values when the score was best; empty before the first."""
+
+    @classmethod
+    def started(cls, rows: Mapping[str, Tensor], shared: Mapping[str, Tensor], count: int) -> Any:
+        """Before the first step."""
+        return cls(
+            rows={name: value.detach().clone() for name, value in rows.items()},
+            shared={name: value.detach().clone() for name, value in shared.items()},
+            row_moments={name: RowMoments.zeros(value) for name, value in rows.items()},
+            shared_moments={
+                name: RowMoments.zeros(value.reshape(1, -1)) for name, value in shared.items()
+            },
+            visibility=torch.zeros(count),
+        )
+
+    def arrays(self) -> dict[str, Tensor]:
+        """All tensors, by name."""
+        found = {"visibility": self.visibility}
+        for kind, values, moments, best in (
+            ("rows", self.rows, self.row_moments, self.best_rows),
+            ("shared", self.shared, self.shared_moments, self.best_shared),
+        ):
+            for name, value in values.items():
+                state = moments[name]
+                found[f"{kind}/{name}/value"] = value
+                found[f"{kind}/{name}/first"] = state.first
+                found[f"{kind}/{name}/second"] = state.second
+                found[f"{kind}/{name}/steps"] = state.steps
+                if name in best:
+                    found[f"{kind}/{name}/best"] = best[name]
+        return found
+
+
+def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -> None:
+    """Write a training; what is there before stays until the new file is complete.
+
+    Args:
+        path: The file.
+        state: What to write.
+        identity: What the training is of, see `read_state`; values that JSON holds.
+
+    Raises:
+        SplatsegError: If it cannot be written; the one before is still there.
+    """
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "identity": dict(identity),
+        "step": state.step,
+        "draw": state.draw,
+        "draw_began": state.draw_began,
+        "losses": state.losses,
+        "scores": state.scores,
+        "best": bool(state.best_rows or state.best_shared),
+    }
+    arrays: dict[str, NDArray[Any]] = {
+        _HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)
+    }
+    arrays |= {name: tensor.cpu().numpy() for name, tensor in state.arrays().items()}
+    unfinished = path.with_name(f"{path.name}.new")
+    try:
+        with unfinished.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        unfinished.replace(path)
+    except OSError as error:
+        raise SplatsegError(f"{path}: the checkpoint cannot be written ({error}).") from error
+
+
+def discard_state(path: Path) -> None:
+    """Remove a checkpoint and what is left of an unfinished one."""
+    for file in (path, path.with_name(f"{path.name}.new")):
+        file.unlink(missing_ok=True)
+
+
+def read_state(path: Path, start: TrainingState, identity: Mapping[str, Any]) -> TrainingState:
+    """Read a training. Inverse of `write_state`.
+
+    Args:
+        path: The file.
+        start: The training before its first step, for names and shapes.
+        identity: What is to be trained: its options, seed and digest of the data. Options that
+            the file does not name count as the defaults in ``identity["defaults"]``.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no checkpoint, damaged, or of another version.
+        InputError: If it is of another training.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"{path}: there is no such checkpoint.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise FileFormatError(f"{path}: {damaged} is damaged.")
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(bytes(arrays.pop(_HEADER)))
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise FileFormatError(
+            f"{path}: expected the checkpoint of a training, but it is damaged or none ({error})."
+        ) from error
+    _check_header(path, header, identity)
+    _fill(path, start, arrays, best=header["best"])
+    start.step, start.draw = int(header["step"]), int(header["draw"])
+    start.draw_began = int(header["draw_began"])
+    start.losses = [float(loss) for loss in header["losses"]]
+    start.scores = [(int(step), float(score)) for step, score in header["scores"]]
+    return start
+
+
+def _check_header(path: Path, header: Any, identity: Mapping[str, Any]) -> None:
+    if not isinstance(header, dict) or cast(dict[str, Any], header).get("format") != FORMAT:
+        raise FileFormatError(f"{path}: expected the checkpoint of a training, got another file.")
+    found = cast(dict[str, Any], header)
+    if found.get("version") != VERSION:
+        raise FileFormatError(
+            f"{path}: expected a checkpoint of version {VERSION}, got version "
+            f"{found.get('version')!r}; another splatseg wrote it."
+        )
+    saved = found["identity"]
+    if saved["data"] != identity["data"]:
+        raise InputError(f"{path}: expected a training of this scene and evidence, got of another.")
+    for name, value in identity["options"].items():
+        before = saved["options"].get(name, identity["defaults"].get(name, value))
+        if before != value:
+            raise InputError(
+                f"{path}: expected a training with {name} {value!r}, got one with {before!r}."
+            )
+
+
+def _fill(path: Path, start: TrainingState, arrays: dict[str, NDArray[Any]], *, best: bool) -> None:
+    if best:
+        start.best_rows = {name: torch.empty_like(v) for name, v in start.rows.items()}
+        start.best_shared = {name: torch.empty_like(v) for name, v in start.shared.items()}
+    for name, tensor in start.arrays().items():
+        saved = arrays.get(name)
+        wanted = str(tensor.dtype).removeprefix("torch.")
+        if saved is None or saved.shape != tuple(tensor.shape) or str(saved.dtype) != wanted:
+            got = "none" if saved is None else f"{saved.dtype} of {saved.shape}"
+            raise FileFormatError(
+                f"{path}: expected an array {name!r}, {wanted} of {tuple(tensor.shape)}, got {got}."
+            )
+        tensor.copy_(torch.from_numpy(saved))

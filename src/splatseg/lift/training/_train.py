@@ -1,0 +1,322 @@
+"""The loop: draw, step, score, stop."""
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.errors import InputError
+from splatseg.lift.training._adam import AdamConstants, RowAdam
+from splatseg.lift.training._model import Model, Values
+from splatseg.lift.training._options import TrainingOptions, rate_factor
+from splatseg.lift.training._sampler import Batch, DrawnRows, RowSampler, held_out_views
+from splatseg.lift.training._state import TrainingState, discard_state, read_state, write_state
+
+# What the generators of a training are seeded with besides the seed and a number.
+_DRAW, _ORDER, _STEP, _HELD_OUT, _SCORE = range(5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingProgress:
+    """Where a training is."""
+
+    step: int
+    """Steps done."""
+
+    steps: int
+    """Steps at most."""
+
+    loss: float
+    """Of the last step."""
+
+    score: float | None
+    """The last score on held-out views; None before the first."""
+
+    best_score: float | None
+    """The best so far."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrainingResult:
+    """What was learnt."""
+
+    rows: Mapping[str, Float[Tensor, "n channels"]]
+    """Arrays with a row a Gaussian, by name."""
+
+    shared: Mapping[str, Tensor]
+    """All others, by name."""
+
+    visibility: Float[Tensor, "n"]
+    """Blending weight of each Gaussian in the pixels that there is something to learn of, summed
+    over the views learnt from and estimated from the drawn pixels; 0 where none shows it."""
+
+    losses: Sequence[float]
+    """Of each step."""
+
+    scores: Sequence[tuple[int, float]]
+    """Steps done, and the score on held-out views then."""
+
+    best_step: int
+    """Steps after which the result's values were reached."""
+
+    stopped: Literal["steps", "patience"]
+    """Whether all steps were done, or scores had got no better for the stated patience."""
+
+
+def train(
+    model: Model,
+    sampler: RowSampler,
+    *,
+    options: TrainingOptions | None = None,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    progress: Callable[[TrainingProgress], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> TrainingResult:
+    """Train a model on rows of W.
+
+    Same seed, same result, whatever the number of threads, and whether it was interrupted and
+    resumed or not.
+
+    Args:
+        model: What is trained.
+        sampler: Where pixels come from. A share of its views is held out.
+        options: How training goes.
+        seed: Of drawn pixels, the order of batches and the model's random choices.
+        checkpoint: Where the state is kept while it goes on; removed at the end.
+        resume: Go on from the checkpoint, which must be there.
+        settings: What else must be the same to resume, in values that JSON holds: the model's
+            own options.
+        progress: Told after each step.
+        cancelled: Asked after each step; where it says so, a checkpoint is written.
+
+    Raises:
+        KeyboardInterrupt: If it was cancelled.
+        InputError: If a checkpoint is of another training, or resuming is asked for without one.
+        MissingFileError: If there is no checkpoint to resume.
+        FileFormatError: If the checkpoint is damaged.
+    """
+    options = options or TrainingOptions()
+    if resume and checkpoint is None:
+        raise InputError("resume: expected a checkpoint to resume from, got none.")
+    run = _Run(model, sampler, options, seed)
+    identity = _identity(sampler, options, seed, settings or {}) if checkpoint else {}
+    if checkpoint is not None and resume:
+        run.state = read_state(checkpoint, run.state, identity)
+    try:
+        while not run.finished:
+            run.advance()
+            if progress is not None:
+                progress(run.progress())
+            if checkpoint is not None and run.state.step % options.checkpoint_every == 0:
+                write_state(checkpoint, run.state, identity)
+            if cancelled is not None and not run.finished and cancelled():
+                if checkpoint is not None:
+                    write_state(checkpoint, run.state, identity)
+                raise KeyboardInterrupt
+    finally:
+        run.close()
+    if checkpoint is not None:
+        discard_state(checkpoint)
+    return run.result()
+
+
+def _identity(
+    sampler: RowSampler, options: TrainingOptions, seed: int, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    given = asdict(options)
+    del given["checkpoint_every"]  # when it was saved does not change what was
+    return {
+        "data": sampler.fingerprint,
+        "options": {"seed": seed} | given | dict(settings),
+        "defaults": {field.name: field.default for field in fields(TrainingOptions)},
+    }
+
+
+class _Run:
+    """One training under way."""
+
+    def __init__(
+        self, model: Model, sampler: RowSampler, options: TrainingOptions, seed: int
+    ) -> None:
+        kept, held_out = held_out_views(sampler.views, options.held_out)
+        self._model = model
+        self._options = options
+        self._seed = seed
+        self._sampler = sampler.of_views(kept)
+        self._held_out = sampler.of_views(held_out) if held_out else None
+        self._scored: list[Batch] = []
+        self._drawn: DrawnRows | None = None
+        self._rates = {
+            name: parameter.rate
+            for name, parameter in {**model.row_parameters, **model.shared_parameters}.items()
+        }
+        constants = AdamConstants(beta1=options.beta1, beta2=options.beta2, epsilon=options.epsilon)
+        self._adam = RowAdam(constants, max_steps=options.steps)
+        self.state: TrainingState = TrainingState.started(
+            {name: parameter.start for name, parameter in model.row_parameters.items()},
+            {name: parameter.start for name, parameter in model.shared_parameters.items()},
+            sampler.count,
+        )
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing more to do."""
+        return self.state.step >= self._options.steps or self._out_of_patience
+
+    @property
+    def _out_of_patience(self) -> bool:
+        patience, scores = self._options.patience, self.state.scores
+        return patience > 0 and len(scores) - 1 - self._best_index >= patience
+
+    @property
+    def _best_index(self) -> int:
+        """Index of the best score: the last that exceeded the best before it by the gain."""
+        best = 0
+        for index, (_, score) in enumerate(self.state.scores):
+            if score > self.state.scores[best][1] + self._options.min_gain:
+                best = index
+        return best
+
+    def advance(self) -> None:
+        """One step, and a score where it is time for one."""
+        state, options = self.state, self._options
+        batch = self._next_batch()
+        state.step += 1
+        with _single_threaded():
+            self._step(batch)
+        last = state.step == options.steps
+        due = state.step % options.score_every == 0 or last
+        if self._held_out is not None and due:
+            self._score()
+
+    def progress(self) -> TrainingProgress:
+        """Where it is."""
+        scores = self.state.scores
+        return TrainingProgress(
+            step=self.state.step,
+            steps=self._options.steps,
+            loss=self.state.losses[-1],
+            score=scores[-1][1] if scores else None,
+            best_score=scores[self._best_index][1] if scores else None,
+        )
+
+    def result(self) -> TrainingResult:
+        """What was learnt."""
+        state = self.state
+        best = self._options.patience > 0 and bool(state.scores)
+        return TrainingResult(
+            rows=state.best_rows if best else state.rows,
+            shared=state.best_shared if best else state.shared,
+            visibility=state.visibility / max(state.draw, 1),
+            losses=tuple(state.losses),
+            scores=tuple(state.scores),
+            best_step=state.scores[self._best_index][0] if best else state.step,
+            stopped="patience" if self._out_of_patience else "steps",
+        )
+
+    def close(self) -> None:
+        """Remove what was drawn."""
+        if self._drawn is not None:
+            self._drawn.close()
+
+    def _rng(self, kind: int, *numbers: int) -> np.random.Generator:
+        """A generator of its own for each thing, so that nothing depends on what came before."""
+        return np.random.default_rng((self._seed, kind, *numbers))
+
+    def _draw(self, number: int) -> DrawnRows:
+        return self._sampler.draw(self._rng(_DRAW, number), batch=self._options.batch)
+
+    def _next_batch(self) -> Batch:
+        state, passes = self.state, self._options.passes
+        if self._drawn is None and state.draw:  # resumed: the same draw again
+            self._drawn = self._draw(state.draw)
+        since = state.step - state.draw_began
+        if self._drawn is None or (passes and since >= passes * len(self._drawn)):
+            self.close()
+            state.draw += 1
+            state.draw_began = state.step
+            self._drawn = self._draw(state.draw)
+            state.visibility += self._drawn.visibility(len(state.visibility))
+            since = 0
+        number, position = divmod(since, len(self._drawn))
+        order = self._rng(_ORDER, state.draw, number).permutation(len(self._drawn))
+        return self._drawn.batch(int(order[position]))
+
+    def _step(self, batch: Batch) -> None:
+        state = self.state
+        values = Values(
+            state.rows,
+            state.shared,
+            rng=self._rng(_STEP, state.step),
+            step=state.step,
+            differentiable=True,
+        )
+        loss = self._model.loss(batch, values)
+        loss.backward()
+        state.losses.append(float(loss.detach()))
+        factor = rate_factor(state.step, self._options)
+        for name, value in state.rows.items():
+            rows, gradient = values.row_gradients(name)
+            rate = self._rates[name] * factor
+            moments = state.row_moments[name]
+            self._adam.step(value, moments, rows=rows, gradient=gradient, rate=rate)
+        only = torch.zeros(1, dtype=torch.int64)
+        for name, value in state.shared.items():
+            gradient = values.shared[name].grad
+            if gradient is None:
+                continue
+            self._adam.step(
+                value.view(1, -1),
+                state.shared_moments[name],
+                rows=only,
+                gradient=gradient.reshape(1, -1),
+                rate=self._rates[name] * factor,
+            )
+
+    def _score(self) -> None:
+        state = self.state
+        if self._held_out is None:
+            return
+        if not self._scored:
+            with self._held_out.draw(
+                self._rng(_HELD_OUT),
+                batch=self._options.batch,
+                pixels=self._options.held_out_pixels,
+            ) as drawn:
+                self._scored = [drawn.batch(index) for index in range(len(drawn))]
+        values = Values(
+            state.rows,
+            state.shared,
+            rng=self._rng(_SCORE, state.step),
+            step=state.step,
+            differentiable=False,
+        )
+        with torch.no_grad(), _single_threaded():
+            score = self._model.score(self._scored, values)
+        state.scores.append((state.step, float(score)))
+        if self._options.patience > 0 and self._best_index == len(state.scores) - 1:
+            state.best_rows = {name: value.clone() for name, value in state.rows.items()}
+            state.best_shared = {name: value.clone() for name, value in state.shared.items()}
+
+
+@contextmanager
+def _single_threaded() -> Generator[None]:
+    """Torch sums in one thread, so that results do not depend on how many there are.
+
+    Kernels of this library share their work among threads all the same, in a fixed order.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,167 @@
+"""From label maps to trained features with a head: what methods trained on label maps share."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, Layer, View
+from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.mass.adjoint import voting_views
+from splatseg.lift.training import (
+    LabelTargets,
+    Model,
+    RowSampler,
+    TrainingProgress,
+    TrainingResult,
+    train,
+)
+from splatseg.methods._method import MethodInputs
+from splatseg.methods._trained_options import LabelTrainingOptions
+from splatseg.render import RenderOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingContext:
+    """What a training on label maps gets besides its data and options."""
+
+    render_options: RenderOptions | None = None
+    """Switches of the blending model."""
+
+    backend: str = "auto"
+    """Name of the rendering backend."""
+
+    progress: Callable[[TrainingProgress], None] | None = None
+    """Told after each step."""
+
+    cancelled: Callable[[], bool] | None = None
+    """Asked after each step."""
+
+    checkpoint: Path | None = None
+    """Where the state is kept while training goes on."""
+
+    resume: bool = False
+    """Go on from the checkpoint."""
+
+    seed: int = 0
+    """Of the pixels, the first values and the order of batches."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LabelData:
+    """Label maps ready to be drawn from."""
+
+    sampler: RowSampler
+    ids: Int64[Tensor, "classes"]
+    """All ids, ascending."""
+
+    views: Sequence[View]
+    """In the order of their names."""
+
+
+def label_data(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: LabelSource,
+    *,
+    options: LabelTrainingOptions,
+    context: TrainingContext,
+) -> LabelData:
+    """Check the views and find all ids.
+
+    Raises:
+        InputError: If there are no views, if one has no label map, or no pixel has a label.
+    """
+    ordered = voting_views(views, evidence, "a label map")
+    source = LabelTargets(evidence, [view.name for view in ordered])
+    sampler = RowSampler(
+        gaussians,
+        ordered,
+        source,
+        options=options.drawing(),
+        render_options=context.render_options,
+        backend=context.backend,
+    )
+    return LabelData(sampler=sampler, ids=source.ids, views=ordered)
+
+
+def train_labels(
+    data: LabelData,
+    model: Model,
+    *,
+    options: LabelTrainingOptions,
+    settings: dict[str, Any],
+    context: TrainingContext,
+) -> TrainingResult:
+    """Train a model on label maps, see `splatseg.lift.training.train`."""
+    return train(
+        model,
+        data.sampler,
+        options=options.training(),
+        seed=context.seed,
+        checkpoint=context.checkpoint,
+        resume=context.resume,
+        settings=settings,
+        progress=context.progress,
+        cancelled=context.cancelled,
+    )
+
+
+def layer_metadata(
+    method: str,
+    options: dict[str, Any],
+    data: LabelData,
+    result: TrainingResult,
+    *,
+    classes: ClassTable | None,
+    seed: int,
+) -> dict[str, Any]:
+    """How a layer was made, in values that JSON holds."""
+    known = () if classes is None else classes.rows
+    present = set(data.ids.tolist())
+    return {
+        "method": method,
+        "options": options,
+        "views": [view.name for view in data.views],
+        "names": {str(row.id): row.name for row in known if row.id in present},
+        "seed": seed,
+        "loss": float(np.mean(result.losses[-20:])),
+        "steps": len(result.losses),
+        "best_step": result.best_step,
+        "stopped": result.stopped,
+        "scores": [[step, score] for step, score in result.scores],
+    }
+
+
+def features_layer(
+    values: Float[Tensor, "n channels"], result: TrainingResult, metadata: dict[str, Any]
+) -> Features:
+    """Trained values as a layer; Gaussians that no drawn pixel shows have a weight of 0."""
+    return Features(values=values, weights=result.visibility, metadata=metadata)
+
+
+def context_of(inputs: MethodInputs) -> TrainingContext:
+    """What a method was given, as a training takes it."""
+    told = inputs.progress
+
+    def tell(state: TrainingProgress) -> None:
+        if told is not None:
+            told(state.step, state.steps)
+
+    return TrainingContext(backend=inputs.backend, progress=tell, seed=inputs.seed)
+
+
+def hard_labels(features: Features, options: LabelTrainingOptions) -> Labels:
+    """Each Gaussian's most likely id, by the head that the layer holds."""
+    kept = {name: value for name, value in features.metadata.items() if name != "head"}
+    head = ClassifierHead.of(features)
+    return head.labels(features, min_share=options.min_share, metadata=kept)
+
+
+def layer_of(features: Features, options: LabelTrainingOptions) -> Layer:
+    """The layer that the options ask for."""
+    return features if options.readout == "rendered" else hard_labels(features, options)

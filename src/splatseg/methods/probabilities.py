@@ -1,0 +1,61 @@
+r"""Probabilities of each Gaussian's own, trained on label maps; see `methods._trained_logits`.
+
+.. math:: \ell_p = -\log \frac{\sum_i w_{pi}\, \mathrm{softmax}(z_i)_{\mathrm{id}(p)}}
+                              {\sum_i w_{pi}}
+"""
+
+from collections.abc import Sequence
+
+from splatseg.core import ClassTable, Features, Gaussians, LabelSource, Layer, View
+from splatseg.methods._method import Method, MethodInputs
+from splatseg.methods._trained_labels import TrainingContext as TrainingContext
+from splatseg.methods._trained_labels import context_of, layer_of
+from splatseg.methods._trained_logits import LogitOptions as LogitOptions
+from splatseg.methods._trained_logits import train_own_logits
+
+
+def train_probabilities(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: LabelSource,
+    *,
+    options: LogitOptions | None = None,
+    classes: ClassTable | None = None,
+    context: TrainingContext | None = None,
+) -> Features:
+    """Train probabilities of Gaussians on label maps, see `train_own_logits`."""
+    return train_own_logits(
+        "probabilities",
+        "probabilities",
+        gaussians=gaussians,
+        views=views,
+        evidence=evidence,
+        options=options,
+        classes=classes,
+        context=context,
+    )
+
+
+def run(inputs: MethodInputs, options: LogitOptions) -> Layer:
+    """Train them, and read them as the options say."""
+    features = train_probabilities(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,
+        options=options,
+        classes=inputs.label_names,
+        context=context_of(inputs),
+    )
+    return layer_of(features, options)
+
+
+METHOD = Method(
+    name="probabilities",
+    summary="a logit of each id for every Gaussian, whose probabilities are rendered; no network",
+    reference="docs/training.md",
+    evidence=("labels", "tracked"),
+    options=LogitOptions,
+    run=run,
+    keeps_ids=True,
+    seeded=True,
+)

@@ -1,0 +1,442 @@
+"""The loop: gradients, shared and row-wise arrays, early stopping, checkpoints, schedules."""
+
+import json
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg import _native
+from splatseg.core import LabelMap, View
+from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, SplatsegError
+from splatseg.lift.training import (
+    Batch,
+    LabelTargets,
+    Parameter,
+    RowSampler,
+    SamplingOptions,
+    TrainingOptions,
+    Values,
+    train,
+)
+from splatseg.lift.training._options import rate_factor
+
+from .conftest import BACKEND, Maps, camera_at, random_gaussians, random_maps
+
+IDS = (3, 8, 900)
+N = 14
+
+
+class Regression:
+    """Rendered values times a shared scale, plus a pull on rows of its own choice."""
+
+    def __init__(self, *, rate: float = 0.01, scores: Sequence[float] = ()) -> None:
+        self.row_parameters = {
+            "values": Parameter(start=torch.linspace(-1, 1, N * 2).reshape(N, 2), rate=rate)
+        }
+        self.shared_parameters = {"scale": Parameter(start=torch.tensor([[1.5, 0.5]]), rate=rate)}
+        self.scores = list(scores)
+        self.seen: list[Batch] = []
+        self.drawn: list[int] = []
+        self.scored: list[list[Batch]] = []
+
+    def loss(self, batch: Batch, values: Values) -> torch.Tensor:
+        self.seen.append(batch)
+        rendered = values.render("values", batch) * values.shared["scale"]
+        picked = torch.from_numpy(np.sort(values.rng.choice(N, 4, replace=False)))
+        self.drawn.append(int(picked[0]))
+        pull = values.rows("values", picked).square().sum()
+        target = batch.target("label").float()[:, None]
+        return (rendered - target).square().mean() + 0.1 * pull
+
+    def score(self, batches: Sequence[Batch], values: Values) -> float:
+        self.scored.append(list(batches))
+        if self.scores:
+            return self.scores[len(self.scored) - 1]
+        total = sum(
+            float((values.render("values", b) * values.shared["scale"]).square().sum())
+            for b in batches
+        )
+        return -total
+
+
+def sampler_of(gaussians, views, maps, **options) -> RowSampler:
+    source = LabelTargets(maps, [view.name for view in views])
+    return RowSampler(gaussians, views, source, options=SamplingOptions(**options), backend=BACKEND)
+
+
+@pytest.fixture
+def sampler(rng, views) -> RowSampler:
+    return sampler_of(random_gaussians(rng, N), views, random_maps(rng, views, IDS), pixels=60)
+
+
+def many_views(rng, count: int) -> RowSampler:
+    views = [
+        View(name=f"v{i}", camera=camera_at(x)) for i, x in enumerate(np.linspace(-1, 1, count))
+    ]
+    return sampler_of(random_gaussians(rng, N), views, random_maps(rng, views, IDS), pixels=40)
+
+
+SHORT = {"steps": 12, "batch": 50, "held_out": 0.0, "patience": 0}
+
+
+def test_gradients_are_those_of_the_dense_loss(rng, sampler) -> None:
+    """Rows asked for twice, shared arrays, and the product: against autograd on dense W."""
+    model = Regression()
+    with sampler.draw(rng, batch=1000) as drawn:
+        batch = drawn.batch(0)
+    start = model.row_parameters["values"].start
+    scale = model.shared_parameters["scale"].start
+    values = Values(
+        {"values": start},
+        {"scale": scale},
+        rng=np.random.default_rng(1),
+        step=1,
+        differentiable=True,
+    )
+    model.loss(batch, values).backward()
+    rows, gradient = values.row_gradients("values")
+
+    full, leaf = start.double().requires_grad_(), scale.double().requires_grad_()
+    matrix = torch.zeros(len(batch), N, dtype=torch.float64)
+    matrix[:, batch.weights.touched] = batch.weights.product(
+        torch.eye(len(batch.weights.touched))
+    ).double()
+    picked = np.sort(np.random.default_rng(1).choice(N, 4, replace=False))
+    target = batch.target("label").double()[:, None]
+    loss = (matrix @ full * leaf - target).square().mean()
+    loss = loss + 0.1 * full[torch.from_numpy(picked)].square().sum()
+    loss.backward()
+    mine = torch.zeros(N, 2)
+    mine[rows] = gradient
+    assert rows.tolist() == sorted(set(rows.tolist()))
+    torch.testing.assert_close(mine.double(), full.grad, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(
+        values.shared["scale"].grad.double(), leaf.grad, rtol=1e-4, atol=1e-6
+    )
+
+
+def test_finite_differences_of_the_product(rng, sampler) -> None:
+    with sampler.draw(rng, batch=1000) as drawn:
+        weights = drawn.batch(0).weights
+    signal = torch.from_numpy(rng.normal(size=(len(weights.touched), 3)).astype(np.float32))
+    image = torch.from_numpy(rng.normal(size=(len(weights), 3)).astype(np.float32))
+    leaf = signal.clone().requires_grad_()
+    (weights.product(leaf) * image).sum().backward()
+    for index in ((0, 0), (3, 2), (len(signal) - 1, 1)):
+        moved = signal.clone()
+        moved[index] += 1.0  # linear: any step is exact
+        difference = (weights.product(moved) - weights.product(signal)).double() * image
+        assert float(difference.sum()) == pytest.approx(float(leaf.grad[index]), rel=1e-3, abs=1e-4)
+
+
+def test_a_step_is_adam_on_touched_rows_and_shared_arrays(sampler) -> None:
+    """The first step of Adam moves each touched number by one rate against its gradient."""
+    model = Regression(rate=0.01)
+    result = train(model, sampler, options=TrainingOptions(**SHORT | {"steps": 1}), seed=3)
+    moved = result.rows["values"] - model.row_parameters["values"].start
+    size = moved.abs()
+    touched = torch.zeros(N, dtype=torch.bool)
+    touched[model.seen[0].weights.touched] = True
+    assert bool(((size - 0.01).abs() < 1e-4)[touched].all())
+    scale = result.shared["scale"] - model.shared_parameters["scale"].start
+    torch.testing.assert_close(scale.abs(), torch.full((1, 2), 0.01), rtol=1e-3, atol=0)
+    assert model.row_parameters["values"].start[0, 0] == -1  # starts are not written to
+
+
+def test_batches_of_a_draw_come_once_a_pass_and_then_anew(sampler) -> None:
+    def pixels(passes: int, steps: int) -> list[tuple]:
+        model = Regression()
+        options = TrainingOptions(**SHORT | {"steps": steps, "passes": passes})
+        train(model, sampler, options=options, seed=1)
+        return [tuple((b.views * 1000 + b.pixels).tolist()) for b in model.seen]
+
+    # 180 pixels in batches of 50: 4 a pass.
+    once = pixels(0, 12)
+    assert len(set(once)) == 4
+    assert len(set(once[:4])) == len(set(once[4:8])) == 4
+    assert once[:4] != once[4:8]  # another order
+    twice = pixels(2, 12)
+    assert set(twice[:4]) == set(twice[4:8])
+    assert not set(twice[4:8]) & set(twice[8:])
+    fresh = pixels(1, 12)
+    assert len(set(fresh)) == 12
+    assert fresh[:4] == twice[:4] == once[:4]
+
+
+def test_early_stopping_by_hand(rng) -> None:
+    """Scores 1 3 2 3 2.9: the second is the best, and after three no better ones it ends."""
+    sampler = many_views(rng, 10)
+    model = Regression(scores=[1.0, 3.0, 2.0, 3.0, 2.9, 9.0])
+    values = []
+    options = TrainingOptions(
+        steps=100, batch=50, held_out=0.2, held_out_pixels=7, score_every=4, patience=3
+    )
+    result = train(
+        model,
+        sampler,
+        options=options,
+        progress=lambda state: values.append((state.step, state.score, state.best_score)),
+    )
+    assert result.scores == ((4, 1.0), (8, 3.0), (12, 2.0), (16, 3.0), (20, 2.9))
+    assert (result.stopped, result.best_step, len(result.losses)) == ("patience", 8, 20)
+    assert values[2] == (3, None, None)
+    assert values[19] == (20, 2.9, 3.0)
+    best = train(
+        Regression(),
+        sampler,
+        options=TrainingOptions(steps=8, batch=50, held_out=0.2, patience=0, score_every=4),
+    )
+    assert torch.equal(result.rows["values"], best.rows["values"])
+    assert torch.equal(result.shared["scale"], best.shared["scale"])
+    # Two of ten views are held out, never learnt from, and always the same pixels are scored.
+    scored = model.scored[0]
+    assert sum(len(batch) for batch in scored) == 14
+    assert all(one is other for one, other in zip(scored, model.scored[-1], strict=True))
+    assert all(int(batch.views.max()) <= 7 for batch in model.seen)
+
+    greedy = Regression(scores=[1.0, 1.05, 1.09, 1.3, 1.2, 1.2])
+    options = TrainingOptions(
+        steps=100, batch=50, held_out=0.2, score_every=1, patience=2, min_gain=0.1
+    )
+    result = train(greedy, sampler, options=options)
+    assert (result.best_step, len(result.losses)) == (1, 3)
+
+    never = Regression(scores=[5.0] + [1.0] * 20)
+    options = TrainingOptions(steps=10, batch=50, held_out=0.2, score_every=3, patience=0)
+    result = train(never, sampler, options=options)
+    assert [step for step, _ in result.scores] == [3, 6, 9, 10]
+    assert (result.stopped, result.best_step, len(result.losses)) == ("steps", 10, 10)
+
+
+def test_no_view_is_held_out_of_too_few(sampler) -> None:
+    model = Regression()
+    result = train(model, sampler, options=TrainingOptions(steps=5, batch=50, score_every=1))
+    assert result.scores == ()
+    assert len(result.losses) == 5
+    assert {int(v) for b in model.seen for v in b.views} == {0, 1, 2}
+
+
+class Stop:
+    """Cancels after some steps."""
+
+    def __init__(self, steps: int) -> None:
+        self.left = steps
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        return self.left == 0
+
+
+@pytest.mark.parametrize("passes", [0, 2])
+@pytest.mark.parametrize("stop", [3, 9, 11])
+def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
+    sampler = many_views(rng, 6)
+    options = TrainingOptions(
+        steps=25, batch=50, passes=passes, held_out=0.34, score_every=4, patience=9,
+        schedule="cosine", warmup=3, held_out_pixels=10, checkpoint_every=100,
+    )  # fmt: skip
+    whole_model = Regression()
+    whole = train(whole_model, sampler, options=options, seed=5)
+    path = tmp_path / "training.npz"
+    with pytest.raises(KeyboardInterrupt):
+        train(Regression(), sampler, options=options, seed=5, checkpoint=path, cancelled=Stop(stop))
+    assert path.is_file()
+    model = Regression()
+    steps = []
+    again = train(
+        model, sampler, options=options, seed=5, checkpoint=path, resume=True,
+        progress=lambda state: steps.append(state.step),
+    )  # fmt: skip
+    assert steps == list(range(stop + 1, 26))
+    assert model.drawn == whole_model.drawn[stop:]
+    assert torch.equal(whole.rows["values"], again.rows["values"])
+    assert torch.equal(whole.shared["scale"], again.shared["scale"])
+    assert torch.equal(whole.visibility, again.visibility)
+    assert (whole.losses, whole.scores) == (again.losses, again.scores)
+    assert (whole.best_step, whole.stopped) == (again.best_step, again.stopped)
+    assert not list(tmp_path.iterdir())  # done: nothing is left to resume
+
+
+def test_checkpoints_are_written_every_so_often(sampler, tmp_path) -> None:
+    path, found = tmp_path / "training.npz", []
+    options = TrainingOptions(**SHORT | {"checkpoint_every": 4})
+    train(
+        Regression(), sampler, options=options, checkpoint=path,
+        progress=lambda state: found.append(path.is_file()),
+    )  # fmt: skip
+    assert found == [False] * 4 + [True] * 8  # told before the one of its own step is written
+
+
+def test_a_broken_write_leaves_the_older_checkpoint(sampler, tmp_path, monkeypatch) -> None:
+    path = tmp_path / "training.npz"
+    options = TrainingOptions(**SHORT | {"checkpoint_every": 2})
+
+    def fails(file, *_args, **_kwargs) -> None:
+        file.write(b"half")
+        raise OSError("full")
+
+    with pytest.raises(KeyboardInterrupt):
+        train(Regression(), sampler, options=options, checkpoint=path, cancelled=Stop(3))
+    before = path.read_bytes()
+    monkeypatch.setattr(np, "savez", fails)
+    with pytest.raises(SplatsegError, match="cannot be written"):
+        train(Regression(), sampler, options=options, checkpoint=path, resume=True)
+    assert path.read_bytes() == before
+
+
+def test_a_checkpoint_of_another_training_is_refused(rng, views, sampler, tmp_path) -> None:
+    path = tmp_path / "training.npz"
+    options = TrainingOptions(**SHORT)
+
+    def run(which=sampler, *, seed=0, settings=None, resume=True, cancelled=None, **changes):
+        return train(
+            Regression(), which, options=TrainingOptions(**SHORT | changes), seed=seed,
+            checkpoint=path, resume=resume, settings=settings, cancelled=cancelled,
+        )  # fmt: skip
+
+    with pytest.raises(MissingFileError, match="no such checkpoint"):
+        run()
+    with pytest.raises(InputError, match="expected a checkpoint to resume from"):
+        train(Regression(), sampler, options=options, resume=True)
+    with pytest.raises(KeyboardInterrupt):
+        run(settings={"blend": "a"}, resume=False, cancelled=Stop(2))
+    with pytest.raises(InputError, match="with seed 1, got one with 0"):
+        run(seed=1, settings={"blend": "a"})
+    with pytest.raises(InputError, match="with blend 'b', got one with 'a'"):
+        run(settings={"blend": "b"})
+    with pytest.raises(InputError, match=r"with beta1 0\.5, got one with 0\.9"):
+        run(settings={"blend": "a"}, beta1=0.5)
+    other = sampler_of(random_gaussians(rng, N), views, random_maps(rng, views, IDS), pixels=60)
+    with pytest.raises(InputError, match="of this scene and evidence"):
+        run(other, settings={"blend": "a"})
+
+    saved = path.read_bytes()
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(bytes(arrays["header"]))
+    assert "beta1" in header["identity"]["options"]
+
+    def rewritten(change) -> None:
+        edited = json.loads(json.dumps(header))
+        change(edited)
+        text = np.frombuffer(json.dumps(edited).encode(), np.uint8)
+        np.savez(path, **arrays | {"header": text})
+
+    # An option that the file does not know yet counts as its default.
+    rewritten(lambda edited: edited["identity"]["options"].pop("beta1"))
+    with pytest.raises(InputError, match=r"with beta1 0\.5, got one with 0\.9"):
+        run(settings={"blend": "a"}, beta1=0.5)
+    assert len(run(settings={"blend": "a"}).losses) == 12
+
+    rewritten(lambda edited: edited.update(version=2))
+    with pytest.raises(FileFormatError, match="of version 1, got version 2"):
+        run(settings={"blend": "a"})
+    rewritten(lambda edited: edited.update(format="other"))
+    with pytest.raises(FileFormatError, match="got another file"):
+        run(settings={"blend": "a"})
+    np.savez(path, **{k: v for k, v in arrays.items() if k != "rows/values/first"})
+    with pytest.raises(FileFormatError, match="rows/values/first"):
+        run(settings={"blend": "a"})
+    for damaged in (saved[:200], b"none", saved[:-2000] + bytes(2000)):
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match="damaged"):
+            run(settings={"blend": "a"})
+
+
+def test_same_seed_same_result_on_any_number_of_threads(rng) -> None:
+    sampler = many_views(rng, 5)
+    before, torch_before = _native.threads(), torch.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 3):
+            _native.set_threads(threads)
+            torch.set_num_threads(threads)
+            options = TrainingOptions(steps=10, batch=50, held_out=0.2, score_every=5)
+            found.append(train(Regression(), sampler, options=options, seed=2))
+            assert torch.get_num_threads() == threads
+    finally:
+        _native.set_threads(before)
+        torch.set_num_threads(torch_before)
+    first, second = found
+    assert torch.equal(first.rows["values"], second.rows["values"])
+    assert (first.losses, first.scores) == (second.losses, second.scores)
+    other = train(Regression(), sampler, options=options, seed=3)
+    assert other.losses != first.losses
+
+
+def test_schedules_by_hand() -> None:
+    def factors(**options) -> list[float]:
+        made = TrainingOptions(steps=6, **options)
+        return [round(rate_factor(step, made), 6) for step in range(1, 7)]
+
+    assert factors(schedule="constant") == [1.0] * 6
+    assert factors(schedule="exponential", final_rate=0.1) == [
+        round(0.1 ** (k / 5), 6) for k in range(6)
+    ]
+    cosine = factors(schedule="cosine", final_rate=0.2)
+    assert cosine == [round(0.2 + 0.4 * (1 + math.cos(math.pi * k / 5)), 6) for k in range(6)]
+    assert factors(warmup=4) == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
+    assert factors(schedule="exponential", warmup=3, final_rate=0.25) == [
+        round(1 / 3, 6), round(2 / 3, 6), 1.0, 1.0, 0.5, 0.25,
+    ]  # fmt: skip
+    assert rate_factor(1, TrainingOptions(steps=1, schedule="cosine")) == 1.0
+
+
+def test_rates_and_constants_are_heeded(sampler) -> None:
+    base = train(Regression(), sampler, options=TrainingOptions(**SHORT))
+    for change in (
+        {"schedule": "cosine"},
+        {"warmup": 5},
+        {"beta1": 0.5},
+        {"beta2": 0.9},
+        {"epsilon": 0.1},
+        {"batch": 20},
+    ):
+        other = train(Regression(), sampler, options=TrainingOptions(**SHORT | change))
+        assert not torch.equal(base.rows["values"], other.rows["values"]), change
+    still = train(Regression(rate=0.0), sampler, options=TrainingOptions(**SHORT))
+    assert torch.equal(still.rows["values"], Regression().row_parameters["values"].start)
+
+
+def test_visibility_is_the_mean_of_the_draws(rng, sampler) -> None:
+    options = TrainingOptions(**SHORT | {"passes": 1, "steps": 12})
+    result = train(Regression(), sampler, options=options, seed=4)
+    draws = []
+    for number in (1, 2, 3):
+        with sampler.draw(np.random.default_rng((4, 0, number)), batch=50) as drawn:
+            draws.append(drawn.visibility(N))
+    torch.testing.assert_close(result.visibility, torch.stack(draws).mean(dim=0))
+
+
+def test_bad_options_are_refused() -> None:
+    for wrong in (
+        {"steps": 0},
+        {"batch": 0},
+        {"passes": -1},
+        {"final_rate": 1.5},
+        {"warmup": -1},
+        {"beta1": 1.0},
+        {"beta2": -0.1},
+        {"epsilon": 0.0},
+        {"held_out": 1.0},
+        {"held_out_pixels": 0},
+        {"score_every": 0},
+        {"patience": -1},
+        {"min_gain": math.nan},
+        {"checkpoint_every": 0},
+    ):
+        with pytest.raises(RangeError, match=next(iter(wrong))):
+            TrainingOptions(**wrong)
+    with pytest.raises(RangeError, match="final_rate"):
+        TrainingOptions(schedule="exponential", final_rate=0.0)
+    with pytest.raises(InputError, match="schedule"):
+        TrainingOptions(schedule="steps")
+
+
+def test_a_scene_of_labels_no_pixel_has(views) -> None:
+    maps = Maps({view.name: LabelMap(ids=torch.full((12, 16), -1)) for view in views})
+    with pytest.raises(InputError, match="expected a labelled pixel in 3 views"):
+        LabelTargets(maps, [view.name for view in views])
