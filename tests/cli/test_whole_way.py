@@ -17,10 +17,7 @@ from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.io.splats import read_splats, write_splats
 
 CPU = ("--backend", "cpu")
-IDENTITY = (
-    *("--identity-steps", 150, "--identity-rate", 0.05),
-    *("--identity-classifier-rate", 0.02),
-)
+TRAINED = ("--steps", 200, "--pixels", 2000)
 
 
 @pytest.fixture
@@ -66,7 +63,7 @@ def test_the_fit_shows_held_out_views(room, run) -> None:
 
 @pytest.mark.parametrize(
     ("method", "options"),
-    [("uplift", ()), ("vote", ()), ("identity", IDENTITY)],
+    [("uplift", ()), ("vote", ()), ("identity", TRAINED), ("probabilities", TRAINED)],
 )
 def test_classes_of_label_maps(room, run, scored, method, options) -> None:
     words = ("--method", method, "--evidence", "labels_semantic", "--layer", "classes")
