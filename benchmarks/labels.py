@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatseg.core import LabelMap, Labels, Scene
+from splatseg.core import Gaussians, InstanceTree, LabelMap, Labels, Scene
 from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import (
@@ -188,6 +188,13 @@ def sam(bench: Bench) -> None:
     _associated(bench, "masks_sam", bench.evidence("masks_sam"))
 
 
+def _completed(gaussians: Gaussians, layer: Labels | InstanceTree) -> Labels:
+    """What `segment` gives by default; of a tree its objects."""
+    if isinstance(layer, InstanceTree):
+        return replace(layer, labels=complete(gaussians, layer.labels)).cut()
+    return complete(gaussians, layer)
+
+
 def _associated(bench: Bench, name: str, found: Evidence) -> None:
     gaussians, segments = bench.scene.gaussians, EvidenceSegments(evidence=found)
     for title, confusion in (
@@ -197,7 +204,7 @@ def _associated(bench: Bench, name: str, found: Evidence) -> None:
         bench.row(
             f"{name}, {title}",
             "instance",
-            lambda confusion=confusion: complete(
+            lambda confusion=confusion: _completed(
                 gaussians, associate(gaussians, bench.train, segments, confusion=confusion)
             ),
         )

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from labels import Bench
 
-from splatseg.core import Gaussians, Labels
+from splatseg.core import Gaussians, InstanceTree, Labels
 from splatseg.evaluate import picture_and_photograph, psnr
 from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene
@@ -39,7 +39,8 @@ def layer(bench: Bench, found: Evidence) -> Labels:
     """What segment makes of it by default."""
     gaussians = bench.scene.gaussians
     if found.kind in ("panoptic", "masks"):
-        labels = associate(gaussians, bench.train, EvidenceSegments(evidence=found))
+        made = associate(gaussians, bench.train, EvidenceSegments(evidence=found))
+        labels = made.cut() if isinstance(made, InstanceTree) else made
     else:
         votes = uplift(gaussians, bench.train, found, options=UpliftOptions(candidates=8, slots=8))
         labels = replace(correct_confusion(votes), candidates=None, shares=None)

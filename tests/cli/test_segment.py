@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Labels, MaskSet, Rle, Segment
+from splatseg.core import InstanceTree, Labels, MaskSet, Rle, Segment
 from splatseg.io.evidence import save_masks, save_segments
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.io.splats import read_splats
@@ -18,6 +18,8 @@ TRAIN = ("train_0", "train_1", "train_3")
 
 def layer_of(scene, name: str) -> Labels:
     layer = load_scene_layer(scene, name)
+    if isinstance(layer, InstanceTree):
+        return layer.cut()
     assert isinstance(layer, Labels)
     return layer
 

@@ -12,9 +12,10 @@ import torch
 from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import ConfusionOptions
+from splatseg.lift.segments.ballots import majority
 from splatseg.lift.segments.shared import shared_masses
 from splatseg.lift.segments.table import SegmentTable, segment_table
-from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, _labels, associate
+from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
 
 from .conftest import camera_at, gaussians_at
 
@@ -208,8 +209,8 @@ def test_large_segments_are_read_on_a_coarser_grid(overlapping) -> None:
             )
         of[view.name] = found
     source = Segments(of, overlapping=overlapping)
-    full = run(source, large, longest_side=10_000)
-    coarse = run(source, large, longest_side=64)
+    full = run(source, large, longest_side=10_000, overlapping="flat")
+    coarse = run(source, large, longest_side=64, overlapping="flat")
     assert groups(full.ids) == groups(coarse.ids) == THINGS
     assert full.evidence is not None
     assert coarse.evidence is not None
@@ -289,7 +290,7 @@ def test_votes_become_a_soft_layer() -> None:
     import scipy.sparse
 
     votes = scipy.sparse.csr_matrix(np.array([[1.0, 3, 0, 0], [2, 0, 2, 0], [0, 0, 0, 0]]))
-    labels = _labels(votes)
+    labels = majority(votes)
     assert labels.ids.tolist() == [2, 1, -1]
     assert labels.candidates is not None
     assert labels.candidates[:, :3].tolist() == [[2, 1, -1], [1, 3, -1], [-1, -1, -1]]
@@ -298,7 +299,7 @@ def test_votes_become_a_soft_layer() -> None:
     assert labels.confidence.tolist() == [0.75, 0.5, 0]
     assert labels.evidence is not None
     assert labels.evidence.tolist() == [4, 4, 0]
-    many = _labels(scipy.sparse.csr_matrix(np.arange(1.0, 11)[None]))
+    many = majority(scipy.sparse.csr_matrix(np.arange(1.0, 11)[None]))
     assert many.candidates is not None
     assert many.candidates.tolist() == [[10, 9, 8, 7, 6, 5, 4, 3]]
 
@@ -370,15 +371,15 @@ def nested(view: View, *, parts: bool, pair: bool, whole: bool) -> MaskSet:
     return MaskSet.from_dense(torch.stack(found))
 
 
-def test_of_nested_masks_those_that_most_views_have_are_taken() -> None:
+def test_of_flat_nested_masks_those_that_most_views_have_are_taken() -> None:
     things = Segments(
         {v.name: nested(v, parts=i < 2, pair=i == 2, whole=True) for i, v in enumerate(VIEWS)},
         overlapping=True,
     )
-    assert groups(run(things).ids) == THINGS
+    assert groups(run(things, overlapping="flat").ids) == THINGS
     # Parts everywhere, wholes in one view only: then the halves of the left thing are taken.
     of = {v.name: nested(v, parts=True, pair=False, whole=i in (0, 1)) for i, v in enumerate(VIEWS)}
-    labels = run(Segments(of, overlapping=True))
+    labels = run(Segments(of, overlapping=True), overlapping="flat")
     assert groups(labels.ids) == [
         frozenset((0, 1)),
         frozenset((2, 3)),

@@ -12,16 +12,14 @@ import tyro
 from torch import Tensor
 
 from splatseg.cli._work import open_scene
-from splatseg.core import Features, Gaussians, Labels, Scene, Selection, Similarity, View
+from splatseg.core import Features, Gaussians, Labels, Layer, Scene, Similarity, View
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import is_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.splats import SplatWarning, read_splats
 from splatseg.lift import Attached, AttachOptions, attach
 from splatseg.tasks.label_columns import label_tables
-from splatseg.tasks.scene_parts import layer_of
-
-Layer = Labels | Features | Selection
+from splatseg.tasks.scene_parts import layer_of, whole_layer
 
 _LABEL_COLUMNS = ("class_id", "confidence", "instance_id", "instance_confidence", "selected")
 
@@ -225,7 +223,7 @@ def _layers(command: Command, scene: Scene) -> dict[str, Layer]:
         names = [name.strip() for name in command.layer.split(",") if name.strip()]
     if not names:
         raise InputError(f"{command.source}: expected a scene with layers to attach, it has none.")
-    return {name: layer_of(scene, name) for name in names}
+    return {name: whole_layer(scene, name) for name in names}
 
 
 def _edited(command: Command) -> Gaussians:

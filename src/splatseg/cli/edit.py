@@ -22,6 +22,7 @@ from splatseg.edit import (
     Where,
     apply,
     ids_named,
+    layer_called,
     load_document,
     prepare,
     save_document,
@@ -228,11 +229,11 @@ def _where(command: Command, document: Document) -> Where | None:
         return None
     ids = command.ids
     if command.names and command.layer is not None:
-        layer = document.layers.get(command.layer)
+        layer = layer_called(document.layers, command.layer)
         if isinstance(layer, Labels):
             named = ids_named(layer, command.names, classes=document.scene.classes)
             ids = tuple(sorted({*ids, *named}))
-        elif layer is not None:
+        else:
             raise InputError(f"--names: layer {command.layer!r} has no names.")
     return Where(layer=command.layer, ids=ids, box=command.box, invert=command.invert)
 

@@ -11,8 +11,18 @@ import tyro
 
 from splatseg.cli._progress import progress
 from splatseg.cli._work import check_new_scene
-from splatseg.core import UNLABELLED, Gaussians, Labels, LabelSource, Scene, View
-from splatseg.edit import Document, load_document, save_document
+from splatseg.core import (
+    UNLABELLED,
+    Gaussians,
+    InstanceTree,
+    Labels,
+    LabelSource,
+    Layer,
+    Scene,
+    View,
+    layer_address,
+)
+from splatseg.edit import Document, layer_called, load_document, save_document
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.evaluate import picture_and_photograph, psnr
@@ -131,7 +141,7 @@ def run(command: Command) -> None:
     }
     if found.exposures:
         provenance[EXPOSURES] = exposures_record({**exposures, **found.exposures})
-    layers = {**document.layers, command.layer: merged(layer, found)}
+    layers = {**document.layers, **_sharpened(document, command.layer, merged(layer, found))}
     scene = replace(scene, gaussians=found.gaussians, provenance=provenance)
     save_document(Document(scene=scene, layers=layers), out)
     # What lies in the scene's own folder would be out of reach from the new one.
@@ -140,6 +150,15 @@ def run(command: Command) -> None:
     sys.stdout.write(_told(command, found, before, after, len(spaced)))
     seconds = time.monotonic() - started
     sys.stdout.write(f"{out}: {len(found.gaussians)} Gaussians, in {seconds:.0f} s\n")
+
+
+def _sharpened(document: Document, address: str, labels: Labels) -> dict[str, Layer]:
+    """The layer after sharpening, under its name; a tree keeps the levels above and below."""
+    name, level = layer_address(address)
+    whole = document.layers[name]
+    if isinstance(whole, InstanceTree):
+        return {name: whole.with_cut(labels, level or "object")}
+    return {name: labels}
 
 
 def merged(layer: Labels, found: Sharpened) -> Labels:
@@ -169,10 +188,7 @@ def merged(layer: Labels, found: Sharpened) -> Labels:
 
 
 def _layer(document: Document, name: str) -> Labels:
-    layer = document.layers.get(name)
-    if layer is None:
-        known = ", ".join(document.layers) or "it has none"
-        raise InputError(f"--layer: expected a layer of the scene ({known}), got {name!r}.")
+    layer = layer_called(document.layers, name)
     if not isinstance(layer, Labels):
         raise InputError(f"--layer: expected labels, {name} is a selection or features.")
     return layer

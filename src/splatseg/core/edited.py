@@ -10,7 +10,8 @@ from torch import Tensor
 from splatseg._check import check_shape, check_values
 from splatseg.core.evidence import UNLABELLED
 from splatseg.core.gaussians import Gaussians
-from splatseg.core.layers import Features, Labels, Layer, Selection
+from splatseg.core.instance_tree import InstanceTree, Layer
+from splatseg.core.layers import Features, Labels, Selection
 from splatseg.errors import InputError, RangeError, ShapeError
 
 NEW = -1
@@ -92,6 +93,8 @@ def apply_rows(layer: Features, edited: Edited) -> Features: ...
 @overload
 def apply_rows(layer: Selection, edited: Edited) -> Selection: ...
 @overload
+def apply_rows(layer: InstanceTree, edited: Edited) -> InstanceTree: ...
+@overload
 def apply_rows(layer: Layer, edited: Edited) -> Layer: ...
 def apply_rows(layer: Layer, edited: Edited) -> Layer:
     """Make a layer follow an edit: row j of the result is row ``edited.rows[j]`` of `layer`.
@@ -118,6 +121,8 @@ def apply_rows(layer: Layer, edited: Edited) -> Layer:
         tensor([ True, False])
     """
     _check_rows(edited.rows, len(layer))
+    if isinstance(layer, InstanceTree):
+        return replace(layer, labels=apply_rows(layer.labels, edited))
     new = edited.rows == NEW
     fractions = edited.fractions
     if not len(layer) and len(edited):

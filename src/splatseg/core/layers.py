@@ -181,7 +181,3 @@ class Selection:
                 f"selection: expected one over {len(self)} Gaussians, got one over {len(other)}."
             )
         return other.mask
-
-
-Layer = Labels | Features | Selection
-"""What a scene keeps of its Gaussians under a name."""

@@ -7,7 +7,16 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Edited, Features, Labels, Layer, Selection, apply_rows
+from splatseg.core import (
+    UNLABELLED,
+    Edited,
+    Features,
+    InstanceTree,
+    Labels,
+    Layer,
+    Selection,
+    apply_rows,
+)
 from splatseg.errors import InputError
 
 
@@ -50,6 +59,8 @@ def _joined(name: str, own: Layer, other: Layer, edited: Edited, behind: Edited)
     match own, other:
         case Labels(), Labels():
             return _joined_labels(own, other, edited, behind)
+        case InstanceTree(), InstanceTree():
+            return _joined_trees(own, other, edited, behind)
         case Selection(), Selection():
             first, second = apply_rows(own, edited), apply_rows(other, behind)
             return replace(first, mask=first.mask | second.mask)
@@ -65,6 +76,43 @@ def _joined(name: str, own: Layer, other: Layer, edited: Edited, behind: Edited)
                 f"layer {name!r}: expected the same kind and as many channels in both scenes, "
                 "got layers that do not fit; rename one of them."
             )
+
+
+def _joined_trees(
+    own: InstanceTree, other: InstanceTree, edited: Edited, behind: Edited
+) -> InstanceTree:
+    """Trees side by side: all nodes of `other` get ids behind those of `own`."""
+    shift = max((node.id for node in own.nodes), default=0)
+    table = {node.id: node.id + shift for node in other.nodes}
+    moved = replace(
+        other,
+        nodes=tuple(
+            replace(node, id=table[node.id], parent=table.get(node.parent, UNLABELLED))
+            for node in other.nodes
+        ),
+        labels=replace(
+            other.labels,
+            ids=_mapped(other.labels.ids, table),
+            background=table.get(other.labels.background, UNLABELLED),
+        ),
+    )
+    first, second = apply_rows(own.labels, edited), apply_rows(moved.labels, behind)
+    new = edited.rows < 0
+    metadata = dict(own.metadata)
+    if table:
+        metadata["merged_ids"] = {str(old): now for old, now in table.items()}
+    return InstanceTree(
+        nodes=own.nodes + moved.nodes,
+        labels=replace(
+            first,
+            ids=torch.where(new, second.ids, first.ids),
+            confidence=torch.where(new, second.confidence, first.confidence),
+            evidence=_either(first.evidence, second.evidence, new),
+            effective_views=_either(first.effective_views, second.effective_views, new),
+            inferred=_either(first.inferred, second.inferred, new),
+            metadata=metadata,
+        ),
+    )
 
 
 def _joined_labels(own: Labels, other: Labels, edited: Edited, behind: Edited) -> Labels:

@@ -7,7 +7,16 @@ from typing import Any, cast
 
 import torch
 
-from splatseg.core import ClassTable, Gaussians, Labels, Layer, Selection
+from splatseg.core import (
+    ClassTable,
+    FlatLayer,
+    Gaussians,
+    Labels,
+    Layer,
+    Selection,
+    flat_layer,
+    layer_address,
+)
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.boundaries.cut import box_corners
 
@@ -114,19 +123,20 @@ def select(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) -> S
     return Selection(mask=~mask if where.invert else mask)
 
 
-def layer_called(layers: Mapping[str, Layer], name: str) -> Layer:
-    """The layer of this name.
+def layer_called(layers: Mapping[str, Layer], address: str) -> FlatLayer:
+    """The layer of this name; of a tree its objects, or the level after an @.
 
     Raises:
         InputError: If there is none.
     """
+    name, level = layer_address(address)
     if name not in layers:
         known = ", ".join(layers) or "there is none"
         raise InputError(f"layer: expected one of the scene ({known}), got {name!r}.")
-    return layers[name]
+    return flat_layer(layers[name], level, name=name)
 
 
-def _of_layer(layer: Layer, where: Where) -> torch.Tensor:
+def _of_layer(layer: FlatLayer, where: Where) -> torch.Tensor:
     match layer:
         case Selection():
             if where.ids:

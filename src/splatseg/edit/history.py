@@ -15,6 +15,7 @@ from splatseg.core import (
     UNLABELLED,
     Edited,
     Gaussians,
+    InstanceTree,
     LabelMap,
     Labels,
     LabelSource,
@@ -23,6 +24,7 @@ from splatseg.core import (
     Selection,
     Similarity,
     View,
+    layer_address,
 )
 from splatseg.edit._merge import merged_layers
 from splatseg.edit._operation import CutBy, Operation
@@ -197,15 +199,19 @@ def _relabelled(document: Document, where: Where, inside: Selection) -> Document
     """The layer that was cut, with parts named after the side that they are on."""
     if where.layer is None:
         return document
+    name, level = layer_address(where.layer)
     layer = layer_called(document.layers, where.layer)
+    whole = document.layers[name]
     match layer:
         case Selection():
             changed: Layer = replace(layer, mask=inside.mask)
         case Labels():
             changed = _labels_by_side(layer, where.ids, inside)
+            if isinstance(whole, InstanceTree):
+                changed = whole.with_cut(changed, level or "object")
         case _:
             return document
-    return replace(document, layers={**document.layers, where.layer: changed})
+    return replace(document, layers={**document.layers, name: changed})
 
 
 def _labels_by_side(labels: Labels, ids: Sequence[int], inside: Selection) -> Labels:

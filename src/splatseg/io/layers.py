@@ -1,4 +1,4 @@
-"""Layers on disk: one npz a layer, version 1; byte for byte in ``docs/formats.md``.
+"""Layers on disk: one npz a layer; byte for byte in ``docs/formats.md``.
 
 An npz is a ZIP archive of NumPy arrays. Entries are stored uncompressed and without time
 stamps, so that the same layer gives the same bytes.
@@ -7,20 +7,32 @@ stamps, so that the same layer gives the same bytes.
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core import UNLABELLED, Features, Labels, Layer, Selection
+from splatseg.core import (
+    UNLABELLED,
+    Features,
+    InstanceTree,
+    Labels,
+    Layer,
+    Selection,
+    TreeNode,
+    node_row,
+)
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import json_text, parse_object
 
 FORMAT = "splatseg-layer"
-VERSION = 1
-"""Version of the files written; all versions up to it are read."""
+VERSION = 2
+"""Versions up to it are read. Trees came with version 2."""
+
+_FLAT_VERSION = 1
+"""Version of the files of layers without levels: readers of version 1 know all of them."""
 
 _HEADER = "header"
 _VOID = 0
@@ -35,7 +47,7 @@ def save_layer(path: Path, layer: Layer) -> None:
         InputError: If an id is 0 (ids in use start at 1), or the metadata has no place in JSON.
         MissingFileError: If the folder of `path` does not exist.
     """
-    header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "count": len(layer)}
+    header: dict[str, Any] = {"format": FORMAT, "version": _FLAT_VERSION, "count": len(layer)}
     match layer:
         case Labels():
             header |= {"kind": "labels", "background": _void(layer.background)}
@@ -56,6 +68,21 @@ def save_layer(path: Path, layer: Layer) -> None:
             arrays = {"values": _floats(layer.values)}
             if layer.weights is not None:
                 arrays |= {"weights": _floats(layer.weights)}
+        case InstanceTree():
+            labels = layer.labels
+            header |= {
+                "kind": "tree",
+                "version": VERSION,
+                "background": _void(labels.background),
+                "nodes": [node_row(node) for node in layer.nodes],
+            }
+            arrays = {"ids": _ids(labels.ids), "confidence": _floats(labels.confidence)}
+            if labels.evidence is not None:
+                arrays |= {"evidence": _floats(labels.evidence.float())}
+            if labels.effective_views is not None:
+                arrays |= {"effective_views": _floats(labels.effective_views.float())}
+            if labels.inferred is not None:
+                arrays |= {"inferred": labels.inferred.cpu().numpy()}
         case Selection():
             header |= {"kind": "selection"}
             arrays = {"mask": layer.mask.cpu().numpy()}
@@ -110,13 +137,59 @@ def load_layer(path: Path) -> Layer:
                 else None,
                 metadata=metadata,
             )
+        case "tree":
+            return _tree(path, header, arrays)
         case "selection":
             mask = torch.from_numpy(_array(path, arrays, "mask", "?", (count,)))
             return Selection(mask=mask, metadata=metadata)
         case kind:
             raise FileFormatError(
-                f"{path}: expected a layer of labels, features or a selection, got {kind!r}."
+                f"{path}: expected a layer of labels, features, a tree or a selection, "
+                f"got {kind!r}."
             )
+
+
+def _tree(
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> InstanceTree:
+    count = int(header["count"])
+    rows = header.get("nodes")
+    if not isinstance(rows, list):
+        raise FileFormatError(f"{path}: expected a list of nodes, got {type(rows).__name__}.")
+    labels = Labels(
+        ids=_from_file(_array(path, arrays, "ids", "i4", (count,))),
+        confidence=torch.from_numpy(_array(path, arrays, "confidence", "f4", (count,))),
+        background=_background(path, header),
+        evidence=torch.from_numpy(_array(path, arrays, "evidence", "f4", (count,)))
+        if "evidence" in arrays
+        else None,
+        effective_views=torch.from_numpy(_array(path, arrays, "effective_views", "f4", (count,)))
+        if "effective_views" in arrays
+        else None,
+        inferred=torch.from_numpy(_array(path, arrays, "inferred", "?", (count,)))
+        if "inferred" in arrays
+        else None,
+        metadata=header["metadata"],
+    )
+    try:
+        nodes = tuple(_node(row) for row in cast("list[Any]", rows))
+        return InstanceTree(nodes=nodes, labels=labels)
+    except (InputError, KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{path}: expected nodes of a tree, got others ({error}).") from error
+
+
+def _node(row: Mapping[str, Any]) -> TreeNode:
+    parent = int(row["parent"])
+    return TreeNode(
+        id=int(row["id"]),
+        parent=UNLABELLED if parent == _VOID else parent,
+        level=row["level"],
+        name=str(row["name"]),
+        class_id=int(row["class"]),
+        support=float(row["support"]),
+        segments=int(row["segments"]),
+        views=int(row["views"]),
+    )
 
 
 def _void(id: int) -> int:

@@ -12,33 +12,49 @@ small things where it is above 0. At 0 all pixels vote alike, and small things c
 by `lift.mass.confusion`: a model that misses a cup calls its pixels table, far more often than one
 that sees a cup where there is only table, and the votes themselves tell how often.
 
-Where masks overlap (levels of granularity), groups of masks are taken one after another, those
-that most of the views that could have seen them did see first; a group that mostly covers what
-is taken already is left out.
+Where masks overlap, segments of one view that lie inside each other are of different levels and
+never one instance (`splatseg.lift.segments.nesting`). Groups of segments then become a tree
+(`splatseg.lift.segments.tree`), whose levels say which nodes are objects
+(`splatseg.lift.segments.levels`); masks of objects and of their parts vote for the objects, and
+within each object for its parts. With ``overlapping="flat"`` there are no levels: groups of masks
+are taken one after another, those that most of the views that could have seen them did see
+first, and a group that mostly covers what is taken already is left out.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from splatseg._check import check_range
-from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, SegmentSource, View
-from splatseg.errors import RangeError
+from splatseg.core import (
+    ClassTable,
+    Gaussians,
+    InstanceTree,
+    Labels,
+    SegmentSource,
+    View,
+    tree_level,
+)
+from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
-from splatseg.lift.segments.clustering import cluster
+from splatseg.lift.segments.ballots import by_mass, majority
+from splatseg.lift.segments.clustering import Agreement, cluster
 from splatseg.lift.segments.flatten import chosen_groups
+from splatseg.lift.segments.levels import node_levels
+from splatseg.lift.segments.nesting import nesting
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.lift.segments.table import SegmentTable, segment_table
+from splatseg.lift.segments.tree import segment_tree
+from splatseg.lift.segments.tree_labels import category_of, instance_tree, tree_votes
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import RenderOptions
 
-_CANDIDATES = 8
-"""Instances of a Gaussian that relabelling chooses from."""
+Overlapping = Literal["tree", "flat"]
+"""What overlapping masks become: a tree of levels, or one label a Gaussian."""
 
 _SURE_SEGMENTS = 3
 """Groups of fewer segments are too few to speak for a small thing: they may be accidents."""
@@ -60,9 +76,22 @@ class AssociateOptions:
     least_views: int = 2
     """An instance needs segments in so many views, or in all there are if they are fewer."""
 
+    overlapping: Overlapping = "tree"
+    """What masks that may overlap become. tree: groups, objects and parts, each in its parent.
+    flat: objects alone, whatever level most of the masks have."""
+
+    level: str = "tree"
+    """Of a tree, what is given: tree is all of it; group, object or part, or a granularity from 0
+    (groups) over 0.5 (objects) to 1 (the finest parts), are one cut of it as labels."""
+
+    min_support: float = 0.3
+    """Of a tree: a group of segments is a node if this share, in [0, 1], of the views that could
+    have seen it has a segment of it. Higher leaves out what few masks speak for."""
+
     overlap: float = 0.7
-    """Of overlapping masks: a group is left out if more than this share of it, in [0, 1], is
-    covered by groups that were taken before."""
+    """Of overlapping masks: a node lies in another if more than this share of it does, in
+    [0, 1]; with flat, a group is left out if more than this share of it is covered by groups
+    that were taken before."""
 
     most_views: int = 50
     """Views of each Gaussian that are compared, those that see most of it; bounds memory and
@@ -77,6 +106,11 @@ class AssociateOptions:
         if not (math.isfinite(self.small_things) and self.small_things >= 0):
             raise RangeError(f"small_things: expected 0 or more, got {self.small_things}.")
         check_range("overlap", self.overlap, 0.0, 1.0)
+        check_range("min_support", self.min_support, 0.0, 1.0)
+        if self.overlapping not in get_args(Overlapping):
+            raise InputError(f"overlapping: expected tree or flat, got {self.overlapping!r}.")
+        if self.level != "tree":
+            tree_level(self.level)
         for name in ("least_views", "most_views", "longest_side"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
@@ -93,7 +127,7 @@ def associate(
     render_options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
-) -> Labels:
+) -> Labels | InstanceTree:
     """Instances from segments of views.
 
     The result depends neither on the order of the views nor on ids of segments. Instances are
@@ -111,9 +145,10 @@ def associate(
         progress: Called with the views done and their number.
 
     Returns:
-        The layer. Its metadata lists ``instances`` (id, name, class, segments, views) and under
-        ``associate`` how many segments there were, what was joined within a view, and what was
-        left out.
+        Labels, or a tree of groups, objects and parts where masks may overlap. The metadata says
+        under ``associate`` how many segments there were, what was joined within a view, and what
+        was left out. That of labels lists ``instances`` (id, name, class, segments, views); the
+        nodes of a tree say the same.
 
     Raises:
         InputError: If there are no views, if one has no segments, or none has any.
@@ -131,14 +166,17 @@ def associate(
         progress=progress,
     )
     agreement = table.agreement()
+    if source.overlapping and options.overlapping == "tree":
+        tree = _tree(table, agreement, options, confusion, classes)
+        return tree if options.level == "tree" else tree.cut(tree_level(options.level))
     group = cluster(agreement, options.agreement)
     group = _seen_often(table, group, min(options.least_views, len(table.views)))
     if source.overlapping:
         group = chosen_groups(table, agreement, group, overlap=options.overlap)
     votes = table.votes(group, _say(table, group, options.small_things))
-    group, votes = _by_mass(group, votes)
+    group, votes = by_mass(group, votes)
     rows = _instances(table, group, classes)
-    labels = _labels(votes)
+    labels = majority(votes)
     if confusion is not None:
         labels = correct_confusion(labels, options=confusion)
     return replace(
@@ -156,6 +194,40 @@ def associate(
             "associate": _account(table, group, tracked=source.persistent),
         },
     )
+
+
+def _tree(
+    table: SegmentTable,
+    agreement: Agreement,
+    options: AssociateOptions,
+    confusion: ConfusionOptions | None,
+    classes: ClassTable | None,
+) -> InstanceTree:
+    """Groups, objects and parts of segments that lie inside each other."""
+    nested = nesting(agreement)
+    group = cluster(nested.agreement, options.agreement, conflicts=nested.conflicts)
+    found = segment_tree(
+        table,
+        agreement,
+        nested,
+        group,
+        min_support=options.min_support,
+        min_views=min(options.least_views, len(table.views)),
+        overlap=options.overlap,
+    )
+    level = node_levels(found)
+    votes = tree_votes(
+        table, found, level, _say(table, found.node, options.small_things), confusion=confusion
+    )
+    tree = instance_tree(table, found, level, votes, classes)
+    account = _account(table, found.node, tracked=False) | {"instances": len(votes.object_rows)}
+    metadata = dict(tree.metadata) | {
+        "method": "associate",
+        "options": asdict(options),
+        "views": list(table.views),
+        "associate": account | {"nodes": len(tree.nodes)},
+    }
+    return replace(tree, labels=replace(tree.labels, metadata=metadata))
 
 
 def _seen_often(table: SegmentTable, group: NDArray[np.int64], least: int) -> NDArray[np.int64]:
@@ -177,55 +249,14 @@ def _say(table: SegmentTable, group: NDArray[np.int64], exponent: float) -> NDAr
     return np.where(there, np.maximum(size, 1e-12)[group] ** -exponent, 1.0)
 
 
-def _by_mass(group: NDArray[np.int64], votes: Any) -> tuple[NDArray[np.int64], Any]:
-    """Groups numbered anew by the votes they have, most first; groups without any go."""
-    total = np.asarray(votes.sum(axis=0)).ravel()
-    order = np.lexsort((np.arange(len(total)), -total))
-    order = order[total[order] > 0]
-    rank = np.full(len(total) + 1, -1)
-    rank[order] = np.arange(len(order))
-    return rank[group], votes.tocsc()[:, order].tocsr()
-
-
-def _labels(votes: Any) -> Labels:
-    """The strongest ids of each Gaussian (the smaller among equals), their shares, all votes."""
-    count = votes.shape[0]
-    votes.sort_indices()
-    rows = np.repeat(np.arange(count), np.diff(votes.indptr))
-    order = np.lexsort((votes.indices, -votes.data, rows))
-    rows = rows[order]
-    first = np.ones(len(rows), bool)
-    first[1:] = rows[1:] != rows[:-1]
-    rank = np.arange(len(rows)) - np.flatnonzero(first)[np.cumsum(first) - 1]
-    kept = rank < _CANDIDATES
-    total = np.asarray(votes.sum(axis=1)).ravel()
-    ids = np.full((count, _CANDIDATES), UNLABELLED, np.int32)
-    shares = np.zeros((count, _CANDIDATES), np.float32)
-    place = rows[kept], rank[kept]
-    ids[place] = votes.indices[order][kept] + 1
-    shares[place] = (votes.data[order][kept] / total[place[0]]).clip(0, 1)
-    return Labels(
-        ids=torch.from_numpy(ids[:, 0].copy()),
-        confidence=torch.from_numpy(shares[:, 0].copy()),
-        candidates=torch.from_numpy(ids),
-        shares=torch.from_numpy(shares),
-        evidence=torch.from_numpy(total.astype(np.float32)),
-    )
-
-
 def _instances(
     table: SegmentTable, group: NDArray[np.int64], classes: ClassTable | None
 ) -> list[dict[str, Any]]:
     """One row an instance: id, name, class (0 for none), segments and views."""
     rows: list[dict[str, Any]] = []
-    weight = table.size * table.score
     for place in range(int(group.max(initial=-1)) + 1):
         members = np.flatnonzero(group == place)
-        known = members[table.category[members] != UNLABELLED]
-        category = 0
-        if len(known):
-            sums = np.bincount(table.category[known], weight[known])
-            category = int(sums.argmax())
+        category = category_of(table, members)
         named = category > 0 and classes is not None
         name = classes.name_of(category) if named and classes is not None else "object"
         rows.append(
@@ -281,7 +312,7 @@ class AssociateMethodOptions:
     """How the evidence errs."""
 
 
-def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels:
+def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels | InstanceTree:
     """Join segments of views, see `associate`."""
     return associate(
         inputs.gaussians,

@@ -12,7 +12,15 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, ClassTable, Labels, LabelSource, Scene, View
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    InstanceTree,
+    Labels,
+    LabelSource,
+    Scene,
+    View,
+)
 from splatseg.evaluate.agreement import SEEN_LONGEST, views_that_show
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
 from splatseg.evaluate.overlaps import InstanceScore, Overlaps, instance_score
@@ -39,9 +47,11 @@ from splatseg.report.html import (
     Table,
     report_html,
 )
+from splatseg.report.tree_section import tree_section
 
 _LEARNED_ROWS = 4
 _HELD_OUT_ROWS = 3
+_TREE_ROWS = 3
 _COMPARED = 12
 _COVERAGE_VIEWS = 100
 _LEGEND = 40
@@ -98,6 +108,9 @@ class SegmentStory:
     """Largest resident memory of the process."""
 
     command: str = ""
+    tree: tuple[Block, ...] = ()
+    """What there is to show of the levels above and below, see `tree_section`."""
+
     facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
@@ -121,6 +134,7 @@ def segment_report(story: SegmentStory, *, longest: int = _PICTURE_SIZES[0]) -> 
             )
         )
         blocks.append(_legend(story))
+    blocks += story.tree
     blocks += [support_table(labels), confidence_bars(labels)]
     if story.seen_of:
         blocks.append(coverage_bars(story.seen, views=story.seen_of))
@@ -155,6 +169,7 @@ def write_segmentation_report(
     timings: Mapping[str, float],
     peak_bytes: int | None,
     command: str,
+    tree: InstanceTree | None = None,
     backend: str = "auto",
 ) -> None:
     """Write the report of a segmentation as one HTML file; atomic.
@@ -174,6 +189,7 @@ def write_segmentation_report(
         timings: Seconds by step.
         peak_bytes: Largest resident memory of the process; None leaves it out.
         command: The words that started it; may be empty.
+        tree: The layer with all its levels, where it has levels; `labels` is a cut of it.
         backend: Who renders.
 
     Raises:
@@ -239,6 +255,9 @@ def write_segmentation_report(
         timings=timings,
         peak_bytes=peak_bytes,
         command=command,
+        tree=()
+        if tree is None
+        else tree_section(scene, tree, [view for view, _ in shown[:_TREE_ROWS]], backend=backend),
         facts=_facts(labels, layer, backend),
     )
     pages = (report_html(segment_report(story, longest=longest)) for longest in _PICTURE_SIZES)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from splatseg.core import ClassTable, Features, Labels, Layer, Scene, View
+from splatseg.core import ClassTable, Features, FlatLayer, Labels, Layer, Scene, View
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     SemanticReport,
@@ -152,7 +152,7 @@ class _Job:
     backend: BackendName
     observer: Observer
 
-    def layer(self, name: str) -> Layer:
+    def layer(self, name: str) -> FlatLayer:
         return layer_of(self.scene, name, self.layers)
 
 
@@ -208,7 +208,7 @@ def _in_views(job: _Job, views: tuple[View, ...], network: Lpips | None) -> dict
 def _layer_figures(
     job: _Job,
     views: tuple[View, ...],
-    layer: Layer,
+    layer: FlatLayer,
     truth: Evidence,
 ) -> dict[str, Any]:
     if isinstance(layer, Features):

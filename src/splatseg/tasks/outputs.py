@@ -5,9 +5,10 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from splatseg.core import Layer, Scene
+from splatseg.core import TREE_LEVELS, InstanceTree, Layer, Scene
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
+from splatseg.io.export import write_node_table
 from splatseg.render import BackendName
 from splatseg.report.segment_report import write_segmentation_report
 from splatseg.tasks._observer import SILENT, Observer
@@ -24,6 +25,7 @@ _FILES: tuple[tuple[What, str], ...] = (
     ("splat", "labelled.ply"),
 )
 _LABEL_MAPS = "label_maps"
+_NODES = "nodes.csv"
 
 
 def check_layer_exports(scene: Scene, root: Path, layer: str) -> None:
@@ -52,7 +54,8 @@ def export_layer(
     """Write ROOT/exports/NAME: everything that a layer of labels is good for elsewhere.
 
     Objects as splat files, a table of them, all Gaussians with their labels as columns, and
-    label maps of the held-out views (of all views where none is held out).
+    label maps of the held-out views (of all views where none is held out). Of a tree these are
+    its objects; with it come the table of all nodes, and label maps of its groups and parts.
     """
     folder = root / EXPORTS_FOLDER / name
     folder.mkdir(parents=True, exist_ok=True)
@@ -69,19 +72,30 @@ def export_layer(
         )
         for what, file in _FILES
     )
+    if isinstance(layer, InstanceTree):
+        write_node_table(layer, folder / _NODES)
+        said = f"{len(layer.nodes)} groups, objects and parts"
+        files = (*files, Exported(output=folder / _NODES, summary=said))
     if not scene.views:
         return files, None
     maps = render_views(
         scene,
         folder / _LABEL_MAPS,
         options=RenderingOptions(
-            split="test" if scene.test_views else "all", what=(name,), coloured=True
+            split="test" if scene.test_views else "all", what=_drawn(name, layer), coloured=True
         ),
         layers=layers,
         backend=backend,
         observer=observer,
     )
     return files, maps
+
+
+def _drawn(name: str, layer: Layer) -> tuple[str, ...]:
+    """What label maps are drawn of: the layer, and the other levels of a tree."""
+    if not isinstance(layer, InstanceTree):
+        return (name,)
+    return (name, *(f"{name}@{level}" for level in TREE_LEVELS if level != "object"))
 
 
 def report_layer(
@@ -120,6 +134,7 @@ def report_layer(
         timings={**result.timings, **(timings or {})},
         peak_bytes=unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         command=command,
+        tree=result.layer if isinstance(result.layer, InstanceTree) else None,
         backend=backend,
     )
     return path

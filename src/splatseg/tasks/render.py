@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Labels, Layer, Scene, Selection, View
+from splatseg.core import UNLABELLED, Labels, Layer, Scene, Selection, View, layer_address
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import labels_of
 from splatseg.io.atomic import atomic_folder
@@ -183,7 +183,7 @@ def _layers(
     for name in wanted:
         if name in _PICTURES:
             continue
-        if name not in known:
+        if layer_address(name)[0] not in known:
             raise InputError(
                 f"what: expected {', '.join(_PICTURES)} or a layer of the scene "
                 f"({', '.join(sorted(known)) or 'it has none'}), got {name!r}."

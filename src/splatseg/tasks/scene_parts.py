@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, cast
 
-from splatseg.core import Layer, Scene, View
+from splatseg.core import FlatLayer, Layer, Scene, View, flat_layer, layer_address
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import MaskUse
 from splatseg.io.evidence import Evidence
@@ -23,8 +23,20 @@ def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
     raise InputError(f"split: expected all or a split of the scene ({known}), got {split!r}.")
 
 
-def layer_of(scene: Scene, name: str, layers: Mapping[str, Layer] | None = None) -> Layer:
-    """A layer by name: one of `layers`, or of the folder that the scene was loaded from."""
+def layer_of(scene: Scene, address: str, layers: Mapping[str, Layer] | None = None) -> FlatLayer:
+    """A layer by name: one of `layers`, or of the folder that the scene was loaded from.
+
+    Of a tree NAME means its objects, and NAME@part, NAME@group and NAME@0.3 other cuts of it.
+
+    Raises:
+        InputError: If there is no such layer, or it has no such level.
+    """
+    name, level = layer_address(address)
+    return flat_layer(whole_layer(scene, name, layers), level, name=name)
+
+
+def whole_layer(scene: Scene, name: str, layers: Mapping[str, Layer] | None = None) -> Layer:
+    """A layer by name with all its levels."""
     if layers is not None and name in layers:
         return layers[name]
     if scene.root is None:

@@ -9,7 +9,16 @@ from typing import Any
 
 import torch
 
-from splatseg.core import UNLABELLED, ClassTable, Features, Labels, Layer, Scene, View
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    Features,
+    InstanceTree,
+    Labels,
+    Layer,
+    Scene,
+    View,
+)
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
     Evidence,
@@ -78,11 +87,13 @@ class Segmentation:
 
     @property
     def labels(self) -> Labels:
-        """The layer, where it is one of labels.
+        """The layer, where it is one of labels; of a tree its objects.
 
         Raises:
             InputError: If the method gives something else.
         """
+        if isinstance(self.layer, InstanceTree):
+            return self.layer.cut()
         if not isinstance(self.layer, Labels):
             raise InputError(
                 f"layer {self.name!r}: expected labels, got {type(self.layer).__name__.lower()}."
@@ -147,8 +158,15 @@ def segment(
             chosen,
         )
         timings[method.name] = time.monotonic() - began
-    if isinstance(layer, Labels):
-        if options.complete and method.complete and not options.published:
+    wanted = options.complete and method.complete and not options.published
+    if isinstance(layer, InstanceTree):
+        if wanted:
+            labels = _completed(scene, layer.labels, completion, timings)
+            layer = replace(layer, labels=labels)
+        if merged is not None:
+            layer = merge_panoptic(scene.gaussians, layer.cut(), *merged)
+    elif isinstance(layer, Labels):
+        if wanted:
             layer = _completed(scene, layer, completion, timings)
         if merged is not None:
             layer = merge_panoptic(scene.gaussians, layer, *merged)
@@ -201,6 +219,8 @@ def _described(
     if isinstance(layer, Labels) and evidence.source_ids is not None:
         present = layer.present.tolist()
         metadata["source_ids"] = {str(id): evidence.source_ids[id] for id in present}
+    if isinstance(layer, InstanceTree):
+        return replace(layer, labels=replace(layer.labels, metadata=metadata))
     return replace(layer, metadata=metadata)
 
 

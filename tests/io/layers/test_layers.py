@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Features, Labels, Selection
+from splatseg.core import Features, InstanceTree, Labels, Selection, TreeNode
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.layers import load_layer, save_layer
 
@@ -28,6 +28,8 @@ def same(a, b) -> None:
         if isinstance(one, torch.Tensor):
             assert one.dtype == other.dtype
             assert torch.equal(one, other), name
+        elif isinstance(one, Labels):
+            same(one, other)
         elif name != "metadata":
             assert one == other
 
@@ -44,6 +46,19 @@ LAYERS = {
     ),
     "features": Features(values=torch.randn(4, 3), weights=torch.rand(4), metadata=METADATA),
     "half": Features(values=torch.randn(4, 3).half()),
+    "tree": InstanceTree(
+        nodes=(
+            TreeNode(id=3, level="group", name="Gruppe", support=1 / 3),
+            TreeNode(id=70000, parent=3, class_id=2, segments=7, views=5),
+            TreeNode(id=1, parent=70000, level="part", name="Fu\u00df"),
+            TreeNode(id=2**31 - 1),
+        ),
+        labels=labels(
+            background=1,
+            evidence=torch.tensor([3.0, 0.0, 1.5, 2.0, 1e6]),
+            inferred=torch.tensor([False, True, False, False, True]),
+        ),
+    ),
     "selection": Selection(mask=torch.tensor([True, False, True]), metadata=METADATA),
     "empty": Labels(ids=torch.zeros(0, dtype=torch.int32), confidence=torch.zeros(0)),
     "none": Selection(mask=torch.zeros(0, dtype=torch.bool)),
@@ -57,6 +72,31 @@ def test_round_trip_and_same_bytes(tmp_path, name) -> None:
     same(LAYERS[name], read)
     save_layer(tmp_path / "b.npz", read)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_layers_without_levels_are_files_that_older_readers_know(tmp_path) -> None:
+    for name, version in (("soft", 1), ("features", 1), ("selection", 1), ("tree", 2)):
+        save_layer(tmp_path / "a.npz", LAYERS[name])
+        with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+            assert json.loads(archive["header"].tobytes())["version"] == version
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda h, a: h.pop("nodes"), "expected a list of nodes, got NoneType"),
+        (lambda h, a: h["nodes"][0].pop("level"), "nodes of a tree.*level"),
+        (lambda h, a: h["nodes"][0].update(id="x"), "nodes of a tree"),
+        (lambda h, a: h["nodes"][1].update(parent=1), "nodes of a tree.*in a group or alone"),
+        (lambda h, a: h["nodes"].pop(0), "nodes of a tree.*parent that is there, got 3"),
+        (lambda h, a: a.update(ids=a["ids"] // 2), "nodes of a tree.*ids of nodes"),
+        (lambda h, a: a.pop("confidence"), "an array 'confidence'"),
+    ],
+)
+def test_files_that_hold_no_tree(tmp_path, change, message) -> None:
+    path = changed(tmp_path, change, layer="tree")
+    with pytest.raises(FileFormatError, match=message):
+        load_layer(path)
 
 
 def test_none_is_0_in_the_file(tmp_path) -> None:
@@ -107,7 +147,7 @@ def changed(tmp_path, change, layer="soft"):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h, a: h.update(version=2), "version 1 or less, got version 2; a later splatseg"),
+        (lambda h, a: h.update(version=3), "version 2 or less, got version 3; a later splatseg"),
         (lambda h, a: h.update(version=0), "got version 0"),
         (lambda h, a: h.update(format="other"), "expected a layer, got 'other'"),
         (lambda h, a: h.update(kind="voxels"), "got 'voxels'"),

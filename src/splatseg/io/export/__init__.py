@@ -20,3 +20,5 @@ from splatseg.io.export._points import write_points as write_points
 from splatseg.io.export._splats import write_object_splats as write_object_splats
 from splatseg.io.export._tables import object_content as object_content
 from splatseg.io.export._tables import write_object_table as write_object_table
+from splatseg.io.export._tree import node_rows as node_rows
+from splatseg.io.export._tree import write_node_table as write_node_table

@@ -15,13 +15,22 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Features, Gaussians, Labels, Selection, Similarity
+from splatseg.core import (
+    UNLABELLED,
+    Features,
+    Gaussians,
+    InstanceTree,
+    Labels,
+    Layer,
+    Selection,
+    Similarity,
+)
 from splatseg.errors import RangeError, ShapeError
 from splatseg.lift.attachment.match import Matches, in_order, match
 from splatseg.lift.attachment.move import Hypothesis, find_move, fit_similarity
 from splatseg.lift.attachment.rows import Rows, extent_of, rows_of
 
-_Layer = TypeVar("_Layer", bound=Labels | Features | Selection)
+_Layer = TypeVar("_Layer", bound=Layer)
 
 _ROUNDS = 3
 _LEAST_SHARE = 0.02
@@ -317,7 +326,7 @@ def _described(move: Move, noise: list[float]) -> dict[str, Any]:
     }
 
 
-def _carried(layer: Labels | Features | Selection, rows: Tensor) -> Labels | Features | Selection:
+def _carried(layer: Layer, rows: Tensor) -> Layer:
     """The layer's rows in a new order, blank where there is none."""
     match layer:
         case Labels():
@@ -339,6 +348,8 @@ def _carried(layer: Labels | Features | Selection, rows: Tensor) -> Labels | Fea
             )
         case Selection():
             return replace(layer, mask=_taken(layer.mask, rows, False))  # noqa: FBT003
+        case InstanceTree():
+            return replace(layer, labels=cast("Labels", _carried(layer.labels, rows)))
 
 
 def _taken(column: Tensor, rows: Tensor, blank: float) -> Tensor:

@@ -13,6 +13,10 @@ are each other's best join, round after round, while the ratio is at least a thr
 of one view share nothing and see all of each other, so that to join them costs what it should
 and is not forbidden: where a model split an object in one view, the other views outvote it.
 
+Where segments of a view may lie inside each other, that says that they are of different levels
+(`lift.segments.nesting`), and so of different groups: two groups stay apart if their segments
+contradict each other so in more than a fifth of the views of the smaller.
+
 No step looks at names, ids or the order of the views. Ties go to the earlier segment.
 """
 
@@ -32,6 +36,10 @@ _DENSE = 0.002
 _BLOCK = 512
 """Rows of such a block."""
 
+_MAX_CONFLICT = 0.2
+"""Two groups stay apart if they contradict each other in more of the views of the smaller: that
+leaves room for a mask that is wrong now and then, and none for two levels."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Agreement:
@@ -47,12 +55,14 @@ class Agreement:
     """(segments,): the view that each segment comes from."""
 
 
-def cluster(agreement: Agreement, threshold: float) -> NDArray[np.int64]:
+def cluster(agreement: Agreement, threshold: float, *, conflicts: Any = None) -> NDArray[np.int64]:
     """The group of each segment, numbered in the order of each group's first segment.
 
     Args:
         agreement: How segments overlap.
         threshold: Least ratio at which two groups join, in (0, 1].
+        conflicts: Sparse symmetric (segments, segments), 1 where two segments of a view cannot
+            be of one group; None where there are no such pairs.
     """
     import scipy.sparse
 
@@ -63,8 +73,9 @@ def cluster(agreement: Agreement, threshold: float) -> NDArray[np.int64]:
     members: Any = scipy.sparse.csr_matrix(
         (np.ones(count), (group, agreement.view)), shape=(count, views)
     )
+    apart: Any = None if conflicts is None else scipy.sparse.csr_matrix(conflicts, dtype=np.float64)
     for _ in range(_ROUNDS):
-        target = _mutual_best(shared, seen, members, threshold)
+        target = _mutual_best(shared, seen, members, threshold, apart)
         if target is None:
             break
         names, compact = np.unique(target, return_inverse=True)
@@ -74,11 +85,15 @@ def cluster(agreement: Agreement, threshold: float) -> NDArray[np.int64]:
         )
         shared = (join @ shared @ join.T).tocsr()
         seen, members = (join @ seen).tocsr(), (join @ members).tocsr()
+        if apart is not None:
+            apart = (join @ apart @ join.T).tocsr()
         group = compact[group]
     return group
 
 
-def _mutual_best(shared: Any, seen: Any, members: Any, threshold: float) -> NDArray[Any] | None:
+def _mutual_best(
+    shared: Any, seen: Any, members: Any, threshold: float, conflicts: Any
+) -> NDArray[Any] | None:
     """Where each group goes: to the earlier of two that are each other's best; None if none do."""
     pairs = shared.tocoo()
     apart = (pairs.row < pairs.col) & (pairs.data > 0)
@@ -87,6 +102,8 @@ def _mutual_best(shared: Any, seen: Any, members: Any, threshold: float) -> NDAr
     row, column, both = row[order], column[order], both[order]
     ratio = both / np.maximum(_unions(seen, members, row, column) - both, 1e-12)
     enough = ratio >= threshold
+    if conflicts is not None:
+        enough[enough] = _compatible(members, conflicts, row[enough], column[enough])
     if not enough.any():
         return None
     row, column, ratio = row[enough], column[enough], ratio[enough]
@@ -102,6 +119,15 @@ def _mutual_best(shared: Any, seen: Any, members: Any, threshold: float) -> NDAr
     mutual = has[best[best[has]] == has]
     target[mutual] = np.minimum(mutual, best[mutual])
     return target
+
+
+def _compatible(
+    members: Any, conflicts: Any, row: NDArray[Any], column: NDArray[Any]
+) -> NDArray[np.bool_]:
+    """Whether the segments of two groups contradict each other in few of the views, for pairs."""
+    views = np.asarray((members > 0).sum(axis=1)).ravel()
+    against = np.asarray(conflicts[row, column]).ravel()
+    return against <= _MAX_CONFLICT * np.minimum(views[row], views[column])
 
 
 def _unions(

@@ -1,0 +1,318 @@
+"""Nested masks of the train views as a tree, scored on the test views by the independent scorer.
+
+    python benchmarks/nested.py SCENE ../shared/data/office [--rows tree cues ...] [--work DIR]
+
+Rows:
+
+- `tree`: `masks_nested` through `associate`: what the default cut answers (`score.py instances`),
+  what the cuts hold together of instances and of parts (`score.py tree`), CPU time and memory.
+- `parts`, `objects`: association of the masks of one level alone, which the recorded truth of the
+  masks (`../masks_nested_truth`) tells: what a tree must not fall short of.
+- `flat`: association without levels.
+- `cues`: how often each cue of a node's level is right, and all of them together; the level of a
+  node is that of most of its masks, without the fragments of textures.
+- `sam`: `masks_sam`, whose levels are drawn at random, as a tree and flat.
+
+The truth of the masks is looked at for references and for counting only.
+"""
+
+import argparse
+import json
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from splatseg.core import InstanceTree, Labels, MaskSet, Scene
+from splatseg.io.evidence import open_evidence
+from splatseg.io.scene import load_scene
+from splatseg.lift import label_map
+from splatseg.lift.completion.complete import complete
+from splatseg.lift.segments.clustering import cluster
+from splatseg.lift.segments.levels import node_levels
+from splatseg.lift.segments.nesting import nesting
+from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments.table import segment_table
+from splatseg.lift.segments.tree import SegmentTree, segment_tree
+from splatseg.methods.associate import AssociateOptions, associate
+
+_SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
+_LEVELS = ("part", "object", "group")
+_CUTS = ("group", "object", "part", 0.75)
+
+
+class OneLevel:
+    """The masks of some levels, which the recorded truth of the masks tells."""
+
+    overlapping = True
+    persistent = False
+
+    def __init__(self, data: Path, name: str, levels: Sequence[str]) -> None:
+        self._source = EvidenceSegments(evidence=open_evidence(data / name))
+        self._truth = data.parent / f"{name}_truth" / data.name
+        self._levels = set(levels)
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return self._source.view_names
+
+    def segments_of(self, name: str) -> MaskSet:
+        masks = self._source.segments_of(name)
+        if not isinstance(masks, MaskSet):
+            raise TypeError("expected masks")
+        rows = true_levels(self._truth, name)
+        kept = [i for i, row in enumerate(rows) if row["level"] in self._levels]
+        index = torch.tensor(kept, dtype=torch.int64)
+        return replace(
+            masks,
+            masks=tuple(masks.masks[i] for i in kept),
+            scores=masks.scores[index],
+            levels=masks.levels[index],
+        )
+
+    def categories_of(self, name: str) -> Mapping[int, int]:
+        return self._source.categories_of(name)
+
+
+def true_levels(folder: Path, view: str) -> list[dict[str, object]]:
+    """Level, instance and part of each mask of a view."""
+    return json.loads((folder / f"{view}.json").read_text())
+
+
+class Bench:
+    """A scene, its capture, and a place for label maps."""
+
+    def __init__(self, scene: Scene, data: Path, work: Path) -> None:
+        self.scene = scene
+        self.data = data
+        self.work = work
+
+    def draw(self, labels: Labels, name: str) -> Path:
+        """Label maps of the test views."""
+        folder = self.work / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for view in self.scene.test_views:
+            drawn = label_map(self.scene.gaussians, view.camera, labels).ids
+            ids = drawn.clamp_min(0).numpy().astype(np.uint16)
+            Image.fromarray(ids).save(folder / f"{view.name}.png")
+        return folder
+
+    def score(self, command: str, predicted: Sequence[Path], truth: str) -> dict[str, float]:
+        """What the independent scorer says."""
+        said = subprocess.run(
+            [sys.executable, str(_SCORE), command, "--pred", *map(str, predicted), "--truth",
+             str(self.data / truth), "--views", "test_*"],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return json.loads(said.stdout)
+
+    def made(self, source: object, **options: object) -> tuple[Labels | InstanceTree, float]:
+        """A completed layer and the CPU seconds that it took."""
+        began = time.process_time()
+        layer = associate(
+            self.scene.gaussians,
+            self.scene.train_views,
+            source,  # type: ignore[arg-type]
+            options=AssociateOptions(**options),  # type: ignore[arg-type]
+        )
+        seconds = time.process_time() - began
+        flat = layer.labels if isinstance(layer, InstanceTree) else layer
+        flat = complete(self.scene.gaussians, flat)
+        return (replace(layer, labels=flat) if isinstance(layer, InstanceTree) else flat), seconds
+
+
+def report_tree(bench: Bench, name: str, tree: InstanceTree, seconds: float) -> None:
+    """Score the default cut and all cuts of a tree."""
+    folders = {level: bench.draw(tree.cut(level), f"{name}_{level}") for level in _CUTS}
+    said = bench.score("instances", [folders["object"]], "instance")
+    line(f"{name}, objects", said, seconds)
+    for truth in ("instance", "part"):
+        said = bench.score("tree", list(folders.values()), truth)
+        line(f"{name}, all cuts against {truth}", said, seconds)
+
+
+def line(title: str, said: Mapping[str, float], seconds: float) -> None:
+    ids = f"{said.get('predicted_instances', '-')}/{said['truth_instances']}"
+    print(
+        f"{title:48s} mIoU {said['mIoU']:.4f}  recall50 {said['recall50']:.3f}  ids {ids}  "
+        f"{seconds:6.1f} s of CPU",
+        flush=True,
+    )
+
+
+def tree(bench: Bench) -> None:
+    """The default."""
+    source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_nested"))
+    layer, seconds = bench.made(source)
+    if not isinstance(layer, InstanceTree):
+        raise TypeError("expected a tree")
+    counts = Counter(node.level for node in layer.nodes)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"{len(layer.nodes)} nodes {dict(counts)}, {peak:.2f} GiB resident at most")
+    report_tree(bench, "masks_nested", layer, seconds)
+
+
+def one_level(level: str, truth: str) -> Callable[[Bench], None]:
+    """A row: association of the masks of one level."""
+
+    def row(bench: Bench) -> None:
+        source = OneLevel(bench.data, "masks_nested", (level,))
+        layer, seconds = bench.made(source, overlapping="flat")
+        if isinstance(layer, InstanceTree):
+            raise TypeError("expected labels")
+        folder = bench.draw(layer, f"{level}s")
+        line(f"{level} masks alone", bench.score("instances", [folder], truth), seconds)
+        line(f"{level} masks alone, tree", bench.score("tree", [folder], truth), seconds)
+
+    return row
+
+
+def flat(bench: Bench) -> None:
+    """Without levels, at the default agreement and a higher one."""
+    source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_nested"))
+    for agreement in (0.2, 0.6):
+        layer, seconds = bench.made(source, overlapping="flat", agreement=agreement)
+        if isinstance(layer, InstanceTree):
+            raise TypeError("expected labels")
+        folder = bench.draw(layer, "flat")
+        line(
+            f"flat, agreement {agreement}", bench.score("instances", [folder], "instance"), seconds
+        )
+
+
+def sam(bench: Bench) -> None:
+    """Masks of a level drawn at random."""
+    source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_sam"))
+    layer, seconds = bench.made(source)
+    if isinstance(layer, InstanceTree):
+        report_tree(bench, "masks_sam", layer, seconds)
+    layer, seconds = bench.made(source, overlapping="flat")
+    if isinstance(layer, Labels):
+        folder = bench.draw(layer, "masks_sam_flat")
+        line("masks_sam, flat", bench.score("instances", [folder], "instance"), seconds)
+
+
+def cues(bench: Bench) -> None:
+    """How often each cue of a node's level is right."""
+    options = AssociateOptions()
+    source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_nested"))
+    table = segment_table(
+        bench.scene.gaussians,
+        bench.scene.train_views,
+        source,
+        most_views=options.most_views,
+        longest_side=options.longest_side,
+    )
+    agreement = table.agreement()
+    nested = nesting(agreement)
+    group = cluster(nested.agreement, options.agreement, conflicts=nested.conflicts)
+    found = segment_tree(
+        table,
+        agreement,
+        nested,
+        group,
+        min_support=options.min_support,
+        min_views=options.least_views,
+        overlap=options.overlap,
+    )
+    folder = bench.data.parent / "masks_nested_truth" / bench.data.name
+    rows = {view: true_levels(folder, view) for view in table.views}
+    level_of = [
+        str(rows[table.views[view]][name]["level"])
+        for view, name in zip(table.view.tolist(), table.name.tolist(), strict=True)
+    ]
+    truth: list[str] = []
+    for node in range(len(found.parent)):
+        counts = Counter(level_of[i] for i in np.flatnonzero(found.node == node).tolist())
+        del counts["texture"]
+        truth.append(counts.most_common(1)[0][0] if counts else "texture")
+    score = np.array([table.score[found.node == node].mean() for node in range(len(truth))])
+    for name, answer in answers(found, score).items():
+        tell(name, truth, answer)
+
+
+def answers(found: SegmentTree, score: np.ndarray) -> dict[str, list[str]]:
+    """The level of each node by each cue alone, and by the rule."""
+    children, count = found.children, len(found.parent)
+    height, depth = np.zeros(count, int), np.zeros(count, int)
+    for node in reversed(found.top_down()):
+        height[node] = 1 + max((height[i] for i in children[node]), default=-1)
+    for node in found.top_down():
+        if found.parent[node] >= 0:
+            depth[node] = depth[found.parent[node]] + 1
+    tiled = np.array(
+        [found.size[c].sum() / found.size[i] if c else 0.0 for i, c in enumerate(children)]
+    )
+    thirds = lambda values: [_LEVELS[int(3 * r)] for r in _rank(values)]  # noqa: E731
+    return {
+        "levels below (0 part, 1 object, 2 group)": [_LEVELS[min(h, 2)] for h in height],
+        "levels above (0 object, 1 part)": ["object" if d == 0 else "part" for d in depth],
+        "children tile it (object if 0.7 or more)": [
+            "object" if t >= 0.7 else "part" for t in tiled
+        ],
+        "size, by thirds": thirds(found.size),
+        "support over views, by thirds": thirds(found.support),
+        "predicted IoU, by thirds": thirds(score),
+        "fewest exceptions (the rule)": [_LEVELS[level] for level in node_levels(found)],
+    }
+
+
+def _rank(values: np.ndarray) -> np.ndarray:
+    order = np.empty(len(values))
+    order[np.argsort(values, kind="stable")] = np.arange(len(values)) / max(len(values), 1)
+    return order
+
+
+def tell(name: str, truth: Sequence[str], answer: Sequence[str]) -> None:
+    """Print how often a cue is right, over all nodes and by true level."""
+    right: dict[str, list[bool]] = {}
+    for true, said in zip(truth, answer, strict=True):
+        if true != "texture":
+            right.setdefault(true, []).append(true == said)
+    all_of = [value for values in right.values() for value in values]
+    parts = "  ".join(f"{level} {np.mean(right.get(level, [False])):.2f}" for level in _LEVELS)
+    print(f"{name:48s} {np.mean(all_of):.3f} of {len(all_of)} nodes;  {parts}", flush=True)
+
+
+ROWS: dict[str, Callable[[Bench], None]] = {
+    "tree": tree,
+    "cues": cues,
+    "parts": one_level("part", "part"),
+    "objects": one_level("object", "instance"),
+    "flat": flat,
+    "sam": sam,
+}
+
+
+def main() -> None:
+    """Print a few lines a row."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--work", type=Path, help="keep label maps here")
+    arguments = parser.parse_args()
+    temporary = None if arguments.work else tempfile.mkdtemp()
+    work = arguments.work or Path(temporary or "")
+    try:
+        bench = Bench(load_scene(arguments.scene), arguments.data, work)
+        for name in arguments.rows:
+            ROWS[name](bench)
+    finally:
+        if temporary:
+            shutil.rmtree(temporary)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,218 @@
+"""Groups of segments of all levels become a tree: what lies inside what.
+
+A node is a set of Gaussians, those that its segments hold most of (its core). It lies inside the
+smallest other node that covers most of it, unless the views say otherwise: where segments of both
+are seen in one view, they must lie inside each other there as well (`lift.segments.nesting`).
+Groups that few of the views saw which could have seen them are no nodes: where a model cuts a
+thing along a shadow it does so in one view and not in the next.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.lift.segments.clustering import Agreement
+from splatseg.lift.segments.nesting import Nesting
+from splatseg.lift.segments.table import SegmentTable
+
+_MIN_HELD = 0.5
+"""Share of what the views with segments of a node see of a Gaussian from which on it is core."""
+
+_MIN_VISIBILITY = 0.3
+"""A view could have seen a node if it sees this share of what the best view sees of it."""
+
+_SAME = 0.75
+"""Intersection over union of two cores from which on they are one node: an object all but one
+part of which is hidden, or a group that fell in two."""
+
+_MIN_NESTED = 0.5
+"""Share of the views with both in which a node's segments must lie in those of its parent."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SegmentTree:
+    """Nodes of the tree and the segments that they are made of."""
+
+    node: NDArray[np.int64]
+    """(segments,): the node of each segment, -1 for none."""
+
+    parent: NDArray[np.int64]
+    """(nodes,): row of the parent, -1 for none. Parents have larger cores."""
+
+    size: NDArray[np.float64]
+    """(nodes,): square root of what is seen of each Gaussian, summed over the core."""
+
+    support: NDArray[np.float64]
+    """(nodes,): share of the views that could have seen the node which did, in [0, 1]."""
+
+    views: NDArray[np.int64]
+    """(nodes,): views with a segment of the node."""
+
+    @property
+    def children(self) -> list[list[int]]:
+        """Rows of the children of each node, ascending."""
+        found: list[list[int]] = [[] for _ in self.parent]
+        for row, parent in enumerate(self.parent.tolist()):
+            if parent >= 0:
+                found[parent].append(row)
+        return found
+
+    def top_down(self) -> list[int]:
+        """Rows of all nodes, parents before their children."""
+        children = self.children
+        order = np.flatnonzero(self.parent < 0).tolist()
+        for row in order:  # grows while it is gone through
+            order.extend(children[row])
+        return order
+
+
+def segment_tree(
+    table: SegmentTable,
+    agreement: Agreement,
+    nested: Nesting,
+    group: NDArray[np.int64],
+    *,
+    min_support: float,
+    min_views: int,
+    overlap: float,
+) -> SegmentTree:
+    """Build the tree of groups of segments.
+
+    Args:
+        table: The segments.
+        agreement: What they share, and what the views see of them.
+        nested: What lies inside what within each view.
+        group: The group of each segment, -1 for none.
+        min_support: Groups are nodes if this share of the views which could have seen them did.
+        min_views: ... and at least so many.
+        overlap: A node lies inside another if more than this share of it does.
+    """
+    support, views = _support(agreement, group, len(table.views))
+    group = _renumbered(group, np.flatnonzero((support >= min_support) & (views >= min_views)))
+    both = _overlaps(table, group)
+    same = _same_nodes(both)
+    if same is not None:
+        group = np.where(group >= 0, same[group], -1)
+        both = _overlaps(table, group)
+    support, views = _support(agreement, group, len(table.views))
+    return SegmentTree(
+        node=group,
+        parent=_parents(table, nested, group, both, overlap),
+        size=both.diagonal().copy(),
+        support=support,
+        views=views,
+    )
+
+
+def _renumbered(group: NDArray[np.int64], kept: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Groups that are kept, numbered in their order; the others are -1."""
+    place = np.full(int(group.max(initial=-1)) + 2, -1)
+    place[kept] = np.arange(len(kept))
+    return place[group]
+
+
+def _support(
+    agreement: Agreement, group: NDArray[np.int64], view_count: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Share of the views that could have seen each group which did, and their number."""
+    import scipy.sparse
+
+    count = int(group.max(initial=-1)) + 1
+    member = np.flatnonzero(group >= 0)
+    joined: Any = scipy.sparse.csr_matrix(
+        (np.ones(len(member)), (group[member], member)), shape=(count, len(group))
+    )
+    sight = (joined @ agreement.seen).toarray()
+    could = sight >= _MIN_VISIBILITY * sight.max(axis=1, keepdims=True, initial=0)
+    did = np.zeros((count, view_count), bool)
+    did[group[member], agreement.view[member]] = True
+    return (could & did).sum(axis=1) / np.maximum(could.sum(axis=1), 1), did.sum(axis=1)
+
+
+def _overlaps(table: SegmentTable, group: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(groups, groups): what the cores share; their sizes on the diagonal."""
+    import scipy.sparse
+
+    count = int(group.max(initial=-1)) + 1
+    row, column, mass = _held_most(table, group)
+    seen = table.sights().power(2).tocsc()
+    member = group >= 0
+    had = np.zeros((len(table.views), count), bool)
+    had[table.view[member], group[member]] = True
+    held = np.zeros(len(mass))
+    for view in range(len(table.views)):
+        sight = seen[:, [view]].toarray().ravel()
+        held += np.where(had[view][column], sight[row], 0.0)
+    core = mass >= _MIN_HELD * held
+    weight = np.sqrt(np.asarray(seen.sum(axis=1)).ravel())
+    cores: Any = scipy.sparse.csr_matrix(
+        (np.ones(int(core.sum())), (column[core], row[core])), shape=(count, seen.shape[0])
+    )
+    return (cores @ scipy.sparse.diags(weight) @ cores.T).toarray()
+
+
+def _held_most(
+    table: SegmentTable, group: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Gaussian, group and mass where a group holds most of what its own segments touch.
+
+    Views whose segments do not touch the Gaussian are to be counted yet; this leaves out most of
+    what is no core without looking at them.
+    """
+    mass = table.votes(group, np.ones(len(group)))
+    touched = replace(table, mass=table.seen).votes(group, np.ones(len(group)))
+    # A view with several segments of a group touches a Gaussian at most so many times.
+    pairs = np.stack((group[group >= 0], table.view[group >= 0]))
+    (names, _), times = np.unique(pairs, axis=1, return_counts=True)
+    repeats = np.ones(mass.shape[1])
+    np.maximum.at(repeats, names, times)
+    # The same segments give both, so that both have the same entries in the same order.
+    entries = mass.tocoo()
+    most = entries.data * repeats[entries.col] >= 0.99 * _MIN_HELD * touched.data
+    return entries.row[most], entries.col[most], entries.data[most]
+
+
+def _same_nodes(both: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    """Where each group goes: to the earlier of two with the same core; None if none do."""
+    size = both.diagonal()
+    ratio = both / np.maximum(size[:, None] + size[None, :] - both, 1e-12)
+    np.fill_diagonal(ratio, 0)
+    best = ratio.argmax(axis=1)
+    row = np.arange(len(size))
+    mutual = (best[best] == row) & (ratio[row, best] > _SAME) & (best < row)
+    if not mutual.any():
+        return None
+    return np.unique(np.where(mutual, best, row), return_inverse=True)[1]
+
+
+def _parents(
+    table: SegmentTable,
+    nested: Nesting,
+    group: NDArray[np.int64],
+    both: NDArray[np.float64],
+    overlap: float,
+) -> NDArray[np.int64]:
+    import scipy.sparse
+
+    size = both.diagonal()
+    count = len(size)
+    pairs = nested.inside.tocoo()
+    inner, outer = group[pairs.row], group[pairs.col]
+    known = (inner >= 0) & (outer >= 0) & (inner != outer)
+    inside: Any = scipy.sparse.csr_matrix(
+        (np.ones(int(known.sum())), (inner[known], outer[known])), shape=(count, count)
+    ).toarray()
+    there = np.zeros((count, len(table.views)))
+    there[group[group >= 0], table.view[group >= 0]] = 1
+    together = there @ there.T
+    # A node seen beside another no more than once cannot be told from it by views.
+    agrees = (together < 2) | (inside >= _MIN_NESTED * together)
+    larger = (size[None, :] > size[:, None]) | (
+        (size[None, :] == size[:, None]) & (np.arange(count)[None, :] < np.arange(count)[:, None])
+    )
+    fits = agrees & larger & (both >= overlap * size[:, None]) & (size > 0)[:, None]
+    smallest = np.where(fits, size[None, :], np.inf)
+    best = smallest.argmin(axis=1) if count else np.zeros(0, np.int64)
+    return np.where(fits.any(axis=1), best, -1).astype(np.int64)

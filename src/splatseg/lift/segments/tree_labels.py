@@ -1,0 +1,257 @@
+"""Votes of a tree of segments: of each Gaussian its object first, and then the part of it.
+
+All masks of an object and of its parts vote for the object: where a view has no mask of the whole,
+those of the parts speak for it. Parts are chosen within the object alone, so that children lie
+inside their parents whatever the single masks did.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatseg.core import UNLABELLED, ClassTable, InstanceTree, Labels, TreeLevel, TreeNode
+from splatseg.lift.mass.confusion import ConfusionOptions, correct_confusion
+from splatseg.lift.segments.ballots import majority
+from splatseg.lift.segments.levels import GROUP, OBJECT, PART
+from splatseg.lift.segments.table import SegmentTable
+from splatseg.lift.segments.tree import SegmentTree
+
+_MIN_PART_VOTES = 0.15
+"""A Gaussian of an object is one of its parts if the masks of these have this share of the votes
+that the masks of the whole have: the rest of the object has no part."""
+
+
+_LEVELS: dict[int, TreeLevel] = {GROUP: "group", OBJECT: "object", PART: "part"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TreeVotes:
+    """What the segments of a tree say of the Gaussians."""
+
+    objects: Labels
+    """Of each Gaussian its object; ids count objects from 1, the one with most votes first."""
+
+    node: NDArray[np.int64]
+    """(Gaussians,): row of the deepest node, -1 for none."""
+
+    object_rows: NDArray[np.int64]
+    """Rows of the nodes that are objects and have a vote, in the order of their ids."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Ballot:
+    """A tree whose segments vote."""
+
+    table: SegmentTable
+    tree: SegmentTree
+    level: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    confusion: ConfusionOptions | None
+
+    def decided(self, group: NDArray[np.int64]) -> Labels:
+        """The labels by the votes of groups of segments, with all candidates."""
+        labels = majority(self.table.votes(group, self.weight))
+        return (
+            labels if self.confusion is None else correct_confusion(labels, options=self.confusion)
+        )
+
+    def own(
+        self, node_of_segment: NDArray[np.int64], node: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Votes that each Gaussian has for its own node."""
+        table = self.table
+        of = node_of_segment[table.segment]
+        mine = (of >= 0) & (of == node[table.gaussian])
+        values = (table.mass * self.weight[table.segment])[mine]
+        votes = np.bincount(table.gaussian[mine], values, minlength=table.gaussians)
+        return votes.astype(np.float64)
+
+
+def tree_votes(
+    table: SegmentTable,
+    tree: SegmentTree,
+    level: NDArray[np.int64],
+    weight: NDArray[np.float64],
+    *,
+    confusion: ConfusionOptions | None,
+) -> TreeVotes:
+    """Let the segments of a tree vote.
+
+    Args:
+        table: The segments.
+        tree: Their tree.
+        level: The level of each node (`lift.segments.levels`).
+        weight: (segments,): factor of each segment's votes.
+        confusion: How segments err, see `correct_confusion`; None takes the majority.
+    """
+    ballot = _Ballot(table=table, tree=tree, level=level, weight=weight, confusion=confusion)
+    object_of, top_part = _above(tree, level)
+    objects, group = _compact(object_of[tree.node])
+    total = np.asarray(table.votes(group, weight).sum(axis=0)).ravel()
+    order = np.lexsort((np.arange(len(total)), -total))
+    order = order[total[order] > 0]
+    rank = np.full(len(objects) + 1, -1)
+    rank[order] = np.arange(len(order))
+    labels = ballot.decided(rank[group])
+    rows = objects[order]
+    ids = labels.ids.numpy()
+    node = np.where(ids == UNLABELLED, -1, np.append(rows, -1)[ids - 1])
+    node = _parts(ballot, node, object_of, top_part[tree.node])
+    return TreeVotes(objects=labels, node=_deeper(ballot, node), object_rows=rows)
+
+
+def _compact(row: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows in use, ascending, and for each segment its index among them, -1 for none."""
+    used = np.unique(row[row >= 0])
+    index = np.full(int(row.max(initial=-1)) + 2, -1)
+    index[used] = np.arange(len(used))
+    return used, index[row]
+
+
+def _above(
+    tree: SegmentTree, level: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The object that each node is or lies in, and the part next to it, -1 for none.
+
+    A last entry is for segments without a node.
+    """
+    object_of = np.full(len(level) + 1, -1)
+    top_part = np.full(len(level) + 1, -1)
+    for row in tree.top_down():
+        parent = tree.parent[row]
+        if level[row] == OBJECT:
+            object_of[row] = row
+        elif level[row] == PART:
+            object_of[row] = object_of[parent]
+            top_part[row] = row if level[parent] == OBJECT else top_part[parent]
+    return object_of, top_part
+
+
+def _parts(
+    ballot: _Ballot,
+    node: NDArray[np.int64],
+    object_of: NDArray[np.int64],
+    part: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Of each Gaussian of an object the part next to it, or the object still.
+
+    Args:
+        ballot: The segments.
+        node: (Gaussians,): the object of each.
+        object_of: (nodes + 1,): the object that each node is or lies in.
+        part: (segments,): the part next to the object that each segment is of, -1 for none.
+    """
+    parts, group = _compact(part)
+    if not len(parts):
+        return node
+    labels = ballot.decided(group)
+    if labels.candidates is None:
+        return node
+    ids = labels.candidates.numpy()
+    chosen = np.where(ids == UNLABELLED, -1, np.append(parts, -1)[ids - 1])
+    inside = (chosen >= 0) & (object_of[chosen] == node[:, None])
+    first = chosen[np.arange(len(node)), inside.argmax(axis=1)]
+    is_object = np.append(ballot.level == OBJECT, False)
+    whole = ballot.own(np.where(is_object[ballot.tree.node], ballot.tree.node, -1), node)
+    pieces = ballot.own(np.where(part >= 0, object_of[part], -1), node)
+    there = inside.any(axis=1) & (pieces >= _MIN_PART_VOTES * whole)
+    return np.where(there, first, node)
+
+
+def _deeper(ballot: _Ballot, node: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Down from parts to the parts of parts, by majority."""
+    tree, children = ballot.tree, ballot.tree.children
+    while True:
+        below = np.full(len(ballot.level) + 1, -1)
+        for row in np.unique(node[node >= 0]).tolist():
+            for child in children[row] if ballot.level[row] == PART else ():
+                below[_subtree(children, child)] = child
+        if not (below >= 0).any():
+            return node
+        votes = ballot.table.votes(below[tree.node], ballot.weight).tocoo()
+        fits = tree.parent[votes.col] == node[votes.row]
+        row, child, value = votes.row[fits], votes.col[fits], votes.data[fits]
+        order = np.lexsort((child, -value, row))
+        row, child, value = row[order], child[order], value[order]
+        first = np.ones(len(row), bool)
+        first[1:] = row[1:] != row[:-1]
+        moved = first & (value >= _MIN_PART_VOTES * ballot.own(tree.node, node)[row])
+        if not moved.any():
+            return node
+        node = node.copy()
+        node[row[moved]] = child[moved]
+
+
+def _subtree(children: list[list[int]], row: int) -> list[int]:
+    found = [row]
+    for inside in found:  # grows while it is gone through
+        found.extend(children[inside])
+    return found
+
+
+def category_of(table: SegmentTable, segments: NDArray[np.int64]) -> int:
+    """The category that most of some segments have, by their mass and score; 0 for none."""
+    known = segments[table.category[segments] != UNLABELLED]
+    if not len(known):
+        return 0
+    weight = table.size[known] * table.score[known]
+    return int(np.bincount(table.category[known], weight).argmax())
+
+
+def instance_tree(
+    table: SegmentTable,
+    tree: SegmentTree,
+    level: NDArray[np.int64],
+    votes: TreeVotes,
+    classes: ClassTable | None,
+) -> InstanceTree:
+    """The tree as a layer: nodes that Gaussians belong to, and those above them.
+
+    Objects have the ids from 1 on, then come groups, then parts, each the largest first.
+    """
+    used = set(votes.node[votes.node >= 0].tolist())
+    for row in reversed(tree.top_down()):
+        if row in used and tree.parent[row] >= 0:
+            used.add(int(tree.parent[row]))
+    order = [row for row in votes.object_rows.tolist() if row in used]
+    for wanted in (GROUP, PART):
+        rows = [row for row in used if level[row] == wanted]
+        order += sorted(rows, key=lambda row: (-tree.size[row], row))
+    ids = np.full(len(level) + 1, UNLABELLED)
+    ids[order] = np.arange(1, len(order) + 1)
+    nodes = tuple(
+        _node(table, tree, row, _LEVELS[int(level[row])], ids=ids, classes=classes) for row in order
+    )
+    labels = replace(
+        votes.objects,
+        ids=torch.from_numpy(ids[votes.node].astype(np.int32)),
+        candidates=None,
+        shares=None,
+    )
+    return InstanceTree(nodes=nodes, labels=labels)
+
+
+def _node(
+    table: SegmentTable,
+    tree: SegmentTree,
+    row: int,
+    level: TreeLevel,
+    *,
+    ids: NDArray[np.int64],
+    classes: ClassTable | None,
+) -> TreeNode:
+    members = np.flatnonzero(tree.node == row)
+    category = category_of(table, members)
+    word = classes.name_of(category) if category > 0 and classes is not None else level
+    return TreeNode(
+        id=int(ids[row]),
+        parent=int(ids[tree.parent[row]]),
+        level=level,
+        name=f"{word} {ids[row]}",
+        class_id=category,
+        support=float(tree.support[row]),
+        segments=len(members),
+        views=int(tree.views[row]),
+    )

@@ -1,0 +1,103 @@
+"""What a report shows of a tree of instances: its nodes, and pictures of its cuts."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+
+from splatseg.core import TREE_LEVELS, UNLABELLED, ClassInfo, ClassTable, InstanceTree, Scene, View
+from splatseg.io.export import node_rows
+from splatseg.io.images import image_camera, load_image
+from splatseg.lift import label_map
+from splatseg.render import render
+from splatseg.report.html import Block, Table
+from splatseg.report.pictures import Gallery, Picture, colour_of, overlay_labels
+
+_LONGEST = 448
+_MAX_ROWS = 400
+
+
+def tree_section(
+    scene: Scene, tree: InstanceTree, views: Sequence[View], *, backend: str = "auto"
+) -> tuple[Block, ...]:
+    """The pictures of three cuts in some views, and a table of all nodes, children indented.
+
+    Args:
+        scene: The scene.
+        tree: The layer.
+        views: Those that are drawn.
+        backend: Who renders.
+    """
+    pictures = (_cuts(scene, tree, views, backend),) if views else ()
+    return (*pictures, _nodes(tree))
+
+
+def _cuts(scene: Scene, tree: InstanceTree, views: Sequence[View], backend: str) -> Gallery:
+    table = ClassTable(
+        rows=tuple(
+            ClassInfo(id=node.id, name=node.name, colour=colour_of(node.id)) for node in tree.nodes
+        )
+    )
+    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    for view in views:
+        camera = image_camera(view, _LONGEST)
+        if view.image is None:
+            colours = render(scene.gaussians, camera, backend=backend).image.float().cpu()
+            photograph = (colours.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        else:
+            photograph = load_image(view, longest=_LONGEST)
+        drawn = [
+            label_map(scene.gaussians, camera, tree.cut(level), backend=backend).ids
+            for level in TREE_LEVELS
+        ]
+        rows.append(
+            (
+                view.name,
+                tuple(Picture(image=overlay_labels(photograph, ids, table)) for ids in drawn),
+            )
+        )
+    return Gallery(
+        title="The tree at three levels",
+        columns=tuple(f"{level}s" for level in TREE_LEVELS),
+        rows=tuple(rows),
+        note="Groups hold objects, objects hold parts. What has no level above it, or none below, "
+        "is shown at the next.",
+    )
+
+
+def _nodes(tree: InstanceTree) -> Table:
+    rows = {row["id"]: row for row in node_rows(tree)}
+    order = _depth_first(tree, {id: row["gaussians"] for id, row in rows.items()})
+    cells = tuple(
+        (
+            "\u2003" * (len(tree.path(id)) - 1) + str(rows[id]["name"]),
+            id,
+            rows[id]["level"],
+            rows[id]["gaussians"],
+            f"{rows[id]['support']:.2f}",
+            rows[id]["segments"],
+            rows[id]["views"],
+        )
+        for id in order[:_MAX_ROWS]
+    )
+    more = f" The first {_MAX_ROWS} of {len(order)} are shown." if len(order) > _MAX_ROWS else ""
+    return Table(
+        title="The tree",
+        columns=("node", "id", "level", "Gaussians", "support", "masks", "views"),
+        rows=cells,
+        note="Support is the share of the views that could have seen a node which have a mask of "
+        f"it.{more}",
+    )
+
+
+def _depth_first(tree: InstanceTree, size: Mapping[int, int]) -> list[int]:
+    """Ids of all nodes, each followed by those below it, the largest first."""
+    below: dict[int, list[int]] = {}
+    for node in tree.nodes:
+        below.setdefault(node.parent, []).append(node.id)
+    stack = sorted(below.get(UNLABELLED, []), key=lambda id: (size[id], -id))
+    found: list[int] = []
+    while stack:
+        id = stack.pop()
+        found.append(id)
+        stack += sorted(below.get(id, []), key=lambda id: (size[id], -id))
+    return found

@@ -1,0 +1,164 @@
+"""Masks that are nested in every view become a tree of groups, objects and parts."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import InstanceTree, Labels, MaskSet, Rle, View
+from splatseg.errors import InputError, RangeError
+from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
+
+from .test_associate import BACKEND, GAUSSIANS, VIEWS, Segments, columns
+
+# What the strips between these borders hold: the halves of the left square, those of the middle
+# one, and the right square.
+BORDERS = (-1.2, -0.6, -0.3, 0.0, 0.3, 1.2)
+HALVES = [frozenset({0, 2}), frozenset({1, 3}), frozenset({4, 6}), frozenset({5, 7})]
+LEFT, MIDDLE, RIGHT = frozenset(range(4)), frozenset(range(4, 8)), frozenset(range(8, 12))
+
+# Strips of each mask: four halves, two wholes, the group of both, and a neighbour of one piece.
+NESTED = ((0,), (1,), (2,), (3,), (0, 1), (2, 3), (0, 1, 2, 3), (4,))
+
+
+def masks(view: View, strips: Sequence[Sequence[int]]) -> MaskSet:
+    strip = columns(view, *BORDERS)
+    found = [torch.isin(strip, torch.tensor(list(wanted))) for wanted in strips]
+    return MaskSet(
+        height=view.camera.height,
+        width=view.camera.width,
+        masks=tuple(Rle.encode(mask) for mask in found),
+        scores=torch.ones(len(found)),
+        levels=torch.zeros(len(found), dtype=torch.int32),
+    )
+
+
+def nested(strips: Mapping[str, Sequence[Sequence[int]]] | None = None, views=VIEWS) -> Segments:
+    strips = strips or {}
+    return Segments(
+        {view.name: masks(view, strips.get(view.name, NESTED)) for view in views},
+        overlapping=True,
+    )
+
+
+def run(source: Segments, views=VIEWS, confusion=DEFAULT_CONFUSION, **options):
+    return associate(
+        GAUSSIANS,
+        views,
+        source,
+        options=AssociateOptions(**options),
+        confusion=confusion,
+        backend=BACKEND,
+    )
+
+
+def tree_of(source: Segments, views=VIEWS, **options) -> InstanceTree:
+    found = run(source, views, **options)
+    assert isinstance(found, InstanceTree)
+    return found
+
+
+def sets(labels: Labels) -> set[frozenset[int]]:
+    """The Gaussians of each id."""
+    return {
+        frozenset((labels.ids == id).nonzero().squeeze(1).tolist())
+        for id in labels.ids.unique().tolist()
+        if id > 0
+    }
+
+
+def test_halves_wholes_group_and_neighbour_are_four_levels_of_one_tree() -> None:
+    tree = tree_of(nested())
+    assert sets(tree.cut()) == {LEFT, MIDDLE, RIGHT}
+    assert sets(tree.cut("part")) == {*HALVES, RIGHT}
+    assert sets(tree.cut("group")) == {LEFT | MIDDLE, RIGHT}
+    assert int(tree.labels.ids[12]) == -1
+    assert sorted(node.level for node in tree.nodes) == [*["group"], *["object"] * 3, *["part"] * 4]
+    assert all(node.views == 4 and node.support == 1 for node in tree.nodes)
+    assert tree.metadata["associate"] == {
+        "segments": 32,
+        "instances": 3,
+        "left_out": 0,
+        "joined_within_views": 0,
+        "nodes": 8,
+    }
+
+
+def test_two_wholes_alone_are_objects_with_parts() -> None:
+    tree = tree_of(nested({view.name: NESTED[:6] + NESTED[7:] for view in VIEWS}))
+    assert sets(tree.cut()) == sets(tree.cut("group")) == {LEFT, MIDDLE, RIGHT}
+    assert sets(tree.cut("part")) == {*HALVES, RIGHT}
+
+
+def test_masks_without_any_nesting_are_objects() -> None:
+    tree = tree_of(nested({view.name: ((0, 1), (2, 3), (4,)) for view in VIEWS}))
+    assert {node.level for node in tree.nodes} == {"object"}
+    assert sets(tree.cut()) == {LEFT, MIDDLE, RIGHT}
+
+
+def test_a_mask_that_one_view_lacks_is_made_up_for_by_the_others() -> None:
+    without_whole = tuple(wanted for wanted in NESTED if wanted != (0, 1))
+    tree = tree_of(nested({"v1": without_whole}))
+    assert sets(tree.cut()) == {LEFT, MIDDLE, RIGHT}
+    support = {node.id: node.support for node in tree.nodes}
+    left = int(tree.cut().ids[0])
+    assert support[left] == 0.75
+
+
+def test_masks_of_few_views_are_no_nodes_where_more_support_is_asked_for() -> None:
+    # The left square has parts in two of the four views only.
+    rare = {view.name: NESTED[2:] for view in VIEWS[2:]}
+    whole = {LEFT, *HALVES[2:], RIGHT}
+    assert sets(tree_of(nested(rare), min_support=0.4).cut("part")) == {*HALVES, RIGHT}
+    assert sets(tree_of(nested(rare), min_support=0.6).cut("part")) == whole
+    assert sets(tree_of(nested(rare), least_views=3).cut("part")) == whole
+
+
+def test_neither_the_order_of_views_nor_that_of_masks_matters() -> None:
+    one = tree_of(nested())
+    other = tree_of(
+        nested({view.name: NESTED[i:] + NESTED[:i] for i, view in enumerate(VIEWS)}), VIEWS[::-1]
+    )
+    assert one.nodes == other.nodes
+    assert torch.equal(one.labels.ids, other.labels.ids)
+    assert torch.equal(one.labels.confidence, other.labels.confidence)
+
+
+def test_a_cut_can_be_asked_for_instead_of_the_tree() -> None:
+    parts = run(nested(), level="part")
+    assert isinstance(parts, Labels)
+    assert sets(parts) == {*HALVES, RIGHT}
+    assert parts.metadata["cut"] == "part"
+    coarse = run(nested(), level="0")
+    assert isinstance(coarse, Labels)
+    assert sets(coarse) == {LEFT | MIDDLE, RIGHT}
+
+
+def test_flat_overlapping_masks_are_labels_as_before() -> None:
+    labels = run(nested(), overlapping="flat", agreement=0.6)
+    assert isinstance(labels, Labels)
+    assert sets(labels) == {LEFT | MIDDLE, RIGHT}
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"overlapping": "levels"}, InputError),
+        ({"level": "things"}, InputError),
+        ({"min_support": 1.5}, RangeError),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options, error) -> None:
+    with pytest.raises(error):
+        AssociateOptions(**options)
+
+
+def test_ids_count_objects_first_by_what_is_seen_of_them() -> None:
+    tree = tree_of(nested())
+    assert [node.level for node in tree.nodes[:4]] == ["object", "object", "object", "group"]
+    assert [node.id for node in tree.nodes] == list(range(1, len(tree.nodes) + 1))
+    evidence = tree.labels.evidence
+    assert evidence is not None
+    mass = [float(evidence[tree.cut().ids == id].sum()) for id in (1, 2, 3)]
+    assert np.all(np.diff(mass) <= 0)

@@ -1,0 +1,105 @@
+"""Levels of trees spelt out: what has parts is an object, what has objects a group."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from splatseg.lift.segments.clustering import Agreement, cluster
+from splatseg.lift.segments.levels import GROUP, OBJECT, PART, node_levels
+from splatseg.lift.segments.nesting import nesting
+from splatseg.lift.segments.tree import SegmentTree
+
+
+def tree(parents: list[int], support: list[float] | None = None) -> SegmentTree:
+    count = len(parents)
+    return SegmentTree(
+        node=np.arange(count),
+        parent=np.array(parents),
+        size=np.ones(count),
+        support=np.ones(count) if support is None else np.array(support),
+        views=np.full(count, 5),
+    )
+
+
+def levels(*arguments) -> list[int]:
+    return node_levels(tree(*arguments)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("parents", "expected"),
+    [
+        ([], []),
+        ([-1], [OBJECT]),
+        ([-1, 0, 0], [OBJECT, PART, PART]),
+        # A desk with a top and a leg, and a cup of one piece and a lamp of two on it.
+        (
+            [-1, 0, 1, 1, 0, 0, 5, 5],
+            [GROUP, OBJECT, PART, PART, OBJECT, OBJECT, PART, PART],
+        ),
+        # A drum whose skin fell into two is no group of a skin and a shell.
+        ([-1, 0, 0, 1, 1], [OBJECT, PART, PART, PART, PART]),
+        # A chain of one child each is an object with parts.
+        ([-1, 0, 1, 2], [OBJECT, PART, PART, PART]),
+        # A room of two desks with two lamps each.
+        (
+            [-1, 0, 0, 1, 1, 1, 2, 2, 2, *(k for k in range(3, 9) for _ in range(2))],
+            [GROUP] * 3 + [OBJECT] * 6 + [PART] * 12,
+        ),
+    ],
+)
+def test_levels_by_hand(parents, expected) -> None:
+    assert levels(parents) == expected
+
+
+def test_parts_count_by_their_support() -> None:
+    # Two things of two parts in one: a group if the parts are surely there, else an object.
+    parents = [-1, 0, 0, 1, 1, 2, 2]
+    assert levels(parents, [1, 1, 1, 1, 1, 1, 1])[0] == GROUP
+    assert levels(parents, [1, 1, 1, 0.4, 0.4, 0.4, 0.4])[0] == OBJECT
+
+
+def test_a_lone_thing_in_a_group_is_half_an_exception() -> None:
+    # Three sub-parts against two and one half for each of two lone things.
+    assert levels([-1, 0, 1, 1, 1, 0])[0] == GROUP
+    assert levels([-1, 0, 1, 1, 1, 0, 0])[0] == OBJECT
+
+
+def agreement(share: np.ndarray, view: list[int]) -> Agreement:
+    """Of segments that hold shares of Gaussians which all views see alike."""
+    seen = scipy.sparse.csr_matrix(np.repeat(share.sum(axis=1)[:, None], max(view) + 1, axis=1))
+    return Agreement(
+        shared=scipy.sparse.csr_matrix(share @ share.T), seen=seen, view=np.array(view)
+    )
+
+
+# A half and the whole in each of three views.
+HALF, WHOLE = [1, 1, 1, 0, 0], [1, 1, 1, 1, 1]
+SHARE = np.array([HALF, WHOLE] * 3, dtype=np.float64)
+VIEW = [0, 0, 1, 1, 2, 2]
+
+
+def test_what_lies_inside_another_of_its_view_is_of_another_level() -> None:
+    found = nesting(agreement(SHARE, VIEW))
+    assert sorted(zip(*found.inside.nonzero(), strict=True)) == [(0, 1), (2, 3), (4, 5)]
+    assert found.share == 1
+    assert found.agreement.shared[0, 1] == 0
+    assert found.agreement.shared[0, 3] == 3
+    assert cluster(agreement(SHARE, VIEW), 0.2).tolist() == [0] * 6
+    together = cluster(found.agreement, 0.2, conflicts=found.conflicts)
+    assert together.tolist() == [0, 1, 0, 1, 0, 1]
+
+
+def test_the_same_mask_twice_in_a_view_is_no_conflict() -> None:
+    found = nesting(agreement(np.array([WHOLE, WHOLE], dtype=np.float64), [0, 0]))
+    assert found.inside.nnz == 0
+    assert found.share == 0
+    assert found.agreement.shared[0, 1] == 5
+
+
+def test_one_contradiction_among_many_views_keeps_nothing_apart() -> None:
+    # The same thing in six views; one of them has a fragment of it besides.
+    share = np.array([WHOLE] * 6 + [[1, 1, 1, 0, 0]], dtype=np.float64)
+    found = nesting(agreement(share, [0, 1, 2, 3, 4, 5, 0]))
+    together = cluster(found.agreement, 0.2, conflicts=found.conflicts)
+    assert together[:6].tolist() == [0] * 6
+    assert together[6] == 1
