@@ -239,7 +239,7 @@ def test_nothing_is_measured_if_not_asked(labelled, splatseg, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--layer", "none"), "expected a layer of the scene (classes, picked), got 'none'"),
+        (("--layer", "none"), "expected one of the scene (classes, picked), got 'none'"),
         (("--layer", "picked"), "expected labels"),
         (("--evidence", "nowhere"), "nowhere"),
         (("--measure", -1), "--measure"),

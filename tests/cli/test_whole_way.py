@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatseg.core import Labels
+from splatseg.core import InstanceTree, Labels
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.io.splats import read_splats, write_splats
@@ -94,31 +94,14 @@ def test_masks_of_a_model_become_instances(room, run) -> None:
     run("see", room, "--model", "classical", "--evidence", "masks", *some)
     run("segment", room, "--method", "associate", "--evidence", "masks", *CPU)
     layer = load_scene_layer(room, "masks")
-    assert isinstance(layer, Labels)
-    assert len(layer.present) > 3
+    assert isinstance(layer, InstanceTree)
+    assert len(layer.cut().present) > 3
 
 
 def test_sharpened_gaussians_agree_more_with_their_labels(room, run, classes, tmp_path) -> None:
-    quick = (
-        "--sharpen-steps",
-        40,
-        "--decide-every",
-        20,
-        "--rates-from",
-        0,
-        "--no-correct-confusion",
-    )
-    run(
-        "sharpen",
-        room,
-        "-o",
-        tmp_path / "sharp",
-        "--layer",
-        classes,
-        *quick,
-        "--no-correct-confusion",
-        *CPU,
-    )
+    quick = ("--sharpen-steps", 40, "--decide-every", 20, "--rates-from", 0)
+    plain = (*quick, "--no-correct-confusion", *CPU)
+    run("sharpen", room, "-o", tmp_path / "sharp", "--layer", classes, *plain)
     first, last = load_scene(tmp_path / "sharp").provenance["sharpened"]["agreement"]
     assert last > first
 
