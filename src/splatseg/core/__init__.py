@@ -10,6 +10,7 @@ from splatseg.core.evidence import LabelMap as LabelMap
 from splatseg.core.evidence import MaskSet as MaskSet
 from splatseg.core.evidence import Segment as Segment
 from splatseg.core.evidence import Track as Track
+from splatseg.core.evidence import map_ids as map_ids
 from splatseg.core.gaussians import Gaussians as Gaussians
 from splatseg.core.layers import Features as Features
 from splatseg.core.layers import Labels as Labels

@@ -16,6 +16,7 @@ from splatseg.core import (
     Scene,
     View,
     camera_of_map,
+    map_ids,
 )
 from splatseg.evaluate.agreement import Agreement, agreement
 from splatseg.evaluate.overlaps import Overlaps, instance_score
@@ -125,12 +126,6 @@ def rename_truth(sights: Sequence[Sight]) -> dict[int, int]:
     }
 
 
-def renamed(ids: Int[Tensor, "height width"], names: dict[int, int]) -> Int[Tensor, "height width"]:
-    """A map under other ids; ids without another name, and -1, stay."""
-    found, at = torch.unique(ids.long(), return_inverse=True)
-    return torch.tensor([names.get(i, i) for i in found.tolist()], dtype=torch.int64)[at]
-
-
 def gallery(
     sights: Sequence[Sight],
     classes: ClassTable,
@@ -204,7 +199,7 @@ def _truth_pictures(
     size = (int(photograph.shape[0]), int(photograph.shape[1]))
     if sight.truth is None:
         return [_nothing(size), _nothing(size)]
-    truth = sight.truth if names is None else renamed(sight.truth, names)
+    truth = sight.truth if names is None else map_ids(sight.truth, names, default=None)
     known = truth != UNLABELLED
     right = float((sight.drawn == truth)[known].double().mean()) if bool(known.any()) else 0.0
     marked = mark_errors(

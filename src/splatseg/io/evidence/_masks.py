@@ -5,7 +5,6 @@ The JSON and the folder are what SAM's automatic mask generator writes.
 
 import csv
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, cast
@@ -15,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet, Rle
+from splatseg.core import FeatureMap, MaskSet, Rle
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
+from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._labels import read_id_map
 from splatseg.io.json_files import read_json
 from splatseg.io.npz import read_npz
@@ -31,44 +30,17 @@ _MOST_RUN = int(np.iinfo(np.uint32).max)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MaskEvidence(Evidence):
+class MaskEvidence(IdFreeEvidence):
     """Overlapping masks without classes."""
-
-    root: Path
-    files: Mapping[str, Path]
-
-    @property
-    @override
-    def folder(self) -> Path:
-        return self.root
 
     @property
     @override
     def kind(self) -> EvidenceKind:
         return "masks"
 
-    @property
-    @override
-    def view_names(self) -> tuple[str, ...]:
-        return tuple(self.files)
-
-    @property
-    @override
-    def classes(self) -> ClassTable | None:
-        return None
-
-    @property
-    @override
-    def source_ids(self) -> Mapping[int, int] | None:
-        return None
-
-    @override
-    def label_map(self, name: str) -> LabelMap:
-        refuse(self, "label maps")
-
     @override
     def masks(self, name: str) -> MaskSet:
-        return read_any_masks(file_of(self.files, name, self.root))
+        return read_any_masks(self.file_of(name))
 
     @override
     def features(self, name: str) -> FeatureMap:

@@ -72,12 +72,8 @@ def open_evidence(
     rule = check_rule(zero_is_class, void)
     maps, arrays = view_files(folder, ".png"), view_files(folder, ".npz")
     objects = view_files(folder, ".json")
-    if unfinished == "refuse" and _is_unfinished(header):
-        count = max(len(maps), len(arrays), len(objects))
-        raise InputError(
-            f"{folder}: expected all its views, got {count} of work that was stopped; give the "
-            "same `splatseg see` again."
-        )
+    if unfinished == "refuse":
+        _check_finished(folder, header, views=max(len(maps), len(arrays), len(objects)))
     if kind is not None and header.get("kind", kind) != kind:
         raise InputError(f"{folder}: expected evidence of {kind}, got {header['kind']}.")
     found: str | None = kind or header.get("kind") or _kind(folder, maps, objects, arrays)
@@ -170,9 +166,13 @@ def _header(folder: Path) -> dict[str, Any]:
     return header
 
 
-def _is_unfinished(header: Mapping[str, Any]) -> bool:
+def _check_finished(folder: Path, header: Mapping[str, Any], *, views: int) -> None:
     metadata = header.get("metadata")
-    return isinstance(metadata, dict) and cast(dict[str, Any], metadata).get("complete") is False
+    if isinstance(metadata, dict) and cast(dict[str, Any], metadata).get("complete") is False:
+        raise InputError(
+            f"{folder}: expected all its views, got {views} of work that was stopped; give the "
+            "same `splatseg see` again."
+        )
 
 
 def _kind(
