@@ -8,7 +8,7 @@ from typing import Any
 
 from splatseg.core import Capture, View
 from splatseg.evaluate import PhotographReport, evaluate_photographs, picture_and_photograph
-from splatseg.evaluate.held_out import MaskUse
+from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import FitOptions, FitResult
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import read_json, write_json

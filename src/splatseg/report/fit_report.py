@@ -9,7 +9,7 @@ from importlib import metadata
 from typing import Any
 
 from splatseg.core import Capture, View
-from splatseg.evaluate.held_out import PhotographReport
+from splatseg.evaluate.photographs import PhotographReport
 from splatseg.fit import FitOptions, FitRecord, FitResult, reduction_note
 from splatseg.report.chart import Chart, Line
 from splatseg.report.html import Bars, Block, Commands, Curves, Figure, Report, Table
