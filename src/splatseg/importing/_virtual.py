@@ -107,23 +107,27 @@ def place_cameras(
     overview = [i for i, g in enumerate(glimpses) if g.overview]
     chosen = _greedy(glimpses, count, begin=overview)
     cameras = _in_order([glimpses[i].camera.resized(width, height) for i in chosen], extent)
-    views = tuple(
+    seen = _seen(gaussians, [glimpses[i].camera for i in chosen], backend)
+    # Every fourth candidate is enough to tell what can be seen at all.
+    visible = seen | _seen(gaussians, [g.camera for g in glimpses[::4]], backend)
+    whole = float(extent.mass[visible].sum())
+    return VirtualViews(
+        views=_views(cameras),
+        kind=kind,
+        up=up,
+        coverage=float(extent.mass[seen].sum()) / whole if whole > 0 else 0.0,
+    )
+
+
+def _views(cameras: Sequence[Camera]) -> tuple[View, ...]:
+    """Views of virtual cameras, some of them held out."""
+    return tuple(
         View(
             name=f"virtual_{i:04d}",
             camera=camera,
             split="test" if i % TEST_EVERY == 0 and len(cameras) > 1 else "train",
         )
         for i, camera in enumerate(cameras)
-    )
-    seen = _seen(gaussians, [glimpses[i].camera for i in chosen], backend)
-    # Every fourth candidate is enough to tell what can be seen at all.
-    visible = seen | _seen(gaussians, [g.camera for g in glimpses[::4]], backend)
-    whole = float(extent.mass[visible].sum())
-    return VirtualViews(
-        views=views,
-        kind=kind,
-        up=up,
-        coverage=float(extent.mass[seen].sum()) / whole if whole > 0 else 0.0,
     )
 
 
