@@ -9,7 +9,8 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, ClassTable, Labels
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
-from splatseg.report._segment_pictures import Sight
+from splatseg.report._common import count_text
+from splatseg.report._segment_pictures import ViewPanel
 from splatseg.report.html import Bars, Block, Cell, Table
 
 _BINS = 10
@@ -17,11 +18,6 @@ _AT_LEAST = (1, 2, 3, 5, 10, 20, 50, 100)
 _CLOSE = (0.5, 0.8, 0.95)
 _ROWS = 60
 _LONG = 200
-
-
-def count_text(count: int) -> str:
-    """A count with thin spaces between thousands."""
-    return f"{count:,}".replace(",", "\N{THIN SPACE}")
 
 
 def support_table(labels: Labels) -> Table:
@@ -85,7 +81,9 @@ def coverage_bars(seen: Int[Tensor, "n"], *, views: int) -> Bars:
     )
 
 
-def conflict_tables(labels: Labels, sights: Sequence[Sight], classes: ClassTable) -> list[Block]:
+def conflict_tables(
+    labels: Labels, panels: Sequence[ViewPanel], classes: ClassTable
+) -> list[Block]:
     """Where evidence disagrees with itself, Gaussian by Gaussian and view by view."""
     blocks: list[Block] = []
     if labels.candidates is not None and labels.candidates.shape[1] > 1 and len(labels):
@@ -130,7 +128,7 @@ def conflict_tables(labels: Labels, sights: Sequence[Sight], classes: ClassTable
                 "whom.",
             )
         )
-    compared = [(s.name, s.agreement) for s in sights if s.agreement is not None]
+    compared = [(s.name, s.agreement) for s in panels if s.agreement is not None]
     if compared:
         compared.sort(key=lambda row: (-row[1].differ, row[0]))
         blocks.append(
@@ -175,7 +173,7 @@ def id_table(
 
     Where the method lists its instances, also how many segments and views each was seen in.
     """
-    told = _told_of_instances(labels.metadata)
+    told = _instance_rows(labels.metadata)
     also = [key for key in ("segments", "views") if any(key in row for row in told.values())]
     ids, confidence = labels.ids.cpu().long(), labels.confidence.detach().double().cpu()
     rows: list[tuple[Cell, ...]] = []
@@ -197,7 +195,7 @@ def id_table(
     return Table(title="Labels", columns=columns, rows=tuple(rows[:_ROWS]), note=" ".join(notes))
 
 
-def _told_of_instances(metadata: Mapping[str, Any]) -> dict[int, Mapping[str, Any]]:
+def _instance_rows(metadata: Mapping[str, Any]) -> dict[int, Mapping[str, Any]]:
     """What the metadata lists under ``instances``, by id."""
     rows: Any = metadata.get("instances")
     listed = cast(list[Any], rows) if isinstance(rows, list) else []

@@ -11,6 +11,7 @@ from typing import Any
 from splatseg.core import Capture, View
 from splatseg.evaluate.photographs import PhotographReport
 from splatseg.fit import FitOptions, FitRecord, FitResult, reduction_note
+from splatseg.report._common import count_text
 from splatseg.report.chart import Chart, Line
 from splatseg.report.html import Bars, Block, Commands, Curves, Figure, Report, Table
 from splatseg.report.pictures import Gallery
@@ -141,7 +142,7 @@ def _figures(story: FitStory) -> tuple[Figure, ...]:
     out.append(
         Figure(
             label="Gaussians",
-            value=f"{len(result.gaussians):,}".replace(",", "\N{THIN SPACE}"),
+            value=count_text(len(result.gaussians)),
             note=f"{story.file_bytes / 1e6:.1f} MB",
         )
     )

@@ -15,7 +15,8 @@ from PIL import Image
 from splatseg.core import ClassTable
 from splatseg.errors import InputError
 from splatseg.report.chart import Chart, chart_svg
-from splatseg.report.pictures import Gallery, Picture, colour_of
+from splatseg.report.legend import colour_of
+from splatseg.report.pictures import Gallery, Picture
 
 Cell = str | int | float | None
 

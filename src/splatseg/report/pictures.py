@@ -1,6 +1,5 @@
 """Label maps, depth and errors as pictures, and pictures side by side on one sheet."""
 
-import colorsys
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,11 +12,10 @@ from torch import Tensor
 from splatseg._check import check_shape
 from splatseg.core import ClassTable
 from splatseg.errors import InputError
+from splatseg.report.legend import NOTHING, Colour, colour_labels, colour_of
 
-Colour = tuple[int, int, int]
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
-_NOTHING: Colour = (24, 24, 28)
 _WRONG: Colour = (226, 48, 48)
 _UNKNOWN: Colour = (90, 120, 220)
 # From far to near: dark blue, teal, sand. Its brightness grows steadily.
@@ -69,34 +67,6 @@ class Gallery:
                 )
 
 
-def colour_of(id: int, classes: ClassTable | None = None) -> Colour:
-    """The class table's colour of an id, else a colour of its own; -1 is nearly black.
-
-    Colours that are made up walk round the hues by the golden ratio, and through brightness by
-    another irrational step, so that no two of the first forty look alike.
-    """
-    if id < 0:
-        return _NOTHING
-    if classes is not None:
-        for row in classes.rows:
-            if row.id == id and row.colour is not None:
-                return row.colour
-    hue = (id * 0.6180339887) % 1.0
-    light = 0.40 + 0.38 * ((id * 0.7548776662) % 1.0)
-    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.62)
-    return round(255 * red), round(255 * green), round(255 * blue)
-
-
-def colour_labels(
-    ids: Int[Tensor, "height width"], classes: ClassTable | None = None
-) -> UInt8[Tensor, "height width 3"]:
-    """A label map in colours, see `colour_of`."""
-    check_shape("ids", ids, (None, None))
-    found, index = torch.unique(ids, return_inverse=True)
-    colours = [colour_of(int(id), classes) for id in found]
-    return torch.tensor(colours, dtype=torch.uint8)[index]
-
-
 def colour_depth(
     depth: Float[Tensor, "height width"], *, near: float | None = None, far: float | None = None
 ) -> UInt8[Tensor, "height width 3"]:
@@ -111,14 +81,14 @@ def colour_depth(
     known = depth > 0
     values = depth[known].double()
     if not len(values):
-        return torch.tensor(_NOTHING, dtype=torch.uint8).expand(*depth.shape, 3).clone()
+        return torch.tensor(NOTHING, dtype=torch.uint8).expand(*depth.shape, 3).clone()
     if near is None:
         near = float(torch.quantile(_thinned(values), 0.01))
     if far is None:
         far = float(torch.quantile(_thinned(values), 0.99))
     share = ((far - depth.double()) / max(far - near, 1e-9)).clamp(0, 1)
     return torch.where(
-        known.unsqueeze(-1), _ramp(share).round(), torch.tensor(_NOTHING, dtype=torch.float64)
+        known.unsqueeze(-1), _ramp(share).round(), torch.tensor(NOTHING, dtype=torch.float64)
     ).to(torch.uint8)
 
 
@@ -144,7 +114,7 @@ def colour_share(values: Float[Tensor, "height width"]) -> UInt8[Tensor, "height
     """Values from dark blue (0) to sand (1); nearly black where they are negative, nothing."""
     check_shape("values", values, (None, None))
     mixed = _ramp(values.double().clamp(0, 1)).round()
-    nothing = torch.tensor(_NOTHING, dtype=torch.float64)
+    nothing = torch.tensor(NOTHING, dtype=torch.float64)
     return torch.where((values >= 0).unsqueeze(-1), mixed, nothing).to(torch.uint8)
 
 
