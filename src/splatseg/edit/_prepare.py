@@ -178,8 +178,8 @@ def _boundary(
         raise InputError(
             "cut: the masks show the scene before it was edited; cut by the layer instead."
         )
-    places = [place for place in (scene.root, scene.source) if place is not None]
-    folder = find_evidence(places, cut.evidence)
+    folders = [path for path in (scene.root, scene.source) if path is not None]
+    folder = find_evidence(folders, cut.evidence)
     return open_evidence(folder, zero_is_class=cut.zero_is_class), ids
 
 
@@ -212,11 +212,11 @@ def _labels_by_side(labels: Labels, ids: Sequence[int], inside: Selection) -> La
         fits = torch.isin(labels.candidates, wanted) == inside.mask.unsqueeze(1)
         fits &= labels.candidates != UNLABELLED
         # Candidates stand strongest first: the first that fits is the best.
-        place = fits.int().argmax(dim=1, keepdim=True)
+        index = fits.int().argmax(dim=1, keepdim=True)
         found = fits.any(dim=1)
-        first = labels.candidates.gather(1, place).squeeze(1)
+        first = labels.candidates.gather(1, index).squeeze(1)
         new = torch.where(found, first, torch.where(inside.mask, wanted[0], UNLABELLED)).int()
-        share = labels.shares.gather(1, place).squeeze(1)
+        share = labels.shares.gather(1, index).squeeze(1)
         confidence = torch.where(right, labels.confidence, torch.where(found, share, 0.0))
         keep = right.unsqueeze(1) | fits
         shares = torch.where(keep, labels.shares, 0.0)

@@ -36,7 +36,7 @@ from splatseg.evaluate.panoptic import segment_keys as segment_keys
 from splatseg.evaluate.photographs import PhotographReport as PhotographReport
 from splatseg.evaluate.photographs import ViewScore as ViewScore
 from splatseg.evaluate.photographs import evaluate_photographs as evaluate_photographs
-from splatseg.evaluate.photographs import picture_and_photograph as picture_and_photograph
+from splatseg.evaluate.photographs import render_and_photograph as render_and_photograph
 from splatseg.evaluate.solid import gaussian_score as gaussian_score
 from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
 from splatseg.evaluate.solid import labels_from_points as labels_from_points

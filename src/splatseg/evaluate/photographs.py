@@ -128,7 +128,7 @@ def _view_score(
     backend: str,
 ) -> ViewScore | None:
     """The scores of a view; None where its mask keeps nothing that could be scored."""
-    picture, photograph = picture_and_photograph(
+    rendered, photograph = render_and_photograph(
         gaussians, view, masks=masks, options=options, backend=backend
     )
     mask = load_mask(view) if masks == "ignore" else None
@@ -138,16 +138,16 @@ def _view_score(
         if not keep[border:-border, border:-border].any():
             return None
         # A network sees whole pictures: where nothing is known, the photograph stands.
-        picture = torch.where(keep[..., None], picture, photograph)
+        rendered = torch.where(keep[..., None], rendered, photograph)
     return ViewScore(
         name=view.name,
-        psnr=psnr(picture, photograph, keep),
-        ssim=ssim(picture, photograph, keep),
-        lpips=None if lpips is None else lpips(picture, photograph),
+        psnr=psnr(rendered, photograph, keep),
+        ssim=ssim(rendered, photograph, keep),
+        lpips=None if lpips is None else lpips(rendered, photograph),
     )
 
 
-def picture_and_photograph(
+def render_and_photograph(
     gaussians: Gaussians,
     view: View,
     *,

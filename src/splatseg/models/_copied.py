@@ -114,8 +114,8 @@ class _Copied(Source):
         known = self.evidence.source_ids
         if known is None:
             return None
-        most = max(self.highest)
-        return {id: source for id, source in known.items() if id <= most}
+        highest = max(self.highest)
+        return {id: source for id, source in known.items() if id <= highest}
 
     @override
     def details(self) -> Mapping[str, Any]:

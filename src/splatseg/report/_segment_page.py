@@ -12,7 +12,7 @@ from splatseg.core import UNLABELLED, ClassTable, Labels
 from splatseg.evaluate.metrics import SemanticScore
 from splatseg.evaluate.overlaps import InstanceScore
 from splatseg.report._common import count_text
-from splatseg.report._segment_pictures import ViewPanel, gallery
+from splatseg.report._segment_panels import ViewPanel, gallery
 from splatseg.report._segment_tables import (
     association_tables,
     confidence_bars,

@@ -23,14 +23,14 @@ from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import label_map
 from splatseg.report._common import count_text, environment, spread
 from splatseg.report.html import Bars, Commands, Figure, Legend, Report, Table, report_html
-from splatseg.report.legend import colour_labels
-from splatseg.report.pictures import (
+from splatseg.report.images import (
     Gallery,
-    Picture,
+    GalleryImage,
     colour_depth,
     contact_sheet,
     mark_errors,
 )
+from splatseg.report.legend import colour_labels
 
 _HELD_OUT_ROWS = 6
 _TRAIN_ROWS = 4
@@ -173,28 +173,28 @@ def _held_out_gallery(
     folder: Path, scene: Scene, truth: Evidence, *, layer: str, objects: str
 ) -> Gallery:
     """Photograph, rendering, depth, labels, truth, errors and objects of some test views."""
-    pictures = folder / "render"
-    unit = read_json(pictures / "depth" / "depth.json")["unit"]
+    renders = folder / "render"
+    unit = read_json(renders / "depth" / "depth.json")["unit"]
     views = spread(scene.test_views, _HELD_OUT_ROWS)
-    depths = [_read(pictures / "depth" / f"{view.name}.png").double() * unit for view in views]
+    depths = [_read(renders / "depth" / f"{view.name}.png").double() * unit for view in views]
     far = max(float(depth.max()) for depth in depths)
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for view, depth in zip(views, depths, strict=True):
         photograph = load_image(view)
-        drawn = _read(pictures / "rgb" / f"{view.name}.png").to(torch.uint8)
-        ids = _ids(pictures / layer / f"{view.name}.png")
-        things = _ids(pictures / objects / f"{view.name}.png")
+        drawn = _read(renders / "rgb" / f"{view.name}.png").to(torch.uint8)
+        ids = _ids(renders / layer / f"{view.name}.png")
+        things = _ids(renders / objects / f"{view.name}.png")
         true = truth.label_map(view.name).ids
         rows.append(
             (
                 view.name,
                 (
-                    Picture(image=photograph),
-                    Picture(image=drawn, caption=f"{psnr(drawn, photograph):.1f} dB"),
-                    Picture(image=colour_depth(depth, near=0.3, far=far)),
+                    GalleryImage(image=photograph),
+                    GalleryImage(image=drawn, caption=f"{psnr(drawn, photograph):.1f} dB"),
+                    GalleryImage(image=colour_depth(depth, near=0.3, far=far)),
                     _labels(ids, scene.classes),
                     _labels(true, scene.classes),
-                    Picture(
+                    GalleryImage(
                         image=mark_errors(photograph, ids, truth=true),
                         caption=f"{_right(ids, true):.1%} right",
                     ),
@@ -221,7 +221,7 @@ def _held_out_gallery(
 
 def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels) -> Gallery:
     """What lifting mends: the labels of train views before and after."""
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for view in spread(scene.train_views, _TRAIN_ROWS):
         true = truth.label_map(view.name).ids
         before = came.label_map(view.name).ids
@@ -230,7 +230,7 @@ def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels
             (
                 view.name,
                 (
-                    Picture(image=load_image(view)),
+                    GalleryImage(image=load_image(view)),
                     _labels(before, scene.classes, right=_right(before, true)),
                     _labels(after, scene.classes, right=_right(after, true)),
                     _labels(true, scene.classes),
@@ -294,9 +294,9 @@ def _facts(folder: Path, scene: Scene, seed: int) -> dict[str, Any]:
 
 def _labels(
     ids: Int[Tensor, "height width"], classes: ClassTable | None, *, right: float | None = None
-) -> Picture:
+) -> GalleryImage:
     caption = "" if right is None else f"{right:.1%} right"
-    return Picture(image=colour_labels(ids, classes), kind="chart", caption=caption)
+    return GalleryImage(image=colour_labels(ids, classes), kind="chart", caption=caption)
 
 
 def _right(ids: Tensor, truth: Tensor) -> float:

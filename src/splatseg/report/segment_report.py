@@ -13,7 +13,7 @@ from splatseg.methods import keeps_ids
 from splatseg.report._common import environment, spread
 from splatseg.report._segment_ids import class_table, ids_agree, ids_are_classes
 from splatseg.report._segment_page import SegmentationReportData, segmentation_page
-from splatseg.report._segment_pictures import ViewPanel, rename_truth, view_panel
+from splatseg.report._segment_panels import ViewPanel, rename_truth, view_panel
 from splatseg.report.html import report_html
 
 _LEARNED_ROWS = 4
@@ -23,7 +23,7 @@ _COVERAGE_VIEWS = 100
 _LARGEST = 4_500_000
 """Bytes of the page above which its pictures are made smaller."""
 
-_PICTURE_SIZES = (448, 320, 224, 128)
+_IMAGE_SIZES = (448, 320, 224, 128)
 """Longest sides of the pictures, pixels, the one to prefer first."""
 
 
@@ -140,7 +140,7 @@ def _panels(
 
 def _small_page(data: SegmentationReportData) -> str:
     """The page with the largest pictures that leave it small enough, else with the smallest."""
-    pages = (report_html(segmentation_page(data, longest=size)) for size in _PICTURE_SIZES)
+    pages = (report_html(segmentation_page(data, longest=size)) for size in _IMAGE_SIZES)
     page = next(pages)
     for smaller in pages:
         if len(page.encode()) <= _LARGEST:

@@ -26,7 +26,7 @@ MASK_TABLE = "metadata.csv"
 
 _SCORES = ("score", "predicted_iou")
 _INT32 = np.iinfo(np.int32)
-_MOST_RUN = int(np.iinfo(np.uint32).max)
+_MAX_RUN = int(np.iinfo(np.uint32).max)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,7 +50,7 @@ class MaskEvidence(IdFreeEvidence):
 def read_any_masks(path: Path) -> MaskSet:
     """The masks of one view: a JSON, an npz or a folder of pictures."""
     if path.is_dir():
-        return read_mask_pictures(path)
+        return read_mask_images(path)
     return read_mask_arrays(path) if path.suffix == ".npz" else read_masks(path)
 
 
@@ -106,7 +106,7 @@ def _are_levels(levels: NDArray[Any]) -> bool:
     return bool(within.all() and (levels == np.trunc(levels)).all())
 
 
-def read_mask_pictures(folder: Path) -> MaskSet:
+def read_mask_images(folder: Path) -> MaskSet:
     """The masks of a folder of pictures, zero outside a mask, in the order of their numbers.
 
     Scores are ``predicted_iou`` of the metadata.csv that SAM's tool writes beside them, else 1.
@@ -117,7 +117,7 @@ def read_mask_pictures(folder: Path) -> MaskSet:
     files = sorted(folder.glob("*.png"), key=lambda p: (len(p.stem), p.stem))
     if not files:
         raise FileFormatError(f"{folder}: expected PNG pictures of masks, got none.")
-    scores = _picture_scores(folder / MASK_TABLE)
+    scores = _image_scores(folder / MASK_TABLE)
     arrays = [read_id_map(path) for path in files]
     for path, array in zip(files, arrays, strict=True):
         if array.shape != arrays[0].shape:
@@ -134,9 +134,9 @@ def read_mask_pictures(folder: Path) -> MaskSet:
     )
 
 
-def mask_folders(folder: Path, *, told_by: Literal["metadata.csv", "*.png"]) -> dict[str, Path]:
+def mask_folders(folder: Path, *, marked_by: Literal["metadata.csv", "*.png"]) -> dict[str, Path]:
     """Folders of mask pictures by view name: those with SAM's metadata.csv, or any with PNGs."""
-    named = {path.parent for path in folder.rglob(told_by)}
+    named = {path.parent for path in folder.rglob(marked_by)}
     return {
         path.relative_to(folder).as_posix(): path
         for path in sorted(named - {folder})
@@ -144,7 +144,7 @@ def mask_folders(folder: Path, *, told_by: Literal["metadata.csv", "*.png"]) -> 
     }
 
 
-def _picture_scores(path: Path) -> dict[str, float]:
+def _image_scores(path: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     try:
@@ -237,10 +237,10 @@ def _rle(segmentation: object, height: int, width: int, *, where: str) -> Rle:
         if isinstance(counts, str):
             return Rle.from_coco(counts, height=height, width=width)
         runs = cast(list[object], counts)
-        wrong = [run for run in runs if type(run) is not int or not 0 <= run <= _MOST_RUN]
+        wrong = [run for run in runs if type(run) is not int or not 0 <= run <= _MAX_RUN]
         if wrong:
             raise InputError(
-                f"counts: expected whole numbers from 0 to {_MOST_RUN}, got {wrong[0]!r:.40}."
+                f"counts: expected whole numbers from 0 to {_MAX_RUN}, got {wrong[0]!r:.40}."
             )
         return Rle(height=height, width=width, counts=np.array(runs, np.uint32))
     except (InputError, OverflowError) as error:

@@ -58,7 +58,7 @@ def diagnose(
     views = [view for view in capture.views if view.image is not None]
     if matches is None:
         matches = match_views(
-            views, most_views=options.views, longest=options.longest, seed=options.seed
+            views, max_views=options.views, longest=options.longest, seed=options.seed
         )
     examination = examine(capture, views, matches, seed=options.seed)
     faults = [*found, *examination.faults]
@@ -107,7 +107,7 @@ def find_points(
     options = options or DoctorOptions()
     views = [view for view in capture.views if view.image is not None]
     matches = match_views(
-        views, most_views=options.views, longest=options.longest, seed=options.seed
+        views, max_views=options.views, longest=options.longest, seed=options.seed
     )
     if len(matches) < MIN_MATCHES:
         return None

@@ -55,7 +55,7 @@ _POINT_VIEWS, _POINT_LONGEST = 20, 320
 
 def fits(score: PointScore) -> bool:
     """Whether start points fit the cameras."""
-    return score.value >= (POINTS_FIT_COLOURS if score.place is None else POINTS_FIT)
+    return score.value >= (POINTS_FIT_COLOURS if score.position is None else POINTS_FIT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -24,14 +24,14 @@ from splatseg.io.evidence import Evidence
 from splatseg.io.images import image_camera, load_image, reduced_size
 from splatseg.lift import label_map
 from splatseg.render import prepare
-from splatseg.report.legend import colour_labels
-from splatseg.report.pictures import (
+from splatseg.report.images import (
     Gallery,
-    Picture,
+    GalleryImage,
     colour_share,
     mark_errors,
     overlay_labels,
 )
+from splatseg.report.legend import colour_labels
 
 _LONGEST = 1024
 """Pixels at which views without a truth are drawn."""
@@ -46,7 +46,7 @@ class ViewPanel:
 
     name: str
     held_out: bool
-    picture: UInt8[Tensor, "height width 3"]
+    image: UInt8[Tensor, "height width 3"]
     """The photograph, or the rendering where there is none."""
 
     drawn: Int[Tensor, "height width"]
@@ -91,15 +91,15 @@ def view_panel(
     alpha = drawn.alpha.float().cpu()
     mean = drawn.image[..., 0].float().cpu() / alpha.clamp_min(1e-6)
     if colours is None:
-        picture = _resized(load_image(view, longest=max(size)), size)
+        image = _resized(load_image(view, longest=max(size)), size)
     else:
-        picture = (colours.image.float().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        image = (colours.image.float().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
     seen = _evidence_ids(evidence, view.name)
     seen = None if seen is None else _nearest(seen, size)
     return ViewPanel(
         name=view.name,
         held_out=held_out,
-        picture=picture,
+        image=image,
         drawn=shown,
         confidence=torch.where(alpha > 0.02, mean.clamp(0, 1), -1.0),
         evidence=seen,
@@ -150,23 +150,23 @@ def gallery(
         columns.insert(1, "evidence as it came")
     if with_truth:
         columns += ["truth", "errors in red"]
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for panel in panels:
-        size = _size(panel.picture, longest)
-        photograph = _resized(panel.picture, size)
+        size = _size(panel.image, longest)
+        photograph = _resized(panel.image, size)
         drawn = _nearest(panel.drawn, size)
-        pictures = [
-            Picture(image=photograph),
-            Picture(image=overlay_labels(photograph, drawn, classes)),
-            Picture(image=colour_share(_nearest(panel.confidence, size))),
+        shown = [
+            GalleryImage(image=photograph),
+            GalleryImage(image=overlay_labels(photograph, drawn, classes)),
+            GalleryImage(image=colour_share(_nearest(panel.confidence, size))),
         ]
         if with_evidence:
             table = classes if evidence_has_same_ids else None
-            pictures.insert(1, _evidence_picture(panel, table, size))
+            shown.insert(1, _evidence_image(panel, table, size))
         if with_truth:
-            pictures += _truth_pictures(panel, classes, truth_names, photograph)
+            shown += _truth_images(panel, classes, truth_names, photograph)
         label = f"{panel.name}, held out" if panel.held_out else panel.name
-        rows.append((label, tuple(pictures)))
+        rows.append((label, tuple(shown)))
     return Gallery(
         title="What it looks like",
         columns=tuple(columns),
@@ -180,24 +180,24 @@ def gallery(
     )
 
 
-def _evidence_picture(
+def _evidence_image(
     panel: ViewPanel, classes: ClassTable | None, size: tuple[int, int]
-) -> Picture:
+) -> GalleryImage:
     if panel.evidence is None or panel.agreement is None:
         return _nothing(size)
-    return Picture(
+    return GalleryImage(
         image=colour_labels(_nearest(panel.evidence, size), classes),
         kind="chart",
         caption=f"{panel.agreement.differ:.1%} differs",
     )
 
 
-def _truth_pictures(
+def _truth_images(
     panel: ViewPanel,
     classes: ClassTable,
     names: dict[int, int] | None,
     photograph: UInt8[Tensor, "height width 3"],
-) -> list[Picture]:
+) -> list[GalleryImage]:
     size = (int(photograph.shape[0]), int(photograph.shape[1]))
     if panel.truth is None:
         return [_nothing(size), _nothing(size)]
@@ -208,14 +208,14 @@ def _truth_pictures(
         photograph, _nearest(panel.drawn, size).long(), truth=_nearest(truth, size).long()
     )
     return [
-        Picture(image=colour_labels(_nearest(truth, size), classes), kind="chart"),
-        Picture(image=marked, caption=f"{right:.1%} right"),
+        GalleryImage(image=colour_labels(_nearest(truth, size), classes), kind="chart"),
+        GalleryImage(image=marked, caption=f"{right:.1%} right"),
     ]
 
 
-def _nothing(size: tuple[int, int]) -> Picture:
+def _nothing(size: tuple[int, int]) -> GalleryImage:
     grey = torch.full((*size, 3), 128, dtype=torch.uint8)
-    return Picture(image=grey, kind="chart", caption="there is none of this view")
+    return GalleryImage(image=grey, kind="chart", caption="there is none of this view")
 
 
 def _evidence_ids(evidence: LabelSource | None, name: str) -> Int[Tensor, "height width"] | None:

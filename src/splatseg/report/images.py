@@ -29,7 +29,7 @@ _GAP = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Picture:
+class GalleryImage:
     """An image for a page or sheet."""
 
     image: UInt8[Tensor, "height width 3"]
@@ -53,17 +53,17 @@ class Gallery:
 
     title: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[Picture, ...]], ...]
+    rows: tuple[tuple[str, tuple[GalleryImage, ...]], ...]
     """Label and pictures of each row."""
 
     note: str = ""
 
     def __post_init__(self) -> None:
-        for label, pictures in self.rows:
-            if len(pictures) != len(self.columns):
+        for label, panels in self.rows:
+            if len(panels) != len(self.columns):
                 raise InputError(
                     f"rows: expected {len(self.columns)} pictures as there are columns, "
-                    f"row {label!r} has {len(pictures)}."
+                    f"row {label!r} has {len(panels)}."
                 )
 
 
@@ -185,12 +185,12 @@ def contact_sheet(
         x = _MARGIN + column * (cell_width + _GAP)
         draw.text((x, head - 22), name, fill=_INK, font=text_font)
     y = head
-    for (label, pictures), row_height in zip(gallery.rows, heights, strict=True):
-        for column, picture in enumerate(pictures):
+    for (label, panels), row_height in zip(gallery.rows, heights, strict=True):
+        for column, panel in enumerate(panels):
             x = _MARGIN + column * (cell_width + _GAP)
-            small = _resized(picture, cell_width)
+            small = _resized(panel, cell_width)
             sheet.paste(small, (x, y))
-            words = label if column == 0 else picture.caption
+            words = label if column == 0 else panel.caption
             words = _fitting(draw, words, label_font, cell_width)
             draw.text((x, y + row_height + 2), words, fill=_QUIET, font=label_font)
         y += row_height + label_height + _GAP
@@ -218,9 +218,9 @@ def _swatches(
 def _ramp(share: Tensor) -> Tensor:
     """Colours, as float64, of values in [0, 1]."""
     steps = torch.tensor(_DEPTH_STEPS, dtype=torch.float64)
-    place = share * (len(steps) - 1)
-    low = place.floor().long().clamp(max=len(steps) - 2)
-    return torch.lerp(steps[low], steps[low + 1], (place - low).unsqueeze(-1))
+    position = share * (len(steps) - 1)
+    low = position.floor().long().clamp(max=len(steps) - 2)
+    return torch.lerp(steps[low], steps[low + 1], (position - low).unsqueeze(-1))
 
 
 def _thinned(values: Tensor) -> Tensor:
@@ -228,15 +228,15 @@ def _thinned(values: Tensor) -> Tensor:
     return values[:: max(1, len(values) // 1_000_000)]
 
 
-def _scaled_height(picture: Picture, width: int) -> int:
-    return max(1, round(picture.image.shape[0] * width / picture.image.shape[1]))
+def _scaled_height(panel: GalleryImage, width: int) -> int:
+    return max(1, round(panel.image.shape[0] * width / panel.image.shape[1]))
 
 
-def _resized(picture: Picture, width: int) -> Image.Image:
+def _resized(panel: GalleryImage, width: int) -> Image.Image:
     """A photo smoothly, a chart without mixing its colours."""
-    method = Image.Resampling.LANCZOS if picture.kind == "photo" else Image.Resampling.NEAREST
-    image = Image.fromarray(picture.image.cpu().numpy())
-    return image.resize((width, _scaled_height(picture, width)), method)
+    method = Image.Resampling.LANCZOS if panel.kind == "photo" else Image.Resampling.NEAREST
+    image = Image.fromarray(panel.image.cpu().numpy())
+    return image.resize((width, _scaled_height(panel, width)), method)
 
 
 def _fitting(
