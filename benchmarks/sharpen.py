@@ -19,7 +19,7 @@ from pathlib import Path
 from labels import Bench
 
 from splatseg.core import Gaussians, InstanceTree, Labels
-from splatseg.evaluate import picture_and_photograph, psnr
+from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import (
@@ -48,7 +48,7 @@ def layer(bench: Bench, found: Evidence) -> Labels:
 
 
 def pictures(bench: Bench, gaussians: Gaussians) -> float:
-    scores = [psnr(*picture_and_photograph(gaussians, view)) for view in bench.scene.test_views]
+    scores = [psnr(*render_and_photograph(gaussians, view)) for view in bench.scene.test_views]
     return statistics.fmean(scores)
 
 

@@ -28,7 +28,7 @@ def test_contested_and_rivals_by_hand() -> None:
         Rivals(winner=1, second=2, count=2),
         Rivals(winner=2, second=1, count=1),
     )
-    assert len(rivals(labels, ratio=0.5, most=1)) == 1
+    assert len(rivals(labels, ratio=0.5, max_pairs=1)) == 1
     assert rivals(labels[3:5], ratio=0.5) == ()
 
 
@@ -83,8 +83,8 @@ def test_views_that_show_a_gaussian() -> None:
     views[1] = View(name="b", camera=half)
     assert views_that_show(scene, views, backend="cpu").tolist() == [2, 2, 0]
     # The first covers some 200 pixels, and 4 where the picture is a tenth as wide.
-    assert views_that_show(scene, views, least=50, backend="cpu").tolist() == [2, 0, 0]
-    small = views_that_show(scene, views, least=50, longest=6, backend="cpu")
+    assert views_that_show(scene, views, min_weight=50, backend="cpu").tolist() == [2, 0, 0]
+    small = views_that_show(scene, views, min_weight=50, longest=6, backend="cpu")
     assert small.tolist() == [0, 0, 0]
-    assert views_that_show(scene, views, least=1e5, backend="cpu").tolist() == [0, 0, 0]
+    assert views_that_show(scene, views, min_weight=1e5, backend="cpu").tolist() == [0, 0, 0]
     assert views_that_show(scene, [], backend="cpu").tolist() == [0, 0, 0]

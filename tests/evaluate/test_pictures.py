@@ -6,9 +6,9 @@ import torch
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import InputError, ShapeError
-from splatseg.report.pictures import (
+from splatseg.report.images import (
     Gallery,
-    Picture,
+    GalleryImage,
     colour_depth,
     colour_labels,
     colour_of,
@@ -23,9 +23,9 @@ CLASSES = ClassTable(
 )
 
 
-def plain(colour, height=30, width=40, **more) -> Picture:
+def plain(colour, height=30, width=40, **more) -> GalleryImage:
     image = torch.tensor(colour, dtype=torch.uint8).expand(height, width, 3)
-    return Picture(image=image, **more)
+    return GalleryImage(image=image, **more)
 
 
 def test_ids_take_the_tables_colours():

@@ -22,7 +22,7 @@ from splatseg.report.html import (
     data_uri,
     report_html,
 )
-from splatseg.report.pictures import Gallery, Picture
+from splatseg.report.images import Gallery, GalleryImage
 
 VOID_ELEMENTS = {"meta", "img", "br"}
 NASTY = "<script>alert('x')</script> & \"y\""
@@ -56,15 +56,15 @@ class Reader(HTMLParser):
 
 
 @pytest.fixture
-def photo(rng) -> Picture:
+def photo(rng) -> GalleryImage:
     smooth = np.linspace(0, 255, 40)[None, :, None] * np.ones((30, 1, 3))
-    return Picture(image=torch.from_numpy(smooth.astype(np.uint8)), caption="a gradient")
+    return GalleryImage(image=torch.from_numpy(smooth.astype(np.uint8)), caption="a gradient")
 
 
 @pytest.fixture
-def chart(rng) -> Picture:
+def chart(rng) -> GalleryImage:
     noise = rng.integers(0, 256, size=(20, 30, 3), dtype=np.uint8)
-    return Picture(image=torch.from_numpy(noise), kind="chart")
+    return GalleryImage(image=torch.from_numpy(noise), kind="chart")
 
 
 @pytest.fixture
@@ -150,7 +150,7 @@ def test_all_words_are_escaped(photo):
                 Gallery(
                     title=NASTY,
                     columns=(NASTY,),
-                    rows=((NASTY, (Picture(image=photo.image, caption=NASTY),)),),
+                    rows=((NASTY, (GalleryImage(image=photo.image, caption=NASTY),)),),
                     note=NASTY,
                 ),
                 Legend(classes=ClassTable(rows=(ClassInfo(id=1, name=NASTY),)), title=NASTY),
@@ -194,8 +194,8 @@ def test_columns_of_numbers_stand_right():
         (lambda p: Bars(title="t", series=("a",), rows=(("x", (0.1, 0.2)),)), "1 values .* got 2"),
         (lambda p: Bars(title="t", series=("a",), rows=(("x", (1.2,)),)), r"in \[0, 1\]"),
         (lambda p: Gallery(title="t", columns=("a",), rows=(("x", ()),)), "1 pictures .* has 0"),
-        (lambda p: Picture(image=p.image.float()), "uint8"),
-        (lambda p: Picture(image=p.image[0]), "shape"),
+        (lambda p: GalleryImage(image=p.image.float()), "uint8"),
+        (lambda p: GalleryImage(image=p.image[0]), "shape"),
     ],
 )
 def test_what_does_not_fit_is_refused(make, said, photo):

@@ -30,7 +30,7 @@ from splatseg.io.evidence import (
     save_masks,
 )
 from splatseg.io.images import save_png
-from splatseg.report import _segment_ids, _segment_pictures, _segment_tables, segment_report
+from splatseg.report import _segment_ids, _segment_panels, _segment_tables, segment_report
 from splatseg.report.segment_report import write_segmentation_report
 
 WIDTH, HEIGHT = 40, 30
@@ -264,7 +264,7 @@ def test_what_association_says_is_shown(write) -> None:
 
 def test_a_page_that_is_too_large_gets_smaller_pictures(write, monkeypatch) -> None:
     large = write()
-    monkeypatch.setattr(segment_report, "_PICTURE_SIZES", (448, 20, 10))
+    monkeypatch.setattr(segment_report, "_IMAGE_SIZES", (448, 20, 10))
     monkeypatch.setattr(segment_report, "_LARGEST", len(large.encode()) - 1)
     small = write()
     assert {p.shape[:2] for p in pictures(large)} == {(HEIGHT, WIDTH)}
@@ -294,7 +294,7 @@ def test_masks_are_painted_from_large_to_small(write) -> None:
     save_masks(folder, "v0", MaskSet.from_dense(dense))
     evidence = open_evidence(folder)
     assert isinstance(evidence, MaskEvidence)
-    ids = _segment_pictures._evidence_ids(evidence, "v0")
+    ids = _segment_panels._evidence_ids(evidence, "v0")
     assert ids[22, 7] == 1
     assert ids[16, 7] == 2
     assert ids[3, 3] == -1

@@ -7,7 +7,7 @@ import torch
 
 from splatseg.core import Gaussians
 from splatseg.errors import InputError, RangeError, SplatsegError
-from splatseg.evaluate import picture_and_photograph, psnr
+from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.fit import FitOptions, Refinement, refine
 from splatseg.render.cpu import set_threads, threads
 
@@ -32,7 +32,7 @@ def worse(scene):
 
 
 def mean_psnr(gaussians, views) -> float:
-    return sum(psnr(*picture_and_photograph(gaussians, view)) for view in views) / len(views)
+    return sum(psnr(*render_and_photograph(gaussians, view)) for view in views) / len(views)
 
 
 def same(one, other) -> bool:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from splatseg.core import Gaussians
 from splatseg.errors import InputError, RangeError
-from splatseg.evaluate import picture_and_photograph, psnr
+from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.fit import (
     Exposure,
     FitOptions,
@@ -29,7 +29,7 @@ BLACK = FitOptions(background="black")
 
 
 def mean_psnr(gaussians, views, masks="off") -> float:
-    found = [psnr(*picture_and_photograph(gaussians, view, masks=masks)) for view in views]
+    found = [psnr(*render_and_photograph(gaussians, view, masks=masks)) for view in views]
     return sum(found) / len(found)
 
 

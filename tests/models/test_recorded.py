@@ -234,7 +234,7 @@ def test_words_of_another_width_than_the_features_are_refused(tmp_path, rng) -> 
     np.savez(folder / "text_embeddings.npz", **(words | {"vectors": np.ones((1, 5))}))
     model = find_model(folder)
     assert isinstance(model, TextFeatures), "words in the folder come before those beside it"
-    assert model.recording.evidence.view_names == ("v0",)
+    assert model.evidence.view_names == ("v0",)
 
 
 def test_own_features_with_words_of_their_width_are_text_features(tmp_path) -> None:

@@ -94,7 +94,7 @@ class Matched:
 
 
 def matched(capture: Capture) -> Matched:
-    matches = match_views(capture.views, most_views=OPTIONS.views, longest=OPTIONS.longest)
+    matches = match_views(capture.views, max_views=OPTIONS.views, longest=OPTIONS.longest)
     return Matched(capture, matches)
 
 
@@ -212,7 +212,7 @@ def test_too_few_matches_are_said(healthy) -> None:
 def test_a_colmap_capture_of_a_real_camera(shared_data) -> None:
     """COLMAP's files hold world-to-camera matrices: what is inverted there is the other way."""
     capture = read_capture(shared_data / "real" / "replica_office0")
-    matches = match_views(capture.views, most_views=15, longest=512)
+    matches = match_views(capture.views, max_views=15, longest=512)
     healthy = diagnose(capture, options=OPTIONS, matches=matches)
     assert healthy.healthy
     assert healthy.unchecked[-1].startswith("the up axis: the capture does not state it")
@@ -225,7 +225,7 @@ def test_a_colmap_capture_of_a_real_camera(shared_data) -> None:
 
 def test_cameras_that_look_one_way_do_not_tell_half_a_pixel(shared_data) -> None:
     capture = read_capture(shared_data / "real" / "llff_fern")
-    matches = match_views(capture.views, most_views=15, longest=512)
+    matches = match_views(capture.views, max_views=15, longest=512)
     for broken in (capture, FAULTS["half-pixel-up"][0](capture)):
         diagnosis = diagnose(broken, options=OPTIONS, matches=matches)
         assert diagnosis.healthy

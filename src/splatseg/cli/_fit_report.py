@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture, View
-from splatseg.evaluate import PhotographReport, evaluate_photographs, picture_and_photograph
-from splatseg.evaluate.held_out import MaskUse
+from splatseg.evaluate import PhotographReport, evaluate_photographs, render_and_photograph
+from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import FitOptions, FitResult
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import GAUSSIANS_FILE, POSES_FOLDER
 from splatseg.render import BackendName
-from splatseg.report.fit_report import FitStory, fit_record, fit_report
+from splatseg.report.fit_report import FitReportData, fit_record, fit_report
 from splatseg.report.html import report_html
-from splatseg.report.pictures import Gallery, Picture, colour_difference
+from splatseg.report.images import Gallery, GalleryImage, colour_difference
 
 # Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
 _SCORING = 20.0
@@ -42,7 +42,7 @@ def score_and_report(
         scores = evaluate_photographs(
             result.gaussians, views, masks=options.masks, seconds=_SCORING, backend=backend
         )
-    story = FitStory(
+    data = FitReportData(
         capture=replace(capture, views=result.views or capture.views),
         options=options,
         result=result,
@@ -59,9 +59,9 @@ def score_and_report(
     folder = root / "reports"
     folder.mkdir(exist_ok=True)
     with atomic_file(folder / "fit.html") as path:
-        page = report_html(fit_report(story, pairs=pairs))
+        page = report_html(fit_report(data, pairs=pairs))
         path.write_text(page, encoding="utf-8", newline="\n")
-    write_json(folder / "fit.json", fit_record(story))
+    write_json(folder / "fit.json", fit_record(data))
     return _told(scores, len(views)) + f"report: {folder / 'fit.html'}\n"
 
 
@@ -79,19 +79,21 @@ def _pairs(
     # Of few views some are two of the three; each is shown once.
     ranks = {0: "worst", middle: "median", last: "best"} if last else {0: "the only one"}
     names = {view.name: view for view in views}
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for rank, label in ranks.items():
         score = ordered[rank]
-        picture, photograph = picture_and_photograph(
+        picture, photograph = render_and_photograph(
             result.gaussians, names[score.name], masks=masks, backend=backend
         )
         rows.append(
             (
                 f"{label}: {score.name}",
                 (
-                    Picture(image=photograph),
-                    Picture(image=picture, caption=f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"),
-                    Picture(image=colour_difference(picture, photograph)),
+                    GalleryImage(image=photograph),
+                    GalleryImage(
+                        image=picture, caption=f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}"
+                    ),
+                    GalleryImage(image=colour_difference(picture, photograph)),
                 ),
             )
         )

@@ -31,7 +31,7 @@ from splatseg.edit import (
 )
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError, MissingFileError
-from splatseg.evaluate import picture_and_photograph, psnr
+from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.io.scene import is_scene
 from splatseg.lift import CutOptions
@@ -387,7 +387,7 @@ def _measured(command: Command, before: Document, split: Document) -> dict[str, 
     if all(view.image is not None and view.image.is_file() for view in spaced):
         for name, gaussians in zip(("photographs_before", "photographs_after"), pairs, strict=True):
             scores = [
-                psnr(*picture_and_photograph(gaussians, view, backend=command.backend))
+                psnr(*render_and_photograph(gaussians, view, backend=command.backend))
                 for view in spaced
             ]
             found[name] = math.fsum(scores) / len(scores)

@@ -25,7 +25,7 @@ from splatseg.core import (
 from splatseg.edit import Document, layer_called, load_document, save_document
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
-from splatseg.evaluate import picture_and_photograph, psnr
+from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.fit import (
     EXPOSURES,
     FitOptions,
@@ -264,7 +264,7 @@ def _psnr(
         return None
     masks = mask_use(scene)
     scores = [
-        psnr(*picture_and_photograph(gaussians, view, masks=masks, backend=backend))
+        psnr(*render_and_photograph(gaussians, view, masks=masks, backend=backend))
         for view in views
     ]
     return sum(scores) / len(scores)

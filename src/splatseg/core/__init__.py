@@ -10,6 +10,7 @@ from splatseg.core.evidence import LabelMap as LabelMap
 from splatseg.core.evidence import MaskSet as MaskSet
 from splatseg.core.evidence import Segment as Segment
 from splatseg.core.evidence import Track as Track
+from splatseg.core.evidence import map_ids as map_ids
 from splatseg.core.gaussians import Gaussians as Gaussians
 from splatseg.core.instance_tree import TREE_LEVELS as TREE_LEVELS
 from splatseg.core.instance_tree import FlatLayer as FlatLayer

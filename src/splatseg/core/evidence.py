@@ -149,3 +149,30 @@ class Track:
     def category(self) -> str | None:
         """The class name with most votes; the first by name among equals."""
         return min(self.votes, key=lambda name: (-self.votes[name], name)) if self.votes else None
+
+
+def map_ids(
+    ids: Int[Tensor, "height width"],
+    values: Mapping[int, float],
+    *,
+    default: float | None,
+    dtype: torch.dtype = torch.int64,
+) -> Tensor:
+    """What each pixel's id stands for.
+
+    Args:
+        ids: The ids of a map.
+        values: What they stand for: other ids, or numbers.
+        default: What an id stands for that has no value; None is the id itself.
+        dtype: Of the result.
+
+    Returns:
+        (height, width), in `dtype`.
+
+    Example:
+        >>> map_ids(torch.tensor([[7, -1]]), {7: 2}, default=None)
+        tensor([[ 2, -1]])
+    """
+    present, index = torch.unique(ids, return_inverse=True)
+    found = [values.get(id, id if default is None else default) for id in present.tolist()]
+    return torch.tensor(found, dtype=dtype)[index]

@@ -1,5 +1,6 @@
 """Views, captures and scenes: what was photographed, and what was made of it."""
 
+from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -101,47 +102,17 @@ class ClassTable:
         raise InputError(f"class: expected one of {known}, got {name!r}.")
 
 
-def _find(views: tuple[View, ...], name: str) -> View:
-    for view in views:
-        if view.name == name:
-            return view
-    shown = ", ".join(view.name for view in views[:5])
-    raise InputError(f"view: there is no {name!r} among {len(views)} views ({shown}, ...).")
-
-
-def _check_names(views: tuple[View, ...]) -> None:
-    names = [view.name for view in views]
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"views: expected distinct names, got {twice!r} more than once.")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Capture:
-    """What a capture folder holds: photographs with poses, and what else came with them."""
-
-    path: Path
-    format: str
-    """Which reader took it: nerfstudio, colmap, llff, ..."""
+class _WithViews(ABC):
+    """What a capture and a scene have in common: views with names of their own, in splits."""
 
     views: tuple[View, ...]
-    points: PointCloud | None = None
-    classes: ClassTable | None = None
-
-    up: tuple[float, float, float] | None = None
-    """Direction away from the ground in the world, where the capture says."""
-
-    metres_per_unit: float | None = None
-    """Length of a scene unit, where the capture says."""
-
-    splats: Path | None = None
-    """A splat file that lies beside the photographs."""
-
-    notes: tuple[str, ...] = ()
-    """What a person should know of how it was read."""
 
     def __post_init__(self) -> None:
-        _check_names(self.views)
+        names = [view.name for view in self.views]
+        if len(set(names)) != len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"views: expected distinct names, got {twice!r} more than once.")
 
     @property
     def train_views(self) -> tuple[View, ...]:
@@ -159,11 +130,41 @@ class Capture:
         Raises:
             InputError: If there is none.
         """
-        return _find(self.views, name)
+        for view in self.views:
+            if view.name == name:
+                return view
+        shown = ", ".join(view.name for view in self.views[:5])
+        raise InputError(
+            f"view: there is no {name!r} among {len(self.views)} views ({shown}, ...)."
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scene:
+class Capture(_WithViews):
+    """What a capture folder holds: photographs with poses, and what else came with them."""
+
+    path: Path
+    format: str
+    """Which reader took it: nerfstudio, colmap, llff, ..."""
+
+    points: PointCloud | None = None
+    classes: ClassTable | None = None
+
+    up: tuple[float, float, float] | None = None
+    """Direction away from the ground in the world, where the capture says."""
+
+    metres_per_unit: float | None = None
+    """Length of a scene unit, where the capture says."""
+
+    splats: Path | None = None
+    """A splat file that lies beside the photographs."""
+
+    notes: tuple[str, ...] = ()
+    """What a person should know of how it was read."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene(_WithViews):
     """Gaussians with the views they came from."""
 
     gaussians: Gaussians
@@ -180,27 +181,6 @@ class Scene:
 
     provenance: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """How it was made, in values that JSON holds."""
-
-    def __post_init__(self) -> None:
-        _check_names(self.views)
-
-    @property
-    def train_views(self) -> tuple[View, ...]:
-        """Views that methods may learn from."""
-        return tuple(view for view in self.views if view.split == "train")
-
-    @property
-    def test_views(self) -> tuple[View, ...]:
-        """Held-out views of the split ``test``."""
-        return tuple(view for view in self.views if view.split == "test")
-
-    def view(self, name: str) -> View:
-        """The view of this name.
-
-        Raises:
-            InputError: If there is none.
-        """
-        return _find(self.views, name)
 
 
 def camera_of_map(view: View, height: int, width: int) -> Camera:

@@ -4,6 +4,8 @@ from splatseg.edit._merge import merged_layers as merged_layers
 from splatseg.edit._operation import CutBy as CutBy
 from splatseg.edit._operation import Operation as Operation
 from splatseg.edit._operation import Recolour as Recolour
+from splatseg.edit._prepare import Prepared as Prepared
+from splatseg.edit._prepare import prepare as prepare
 from splatseg.edit._where import Where as Where
 from splatseg.edit._where import ids_named as ids_named
 from splatseg.edit._where import layer_called as layer_called
@@ -11,9 +13,7 @@ from splatseg.edit._where import select as select
 from splatseg.edit.document import Document as Document
 from splatseg.edit.document import load_document as load_document
 from splatseg.edit.document import save_document as save_document
-from splatseg.edit.history import Prepared as Prepared
 from splatseg.edit.history import apply as apply
-from splatseg.edit.history import prepare as prepare
 from splatseg.edit.history import replay as replay
 from splatseg.edit.history import undo as undo
 from splatseg.edit.operations import duplicate as duplicate

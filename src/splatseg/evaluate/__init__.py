@@ -7,13 +7,9 @@ from splatseg.evaluate.boundary import BoundaryScore as BoundaryScore
 from splatseg.evaluate.boundary import boundary_overlap as boundary_overlap
 from splatseg.evaluate.boundary import boundary_score as boundary_score
 from splatseg.evaluate.held_out import BinaryReport as BinaryReport
-from splatseg.evaluate.held_out import PhotographReport as PhotographReport
 from splatseg.evaluate.held_out import SemanticReport as SemanticReport
-from splatseg.evaluate.held_out import ViewScore as ViewScore
 from splatseg.evaluate.held_out import evaluate_binary as evaluate_binary
-from splatseg.evaluate.held_out import evaluate_photographs as evaluate_photographs
 from splatseg.evaluate.held_out import evaluate_semantic as evaluate_semantic
-from splatseg.evaluate.held_out import picture_and_photograph as picture_and_photograph
 from splatseg.evaluate.held_out_segments import InstanceReport as InstanceReport
 from splatseg.evaluate.held_out_segments import PanopticReport as PanopticReport
 from splatseg.evaluate.held_out_segments import PointReport as PointReport
@@ -37,6 +33,10 @@ from splatseg.evaluate.panoptic import PrecisionScore as PrecisionScore
 from splatseg.evaluate.panoptic import average_precision as average_precision
 from splatseg.evaluate.panoptic import panoptic_score as panoptic_score
 from splatseg.evaluate.panoptic import segment_keys as segment_keys
+from splatseg.evaluate.photographs import PhotographReport as PhotographReport
+from splatseg.evaluate.photographs import ViewScore as ViewScore
+from splatseg.evaluate.photographs import evaluate_photographs as evaluate_photographs
+from splatseg.evaluate.photographs import render_and_photograph as render_and_photograph
 from splatseg.evaluate.solid import gaussian_score as gaussian_score
 from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
 from splatseg.evaluate.solid import labels_from_points as labels_from_points

@@ -30,18 +30,18 @@ def views_that_show(
     gaussians: Gaussians,
     views: Sequence[View],
     *,
-    least: float = SEEN_WEIGHT,
+    min_weight: float = SEEN_WEIGHT,
     longest: int = SEEN_LONGEST,
     options: RenderOptions | None = None,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Int[Tensor, "n"]:
-    r"""In how many views each Gaussian is seen: those with :math:`\sum_p w_{pi} \ge` `least`.
+    r"""In how many views each Gaussian is seen: those with :math:`\sum_p w_{pi} \ge` `min_weight`.
 
     Args:
         gaussians: The Gaussians of the scene.
         views: Where to look.
-        least: Blending weight that makes a Gaussian seen; 1 is one fully visible pixel.
+        min_weight: Blending weight that makes a Gaussian seen; 1 is one fully visible pixel.
         longest: Larger views are looked at with their longest side reduced to this, pixels, so
             that the figure does not depend on the size of photographs.
         options: Switches of the blending model.
@@ -52,10 +52,10 @@ def views_that_show(
     for done, view in enumerate(views, start=1):
         width, height = reduced_size(view.camera.width, view.camera.height, longest)
         camera = view.camera.resized(width, height)
-        paper = gaussians.means.new_zeros(height, width, 1)
+        ones = gaussians.means.new_zeros(height, width, 1)
         with torch.no_grad():
-            seen = back_project(gaussians, camera, paper, options=options, backend=backend)
-        counts += seen.weights.cpu() >= least
+            seen = back_project(gaussians, camera, ones, options=options, backend=backend)
+        counts += seen.weights.cpu() >= min_weight
         if progress is not None:
             progress(done, len(views))
     return counts
@@ -86,7 +86,7 @@ class Rivals:
     """Gaussians."""
 
 
-def rivals(labels: Labels, *, ratio: float, most: int = 10) -> tuple[Rivals, ...]:
+def rivals(labels: Labels, *, ratio: float, max_pairs: int = 10) -> tuple[Rivals, ...]:
     """Pairs of winner and second that occur most among the contested Gaussians, most first.
 
     Raises:
@@ -97,7 +97,7 @@ def rivals(labels: Labels, *, ratio: float, most: int = 10) -> tuple[Rivals, ...
     if not bool(which.any()):
         return ()
     found, counts = torch.unique(pairs[which], dim=0, return_counts=True)
-    order = torch.argsort(counts, descending=True, stable=True)[:most].tolist()
+    order = torch.argsort(counts, descending=True, stable=True)[:max_pairs].tolist()
     return tuple(
         Rivals(winner=int(found[i, 0]), second=int(found[i, 1]), count=int(counts[i]))
         for i in order
@@ -139,10 +139,10 @@ def agreement(
         fit = int((drawn == evidence)[both].sum())
     else:
         found = Overlaps.of(drawn[both], evidence[both])
-        most: dict[int, int] = {}
+        best: dict[int, int] = {}
         for (segment, _), count in zip(found.pairs.tolist(), found.counts.tolist(), strict=True):
-            most[segment] = max(most.get(segment, 0), count)
-        fit = sum(most.values())
+            best[segment] = max(best.get(segment, 0), count)
+        fit = sum(best.values())
     return Agreement(pixels=pixels, differ=1 - fit / pixels if pixels else 0.0)
 
 

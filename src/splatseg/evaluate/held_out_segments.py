@@ -9,14 +9,29 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels, LabelSource, View
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    Gaussians,
+    LabelMap,
+    Labels,
+    LabelSource,
+    View,
+    map_ids,
+)
 from splatseg.errors import InputError, ShapeError
-from splatseg.evaluate.held_out import Progress, drawn_like, learned_from, with_truth
+from splatseg.evaluate.held_out import (
+    Progress,
+    ViewsReport,
+    drawn_and_true,
+    drawn_like,
+    learned_from,
+    with_truth,
+)
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
 from splatseg.evaluate.overlaps import InstanceScore, Overlaps, instance_score
 from splatseg.evaluate.panoptic import (
@@ -32,20 +47,15 @@ from splatseg.render import RenderOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InstanceReport:
+class InstanceReport(ViewsReport):
     """Scores of a layer's instances, classes aside."""
 
     score: InstanceScore
-    views: tuple[str, ...]
-    """Views that were scored."""
-
-    learned_from: tuple[str, ...]
-    """Those of them that the layer was made from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PanopticReport:
-    """Scores of a layer of classes with a layer of instances."""
+class PanopticReport(ViewsReport):
+    """Scores of a layer of classes with a layer of instances; `learned_from` is of either."""
 
     score: PanopticScore
     """PQ over the scene."""
@@ -55,12 +65,6 @@ class PanopticReport:
 
     semantic: SemanticScore
     """Of the classes alone."""
-
-    views: tuple[str, ...]
-    """Views that were scored."""
-
-    learned_from: tuple[str, ...]
-    """Those of them that either layer was made from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,12 +111,10 @@ def evaluate_instances(
     """
     scored = with_truth(views, truth)
     total = Overlaps.none()
-    for done, view in enumerate(scored, start=1):
-        true = truth.label_map(view.name)
-        drawn = drawn_like(gaussians, view, labels, true, options=options, backend=backend)
+    for drawn, true in drawn_and_true(
+        gaussians, scored, labels, truth, options=options, backend=backend, progress=progress
+    ):
         total = total + Overlaps.of(drawn.ids, true.ids)
-        if progress is not None:
-            progress(done, len(scored))
     return InstanceReport(
         score=instance_score(total),
         views=tuple(view.name for view in scored),
@@ -160,26 +162,15 @@ def evaluate_panoptic(
     things = frozenset(row.id for row in table.rows if row.isthing)
     scored = sorted(with_truth(views, true_classes), key=lambda view: view.name)
     class_of = None if classes is not None else classes_of_instances(instances)
-    known = set(true_instances.view_names)
-    lacking = [view.name for view in scored if view.name not in known]
-    if lacking:
-        raise InputError(
-            f"true_instances: expected those of all {len(scored)} views with true classes, "
-            f"{len(lacking)} lack them, the first is {lacking[0]}."
-        )
+    _check_instances(scored, true_instances)
     total, detections, confusion = Overlaps.none(), Detections(), Confusion.none()
     for done, view in enumerate(scored, start=1):
-        true, true_ids = true_classes.label_map(view.name), true_instances.label_map(view.name)
-        if true.ids.shape != true_ids.ids.shape:
-            raise ShapeError(
-                f"true_instances: {view.name}: expected the size {tuple(true.ids.shape)} of the "
-                f"true classes, got {tuple(true_ids.ids.shape)}."
-            )
+        true, true_ids = _true_maps(view, true_classes, true_instances)
         found = drawn_like(gaussians, view, instances, true, options=options, backend=backend).ids
         if classes is not None:
             drawn = drawn_like(gaussians, view, classes, true, options=options, backend=backend).ids
         else:
-            drawn = _looked_up(found, class_of or {})
+            drawn = map_ids(found, class_of or {}, default=UNLABELLED)
         one = Overlaps.of(
             segment_keys(drawn, found, things=things),
             segment_keys(true.ids, true_ids.ids, things=things),
@@ -198,6 +189,29 @@ def evaluate_panoptic(
         views=tuple(view.name for view in scored),
         learned_from=tuple(view.name for view in scored if view.name in both),
     )
+
+
+def _check_instances(scored: Sequence[View], true_instances: LabelSource) -> None:
+    known = set(true_instances.view_names)
+    lacking = [view.name for view in scored if view.name not in known]
+    if lacking:
+        raise InputError(
+            f"true_instances: expected those of all {len(scored)} views with true classes, "
+            f"{len(lacking)} lack them, the first is {lacking[0]}."
+        )
+
+
+def _true_maps(
+    view: View, true_classes: LabelSource, true_instances: LabelSource
+) -> tuple[LabelMap, LabelMap]:
+    """The true classes and instances of a view, of one size."""
+    classes, instances = true_classes.label_map(view.name), true_instances.label_map(view.name)
+    if classes.ids.shape != instances.ids.shape:
+        raise ShapeError(
+            f"true_instances: {view.name}: expected the size {tuple(classes.ids.shape)} of the "
+            f"true classes, got {tuple(instances.ids.shape)}."
+        )
+    return classes, instances
 
 
 def classes_of_instances(instances: Labels) -> dict[int, int]:
@@ -264,9 +278,3 @@ def evaluate_points(
         points=int((truth >= 0).sum()),
         unlabelled=float((ids[truth >= 0] < 0).double().mean()),
     )
-
-
-def _looked_up(ids: Int[Tensor, "height width"], names: Mapping[int, int]) -> Tensor:
-    """What each id stands for; -1 where nothing says."""
-    present, at = torch.unique(ids, return_inverse=True)
-    return torch.tensor([names.get(i, UNLABELLED) for i in present.tolist()])[at]

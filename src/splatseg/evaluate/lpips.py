@@ -192,10 +192,10 @@ def _network(found: Mapping[tuple[int, str], Tensor], where: str) -> str:
 
 
 def _kernel(
-    found: Mapping[tuple[int, str], Tensor], layers: Sequence[_Layer], place: int, where: str
+    found: Mapping[tuple[int, str], Tensor], layers: Sequence[_Layer], layer_index: int, where: str
 ) -> tuple[Tensor, Tensor]:
-    layer = layers[place]
-    channels = layers[place - 1].out if place else 3
+    layer = layers[layer_index]
+    channels = layers[layer_index - 1].out if layer_index else 3
     weight, bias = (found.get((layer.index, kind)) for kind in ("weight", "bias"))
     if weight is None or bias is None:
         raise InputError(f"{where}: expected weight and bias of convolution {layer.index}.")

@@ -35,7 +35,7 @@ SSIM_SIGMA = 1.5
 
 _SSIM_C1 = 0.01**2
 _SSIM_C2 = 0.03**2
-_LEAST_ERROR = 1e-12
+_MIN_ERROR = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -245,11 +245,11 @@ def psnr(
         >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.1)), 3)
         20.0
     """
-    a, b = _picture_pair(image, truth)
+    a, b = _image_pair(image, truth)
     squares = (a - b) ** 2
     if keep is not None:
         squares = squares[_kept(keep, squares)]
-    return -10 * math.log10(max(float(squares.mean()), _LEAST_ERROR))
+    return -10 * math.log10(max(float(squares.mean()), _MIN_ERROR))
 
 
 def ssim(
@@ -274,7 +274,7 @@ def ssim(
         ShapeError: If the sizes differ or are smaller than the window.
         InputError: If `keep` keeps no window's middle.
     """
-    a, b = _picture_pair(image, truth)
+    a, b = _image_pair(image, truth)
     if min(a.shape[:2]) < SSIM_WINDOW:
         raise ShapeError(
             f"image: expected at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, "
@@ -339,7 +339,7 @@ def id_pair(predicted: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     return predicted.cpu().long(), truth.cpu().long()
 
 
-def _picture_pair(image: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+def _image_pair(image: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     check_shape("image", image, (None, None, None))
     if image.shape != truth.shape:
         raise ShapeError(

@@ -122,22 +122,34 @@ def labels_of_points(
         raise InputError(f"gaussians: expected one with an opacity of {min_opacity:g} or more.")
     there = gaussians[solid.to(gaussians.means.device)].to(device="cpu", dtype=torch.float64)
     kept = ids.cpu().int()[solid]
-    index = NeighbourIndex(there)
-    near = 1 if rule == "nearest" else min(neighbours, count)
+    return _labels_at(there, kept, points, rule=rule, neighbours=min(neighbours, count))
+
+
+def _labels_at(
+    gaussians: Gaussians,
+    ids: Int[Tensor, "n"],
+    points: Float[Tensor, "p 3"],
+    *,
+    rule: PointRule,
+    neighbours: int,
+) -> Int[Tensor, "p"]:
+    """The rules of `labels_of_points` among Gaussians that are all there, a block at a time."""
+    index = NeighbourIndex(gaussians)
+    count = 1 if rule == "nearest" else neighbours
     # Rows of whitening matrices: |S^-1 R^T (x - mean)| is the Mahalanobis distance.
-    rotations = rotation_from_quaternion(there.rotations)
-    scales = there.scales.clamp_min(1e-12)
+    rotations = rotation_from_quaternion(gaussians.rotations)
+    scales = gaussians.scales.clamp_min(1e-12)
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)
     for start in range(0, len(points), _POINTS):
         part = points[start : start + _POINTS].detach().cpu().double()
-        found = index.nearest(part, near).indices
-        at = kept[found]
+        found = index.nearest(part, count).indices
+        at = ids[found]
         if rule == "nearest":
             out[start : start + _POINTS] = at[:, 0]
             continue
-        offsets = part[:, None] - there.means[found]
+        offsets = part[:, None] - gaussians.means[found]
         local = torch.einsum("pkji,pkj->pki", rotations[found], offsets) / scales[found]
-        density = there.opacities[found] * torch.exp(-0.5 * local.square().sum(dim=-1))
+        density = gaussians.opacities[found] * torch.exp(-0.5 * local.square().sum(dim=-1))
         out[start : start + _POINTS] = _winners(at, density)
     return out
 

@@ -67,7 +67,7 @@ def outside(extent: Extent, frame: Frame) -> list[Camera]:
                 x, y, z = (corners @ rotation.T).unbind(-1)
                 needed = torch.maximum(x.abs() / tangent_x, y.abs() / tangent_y) - z
                 distance = _MARGIN * float(needed.max()) * near
-                eye = extent.middle + distance * away
+                eye = extent.centre + distance * away
                 cameras.append(_camera(extent, eye, rotation, frame, OUTSIDE_VIEW))
     return cameras
 
@@ -75,7 +75,7 @@ def outside(extent: Extent, frame: Frame) -> list[Camera]:
 def inside(extent: Extent, frame: Frame) -> list[Camera]:
     """Cameras at free places within the bounds, in all directions; none where nothing is free."""
     cameras: list[Camera] = []
-    for eye in free_places(extent):
+    for eye in free_positions(extent):
         for pitch in _PITCHES:
             for turn in range(_DIRECTIONS):
                 azimuth = 2 * math.pi * (turn + 0.5 * (pitch > 0)) / _DIRECTIONS
@@ -92,13 +92,13 @@ def inside(extent: Extent, frame: Frame) -> list[Camera]:
     return cameras
 
 
-def free_places(extent: Extent) -> list[Tensor]:
+def free_positions(extent: Extent) -> list[Tensor]:
     """Points of a grid within the bounds that are away from all solid Gaussians, spread out."""
     axes = [
         torch.linspace(-_INNER, _INNER, n, dtype=torch.float64) * extent.half[k]
         for k, n in enumerate(_GRID)
     ]
-    grid = torch.cartesian_prod(*axes) + extent.middle
+    grid = torch.cartesian_prod(*axes) + extent.centre
     distance = NeighbourIndex(extent.solid).nearest(grid, 1).distances[:, 0]
     clear = distance > _CLEARANCE * extent.radius
     free, room = grid[clear], distance[clear]

@@ -21,7 +21,7 @@ class Extent:
     world_from_level: Float[Tensor, "3 3"]
     """Rotation whose columns are the level axes in the world, float64."""
 
-    middle: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]
     """Middle of the bounds, level axes."""
 
     half: Float[Tensor, "3"]
@@ -77,7 +77,7 @@ def extent_of(gaussians: Gaussians, up: tuple[float, float, float]) -> Extent:
     mass = torch.where(inside, mass, torch.zeros_like(mass))
     return Extent(
         world_from_level=rotation,
-        middle=(low + high) / 2,
+        centre=(low + high) / 2,
         half=half.clamp_min(1e-3 * float(half.max())),
         solid=kept,
         mass=(mass / mass.sum().clamp_min(1e-30)).float(),

@@ -29,14 +29,14 @@ _CELLS = 40
 # A place counts in full until this many views show it.
 _OFTEN = 3
 _NEAR_INSIDE, _NEAR_OUTSIDE = 0.08, 0.25
-_MOST_NEAR = 0.2
-_LEAST_ALPHA = {"object": 0.02, "room": 0.5}
+_MAX_NEAR = 0.2
+_MIN_ALPHA = {"object": 0.02, "room": 0.5}
 _GAIN = 2e-3
 _FAINT = 0.05
 _PIXELS_A_CELL = 4
-_FEWEST = 12
+_MIN_VIEWS = 12
 # A flat thing has a free place or two within its bounds, and is no room.
-_FEWEST_PLACES = 6
+_MIN_POSITIONS = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,23 +107,27 @@ def place_cameras(
     overview = [i for i, g in enumerate(glimpses) if g.overview]
     chosen = _greedy(glimpses, count, begin=overview)
     cameras = _in_order([glimpses[i].camera.resized(width, height) for i in chosen], extent)
-    views = tuple(
+    seen = _seen(gaussians, [glimpses[i].camera for i in chosen], backend)
+    # Every fourth candidate is enough to tell what can be seen at all.
+    visible = seen | _seen(gaussians, [g.camera for g in glimpses[::4]], backend)
+    whole = float(extent.mass[visible].sum())
+    return VirtualViews(
+        views=_views(cameras),
+        kind=kind,
+        up=up,
+        coverage=float(extent.mass[seen].sum()) / whole if whole > 0 else 0.0,
+    )
+
+
+def _views(cameras: Sequence[Camera]) -> tuple[View, ...]:
+    """Views of virtual cameras, some of them held out."""
+    return tuple(
         View(
             name=f"virtual_{i:04d}",
             camera=camera,
             split="test" if i % TEST_EVERY == 0 and len(cameras) > 1 else "train",
         )
         for i, camera in enumerate(cameras)
-    )
-    seen = _seen(gaussians, [glimpses[i].camera for i in chosen], backend)
-    # Every fourth candidate is enough to tell what can be seen at all.
-    visible = seen | _seen(gaussians, [g.camera for g in glimpses[::4]], backend)
-    whole = float(extent.mass[visible].sum())
-    return VirtualViews(
-        views=views,
-        kind=kind,
-        up=up,
-        coverage=float(extent.mass[seen].sum()) / whole if whole > 0 else 0.0,
     )
 
 
@@ -150,13 +154,15 @@ def _kind(
     The median over places of how much of the view all round is covered: beside an object most
     of it is empty.
     """
-    if len(within) < _FEWEST_PLACES * VIEWS_A_PLACE:
+    if len(within) < _MIN_POSITIONS * VIEWS_A_PLACE:
         return "object"
-    places = [within[i : i + VIEWS_A_PLACE : 2] for i in range(0, len(within), 2 * VIEWS_A_PLACE)]
+    positions = [
+        within[i : i + VIEWS_A_PLACE : 2] for i in range(0, len(within), 2 * VIEWS_A_PLACE)
+    ]
     nothing = gaussians.means.new_zeros(len(gaussians), 1)
     covered: list[float] = []
     with torch.no_grad():
-        for cameras in places:
+        for cameras in positions:
             alphas = [
                 float(render(gaussians, camera, nothing, backend=backend).alpha.mean())
                 for camera in cameras
@@ -193,17 +199,17 @@ def _glimpse(
     # What never stops half of the light has no median; its expected depth serves.
     depth = torch.where(depth > 0, depth, drawn.depth.cpu().double())
     solid = (depth > 0) & (alpha > _FAINT)
-    if float(alpha.mean()) < _LEAST_ALPHA[kind] or not bool(solid.any()):
+    if float(alpha.mean()) < _MIN_ALPHA[kind] or not bool(solid.any()):
         return None
-    to_middle = float(torch.linalg.vector_norm(camera.centre - extent.world(extent.middle)))
-    near = _NEAR_INSIDE * extent.radius if kind == "room" else _NEAR_OUTSIDE * to_middle
-    if float((solid & (depth < near)).double().mean()) > _MOST_NEAR:
+    to_centre = float(torch.linalg.vector_norm(camera.centre - extent.world(extent.centre)))
+    near = _NEAR_INSIDE * extent.radius if kind == "room" else _NEAR_OUTSIDE * to_centre
+    if float((solid & (depth < near)).double().mean()) > _MAX_NEAR:
         return None
     pixels = camera.pixel_centres()[solid]
     points = camera.unproject(pixels, depth[solid]) @ extent.world_from_level
-    inside_bounds = ((points - extent.middle).abs() <= 1.3 * extent.half).all(dim=1)
+    inside_bounds = ((points - extent.centre).abs() <= 1.3 * extent.half).all(dim=1)
     cell = 2 * float(extent.half.max()) / _CELLS
-    index = torch.floor((points[inside_bounds] - extent.middle) / cell).long() + 2 * _CELLS
+    index = torch.floor((points[inside_bounds] - extent.centre) / cell).long() + 2 * _CELLS
     flat = (index[:, 0] * 4 * _CELLS + index[:, 1]) * 4 * _CELLS + index[:, 2]
     cells, inverse = flat.unique(return_inverse=True)
     if not len(cells):
@@ -221,19 +227,19 @@ def _greedy(glimpses: Sequence[_Glimpse], count: int, *, begin: Sequence[int]) -
     The first half is taken from `begin`, as far as there are any.
     """
     every = torch.cat([g.cells for g in glimpses]).unique()
-    places = [torch.searchsorted(every, g.cells) for g in glimpses]
+    rows = [torch.searchsorted(every, g.cells) for g in glimpses]
     often = torch.zeros(len(every), dtype=torch.float64)
     chosen: list[int] = []
     while len(chosen) < min(count, len(glimpses)):
         value = torch.where(often < _OFTEN, 0.5**often, torch.zeros_like(often))
         first = [i for i in begin if i not in chosen] if len(chosen) < (count + 1) // 2 else []
         able = first or [i for i in range(len(glimpses)) if i not in chosen]
-        gains = {i: float((value[places[i]] * glimpses[i].worth).sum()) for i in able}
+        gains = {i: float((value[rows[i]] * glimpses[i].worth).sum()) for i in able}
         best = max(able, key=gains.__getitem__)
-        if not first and len(chosen) >= _FEWEST and gains[best] < _GAIN * len(every):
+        if not first and len(chosen) >= _MIN_VIEWS and gains[best] < _GAIN * len(every):
             break
         chosen.append(best)
-        often[places[best]] += glimpses[best].worth
+        often[rows[best]] += glimpses[best].worth
     return chosen
 
 
@@ -242,7 +248,7 @@ def _in_order(cameras: Sequence[Camera], extent: Extent) -> list[Camera]:
 
     def turn(camera: Camera) -> tuple[float, float]:
         forward = camera.cam_from_world[2, :3] @ extent.world_from_level
-        eye = camera.centre @ extent.world_from_level - extent.middle
+        eye = camera.centre @ extent.world_from_level - extent.centre
         return math.atan2(float(forward[1]), float(forward[0])), float(eye[2])
 
     return [replace(c) for c in sorted(cameras, key=turn)]

@@ -5,7 +5,7 @@ from typing import Any, cast
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import FileFormatError
 
-_MOST = 2**31 - 1
+_MAX_ID = 2**31 - 1
 """Ids are int32."""
 
 
@@ -49,8 +49,8 @@ def _class_info(row: object, *, where: str) -> ClassInfo:
     id, name, colour = entry.get("id"), entry.get("name"), entry.get("colour")
     if isinstance(id, bool) or not isinstance(id, int) or id < 0 or not isinstance(name, str):
         raise FileFormatError(f"{where}: expected an integer id and a name, got {entry!r:.80}.")
-    if id > _MOST:
-        raise FileFormatError(f"{where}: expected an id up to {_MOST}, got {id}.")
+    if id > _MAX_ID:
+        raise FileFormatError(f"{where}: expected an id up to {_MAX_ID}, got {id}.")
     if colour is not None:
         values = cast(list[object], colour) if isinstance(colour, list) else []
         if len(values) != 3 or not all(isinstance(v, int) and 0 <= v <= 255 for v in values):

@@ -289,13 +289,13 @@ def _source(
     if not isinstance(source, dict):
         return None
     entry = cast(dict[str, Any], source)
-    places = [
+    candidates = [
         Path(os.path.normpath(root / str(entry.get("relative")))),
         Path(str(entry.get("absolute"))),
     ]
-    there = [place for place in places if place.is_dir()]
+    there = [candidate for candidate in candidates if candidate.is_dir()]
     with_photographs = [p for p in there if not photographs or (p / photographs[0]).is_file()]
-    return next(iter([*with_photographs, *there, places[1]]))
+    return next(iter([*with_photographs, *there, candidates[1]]))
 
 
 def _with_splits(

@@ -23,7 +23,7 @@ _TYPES = {
     "I32": (torch.int32, 4),
     "U8": (torch.uint8, 1),
 }
-_MOST_HEADER = 100_000_000
+_MAX_HEADER = 100_000_000
 _CONVERT = (
     "python -c \"import numpy, torch; numpy.savez('weights.npz', "
     "**torch.load('weights.pth', weights_only=True))\""
@@ -67,7 +67,7 @@ def _npz(path: Path) -> dict[str, Tensor]:
 def _safetensors(path: Path) -> dict[str, Tensor]:
     data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(_MOST_HEADER, len(data) - 8):
+    if len(data) < 8 or length > min(_MAX_HEADER, len(data) - 8):
         raise FileFormatError(f"{path}: expected a safetensors file, its header is cut off.")
     try:
         header: Any = json.loads(data[8 : 8 + length])

@@ -56,8 +56,8 @@ def write_video(
         )
     command = _command(encoder.get_ffmpeg_exe(), width, height, fps)
     with atomic_file(path) as temporary, TemporaryFile() as complaints:
-        pictures = (_bytes(frame, first.shape, height, width) for frame in chain((first,), rest))
-        count = _fed([*command, str(temporary)], pictures, complaints, path)
+        frame_bytes = (_bytes(frame, first.shape, height, width) for frame in chain((first,), rest))
+        count = _fed([*command, str(temporary)], frame_bytes, complaints, path)
     return count
 
 
@@ -72,7 +72,7 @@ def _command(program: str, width: int, height: int, fps: float) -> list[str]:
 
 def _fed(
     command: Sequence[str],
-    pictures: Iterable[bytes],
+    frame_bytes: Iterable[bytes],
     complaints: IO[bytes],
     path: str | os.PathLike[str],
 ) -> int:
@@ -88,9 +88,9 @@ def _fed(
         pipe = process.stdin or contextlib.nullcontext()
         # An encoder that ended early says why by its status and words.
         with contextlib.suppress(BrokenPipeError), pipe as into:
-            for picture in pictures:
+            for one_frame in frame_bytes:
                 if into is not None:
-                    into.write(picture)
+                    into.write(one_frame)
                 count += 1
         process.wait()
     except BaseException:
@@ -100,8 +100,8 @@ def _fed(
     if process.returncode:
         complaints.seek(0)
         words = complaints.read().decode(errors="replace").strip().splitlines()
-        said = words[-1] if words else f"status {process.returncode}"
-        raise BackendError(f"{path}: the video encoder failed: {said}.")
+        reason = words[-1] if words else f"status {process.returncode}"
+        raise BackendError(f"{path}: the video encoder failed: {reason}.")
     return count
 
 

@@ -28,8 +28,10 @@ from splatseg.io.evidence import (
     save_tracks,
     view_files,
 )
+from splatseg.models._recorded_features import check_grid
+from splatseg.models._recording import check_size
 from splatseg.models._sources import Source, some, without_empty
-from splatseg.models.recorded import AnyRecorded, check_grid, check_size
+from splatseg.models.recorded import AnyRecorded
 
 _SHARED = ("quant.npz", "basis.npz")
 _ASKED: Mapping[str, tuple[EvidenceKind, ...]] = {
@@ -53,7 +55,7 @@ def copied(
     Raises:
         InputError: If it is of another kind, or lacks views.
     """
-    evidence = model.recording.evidence
+    evidence = model.evidence
     if what is not None and evidence.kind not in _ASKED.get(what, ()):
         raise InputError(f"{evidence.folder}: expected evidence of {what}, got {evidence.kind}.")
     there = frozenset(evidence.view_names)
@@ -112,8 +114,8 @@ class _Copied(Source):
         known = self.evidence.source_ids
         if known is None:
             return None
-        most = max(self.highest)
-        return {id: source for id, source in known.items() if id <= most}
+        highest = max(self.highest)
+        return {id: source for id, source in known.items() if id <= highest}
 
     @override
     def details(self) -> Mapping[str, Any]:

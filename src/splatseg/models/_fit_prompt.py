@@ -5,7 +5,7 @@ import torch
 from splatseg.core import MaskSet
 from splatseg.core.models import Prompt
 
-LEAST_FIT = 0.05
+MIN_FIT = 0.05
 """Masks that fit less are no answer."""
 
 
@@ -21,7 +21,7 @@ def best_masks(masks: MaskSet, prompt: Prompt, *, count: int = 3) -> MaskSet:
     fits = [_fit(masks, i, prompt) for i in range(len(masks))]
     recorded: list[float] = masks.scores.tolist()
     order = sorted(
-        (i for i in range(len(masks)) if fits[i] >= LEAST_FIT),
+        (i for i in range(len(masks)) if fits[i] >= MIN_FIT),
         key=lambda i: (-fits[i], -recorded[i], masks.masks[i].area, i),
     )[:count]
     return MaskSet(

@@ -103,8 +103,8 @@ def finish_model(
         for point in image.points2D:
             point.xy = point.xy * scale
         image.name = lens["images"][image.name]
-    for camera_id, place in lens_of.items():
-        _scale_camera(reconstruction.camera(camera_id), lenses[place])
+    for camera_id, index in lens_of.items():
+        _scale_camera(reconstruction.camera(camera_id), lenses[index])
     return sorted(lens_of[id] for id in straightened)
 
 

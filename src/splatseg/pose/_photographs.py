@@ -94,11 +94,11 @@ def find_photographs(folder: Path) -> tuple[Path, ...]:
 
 def holds_photographs(folder: Path) -> bool:
     """Whether a folder, or its folder ``images``, holds photographs, be they HEIC or RAW."""
-    places = [place for place in (folder, folder / "images") if place.is_dir()]
+    folders = [path for path in (folder, folder / "images") if path.is_dir()]
     return bool(bare_photographs(folder)) or any(
         path.suffix.lower() in HEIC_SUFFIXES | RAW_SUFFIXES
-        for place in places
-        for path in place.iterdir()
+        for parent in folders
+        for path in parent.iterdir()
     )
 
 
@@ -231,8 +231,8 @@ def _copy(photograph: Photograph, target: Path, *, longest: int) -> None:
 
 def _refuse_undecodable(folder: Path, found: Sequence[Path]) -> None:
     """Raise for HEIC and RAW files, unless each lies beside its own JPEG."""
-    place = found[0].parent if found else folder
-    places = {place, folder, folder / "images"}
+    holder = found[0].parent if found else folder
+    folders = {holder, folder, folder / "images"}
     stems = {path.stem.lower() for path in found}
     for suffixes, kind, how in (
         (
@@ -248,9 +248,9 @@ def _refuse_undecodable(folder: Path, found: Sequence[Path]) -> None:
     ):
         files = sorted(
             path
-            for place in places
-            if place.is_dir()
-            for path in place.iterdir()
+            for parent in folders
+            if parent.is_dir()
+            for path in parent.iterdir()
             if path.suffix.lower() in suffixes and path.stem.lower() not in stems
         )
         if files:

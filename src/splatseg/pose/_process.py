@@ -28,9 +28,9 @@ def usable_threads(asked: int | None) -> int:
     """Threads to work with: what was asked for, OMP_NUM_THREADS, or the cores we may use."""
     if asked is not None:
         return asked
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    if told.isdigit() and int(told) > 0:
-        return int(told)
+    setting = os.environ.get("OMP_NUM_THREADS", "")
+    if setting.isdigit() and int(setting) > 0:
+        return int(setting)
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -91,8 +91,8 @@ def _environment(threads: int) -> dict[str, str]:
 
 def _pass_on(line: str, progress: Callable[[str, int, int], None]) -> None:
     try:
-        said = json.loads(line)
-        stage, done, total = said["stage"], said["done"], said["total"]
+        message = json.loads(line)
+        stage, done, total = message["stage"], message["done"], message["total"]
     except (ValueError, TypeError, KeyError):
         return  # Something that a library printed.
     progress(str(stage), int(done), int(total))

@@ -3,8 +3,8 @@
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -97,13 +97,9 @@ def recover_poses(
     source = Path(photographs)
     require_pycolmap()
     tell = _teller(progress)
-    with ExitStack() as stack:
-        if folder is None:
-            if is_video(source):
-                raise InputError("folder: expected a folder for the frames of the video, got None.")
-            kept = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="splatseg-")))
-        else:
-            kept = Path(folder)
+    if folder is None and is_video(source):
+        raise InputError("folder: expected a folder for the frames of the video, got None.")
+    with _given_or_temporary(folder) as kept:
         if is_video(source):
             root, files = kept, _frames(source, kept, options, tell)
         else:
@@ -121,6 +117,16 @@ def recover_poses(
         report=report,
         reused=reused,
     )
+
+
+@contextmanager
+def _given_or_temporary(folder: Path | str | None) -> Generator[Path]:
+    """The folder; where there is none, one that is deleted afterwards."""
+    if folder is not None:
+        yield Path(folder)
+        return
+    with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:
+        yield Path(temporary)
 
 
 def _recover(
@@ -153,27 +159,7 @@ def _recover(
             f"{source}: expected at least {MIN_PHOTOGRAPHS} photographs that can be read, "
             f"got {count} ({named})."
         )
-    result = run_worker(
-        {
-            "database": str(work / "features.db"),
-            "images": str(work / "images"),
-            "folder": str(work),
-            "result": str(work / "result.json"),
-            "lenses": [lens.as_json() for lens in lenses],
-            "options": {
-                "max_features": options.max_features,
-                "matching": options.matching,
-                "exhaustive_up_to": options.exhaustive_up_to,
-                "overlap": options.overlap,
-                "neighbours": options.neighbours,
-                "mapper": options.mapper,
-                "seed": options.seed,
-                "threads": threads,
-            },
-        },
-        work,
-        progress=tell,
-    )
+    result = run_worker(_worker_job(work, lenses, options, threads), work, progress=tell)
     best = None if result["best"] is None else result["tries"][result["best"]]
     if best is None or best["registered"] < MIN_PHOTOGRAPHS:
         placed = 0 if best is None else best["registered"]
@@ -196,6 +182,29 @@ def _recover(
     save_poses(folder, model=work / "model", made_of=made_of, report=report)
     shutil.rmtree(work)
     return report
+
+
+def _worker_job(
+    work: Path, lenses: Sequence[WorkingLens], options: PoseOptions, threads: int
+) -> dict[str, Any]:
+    """What the process with pycolmap is told, in values that JSON holds."""
+    return {
+        "database": str(work / "features.db"),
+        "images": str(work / "images"),
+        "folder": str(work),
+        "result": str(work / "result.json"),
+        "lenses": [lens.as_json() for lens in lenses],
+        "options": {
+            "max_features": options.max_features,
+            "matching": options.matching,
+            "exhaustive_up_to": options.exhaustive_up_to,
+            "overlap": options.overlap,
+            "neighbours": options.neighbours,
+            "mapper": options.mapper,
+            "seed": options.seed,
+            "threads": threads,
+        },
+    }
 
 
 def _root_of(files: Sequence[Path]) -> Path:

@@ -45,7 +45,7 @@ def check_video(path: Path) -> None:
         )
 
 
-def sharpness(picture: NDArray[np.uint8]) -> float:
+def sharpness(frame: NDArray[np.uint8]) -> float:
     """Variance of the Laplacian of a picture's grey values: large where edges are sharp.
 
     References:
@@ -53,7 +53,7 @@ def sharpness(picture: NDArray[np.uint8]) -> float:
     """
     import cv2
 
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
     scale = _JUDGED / max(grey.shape)
     if scale < 1:
         size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
@@ -95,16 +95,16 @@ def take_frames(
     with atomic_folder(folder) as temporary:
         best: tuple[float, int, NDArray[np.uint8]] | None = None
         current = 0
-        for i, picture in enumerate(_frames(video)):
+        for i, frame in enumerate(_frames(video)):
             # The count comes from the packets; a decoder may give a frame more or less.
             interval = interval_of(min(i, count - 1), frames=count, wanted=wanted)
             if interval != current and best is not None:
                 _save(best, temporary)
                 best = None
             current = interval
-            score = sharpness(picture)
+            score = sharpness(frame)
             if best is None or score > best[0]:
-                best = (score, i, picture)
+                best = (score, i, frame)
             progress(min(i + 1, count), count)
         if best is None:
             raise FileFormatError(f"{video}: expected a video, got one without frames.")
@@ -113,17 +113,15 @@ def take_frames(
 
 
 def _save(best: tuple[float, int, NDArray[np.uint8]], folder: Path) -> None:
-    _, index, picture = best
-    Image.fromarray(picture).save(
-        folder / f"frame_{index:06d}.jpg", quality=_QUALITY, subsampling=0
-    )
+    _, index, frame = best
+    Image.fromarray(frame).save(folder / f"frame_{index:06d}.jpg", quality=_QUALITY, subsampling=0)
 
 
 def _count(video: Path) -> int:
     """Frames of a video, from its packets alone."""
     words = ["-map", "0:v:0", "-c", "copy", "-f", "null", "-progress", "pipe:1", "-"]
-    with _ffmpeg(video, words) as said:
-        counts = [line for line in said.read().split() if line.startswith(b"frame=")]
+    with _ffmpeg(video, words) as output:
+        counts = [line for line in output.read().split() if line.startswith(b"frame=")]
     count = int(counts[-1].removeprefix(b"frame=")) if counts else 0
     if not count:
         raise FileFormatError(f"{video}: expected a video, got a file without frames.")
@@ -170,6 +168,6 @@ def _ffmpeg(video: Path, words: Sequence[str]) -> Generator[IO[bytes]]:
                 process.stdout.close()
         if status:
             complaints.seek(0)
-            said = complaints.read().decode(errors="replace").strip().splitlines()
-            reason = said[-1].removeprefix(f"{video}: ") if said else f"status {status}"
+            output = complaints.read().decode(errors="replace").strip().splitlines()
+            reason = output[-1].removeprefix(f"{video}: ") if output else f"status {status}"
             raise FileFormatError(f"{video}: cannot be read as a video ({reason}).")

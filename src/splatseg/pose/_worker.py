@@ -36,7 +36,7 @@ _IMAGES_AT_ONCE = 8
 _PAIRS_AT_ONCE = 256
 # Photographs with fewer verified matches in all are looked at again, at seconds a pair.
 _WEAK = 150
-_MOST_LOOKED_AT_AGAIN = 12
+_MAX_GUIDED_PAIRS = 12
 # COLMAP's own threshold for a verified pair.
 _MIN_INLIERS = 15
 # Without a second try: a model that has all photographs and fits them like this, in pixels.
@@ -169,7 +169,7 @@ class Job:
             for i in pair:
                 strength[i] += inliers
         weak = [pair for pair in verified if min(strength[i] for i in pair) < _WEAK]
-        weak = sorted(sorted(weak, key=lambda pair: -verified[pair])[:_MOST_LOOKED_AT_AGAIN])
+        weak = sorted(sorted(weak, key=lambda pair: -verified[pair])[:_MAX_GUIDED_PAIRS])
         database = pycolmap.Database.open(self._database)
         try:
             ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -218,14 +218,14 @@ class Job:
         """How many matches say that two photographs show the same, by their places."""
         database = pycolmap.Database.open(self._database)
         try:
-            place = {name: i for i, name in enumerate(self._names)}
-            places = {i.image_id: place[i.name] for i in database.read_all_images()}
+            index_of = {name: i for i, name in enumerate(self._names)}
+            index_of_id = {i.image_id: index_of[i.name] for i in database.read_all_images()}
             pair_ids, inliers = database.read_two_view_geometry_num_inliers()
         finally:
             database.close()
         verified: dict[tuple[int, int], int] = {}
         for pair_id, count in zip(pair_ids, inliers, strict=True):
-            a, b = (places[id] for id in pycolmap.pair_id_to_image_pair(pair_id))
+            a, b = (index_of_id[id] for id in pycolmap.pair_id_to_image_pair(pair_id))
             if count >= _MIN_INLIERS:
                 verified[min(a, b), max(a, b)] = int(count)
         return verified
@@ -243,8 +243,8 @@ class Job:
             tries.append(self._global(database))
         if mapper == "incremental" or (mapper == "auto" and not self._good(tries)):
             tries.append(self._incremental(database, "incremental"))
-            most = max(attempt.registered for attempt in tries)
-            if mapper == "auto" and guessed and most < _POOR_SHARE * len(self._names):
+            registered = max(attempt.registered for attempt in tries)
+            if mapper == "auto" and guessed and registered < _POOR_SHARE * len(self._names):
                 tries.append(self._incremental(plain, "incremental, other focal length"))
         found = [attempt for attempt in tries if attempt.registered]
         best = min(found, key=lambda a: (-a.registered, a.error), default=None)

@@ -1,11 +1,8 @@
 """What the ids of a layer mean, and whether others mean the same by them."""
 
-from collections.abc import Mapping
-from typing import Any
-
 from splatseg.core import ClassInfo, ClassTable, Labels, LabelSource
 from splatseg.io.evidence import Evidence
-from splatseg.report.pictures import colour_of
+from splatseg.report.legend import colour_of, own_names
 
 
 def ids_agree(labels: Labels, source: LabelSource, *, otherwise: bool) -> bool:
@@ -14,19 +11,13 @@ def ids_agree(labels: Labels, source: LabelSource, *, otherwise: bool) -> bool:
     They do where every name that the layer has is the source's name of the same id. Where one
     of them has no names, `otherwise` says.
     """
-    named = names_of(labels)
+    named = own_names(labels)
     table = source.classes if isinstance(source, Evidence) else None
     if table is None or not table.rows or not named:
         return otherwise
     present = set(labels.present.tolist())
     theirs = {row.id: row.name for row in table.rows}
     return all(theirs.get(id) == name for id, name in named.items() if id in present)
-
-
-def names_of(labels: Labels) -> dict[int, str]:
-    """Names that the layer itself gives its ids; none where it gives none."""
-    own: Any = labels.metadata.get("names")
-    return {int(id): str(name) for id, name in own.items()} if isinstance(own, Mapping) else {}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 
 def ids_are_classes(evidence: LabelSource | None) -> bool:
@@ -44,7 +35,7 @@ def class_table(
         classes: Of the scene. Their colours are taken where id and name agree.
         unnamed_are_classes: A layer without names has the ids of these classes.
     """
-    named = names_of(labels)
+    named = own_names(labels)
     theirs = {row.id: row for row in classes.rows} if classes is not None else {}
     rows: list[ClassInfo] = []
     for id in labels.present.tolist():

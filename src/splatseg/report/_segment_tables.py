@@ -9,19 +9,15 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, ClassTable, Labels
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
-from splatseg.report._segment_pictures import Sight
+from splatseg.report._common import count_text
+from splatseg.report._segment_panels import ViewPanel
 from splatseg.report.html import Bars, Block, Cell, Table
 
 _BINS = 10
-_AT_LEAST = (1, 2, 3, 5, 10, 20, 50, 100)
+_MIN_VIEWS = (1, 2, 3, 5, 10, 20, 50, 100)
 _CLOSE = (0.5, 0.8, 0.95)
 _ROWS = 60
 _LONG = 200
-
-
-def count_text(count: int) -> str:
-    """A count with thin spaces between thousands."""
-    return f"{count:,}".replace(",", "\N{THIN SPACE}")
 
 
 def support_table(labels: Labels) -> Table:
@@ -52,11 +48,11 @@ def confidence_bars(labels: Labels) -> Bars:
     """How the confidence of labelled Gaussians is distributed."""
     labelled = labels.ids != UNLABELLED
     values = labels.confidence.detach().double().cpu()[labelled.cpu()].clamp(0, 1)
-    place = (values * _BINS).long().clamp(max=_BINS - 1)
-    series, columns = ["share of the labelled Gaussians"], [_shares(place, None)]
+    bins = (values * _BINS).long().clamp(max=_BINS - 1)
+    series, columns = ["share of the labelled Gaussians"], [_shares(bins, None)]
     if labels.evidence is not None:
         series.append("share of their evidence")
-        columns.append(_shares(place, labels.evidence.detach().double().cpu()[labelled.cpu()]))
+        columns.append(_shares(bins, labels.evidence.detach().double().cpu()[labelled.cpu()]))
     rows = tuple(
         (f"{i / _BINS:.1f} to {(i + 1) / _BINS:.1f}", tuple(column[i] for column in columns))
         for i in reversed(range(_BINS))
@@ -71,7 +67,7 @@ def confidence_bars(labels: Labels) -> Bars:
 
 def coverage_bars(seen: Int[Tensor, "n"], *, views: int) -> Bars:
     """Share of the Gaussians that at least so many views show."""
-    steps = [n for n in _AT_LEAST if n <= views] or [1]
+    steps = [n for n in _MIN_VIEWS if n <= views] or [1]
     count = max(len(seen), 1)
     return Bars(
         title="Coverage",
@@ -85,7 +81,9 @@ def coverage_bars(seen: Int[Tensor, "n"], *, views: int) -> Bars:
     )
 
 
-def conflict_tables(labels: Labels, sights: Sequence[Sight], classes: ClassTable) -> list[Block]:
+def conflict_tables(
+    labels: Labels, panels: Sequence[ViewPanel], classes: ClassTable
+) -> list[Block]:
     """Where evidence disagrees with itself, Gaussian by Gaussian and view by view."""
     blocks: list[Block] = []
     if labels.candidates is not None and labels.candidates.shape[1] > 1 and len(labels):
@@ -130,7 +128,7 @@ def conflict_tables(labels: Labels, sights: Sequence[Sight], classes: ClassTable
                 "whom.",
             )
         )
-    compared = [(s.name, s.agreement) for s in sights if s.agreement is not None]
+    compared = [(s.name, s.agreement) for s in panels if s.agreement is not None]
     if compared:
         compared.sort(key=lambda row: (-row[1].differ, row[0]))
         blocks.append(
@@ -148,17 +146,17 @@ def conflict_tables(labels: Labels, sights: Sequence[Sight], classes: ClassTable
 
 def association_tables(metadata: Mapping[str, Any]) -> list[Block]:
     """What a method that joins ids says of it in the layer's metadata, as far as it says it."""
-    said = metadata.get("associate")
-    if not isinstance(said, Mapping):
+    facts = metadata.get("associate")
+    if not isinstance(facts, Mapping):
         return []
-    said = cast(Mapping[str, Any], said)
+    facts = cast(Mapping[str, Any], facts)
     blocks: list[Block] = []
-    plain = fact_rows({k: v for k, v in said.items() if not isinstance(v, list | Mapping)})
+    plain = fact_rows({k: v for k, v in facts.items() if not isinstance(v, list | Mapping)})
     if plain:
         blocks.append(
             Table(title="Segments to instances", columns=("what", "value"), rows=tuple(plain))
         )
-    for name, value in said.items():
+    for name, value in facts.items():
         if isinstance(value, list) and value:
             blocks.append(_listed(name, cast(list[Any], value)))
         elif isinstance(value, Mapping) and value:
@@ -175,8 +173,8 @@ def id_table(
 
     Where the method lists its instances, also how many segments and views each was seen in.
     """
-    told = _told_of_instances(labels.metadata)
-    also = [key for key in ("segments", "views") if any(key in row for row in told.values())]
+    instances = _instance_rows(labels.metadata)
+    also = [key for key in ("segments", "views") if any(key in row for row in instances.values())]
     ids, confidence = labels.ids.cpu().long(), labels.confidence.detach().double().cpu()
     rows: list[tuple[Cell, ...]] = []
     for row in classes.rows:
@@ -184,7 +182,7 @@ def id_table(
         count = int(mask.sum())
         mean = float(confidence[mask].mean()) if count else None
         values: list[Cell] = [row.id, row.name, count, mean]
-        values += [_cell(told.get(row.id, {}).get(key)) for key in also]
+        values += [_cell(instances.get(row.id, {}).get(key)) for key in also]
         if scores:
             values.append(scores.get(row.id))
         rows.append(tuple(values))
@@ -197,7 +195,7 @@ def id_table(
     return Table(title="Labels", columns=columns, rows=tuple(rows[:_ROWS]), note=" ".join(notes))
 
 
-def _told_of_instances(metadata: Mapping[str, Any]) -> dict[int, Mapping[str, Any]]:
+def _instance_rows(metadata: Mapping[str, Any]) -> dict[int, Mapping[str, Any]]:
     """What the metadata lists under ``instances``, by id."""
     rows: Any = metadata.get("instances")
     listed = cast(list[Any], rows) if isinstance(rows, list) else []
@@ -242,7 +240,7 @@ def _cell(value: Any) -> Cell:
     return words if len(words) <= _LONG else f"{words[:_LONG]}..."
 
 
-def _shares(place: Tensor, weights: Tensor | None) -> list[float]:
-    counts = torch.bincount(place, weights=weights, minlength=_BINS).double()
+def _shares(bins: Tensor, weights: Tensor | None) -> list[float]:
+    counts = torch.bincount(bins, weights=weights, minlength=_BINS).double()
     # Rounding may carry a share past 1.
     return (counts / counts.sum().clamp_min(1e-300)).clamp(0, 1).tolist()

@@ -10,7 +10,7 @@ from splatseg.errors import InputError, RangeError
 _WIDTH, _HEIGHT = 380, 220
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 10, 34
 _TICKS = 5
-_MOST_POINTS = 400
+_MAX_POINTS = 400
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +70,7 @@ def chart_svg(chart: Chart) -> str:
     x_low, x_high = _range(xs)
     y_low, y_high = _range(ys)
 
-    def place(x: float, y: float) -> tuple[float, float]:
+    def to_pixels(x: float, y: float) -> tuple[float, float]:
         across = (x - x_low) / (x_high - x_low)
         up = (y - y_low) / (y_high - y_low)
         return (
@@ -80,7 +80,7 @@ def chart_svg(chart: Chart) -> str:
 
     parts: list[str] = []
     for value in ticks(y_low, y_high):
-        _, y = place(x_low, value)
+        _, y = to_pixels(x_low, value)
         parts.append(
             f'<line class="grid" stroke="currentColor" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" '
             f'y1="{y:.1f}" y2="{y:.1f}"/>'
@@ -89,7 +89,7 @@ def chart_svg(chart: Chart) -> str:
             f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{_shown(value)}</text>'
         )
     for value in ticks(x_low, x_high):
-        x, _ = place(value, y_low)
+        x, _ = to_pixels(value, y_low)
         parts.append(
             f'<text x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 15}" text-anchor="middle">'
             f"{_shown(value)}</text>"
@@ -99,7 +99,7 @@ def chart_svg(chart: Chart) -> str:
         f"{html.escape(chart.across)}</text>"
     )
     for i, line in enumerate(chart.lines):
-        spots = [place(x, y) for x, y in _thinned(line.points)]
+        spots = [to_pixels(x, y) for x, y in _thinned(line.points)]
         if len(spots) == 1:
             x, y = spots[0]
             parts.append(f'<circle class="dot{i}" cx="{x:.1f}" cy="{y:.1f}" r="3"/>')
@@ -109,9 +109,9 @@ def chart_svg(chart: Chart) -> str:
                 f'<polyline class="line{i}" fill="none" stroke="currentColor" points="{path}"/>'
             )
     named = [line.name for line in chart.lines]
-    told = html.escape(f"{chart.title}: {', '.join(named)}", quote=True)
+    summary = html.escape(f"{chart.title}: {', '.join(named)}", quote=True)
     return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" font-size="11" aria-label="{told}">'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" font-size="11" aria-label="{summary}">'
         f"{''.join(parts)}</svg>"
     )
 
@@ -127,7 +127,7 @@ def _range(values: Sequence[float]) -> tuple[float, float]:
 
 def _thinned(points: tuple[tuple[float, float], ...]) -> Sequence[tuple[float, float]]:
     """At most about 400 points, the last among them."""
-    step = max(1, len(points) // _MOST_POINTS)
+    step = max(1, len(points) // _MAX_POINTS)
     return points if step == 1 else (*points[:-1:step], points[-1])
 
 

@@ -1,14 +1,10 @@
 """What the demo shows at its end: a contact sheet and a report."""
 
-import math
-import os
-import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,17 +21,16 @@ from splatseg.io.images import load_image, save_png
 from splatseg.io.json_files import read_json
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import label_map
+from splatseg.report._common import count_text, environment, spread
 from splatseg.report.html import Bars, Commands, Figure, Legend, Report, Table, report_html
-from splatseg.report.pictures import (
+from splatseg.report.images import (
     Gallery,
-    Picture,
+    GalleryImage,
     colour_depth,
-    colour_labels,
     contact_sheet,
     mark_errors,
 )
-
-_T = TypeVar("_T")
+from splatseg.report.legend import colour_labels
 
 _HELD_OUT_ROWS = 6
 _TRAIN_ROWS = 4
@@ -93,25 +88,7 @@ def write_report(
         raise InputError(f"{layer}: expected a layer of labels.")
     came = open_evidence(folder / "capture" / evidence)
     mended = _train_gallery(scene, truth, came, labels)
-    decibels, before, after = (
-        figures.test["PSNR"],
-        figures.came.miou,
-        figures.test["mIoU"],
-    )
-    sheet = contact_sheet(
-        Gallery(
-            title="splatseg demo: a generated room, seen from held-out views",
-            columns=held_out.columns,
-            rows=_spread(held_out.rows, _SHEET_ROWS),
-        ),
-        subtitle=(
-            f"PSNR {decibels:.1f} dB on {figures.test['photographs']} held-out views; mIoU of the "
-            f"labels {before:.2f} as they came, {after:.2f} lifted into 3D and rendered"
-        ),
-        classes=classes,
-        cell_width=288,
-    )
-    save_png(sheet, folder / "contact_sheet.png")
+    save_png(_sheet(figures, held_out, classes), folder / "contact_sheet.png")
     report = Report(
         title="A generated room, segmented in 3D",
         summary=(
@@ -120,36 +97,7 @@ def write_report(
             "agree with each other from all sides. The truth is known exactly, because the room "
             "was generated; held-out views were not used for anything but this report."
         ),
-        figures=(
-            Figure(
-                label="Pictures of held-out views",
-                value=f"{decibels:.1f} dB",
-                note=f"PSNR, mean of {figures.test['photographs']} views; "
-                f"SSIM {figures.test['SSIM']:.3f}",
-            ),
-            Figure(
-                label="Labels as they came",
-                value=f"{before:.3f}",
-                note="pooled mIoU of the machine labels, train views",
-            ),
-            Figure(
-                label="Labels lifted and rendered",
-                value=f"{after:.3f}",
-                note=f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points",
-            ),
-            Figure(
-                label="Objects, from masks without weights",
-                value=f"{figures.objects['mIoU']:.3f}",
-                note="instance mIoU on held-out views; "
-                f"{figures.objects['predicted_instances']} found, "
-                f"{figures.objects['truth_instances']} true ones",
-            ),
-            Figure(
-                label="Gaussians",
-                value=f"{len(scene.gaussians):,}".replace(",", "\N{THIN SPACE}"),
-                note=f"from {len(scene.train_views)} photographs",
-            ),
-        ),
+        figures=_figures(figures, scene),
         blocks=(
             held_out,
             Legend(classes=classes, title="Colours of the classes"),
@@ -169,32 +117,84 @@ def write_report(
         path.write_text(report_html(report), encoding="utf-8", newline="\n")
 
 
+def _sheet(figures: DemoFigures, held_out: Gallery, classes: ClassTable) -> Tensor:
+    """The contact sheet: some rows of the gallery under the figures that matter."""
+    return contact_sheet(
+        Gallery(
+            title="splatseg demo: a generated room, seen from held-out views",
+            columns=held_out.columns,
+            rows=spread(held_out.rows, _SHEET_ROWS),
+        ),
+        subtitle=(
+            f"PSNR {figures.test['PSNR']:.1f} dB on {figures.test['photographs']} held-out views; "
+            f"mIoU of the labels {figures.came.miou:.2f} as they came, "
+            f"{figures.test['mIoU']:.2f} lifted into 3D and rendered"
+        ),
+        classes=classes,
+        cell_width=288,
+    )
+
+
+def _figures(figures: DemoFigures, scene: Scene) -> tuple[Figure, ...]:
+    before, after = figures.came.miou, figures.test["mIoU"]
+    return (
+        Figure(
+            label="Pictures of held-out views",
+            value=f"{figures.test['PSNR']:.1f} dB",
+            note=f"PSNR, mean of {figures.test['photographs']} views; "
+            f"SSIM {figures.test['SSIM']:.3f}",
+        ),
+        Figure(
+            label="Labels as they came",
+            value=f"{before:.3f}",
+            note="pooled mIoU of the machine labels, train views",
+        ),
+        Figure(
+            label="Labels lifted and rendered",
+            value=f"{after:.3f}",
+            note=f"pooled mIoU on held-out views, {100 * (after - before):+.1f} points",
+        ),
+        Figure(
+            label="Objects, from masks without weights",
+            value=f"{figures.objects['mIoU']:.3f}",
+            note="instance mIoU on held-out views; "
+            f"{figures.objects['predicted_instances']} found, "
+            f"{figures.objects['truth_instances']} true ones",
+        ),
+        Figure(
+            label="Gaussians",
+            value=count_text(len(scene.gaussians)),
+            note=f"from {len(scene.train_views)} photographs",
+        ),
+    )
+
+
 def _held_out_gallery(
     folder: Path, scene: Scene, truth: Evidence, *, layer: str, objects: str
 ) -> Gallery:
     """Photograph, rendering, depth, labels, truth, errors and objects of some test views."""
-    pictures = folder / "render"
-    unit = read_json(pictures / "depth" / "depth.json")["unit"]
-    views = _spread(scene.test_views, _HELD_OUT_ROWS)
-    depths = [_read(pictures / "depth" / f"{view.name}.png").double() * unit for view in views]
+    renders = folder / "render"
+    unit = read_json(renders / "depth" / "depth.json")["unit"]
+    views = spread(scene.test_views, _HELD_OUT_ROWS)
+    depths = [_read(renders / "depth" / f"{view.name}.png").double() * unit for view in views]
     far = max(float(depth.max()) for depth in depths)
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for view, depth in zip(views, depths, strict=True):
         photograph = load_image(view)
-        drawn = _read(pictures / "rgb" / f"{view.name}.png").to(torch.uint8)
-        ids = _ids(pictures / layer / f"{view.name}.png")
-        things = _ids(pictures / objects / f"{view.name}.png")
+        drawn = _read(renders / "rgb" / f"{view.name}.png").to(torch.uint8)
+        ids = _ids(renders / layer / f"{view.name}.png")
+        things = _ids(renders / objects / f"{view.name}.png")
         true = truth.label_map(view.name).ids
         rows.append(
             (
                 view.name,
                 (
-                    Picture(image=photograph),
-                    Picture(image=drawn, caption=f"{psnr(drawn, photograph):.1f} dB"),
-                    Picture(image=colour_depth(depth, near=0.3, far=far)),
+                    GalleryImage(image=photograph),
+                    GalleryImage(image=drawn, caption=f"{psnr(drawn, photograph):.1f} dB"),
+                    GalleryImage(image=colour_depth(depth, near=0.3, far=far)),
                     _labels(ids, scene.classes),
                     _labels(true, scene.classes),
-                    Picture(
+                    GalleryImage(
                         image=mark_errors(photograph, ids, truth=true),
                         caption=f"{_right(ids, true):.1%} right",
                     ),
@@ -221,8 +221,8 @@ def _held_out_gallery(
 
 def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels) -> Gallery:
     """What lifting mends: the labels of train views before and after."""
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
-    for view in _spread(scene.train_views, _TRAIN_ROWS):
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
+    for view in spread(scene.train_views, _TRAIN_ROWS):
         true = truth.label_map(view.name).ids
         before = came.label_map(view.name).ids
         after = label_map(scene.gaussians, view.camera, labels).ids
@@ -230,7 +230,7 @@ def _train_gallery(scene: Scene, truth: Evidence, came: Evidence, labels: Labels
             (
                 view.name,
                 (
-                    Picture(image=load_image(view)),
+                    GalleryImage(image=load_image(view)),
                     _labels(before, scene.classes, right=_right(before, true)),
                     _labels(after, scene.classes, right=_right(after, true)),
                     _labels(true, scene.classes),
@@ -289,24 +289,14 @@ def _facts(folder: Path, scene: Scene, seed: int) -> dict[str, Any]:
         "photographs": f"{len(scene.train_views)} train and {len(scene.test_views)} held out, "
         f"{capture['width']} x {capture['height']} pixels",
         "fit": f"{scene.provenance.get('steps')} steps",
-        "splatseg": metadata.version("splatseg"),
-        "torch": metadata.version("torch"),
-        "Python": platform.python_version(),
-        "cores": os.cpu_count(),
-    }
-
-
-def _spread(items: Sequence[_T], count: int) -> tuple[_T, ...]:
-    """At most `count` items, evenly spread over the whole."""
-    step = max(1.0, len(items) / count)
-    return tuple(items[math.floor(i * step)] for i in range(min(count, len(items))))
+    } | environment()
 
 
 def _labels(
     ids: Int[Tensor, "height width"], classes: ClassTable | None, *, right: float | None = None
-) -> Picture:
+) -> GalleryImage:
     caption = "" if right is None else f"{right:.1%} right"
-    return Picture(image=colour_labels(ids, classes), kind="chart", caption=caption)
+    return GalleryImage(image=colour_labels(ids, classes), kind="chart", caption=caption)
 
 
 def _right(ids: Tensor, truth: Tensor) -> float:

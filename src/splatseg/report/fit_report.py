@@ -9,17 +9,18 @@ from importlib import metadata
 from typing import Any
 
 from splatseg.core import Capture, View
-from splatseg.evaluate.held_out import PhotographReport
+from splatseg.evaluate.photographs import PhotographReport
 from splatseg.fit import FitOptions, FitRecord, FitResult, reduction_note
+from splatseg.report._common import count_text
 from splatseg.report.chart import Chart, Line
 from splatseg.report.html import Bars, Block, Commands, Curves, Figure, Report, Table
-from splatseg.report.pictures import Gallery
+from splatseg.report.images import Gallery
 
 _LONG_LIST = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FitStory:
+class FitReportData:
     """Everything that the report of a fit tells."""
 
     capture: Capture
@@ -47,14 +48,14 @@ class FitStory:
     """More of how it was made, such as the backend."""
 
 
-def fit_report(story: FitStory, *, pairs: Gallery | None = None) -> Report:
+def fit_report(data: FitReportData, *, pairs: Gallery | None = None) -> Report:
     """The page.
 
     Args:
-        story: The fit.
+        data: The fit.
         pairs: Photographs beside pictures of held-out views.
     """
-    result, scores = story.result, story.scores
+    result, scores = data.result, data.scores
     rate = result.steps / max(result.seconds, 1e-9)
     ended = "It was stopped early, and can go on with --resume. " if result.interrupted else ""
     held_out = (
@@ -66,49 +67,49 @@ def fit_report(story: FitStory, *, pairs: Gallery | None = None) -> Report:
     curves = _curves(result.history)
     if curves is not None:
         blocks.append(curves)
-    blocks += [_stages(result), _input(story), _output(story)]
+    blocks += [_stages(result), _input(data), _output(data)]
     if scores is not None:
         blocks.append(_score_table(scores))
-    blocks.append(_changed_options(story.options))
-    if story.command:
-        blocks.append(Commands(title="The same from the shell", lines=(story.command,)))
+    blocks.append(_changed_options(data.options))
+    if data.command:
+        blocks.append(Commands(title="The same from the shell", lines=(data.command,)))
     return Report(
-        title=f"Fit of {story.capture.path.name}",
+        title=f"Fit of {data.capture.path.name}",
         summary=f"{_length(result)}, {rate:.1f} steps a second. {ended}{held_out}",
-        figures=_figures(story),
+        figures=_figures(data),
         blocks=tuple(blocks),
-        facts=_facts(story),
+        facts=_facts(data),
     )
 
 
-def fit_record(story: FitStory) -> dict[str, Any]:
+def fit_record(data: FitReportData) -> dict[str, Any]:
     """The same as values that JSON holds: fit.json."""
-    result, scores = story.result, story.scores
+    result, scores = data.result, data.scores
     return {
         "made_by": "splatseg fit",
-        "command": story.command,
+        "command": data.command,
         "interrupted": result.interrupted,
         "steps": result.steps,
         "seconds": round(result.seconds, 3),
         "gaussians": len(result.gaussians),
-        "file_bytes": story.file_bytes,
+        "file_bytes": data.file_bytes,
         "held_out": None
         if scores is None
         else {
-            "views": story.held_out,
+            "views": data.held_out,
             "scored": len(scores.views),
             "psnr": scores.psnr,
             "psnr_min": scores.psnr_min,
             "ssim": scores.ssim,
             "per_view": [asdict(score) for score in scores.per_view],
         },
-        "input": dict(_input_rows(story)),
-        "poses": None if story.poses is None else dict(story.poses),
-        "notes": [*story.capture.notes, *result.notes],
+        "input": dict(_input_rows(data)),
+        "poses": None if data.poses is None else dict(data.poses),
+        "notes": [*data.capture.notes, *result.notes],
         "stages_seconds": {name: round(spent, 4) for name, spent in result.stages.items()},
         "history": [asdict(record) for record in result.history],
-        "options": asdict(story.options),
-        **_facts(story),
+        "options": asdict(data.options),
+        **_facts(data),
     }
 
 
@@ -117,11 +118,11 @@ def _length(result: FitResult) -> str:
     return f"{result.steps} steps in {minutes} min {seconds:02d} s"
 
 
-def _figures(story: FitStory) -> tuple[Figure, ...]:
-    result, scores = story.result, story.scores
+def _figures(data: FitReportData) -> tuple[Figure, ...]:
+    result, scores = data.result, data.scores
     out: list[Figure] = []
     if scores is not None:
-        of = f"{len(scores.views)} of {story.held_out}"
+        of = f"{len(scores.views)} of {data.held_out}"
         out.append(
             Figure(
                 label="Held-out views",
@@ -141,8 +142,8 @@ def _figures(story: FitStory) -> tuple[Figure, ...]:
     out.append(
         Figure(
             label="Gaussians",
-            value=f"{len(result.gaussians):,}".replace(",", "\N{THIN SPACE}"),
-            note=f"{story.file_bytes / 1e6:.1f} MB",
+            value=count_text(len(result.gaussians)),
+            note=f"{data.file_bytes / 1e6:.1f} MB",
         )
     )
     return tuple(out)
@@ -184,16 +185,16 @@ def _stages(result: FitResult) -> Bars:
     )
 
 
-def _input(story: FitStory) -> Table:
-    notes = (*story.capture.notes, *story.result.notes)
-    rows = [*_input_rows(story), *(("note", note) for note in notes)]
-    if story.poses is not None:
-        rows += _pose_rows(story.poses)
+def _input(data: FitReportData) -> Table:
+    notes = (*data.capture.notes, *data.result.notes)
+    rows = [*_input_rows(data), *(("note", note) for note in notes)]
+    if data.poses is not None:
+        rows += _pose_rows(data.poses)
     return Table(title="What was in", columns=("what", "value"), rows=tuple(rows))
 
 
-def _input_rows(story: FitStory) -> list[tuple[str, str]]:
-    capture, options = story.capture, story.options
+def _input_rows(data: FitReportData) -> list[tuple[str, str]]:
+    capture, options = data.capture, data.options
     train = [view for view in capture.train_views if view.image is not None]
     masks = sum(view.mask is not None for view in train)
     depths = sum(view.depth is not None for view in train)
@@ -230,19 +231,19 @@ def _pose_rows(poses: Mapping[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _output(story: FitStory) -> Table:
-    result = story.result
+def _output(data: FitReportData) -> Table:
+    result = data.result
     gaussians = result.gaussians
     rows = [
         ("Gaussians", f"{len(gaussians)}"),
         ("harmonics", f"degree {gaussians.sh_degree}"),
-        ("file", f"{story.file_bytes / 1e6:.1f} MB"),
+        ("file", f"{data.file_bytes / 1e6:.1f} MB"),
         ("steps", str(result.steps)),
         ("time", f"{result.seconds:.1f} s"),
         ("ended", "interrupted" if result.interrupted else "as planned"),
     ]
-    if story.scores is not None:
-        rows.append(("held-out views scored", f"{len(story.scores.views)} of {story.held_out}"))
+    if data.scores is not None:
+        rows.append(("held-out views scored", f"{len(data.scores.views)} of {data.held_out}"))
     return Table(title="What came out", columns=("what", "value"), rows=tuple(rows))
 
 
@@ -272,10 +273,10 @@ def _changed_options(options: FitOptions) -> Table:
     )
 
 
-def _facts(story: FitStory) -> dict[str, Any]:
+def _facts(data: FitReportData) -> dict[str, Any]:
     return {
-        "seed": story.options.seed,
-        **story.facts,
+        "seed": data.options.seed,
+        **data.facts,
         "splatseg": metadata.version("splatseg"),
         "torch": metadata.version("torch"),
         "python": platform.python_version(),

@@ -15,7 +15,8 @@ from PIL import Image
 from splatseg.core import ClassTable
 from splatseg.errors import InputError
 from splatseg.report.chart import Chart, chart_svg
-from splatseg.report.pictures import Gallery, Picture, colour_of
+from splatseg.report.images import Gallery, GalleryImage
+from splatseg.report.legend import colour_of
 
 Cell = str | int | float | None
 
@@ -148,11 +149,11 @@ def report_html(report: Report) -> str:
     )
 
 
-def data_uri(picture: Picture) -> str:
+def data_uri(panel: GalleryImage) -> str:
     """The picture as a ``data:`` address: JPEG for a photo, PNG for a chart."""
     file = io.BytesIO()
-    image = Image.fromarray(picture.image.cpu().numpy())
-    if picture.kind == "photo":
+    image = Image.fromarray(panel.image.cpu().numpy())
+    if panel.kind == "photo":
         image.save(file, format="JPEG", quality=_JPEG_QUALITY)
         kind = "jpeg"
     else:
@@ -195,8 +196,8 @@ def _block(block: Block) -> str:
     else:
         inner = f"<pre>{_text(chr(10).join(block.lines))}</pre>"
     note = "" if isinstance(block, Legend) or not block.note else block.note
-    told = f'<p class="note">{_text(note)}</p>' if note else ""
-    return f"<section><h2>{_text(block.title)}</h2>{told}{inner}</section>"
+    intro = f'<p class="note">{_text(note)}</p>' if note else ""
+    return f"<section><h2>{_text(block.title)}</h2>{intro}{inner}</section>"
 
 
 def _table(table: Table) -> str:
@@ -244,9 +245,9 @@ def _curves(curves: Curves) -> str:
             f'<span><i class="series{i + 1}"></i>{_text(name)}</span>'
             for i, name in enumerate(names)
         )
-        told = f'<div class="keys">{keys}</div>' if len(names) > 1 else ""
+        key = f'<div class="keys">{keys}</div>' if len(names) > 1 else ""
         figures.append(
-            f"<figure><figcaption>{_text(chart.title)}</figcaption>{told}{chart_svg(chart)}</figure>"
+            f"<figure><figcaption>{_text(chart.title)}</figcaption>{key}{chart_svg(chart)}</figure>"
         )
     return f'<div class="charts">{"".join(figures)}</div>'
 
@@ -254,10 +255,10 @@ def _curves(curves: Curves) -> str:
 def _gallery(gallery: Gallery) -> str:
     head = "".join(f'<th scope="col">{_text(name)}</th>' for name in ("", *gallery.columns))
     rows: list[str] = []
-    for label, pictures in gallery.rows:
+    for label, panels in gallery.rows:
         cells = "".join(
-            f"<td>{_image(picture, f'{label}: {name}')}</td>"
-            for picture, name in zip(pictures, gallery.columns, strict=True)
+            f"<td>{_image(panel, f'{label}: {name}')}</td>"
+            for panel, name in zip(panels, gallery.columns, strict=True)
         )
         rows.append(f'<tr><th scope="row">{_text(label)}</th>{cells}</tr>')
     return (
@@ -266,12 +267,12 @@ def _gallery(gallery: Gallery) -> str:
     )
 
 
-def _image(picture: Picture, alternative: str) -> str:
-    height, width = picture.image.shape[:2]
-    caption = f"<figcaption>{_text(picture.caption)}</figcaption>" if picture.caption else ""
+def _image(panel: GalleryImage, alternative: str) -> str:
+    height, width = panel.image.shape[:2]
+    caption = f"<figcaption>{_text(panel.caption)}</figcaption>" if panel.caption else ""
     return (
-        f'<figure><img src="{data_uri(picture)}" width="{width}" height="{height}" '
-        f'alt="{_text(picture.caption or alternative)}" loading="lazy">{caption}</figure>'
+        f'<figure><img src="{data_uri(panel)}" width="{width}" height="{height}" '
+        f'alt="{_text(panel.caption or alternative)}" loading="lazy">{caption}</figure>'
     )
 
 

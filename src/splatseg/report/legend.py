@@ -1,4 +1,4 @@
-"""What the ids of a drawn layer mean, in words and colours: legend.json."""
+"""What ids mean to the eye: the one colour and the name that each has everywhere."""
 
 import colorsys
 from collections.abc import Mapping
@@ -8,24 +8,54 @@ import torch
 from jaxtyping import Int, UInt8
 from torch import Tensor
 
+from splatseg._check import check_shape
 from splatseg.core import UNLABELLED, ClassTable, Labels
 
 Colour = tuple[int, int, int]
 
-_GOLDEN = 0.6180339887498949
+NOTHING: Colour = (24, 24, 28)
+"""Where there is no id, or nothing at all."""
 
 
-def colour_of(id: int, classes: ClassTable | None) -> Colour:
-    """The class table's colour of an id, or one that differs from its neighbours'.
+def colour_of(id: int, classes: ClassTable | None = None) -> Colour:
+    """The class table's colour of an id, else a colour of its own; -1 is nearly black.
 
-    Hues go round by the golden ratio, which keeps any run of consecutive ids apart.
+    Colours that are made up walk round the hues by the golden ratio, and through brightness by
+    another irrational step, so that no two of the first forty look alike.
     """
-    for row in () if classes is None else classes.rows:
-        if row.id == id and row.colour is not None:
-            return row.colour
-    lightness = (0.55, 0.42, 0.68)[id % 3]
-    red, green, blue = colorsys.hls_to_rgb((id * _GOLDEN) % 1.0, lightness, 0.65)
+    if id < 0:
+        return NOTHING
+    if classes is not None:
+        for row in classes.rows:
+            if row.id == id and row.colour is not None:
+                return row.colour
+    hue = (id * 0.6180339887) % 1.0
+    light = 0.40 + 0.38 * ((id * 0.7548776662) % 1.0)
+    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.62)
     return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def colour_labels(
+    ids: Int[Tensor, "height width"], classes: ClassTable | None = None
+) -> UInt8[Tensor, "height width 3"]:
+    """A label map in colours, see `colour_of`."""
+    check_shape("ids", ids, (None, None))
+    present, index = torch.unique(ids, return_inverse=True)
+    colours = [colour_of(id, classes) for id in present.tolist()]
+    return torch.tensor(colours, dtype=torch.uint8)[index]
+
+
+def own_names(labels: Labels) -> dict[int, str]:
+    """Names that the layer itself gives its ids; none where it gives none."""
+    names: Any = labels.metadata.get("names")
+    return {int(id): str(name) for id, name in names.items()} if isinstance(names, Mapping) else {}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+
+
+def names_of(labels: Labels, classes: ClassTable | None) -> dict[int, str]:
+    """Names of the ids in use: the layer's own, or the scene's where it has none."""
+    present = set(labels.present.tolist())
+    rows = () if classes is None else classes.rows
+    return own_names(labels) or {row.id: row.name for row in rows if row.id in present}
 
 
 def legend_of(labels: Labels, classes: ClassTable | None) -> dict[str, Any]:
@@ -39,25 +69,3 @@ def legend_of(labels: Labels, classes: ClassTable | None) -> dict[str, Any]:
             rows[str(id)]["source_id"] = sources[str(id)]
     background = 0 if labels.background == UNLABELLED else labels.background
     return {"none": 0, "background": background, "ids": rows}
-
-
-def names_of(labels: Labels, classes: ClassTable | None) -> dict[int, str]:
-    """Names of the ids in use: the layer's own, or the scene's where it has none."""
-    own = labels.metadata.get("names")
-    if isinstance(own, dict) and own:
-        return {int(key): str(name) for key, name in own.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-    rows = () if classes is None else classes.rows
-    present = set(labels.present.tolist())
-    return {row.id: row.name for row in rows if row.id in present}
-
-
-def coloured(
-    ids: Int[Tensor, "height width"], classes: ClassTable | None
-) -> UInt8[Tensor, "height width 3"]:
-    """A picture of an id map: the legend's colours, black where there is none."""
-    present, place = torch.unique(ids, return_inverse=True)
-    table = torch.tensor(
-        [(0, 0, 0) if i == UNLABELLED else colour_of(int(i), classes) for i in present.tolist()],
-        dtype=torch.uint8,
-    )
-    return table[place]

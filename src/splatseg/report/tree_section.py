@@ -10,7 +10,8 @@ from splatseg.io.images import image_camera, load_image
 from splatseg.lift import label_map
 from splatseg.render import render
 from splatseg.report.html import Block, Table
-from splatseg.report.pictures import Gallery, Picture, colour_of, overlay_labels
+from splatseg.report.images import Gallery, GalleryImage, overlay_labels
+from splatseg.report.legend import colour_of
 
 _LONGEST = 448
 _MAX_ROWS = 400
@@ -37,7 +38,7 @@ def _cuts(scene: Scene, tree: InstanceTree, views: Sequence[View], backend: str)
             ClassInfo(id=node.id, name=node.name, colour=colour_of(node.id)) for node in tree.nodes
         )
     )
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for view in views:
         camera = image_camera(view, _LONGEST)
         if view.image is None:
@@ -52,7 +53,7 @@ def _cuts(scene: Scene, tree: InstanceTree, views: Sequence[View], backend: str)
         rows.append(
             (
                 view.name,
-                tuple(Picture(image=overlay_labels(photograph, ids, table)) for ids in drawn),
+                tuple(GalleryImage(image=overlay_labels(photograph, ids, table)) for ids in drawn),
             )
         )
     return Gallery(

@@ -84,17 +84,7 @@ def write_capture(
         severity=severity,
     )
     with atomic_folder(Path(folder)) as target:
-        for name in ("images", "semantic", "instance", "depth", "labels_semantic"):
-            (target / name).mkdir()
-        for name, truth in truths.items():
-            photograph = Image.fromarray(truth.image.numpy())
-            photograph.save(target / "images" / f"{name}.jpg", quality=_JPEG_QUALITY)
-            _save_ids(truth.semantic, target / "semantic" / f"{name}.png")
-            _save_ids(truth.instance, target / "instance" / f"{name}.png", wide=True)
-            depth = (truth.depth[::2, ::2] / _DEPTH_UNIT).round().numpy().astype(np.uint16)
-            Image.fromarray(depth).save(target / "depth" / f"{name}.png")
-        for name, ids in labels.items():
-            _save_ids(ids, target / "labels_semantic" / f"{name}.png")
+        _save_images(target, truths, labels)
         cloud = start_points(chosen, truths, count=points, seed=seed)
         (target / "points3D.ply").write_bytes(_ply(cloud))
         _save_json(_transforms(chosen, intrinsics), target / "transforms.json")
@@ -114,6 +104,21 @@ def _one_thread() -> Generator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def _save_images(folder: Path, truths: Mapping[str, Truth], labels: Mapping[str, Tensor]) -> None:
+    """Photographs, true maps and machine labels, each kind in a folder of its own."""
+    for name in ("images", "semantic", "instance", "depth", "labels_semantic"):
+        (folder / name).mkdir()
+    for name, truth in truths.items():
+        photograph = Image.fromarray(truth.image.numpy())
+        photograph.save(folder / "images" / f"{name}.jpg", quality=_JPEG_QUALITY)
+        _save_ids(truth.semantic, folder / "semantic" / f"{name}.png")
+        _save_ids(truth.instance, folder / "instance" / f"{name}.png", wide=True)
+        depth = (truth.depth[::2, ::2] / _DEPTH_UNIT).round().numpy().astype(np.uint16)
+        Image.fromarray(depth).save(folder / "depth" / f"{name}.png")
+    for name, ids in labels.items():
+        _save_ids(ids, folder / "labels_semantic" / f"{name}.png")
 
 
 def _save_ids(ids: Tensor, path: Path, *, wide: bool = False) -> None:

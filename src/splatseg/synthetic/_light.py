@@ -61,16 +61,16 @@ def light_volume(scene: SyntheticScene) -> LightVolume:
     low, high = (torch.tensor(corner, dtype=torch.float32) for corner in scene.bounds)
     shape = [max(2, int(n)) for n in ((high - low) / (2 * _CELL)).ceil().tolist()]
     solid = _occupancy(scene, low, high, [2 * n for n in shape])
-    places = _cell_centres(low, high, shape)
-    day, lamp = torch.zeros_like(places), torch.zeros_like(places)
+    points = _cell_centres(low, high, shape)
+    day, lamp = torch.zeros_like(points), torch.zeros_like(points)
     for primitive in scene.primitives:
         if primitive.texture.glow <= 0:
             continue
         if primitive.shape == "plane":
-            day += _from_plane(primitive, places, solid, low, high)
+            day += _from_plane(primitive, points, solid, low, high)
         else:
             centre = torch.tensor(primitive.centre, dtype=torch.float32)
-            lamp += 0.35 * primitive.texture.glow * _from_point(centre, places, solid, low, high)
+            lamp += 0.35 * primitive.texture.glow * _from_point(centre, points, solid, low, high)
     return LightVolume(
         low=low,
         high=high,
@@ -97,14 +97,14 @@ def _occupancy(
     scene: SyntheticScene, low: Tensor, high: Tensor, shape: list[int]
 ) -> Float[Tensor, "1 1 nz ny nx"]:
     """1 where a solid that gives no light is; planes are too thin to count."""
-    places = _cell_centres(low, high, shape)
-    inside = torch.zeros(len(places), dtype=torch.bool)
+    points = _cell_centres(low, high, shape)
+    inside = torch.zeros(len(points), dtype=torch.bool)
     for primitive in scene.primitives:
         if primitive.shape == "plane" or primitive.texture.glow > 0:
             continue
         centre = torch.tensor(primitive.centre, dtype=torch.float32)
-        near = ((places - centre).abs() <= primitive.radius + 0.03).all(dim=-1).nonzero()[:, 0]
-        inside[near] |= primitive.contains(places[near], 0.02)
+        near = ((points - centre).abs() <= primitive.radius + 0.03).all(dim=-1).nonzero()[:, 0]
+        inside[near] |= primitive.contains(points[near], 0.02)
     return _volume(inside.float().unsqueeze(-1), shape)
 
 
@@ -125,27 +125,27 @@ def _sample(volume: Tensor, points: Tensor, low: Tensor, high: Tensor) -> Float[
 
 def _from_point(
     light: Float[Tensor, "3"],
-    places: Float[Tensor, "n 3"],
+    points: Float[Tensor, "n 3"],
     solid: Tensor,
     low: Tensor,
     high: Tensor,
 ) -> Float[Tensor, "n 3"]:
     """Direction to a light of unit power, divided by the squared distance, times visibility."""
-    way = light - places
+    way = light - points
     distance = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
     # The first decimetre is left out, so that a surface does not shade itself.
     start = (0.1 / distance).clamp(max=1.0)
     passed = torch.zeros_like(distance)
     for step in range(_STEPS):
         share = start + (1 - start) * (step + 0.5) / _STEPS
-        passed += _sample(solid, places + share * way, low, high) * (1 - start) / _STEPS
+        passed += _sample(solid, points + share * way, low, high) * (1 - start) / _STEPS
     seen = torch.exp(-_ABSORPTION * passed * distance)
     return way / distance.clamp_min(1e-6) * seen / (distance * distance + 0.15)
 
 
 def _from_plane(
     primitive: Primitive,
-    places: Float[Tensor, "n 3"],
+    points: Float[Tensor, "n 3"],
     solid: Tensor,
     low: Tensor,
     high: Tensor,
@@ -155,11 +155,11 @@ def _from_plane(
     centre = torch.tensor(primitive.centre, dtype=torch.float32)
     half = torch.tensor(primitive.half_size, dtype=torch.float32)
     power = primitive.texture.glow * 4 * float(half[0] * half[1]) / 6
-    total = torch.zeros_like(places)
+    total = torch.zeros_like(points)
     for u in (-2 / 3, 0.0, 2 / 3):
         for v in (-0.5, 0.5):
             light = centre + turn[:, 0] * u * half[0] + turn[:, 1] * v * half[1]
-            vector = _from_point(light, places, solid, low, high)
+            vector = _from_point(light, points, solid, low, high)
             length = torch.linalg.vector_norm(vector, dim=-1, keepdim=True).clamp_min(1e-9)
             cosine = (vector @ turn[:, 2:]).abs() / length
             total += power * cosine * vector

@@ -130,7 +130,7 @@ def render_truth(scene: SyntheticScene, camera: Camera) -> Truth:
     miss = which < 0
     depth = (distance.float() * cosine).masked_fill(miss, 0.0)
     return Truth(
-        image=_picture(scene, camera, order),
+        image=_shaded(scene, camera, order),
         semantic=_unordered(tables.semantic[which].masked_fill(miss, UNLABELLED), order, camera),
         instance=_unordered(tables.instance[which].masked_fill(miss, UNLABELLED), order, camera),
         depth=_unordered(depth, order, camera),
@@ -151,7 +151,7 @@ def _unordered(values: Tensor, order: Tensor, camera: Camera) -> Tensor:
     return out.reshape(camera.height, camera.width, *values.shape[1:])
 
 
-def _picture(scene: SyntheticScene, camera: Camera, order: Tensor) -> UInt8[Tensor, "h w 3"]:
+def _shaded(scene: SyntheticScene, camera: Camera, order: Tensor) -> UInt8[Tensor, "h w 3"]:
     total = torch.zeros(len(order), 3)
     centres = camera.pixel_centres().reshape(-1, 2)[order]
     for shift in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):

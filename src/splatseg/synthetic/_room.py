@@ -40,25 +40,25 @@ def _wall_texture(b: Builder) -> tuple[Texture, Texture]:
     base = tone[b.rng.integers(len(tone))]
     paint = Texture(kind="plain", palette=shades(base, spread=0.18), scale=0.5)
     motif: TextureName = "dots" if b.rng.random() < 0.5 else "stripes"
-    paper = Texture(
+    wallpaper = Texture(
         kind=motif,
         palette=(base, shades(base, spread=0.30)[2], shades(b.accent(), spread=0.35)[2]),
         scale=0.34,
     )
-    return paint, paper
+    return paint, wallpaper
 
 
 def _shell(b: Builder) -> None:
     """Walls with skirting boards, floor, ceiling and the window."""
-    paint, paper = _wall_texture(b)
+    paint, wallpaper = _wall_texture(b)
     b.object("wall", "walls")
     half = _HEIGHT / 2
     upright = math.pi / 2
     for x, y, yaw, reach, texture in (
         (0.0, _HALF_Y, 0.0, _HALF_X, paint),
-        (0.0, -_HALF_Y, math.pi, _HALF_X, paper),
+        (0.0, -_HALF_Y, math.pi, _HALF_X, wallpaper),
         (_HALF_X, 0.0, -upright, _HALF_Y, paint),
-        (-_HALF_X, 0.0, upright, _HALF_Y, paper),
+        (-_HALF_X, 0.0, upright, _HALF_Y, wallpaper),
     ):
         b.solid("plane", (x, y, half), (reach, half, 1.0), texture, yaw=yaw, tilt=upright)
     white = Texture(palette=shades((0.86, 0.84, 0.80), spread=0.15), scale=0.3)
@@ -109,13 +109,13 @@ def _sitting_corner(b: Builder) -> None:
         pillow = b.cloth(kind=kind, scale=0.14)
         b.solid("sphere", (0.0, 0.0, 0.0), (0.25, 0.10, 0.20), pillow, tilt=-0.3)
 
-    place = (0.1 + b.jitter(0.1), -0.35 + b.jitter(0.08), 0.012)
-    low = b.object("table", "coffee table", at=place, yaw=b.jitter(0.25), parent=rug)
+    position = (0.1 + b.jitter(0.1), -0.35 + b.jitter(0.08), 0.012)
+    low = b.object("table", "coffee table", at=position, yaw=b.jitter(0.25), parent=rug)
     board = b.wood()
     b.solid("box", (0.0, 0.0, 0.40), (0.50, 0.30, 0.025), board)
     b.legs(0.44, 0.24, 0.38, 0.03, board)
-    _vase(b, "vase on the coffee table", at=(place[0] - 0.22, place[1], 0.437), parent=low)
-    spot = (place[0] + 0.20, place[1] + 0.04, 0.437)
+    _vase(b, "vase on the coffee table", at=(position[0] - 0.22, position[1], 0.437), parent=low)
+    spot = (position[0] + 0.20, position[1] + 0.04, 0.437)
     b.object("books", "books on the coffee table", at=spot, yaw=b.jitter(0.6), parent=low)
     for i in range(3):
         cover = Texture(palette=shades(b.accent(), spread=0.2), scale=0.15)
@@ -153,11 +153,11 @@ def _dining_corner(b: Builder) -> None:
     for i, side in enumerate(("north", "west", "south", "east")):
         angle = math.pi / 2 * (i + 1) + b.jitter(0.25)
         reach = 0.62 + b.jitter(0.06)
-        place = (x + reach * math.cos(angle), y + reach * math.sin(angle), 0.0)
+        position = (x + reach * math.cos(angle), y + reach * math.sin(angle), 0.0)
         b.object(
             "chair",
             f"{side} chair at the dining table",
-            at=place,
+            at=position,
             yaw=angle - math.pi / 2,
             parent=2,
         )
@@ -217,9 +217,13 @@ def _corners_and_walls(b: Builder) -> None:
     _plant(b, "plant in the south-east", at=(2.15, -1.65, 0.0), size=1.0)
     _plant(b, "plant in the south-west", at=(-1.35, -1.72, 0.0), size=0.8)
 
-    place = (1.95, 0.15 + b.jitter(0.15), 0.0)
+    position = (1.95, 0.15 + b.jitter(0.15), 0.0)
     b.object(
-        "chair", "armchair at the east wall", at=place, yaw=-math.pi / 2 + b.jitter(0.3), parent=2
+        "chair",
+        "armchair at the east wall",
+        at=position,
+        yaw=-math.pi / 2 + b.jitter(0.3),
+        parent=2,
     )
     cover = b.cloth(scale=0.10)
     b.solid("box", (0.0, 0.0, 0.24), (0.36, 0.36, 0.14), cover)

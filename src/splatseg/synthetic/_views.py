@@ -104,12 +104,12 @@ def _stand(
 ) -> tuple[list[float], list[float]]:
     """A free place on the ring and what it looks at."""
     low, high = np.array(scene.bounds[0]), np.array(scene.bounds[1])
-    middle, half = (low + high) / 2, (high - low) / 2
+    centre, half = (low + high) / 2, (high - low) / 2
     for _ in range(200):
         angle = turn + rng.uniform(-0.05, 0.05)
         round_ = np.array([math.cos(angle), math.sin(angle)])
         eye = np.empty(3)
-        eye[:2] = middle[:2] + rng.uniform(0.35, 0.68) * half[:2] * round_
+        eye[:2] = centre[:2] + rng.uniform(0.35, 0.68) * half[:2] * round_
         eye[2] = low[2] + rng.uniform(0.42, 0.72) * 2 * half[2]
         if look == "near":
             aside = angle + rng.choice([-1, 1]) * rng.uniform(0.9, 1.5)
@@ -119,14 +119,14 @@ def _stand(
             aside = angle + math.pi + rng.uniform(-0.5, 0.5)
             target = np.array(
                 [
-                    *(middle[:2] + 0.5 * half[:2] * [math.cos(aside), math.sin(aside)]),
+                    *(centre[:2] + 0.5 * half[:2] * [math.cos(aside), math.sin(aside)]),
                     0.0,
                 ]
             )
         rise = rng.uniform(*_RISE[look])
         target[2] = low[2] + rise * 2 * half[2]
-        place = torch.tensor(eye).unsqueeze(0)
-        if not any(bool(p.contains(place, _CLEARANCE)) for p in scene.primitives):
+        position = torch.tensor(eye).unsqueeze(0)
+        if not any(bool(p.contains(position, _CLEARANCE)) for p in scene.primitives):
             return eye.tolist(), target.tolist()
     raise InputError(f"scene: no free place for a camera near the angle {turn:.2f} rad was found.")
 

@@ -16,8 +16,8 @@ from splatseg.io.json_files import read_json, write_json
 from splatseg.io.video import check_encoder, write_video
 from splatseg.render import BackendName, render
 from splatseg.render.paths import camera_path, is_forward_facing
-from splatseg.report.legend import coloured
-from splatseg.report.pictures import colour_depth
+from splatseg.report.images import colour_depth
+from splatseg.report.legend import colour_labels
 
 # Depths beyond these shares of all are shown in the end colours.
 _NEAR, _FAR = 0.01, 0.99
@@ -125,7 +125,7 @@ def _depths(files: Sequence[Path], *, unit: float) -> Generator[UInt8[Tensor, "h
 
 def _coloured_ids(file: Path, classes: ClassTable | None) -> UInt8[Tensor, "h w 3"]:
     ids = torch.from_numpy(_read(file).astype(np.int32))
-    return coloured(torch.where(ids == 0, -1, ids), classes)
+    return colour_labels(torch.where(ids == 0, -1, ids), classes)
 
 
 def _colours(file: Path) -> UInt8[Tensor, "h w 3"]:

@@ -21,7 +21,7 @@ from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift import label_map
 from splatseg.render import BackendName, Rendered, render
-from splatseg.report.legend import coloured, legend_of
+from splatseg.report.legend import colour_labels, legend_of
 from splatseg.tasks._film import check_film, path_views, write_film, write_path
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import layer_of, views_of_split
@@ -292,7 +292,7 @@ def _draw_layer(
     _save(torch.where(ids == UNLABELLED, 0, ids), into[layer.name], view)
     pictures = into.get(f"{layer.name}_coloured")
     if pictures is not None:
-        _save(coloured(ids, scene.classes), pictures, view)
+        _save(colour_labels(ids, scene.classes), pictures, view)
 
 
 def _save(image: Tensor, folder: Path, view: View) -> None:

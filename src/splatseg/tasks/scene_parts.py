@@ -5,7 +5,7 @@ from typing import Any, cast
 
 from splatseg.core import FlatLayer, Layer, Scene, View, flat_layer, layer_address
 from splatseg.errors import InputError
-from splatseg.evaluate.held_out import MaskUse
+from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene_layer
 

@@ -62,13 +62,13 @@ class _Cursor:
         self._offset = start + size
         return start
 
-    def count(self, least: int) -> int:
+    def count(self, min_bytes: int) -> int:
         """The number of records that follow, each of at least this many bytes."""
         (number,) = self.read(_U64)
         left = len(self._data) - self._offset
-        if number * least > left:
+        if number * min_bytes > left:
             raise FileFormatError(
-                f"{self._path}: expected {number} records of at least {least} bytes, but "
+                f"{self._path}: expected {number} records of at least {min_bytes} bytes, but "
                 f"{left} bytes are left: it is cut short or corrupt."
             )
         return int(number)

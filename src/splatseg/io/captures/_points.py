@@ -139,6 +139,6 @@ def _colours(rows: NDArray[np.void], names: list[str]) -> NDArray[np.uint8] | No
                 values = np.clip(np.nan_to_num(values), 0, 1) * 255 + 0.5
             return np.clip(values, 0, 255).astype(np.uint8)
     if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(names):
-        harmonics = np.stack([rows[f"f_dc_{i}"] for i in range(3)], axis=1)
-        return (np.clip(0.5 + SH_C0 * np.nan_to_num(harmonics), 0, 1) * 255 + 0.5).astype(np.uint8)
+        sh = np.stack([rows[f"f_dc_{i}"] for i in range(3)], axis=1)
+        return (np.clip(0.5 + SH_C0 * np.nan_to_num(sh), 0, 1) * 255 + 0.5).astype(np.uint8)
     return None

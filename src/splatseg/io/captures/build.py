@@ -110,12 +110,7 @@ def build_capture(
             )
         )
     metadata = read_metadata(path)
-    found = [
-        *notes,
-        *scaled,
-        *([split_note] if split_note else []),
-        *_size_notes(views),
-    ]
+    found = (*notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
     return Capture(
         path=path,
         format=format,
@@ -125,7 +120,7 @@ def build_capture(
         up=metadata.up,
         metres_per_unit=metadata.metres_per_unit,
         splats=splats,
-        notes=tuple(found),
+        notes=found,
     )
 
 

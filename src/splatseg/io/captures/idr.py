@@ -129,14 +129,14 @@ def _matrices(path: Path) -> list[NDArray[np.float64]]:
 
 def _scale(ks: list[NDArray[np.float64]], sizes: list[tuple[int, int]], path: Path) -> float:
     points = np.array([(k[0, 2], k[1, 2]) for k in ks])
-    middles = np.array(sizes) / 2
-    errors = [float(np.abs(points * s / middles - 1).mean()) for s in _SCALES]
+    centres = np.array(sizes) / 2
+    errors = [float(np.abs(points * s / centres - 1).mean()) for s in _SCALES]
     best = int(np.argmin(errors))
     if errors[best] > _OFF_CENTRE:
-        middle = points.mean(axis=0)
+        centre = points.mean(axis=0)
         raise InputError(
             f"{path}: expected principal points near the middle of photographs of "
             f"{sizes[0][0]}x{sizes[0][1]} at a scale of {', '.join(f'{s:g}' for s in _SCALES)}, "
-            f"got ({middle[0]:.0f}, {middle[1]:.0f})."
+            f"got ({centre[0]:.0f}, {centre[1]:.0f})."
         )
     return _SCALES[best]

@@ -2,8 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NoReturn, TypeGuard
+
+from typing_extensions import override
 
 from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
 from splatseg.errors import InputError
@@ -77,6 +80,58 @@ class Evidence(ABC):
         """
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FileEvidence(Evidence, ABC):
+    """Evidence of which each view has one file, or one folder."""
+
+    root: Path
+    files: Mapping[str, Path]
+    """By view name."""
+
+    @property
+    @override
+    def folder(self) -> Path:
+        return self.root
+
+    @property
+    @override
+    def view_names(self) -> tuple[str, ...]:
+        return tuple(self.files)
+
+    def file_of(self, name: str) -> Path:
+        """The file of a view.
+
+        Raises:
+            InputError: If there is none.
+        """
+        if name not in self.files:
+            first = ", ".join(list(self.files)[:3])
+            raise InputError(
+                f"{self.root}: there is nothing of view {name!r} among {len(self.files)} views "
+                f"({first}, ...)."
+            )
+        return self.files[name]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IdFreeEvidence(FileEvidence, ABC):
+    """Evidence without ids: no names of them, and no label maps."""
+
+    @property
+    @override
+    def classes(self) -> ClassTable | None:
+        return None
+
+    @property
+    @override
+    def source_ids(self) -> Mapping[int, int] | None:
+        return None
+
+    @override
+    def label_map(self, name: str) -> LabelMap:
+        refuse(self, "label maps")
+
+
 def refuse(evidence: Evidence, wanted: str) -> NoReturn:
     """Say that evidence of this kind does not hold what was asked for."""
     raise InputError(f"{evidence.folder}: expected evidence of {wanted}, got {evidence.kind}.")
@@ -97,17 +152,3 @@ def view_files(folder: Path, suffix: str) -> dict[str, Path]:
 def is_id(value: object) -> TypeGuard[int]:
     """Whether a value of a JSON table is an id that a label map can hold."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_FILE_ID
-
-
-def file_of(files: Mapping[str, Path], name: str, folder: Path) -> Path:
-    """The file of a view.
-
-    Raises:
-        InputError: If there is none.
-    """
-    if name not in files:
-        first = ", ".join(list(files)[:3])
-        raise InputError(
-            f"{folder}: there is nothing of view {name!r} among {len(files)} views ({first}, ...)."
-        )
-    return files[name]

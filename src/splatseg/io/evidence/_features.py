@@ -19,9 +19,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from splatseg._check import check_shape
-from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.core import FeatureMap, MaskSet
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
+from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.npz import read_npz
 
 QUANTISATION_FILE = "quant.npz"
@@ -30,11 +30,9 @@ TEXT_FILE = "text_embeddings.npz"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FeatureEvidence(Evidence):
+class FeatureEvidence(IdFreeEvidence):
     """Dense features of each view."""
 
-    root: Path
-    files: Mapping[str, Path]
     scale: NDArray[np.float32] | None = None
     """(channels,) or (blocks, channels); None where features are not quantised."""
 
@@ -53,32 +51,8 @@ class FeatureEvidence(Evidence):
 
     @property
     @override
-    def folder(self) -> Path:
-        return self.root
-
-    @property
-    @override
     def kind(self) -> EvidenceKind:
         return "features"
-
-    @property
-    @override
-    def view_names(self) -> tuple[str, ...]:
-        return tuple(self.files)
-
-    @property
-    @override
-    def classes(self) -> ClassTable | None:
-        return None
-
-    @property
-    @override
-    def source_ids(self) -> Mapping[int, int] | None:
-        return None
-
-    @override
-    def label_map(self, name: str) -> LabelMap:
-        refuse(self, "label maps")
 
     @override
     def masks(self, name: str) -> MaskSet:
@@ -99,7 +73,7 @@ class FeatureEvidence(Evidence):
             InputError: If there is no such block or view.
             FileFormatError: If the file does not hold them.
         """
-        path = file_of(self.files, name, self.root)
+        path = self.file_of(name)
         if self.scale is None or self.offset is None:
             return _own_features(path)
         codes = read_npz(path, ["f"])["f"]

@@ -15,9 +15,8 @@ from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
     HEADER_FILE,
     MAX_FILE_ID,
-    Evidence,
     EvidenceKind,
-    file_of,
+    FileEvidence,
     refuse,
 )
 from splatseg.io.images import open_image
@@ -87,11 +86,9 @@ def read_id_map(path: Path) -> NDArray[np.int32]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LabelEvidence(Evidence):
+class LabelEvidence(FileEvidence):
     """One label map a view."""
 
-    root: Path
-    files: Mapping[str, Path]
     table: ClassTable | None
     """Classes by the ids of the files."""
 
@@ -102,18 +99,8 @@ class LabelEvidence(Evidence):
 
     @property
     @override
-    def folder(self) -> Path:
-        return self.root
-
-    @property
-    @override
     def kind(self) -> EvidenceKind:
         return "labels"
-
-    @property
-    @override
-    def view_names(self) -> tuple[str, ...]:
-        return tuple(self.files)
 
     @property
     @override
@@ -127,7 +114,7 @@ class LabelEvidence(Evidence):
 
     @override
     def label_map(self, name: str) -> LabelMap:
-        ids = self.rule.to_memory(read_id_map(file_of(self.files, name, self.root)))
+        ids = self.rule.to_memory(read_id_map(self.file_of(name)))
         self._check_recorded(name, ids)
         return LabelMap(ids=torch.from_numpy(ids), confidence=self._confidence(name, ids.shape))
 

@@ -5,7 +5,6 @@ The JSON and the folder are what SAM's automatic mask generator writes.
 
 import csv
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, cast
@@ -15,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet, Rle
+from splatseg.core import FeatureMap, MaskSet, Rle
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.evidence._base import Evidence, EvidenceKind, file_of, refuse
+from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._labels import read_id_map
 from splatseg.io.json_files import read_json
 from splatseg.io.npz import read_npz
@@ -27,48 +26,21 @@ MASK_TABLE = "metadata.csv"
 
 _SCORES = ("score", "predicted_iou")
 _INT32 = np.iinfo(np.int32)
-_MOST_RUN = int(np.iinfo(np.uint32).max)
+_MAX_RUN = int(np.iinfo(np.uint32).max)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MaskEvidence(Evidence):
+class MaskEvidence(IdFreeEvidence):
     """Overlapping masks without classes."""
-
-    root: Path
-    files: Mapping[str, Path]
-
-    @property
-    @override
-    def folder(self) -> Path:
-        return self.root
 
     @property
     @override
     def kind(self) -> EvidenceKind:
         return "masks"
 
-    @property
-    @override
-    def view_names(self) -> tuple[str, ...]:
-        return tuple(self.files)
-
-    @property
-    @override
-    def classes(self) -> ClassTable | None:
-        return None
-
-    @property
-    @override
-    def source_ids(self) -> Mapping[int, int] | None:
-        return None
-
-    @override
-    def label_map(self, name: str) -> LabelMap:
-        refuse(self, "label maps")
-
     @override
     def masks(self, name: str) -> MaskSet:
-        return read_any_masks(file_of(self.files, name, self.root))
+        return read_any_masks(self.file_of(name))
 
     @override
     def features(self, name: str) -> FeatureMap:
@@ -78,7 +50,7 @@ class MaskEvidence(Evidence):
 def read_any_masks(path: Path) -> MaskSet:
     """The masks of one view: a JSON, an npz or a folder of pictures."""
     if path.is_dir():
-        return read_mask_pictures(path)
+        return read_mask_images(path)
     return read_mask_arrays(path) if path.suffix == ".npz" else read_masks(path)
 
 
@@ -134,7 +106,7 @@ def _are_levels(levels: NDArray[Any]) -> bool:
     return bool(within.all() and (levels == np.trunc(levels)).all())
 
 
-def read_mask_pictures(folder: Path) -> MaskSet:
+def read_mask_images(folder: Path) -> MaskSet:
     """The masks of a folder of pictures, zero outside a mask, in the order of their numbers.
 
     Scores are ``predicted_iou`` of the metadata.csv that SAM's tool writes beside them, else 1.
@@ -145,7 +117,7 @@ def read_mask_pictures(folder: Path) -> MaskSet:
     files = sorted(folder.glob("*.png"), key=lambda p: (len(p.stem), p.stem))
     if not files:
         raise FileFormatError(f"{folder}: expected PNG pictures of masks, got none.")
-    scores = _picture_scores(folder / MASK_TABLE)
+    scores = _image_scores(folder / MASK_TABLE)
     arrays = [read_id_map(path) for path in files]
     for path, array in zip(files, arrays, strict=True):
         if array.shape != arrays[0].shape:
@@ -162,9 +134,9 @@ def read_mask_pictures(folder: Path) -> MaskSet:
     )
 
 
-def mask_folders(folder: Path, *, told_by: Literal["metadata.csv", "*.png"]) -> dict[str, Path]:
+def mask_folders(folder: Path, *, marked_by: Literal["metadata.csv", "*.png"]) -> dict[str, Path]:
     """Folders of mask pictures by view name: those with SAM's metadata.csv, or any with PNGs."""
-    named = {path.parent for path in folder.rglob(told_by)}
+    named = {path.parent for path in folder.rglob(marked_by)}
     return {
         path.relative_to(folder).as_posix(): path
         for path in sorted(named - {folder})
@@ -172,7 +144,7 @@ def mask_folders(folder: Path, *, told_by: Literal["metadata.csv", "*.png"]) -> 
     }
 
 
-def _picture_scores(path: Path) -> dict[str, float]:
+def _image_scores(path: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     try:
@@ -265,10 +237,10 @@ def _rle(segmentation: object, height: int, width: int, *, where: str) -> Rle:
         if isinstance(counts, str):
             return Rle.from_coco(counts, height=height, width=width)
         runs = cast(list[object], counts)
-        wrong = [run for run in runs if type(run) is not int or not 0 <= run <= _MOST_RUN]
+        wrong = [run for run in runs if type(run) is not int or not 0 <= run <= _MAX_RUN]
         if wrong:
             raise InputError(
-                f"counts: expected whole numbers from 0 to {_MOST_RUN}, got {wrong[0]!r:.40}."
+                f"counts: expected whole numbers from 0 to {_MAX_RUN}, got {wrong[0]!r:.40}."
             )
         return Rle(height=height, width=width, counts=np.array(runs, np.uint32))
     except (InputError, OverflowError) as error:

@@ -72,12 +72,8 @@ def open_evidence(
     rule = check_rule(zero_is_class, void)
     maps, arrays = view_files(folder, ".png"), view_files(folder, ".npz")
     objects = view_files(folder, ".json")
-    if unfinished == "refuse" and _is_unfinished(header):
-        count = max(len(maps), len(arrays), len(objects))
-        raise InputError(
-            f"{folder}: expected all its views, got {count} of work that was stopped; give the "
-            "same `splatseg see` again."
-        )
+    if unfinished == "refuse":
+        _check_finished(folder, header, views=max(len(maps), len(arrays), len(objects)))
     if kind is not None and header.get("kind", kind) != kind:
         raise InputError(f"{folder}: expected evidence of {kind}, got {header['kind']}.")
     found: str | None = kind or header.get("kind") or _kind(folder, maps, objects, arrays)
@@ -93,7 +89,7 @@ def open_evidence(
             return labels
         return open_panoptic(labels) if found == "panoptic" else open_tracked(labels)
     if found == "masks":
-        files = objects or arrays or mask_folders(folder, told_by="*.png")
+        files = objects or arrays or mask_folders(folder, marked_by="*.png")
         return MaskEvidence(root=folder, files=files)
     if found == "features":
         return open_features(folder, arrays)
@@ -115,26 +111,26 @@ def evidence_header(folder: Path | str) -> dict[str, Any] | None:
     return _header(Path(folder)) or None
 
 
-def find_evidence(places: Iterable[Path], name: str) -> Path:
+def find_evidence(folders: Iterable[Path], name: str) -> Path:
     """The folder of evidence of this name: in a scene's ``evidence``, or in a capture.
 
     Args:
-        places: Folders of scenes and captures, the one to prefer first.
+        folders: Folders of scenes and captures, the one to prefer first.
         name: The folder's name, such as ``labels_semantic``.
 
     Raises:
         InputError: If there is none; the message lists those that are there.
     """
-    places = tuple(places)
-    for place in places:
-        for folder in (place / "evidence" / name, place / name):
+    folders = tuple(folders)
+    for parent in folders:
+        for folder in (parent / "evidence" / name, parent / name):
             if folder.is_dir():
                 return folder
-    known = ", ".join(evidence_names(places)) or "there is none"
+    known = ", ".join(evidence_names(folders)) or "there is none"
     raise InputError(f"evidence: expected one of those at hand ({known}), got {name!r}.")
 
 
-def evidence_names(places: Iterable[Path]) -> tuple[str, ...]:
+def evidence_names(folders: Iterable[Path]) -> tuple[str, ...]:
     """Names of the evidence of scenes and captures, sorted.
 
     Of a scene these are the folders in ``evidence``. Of a capture they are the folders called
@@ -142,13 +138,13 @@ def evidence_names(places: Iterable[Path]) -> tuple[str, ...]:
     evidence.
     """
     names: set[str] = set()
-    for place in places:
-        if (place / "evidence").is_dir():
-            names |= {p.name for p in (place / "evidence").iterdir() if p.is_dir()}
-        if place.is_dir():
+    for folder in folders:
+        if (folder / "evidence").is_dir():
+            names |= {p.name for p in (folder / "evidence").iterdir() if p.is_dir()}
+        if folder.is_dir():
             names |= {
                 p.name
-                for p in place.iterdir()
+                for p in folder.iterdir()
                 if p.is_dir() and (p.name.startswith(_PREFIXES) or p.name.endswith(_SUFFIX))
             }
     return tuple(sorted(name for name in names if not name.startswith(".")))
@@ -170,9 +166,13 @@ def _header(folder: Path) -> dict[str, Any]:
     return header
 
 
-def _is_unfinished(header: Mapping[str, Any]) -> bool:
+def _check_finished(folder: Path, header: Mapping[str, Any], *, views: int) -> None:
     metadata = header.get("metadata")
-    return isinstance(metadata, dict) and cast(dict[str, Any], metadata).get("complete") is False
+    if isinstance(metadata, dict) and cast(dict[str, Any], metadata).get("complete") is False:
+        raise InputError(
+            f"{folder}: expected all its views, got {views} of work that was stopped; give the "
+            "same `splatseg see` again."
+        )
 
 
 def _kind(
@@ -182,7 +182,7 @@ def _kind(
     arrays: Mapping[str, Path],
 ) -> str | None:
     """The kind that files without a header show; the first one must hold what its kind has."""
-    if maps and mask_folders(folder, told_by="metadata.csv"):
+    if maps and mask_folders(folder, marked_by="metadata.csv"):
         return "masks"
     if maps:
         if (folder / SEGMENTS_FILE).is_file():

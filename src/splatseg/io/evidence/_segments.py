@@ -1,6 +1,7 @@
 """Panoptic and tracked evidence: label maps whose ids have a table beside them."""
 
 import math
+from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from splatseg.core import (
     MaskSet,
     Segment,
     Track,
+    map_ids,
 )
 from splatseg.errors import FileFormatError
 from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind, is_id, refuse
@@ -30,12 +32,12 @@ _DIGITS = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PanopticEvidence(Evidence):
-    """Segments of each view; an id means something in its own view only."""
+class TableEvidence(Evidence, ABC):
+    """Label maps with a table beside them that tells more of their ids."""
 
     maps: LabelEvidence
     table: Mapping[str, Any]
-    """Content of segments.json."""
+    """Content of segments.json or tracks.json."""
 
     @property
     @override
@@ -44,18 +46,8 @@ class PanopticEvidence(Evidence):
 
     @property
     @override
-    def kind(self) -> EvidenceKind:
-        return "panoptic"
-
-    @property
-    @override
     def view_names(self) -> tuple[str, ...]:
         return self.maps.view_names
-
-    @property
-    @override
-    def classes(self) -> ClassTable | None:
-        return self.maps.table
 
     @property
     @override
@@ -63,27 +55,42 @@ class PanopticEvidence(Evidence):
         return None
 
     @override
+    def features(self, name: str) -> FeatureMap:
+        refuse(self, "features")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PanopticEvidence(TableEvidence):
+    """Segments of each view; an id means something in its own view only."""
+
+    @property
+    @override
+    def kind(self) -> EvidenceKind:
+        return "panoptic"
+
+    @property
+    @override
+    def classes(self) -> ClassTable | None:
+        return self.maps.table
+
+    @override
     def label_map(self, name: str) -> LabelMap:
         """Segment ids of a view, with each segment's score as confidence."""
         ids = self.maps.label_map(name).ids
         scores = {segment.id: segment.score for segment in self.segments(name)}
-        return LabelMap(ids=ids, confidence=_looked_up(ids, scores, torch.float32, 0.0))
+        return LabelMap(ids=ids, confidence=map_ids(ids, scores, default=0.0, dtype=torch.float32))
 
     def category_map(self, name: str) -> LabelMap:
         """Category ids of a view, which mean the same in all views; scores as confidence."""
         segments = self.segments(name)
         maps = self.label_map(name)
         categories = {segment.id: segment.category for segment in segments}
-        ids = _looked_up(maps.ids, categories, torch.int32, UNLABELLED)
+        ids = map_ids(maps.ids, categories, default=UNLABELLED, dtype=torch.int32)
         return LabelMap(ids=ids, confidence=maps.confidence)
 
     @override
     def masks(self, name: str) -> MaskSet:
         return masks_of_ids(self.label_map(name))[0]
-
-    @override
-    def features(self, name: str) -> FeatureMap:
-        refuse(self, "features")
 
     def segments(self, name: str) -> tuple[Segment, ...]:
         """Segments of a view by ascending id.
@@ -125,27 +132,13 @@ class PanopticEvidence(Evidence):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TrackedEvidence(Evidence):
+class TrackedEvidence(TableEvidence):
     """Objects followed through the views; an id means the same object in all of them."""
-
-    maps: LabelEvidence
-    table: Mapping[str, Any]
-    """Content of tracks.json."""
-
-    @property
-    @override
-    def folder(self) -> Path:
-        return self.maps.folder
 
     @property
     @override
     def kind(self) -> EvidenceKind:
         return "tracked"
-
-    @property
-    @override
-    def view_names(self) -> tuple[str, ...]:
-        return self.maps.view_names
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -204,11 +197,6 @@ class TrackedEvidence(Evidence):
             )
         )
 
-    @property
-    @override
-    def source_ids(self) -> Mapping[int, int] | None:
-        return None
-
     @override
     def label_map(self, name: str) -> LabelMap:
         return self.maps.label_map(name)
@@ -216,10 +204,6 @@ class TrackedEvidence(Evidence):
     @override
     def masks(self, name: str) -> MaskSet:
         return self.maps.masks(name)
-
-    @override
-    def features(self, name: str) -> FeatureMap:
-        refuse(self, "features")
 
 
 def open_panoptic(maps: LabelEvidence) -> PanopticEvidence:
@@ -235,12 +219,3 @@ def open_tracked(maps: LabelEvidence) -> TrackedEvidence:
 def _is_key(key: str) -> bool:
     # Digits of other alphabets are decimal too, but no JSON of ours has them.
     return key.isascii() and key.isdecimal() and len(key) <= _DIGITS and is_id(int(key))
-
-
-def _looked_up(
-    ids: torch.Tensor, values: Mapping[int, float], dtype: torch.dtype, default: float
-) -> torch.Tensor:
-    """Each pixel's value by its id; `default` where the id has none."""
-    present, place = torch.unique(ids, return_inverse=True)
-    table = torch.tensor([values.get(int(i), default) for i in present.tolist()], dtype=dtype)
-    return table[place]

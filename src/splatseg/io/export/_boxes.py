@@ -133,13 +133,13 @@ def _upright_axes(means: Array, covariances: Array, weights: Array, up: Array) -
     rows = _sample(weights)
     points, spread = means[rows] @ level, level.T @ covariances[rows] @ level
     even = np.ones(len(rows)) if len(rows) < len(weights) else weights
-    angle = _least_area(points, spread, even, _COARSE)
-    angle = _least_area(points, spread, even, angle + _FINE)
+    angle = _min_area(points, spread, even, _COARSE)
+    angle = _min_area(points, spread, even, angle + _FINE)
     first = _pointing_forward(level @ np.array([np.cos(angle), np.sin(angle)]))
     return np.stack((first, np.cross(up, first), up), axis=1)
 
 
-def _least_area(points: Array, spread: Array, weights: Array, angles: Array) -> float:
+def _min_area(points: Array, spread: Array, weights: Array, angles: Array) -> float:
     lengths: list[Array] = []
     for turn in (0.0, np.pi / 2):
         axes = np.stack((np.cos(angles + turn), np.sin(angles + turn)))

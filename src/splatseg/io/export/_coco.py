@@ -89,18 +89,11 @@ def write_coco_panoptic(
 
     Raises:
         InputError: If the folder holds something other than an earlier export, an id is
-            missing from `segments` or has no place in 24 bits, a category is unknown, or two
+            missing from `segments` or does not fit into 24 bits, a category is unknown, or two
             frames have one name.
     """
     check_replaceable(folder, PANOPTIC_FILE)
-    known = {category.id for category in categories}
-    if len(known) != len(categories):
-        raise InputError("categories: expected distinct ids.")
-    for id, segment in segments.items():
-        if not 0 < id <= _LARGEST:
-            raise InputError(f"segments: expected ids from 1 to {_LARGEST}, got {id}.")
-        if segment.category_id not in known:
-            raise InputError(f"segments[{id}]: there is no category {segment.category_id}.")
+    _check_ids(segments, categories)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     names: set[str] = set()
@@ -118,35 +111,40 @@ def write_coco_panoptic(
             images.append(
                 {"id": number, "file_name": frame.image, "width": width, "height": height}
             )
-            annotations.append(
-                {
-                    "image_id": number,
-                    "file_name": file,
-                    "segments_info": _segments(ids, segments, frame.name),
-                }
-            )
+            info = _segments(ids, segments, frame.name)
+            annotations.append({"image_id": number, "file_name": file, "segments_info": info})
         (temporary / PANOPTIC_FOLDER).mkdir(exist_ok=True)
-        write_json(
-            temporary / PANOPTIC_FILE,
-            {
-                "made_by": MADE_BY,
-                "info": {"description": "rendered from a splatseg scene"} | dict(about or {}),
-                "licenses": [],
-                "images": images,
-                "annotations": annotations,
-                "categories": [
-                    {
-                        "id": category.id,
-                        "name": category.name,
-                        "supercategory": category.name,
-                        "isthing": int(category.isthing),
-                        "color": list(category.colour),
-                    }
-                    for category in categories
-                ],
-            },
-        )
+        content = {
+            "made_by": MADE_BY,
+            "info": {"description": "rendered from a splatseg scene"} | dict(about or {}),
+            "licenses": [],
+            "images": images,
+            "annotations": annotations,
+            "categories": [_category_content(category) for category in categories],
+        }
+        write_json(temporary / PANOPTIC_FILE, content)
     return len(images)
+
+
+def _check_ids(segments: Mapping[int, SegmentInfo], categories: Sequence[Category]) -> None:
+    known = {category.id for category in categories}
+    if len(known) != len(categories):
+        raise InputError("categories: expected distinct ids.")
+    for id, segment in segments.items():
+        if not 0 < id <= _LARGEST:
+            raise InputError(f"segments: expected ids from 1 to {_LARGEST}, got {id}.")
+        if segment.category_id not in known:
+            raise InputError(f"segments[{id}]: there is no category {segment.category_id}.")
+
+
+def _category_content(category: Category) -> dict[str, Any]:
+    return {
+        "id": category.id,
+        "name": category.name,
+        "supercategory": category.name,
+        "isthing": int(category.isthing),
+        "color": list(category.colour),
+    }
 
 
 def _encoded(ids: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -160,12 +158,12 @@ def _segments(
 ) -> list[dict[str, Any]]:
     """Area and bounds of each segment of a view, by ascending id."""
     rows, columns = np.nonzero(ids != UNLABELLED)
-    present, place, areas = np.unique(ids[rows, columns], return_inverse=True, return_counts=True)
+    present, index, areas = np.unique(ids[rows, columns], return_inverse=True, return_counts=True)
     ends = np.empty((4, len(present)), np.int64)
     for k, at in enumerate((columns, rows)):
         ends[k], ends[2 + k] = ids.size, -1
-        np.minimum.at(ends[k], place, at)
-        np.maximum.at(ends[2 + k], place, at)
+        np.minimum.at(ends[k], index, at)
+        np.maximum.at(ends[2 + k], index, at)
     content: list[dict[str, Any]] = []
     for id, area, (left, top, right, bottom) in zip(
         present.tolist(), areas.tolist(), ends.T.tolist(), strict=True

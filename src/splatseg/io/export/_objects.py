@@ -119,8 +119,8 @@ def _class(gaussians: Gaussians, classes: Labels, members: Tensor) -> int:
     if not bool(known.any()):
         return UNLABELLED
     votes = (gaussians.opacities.cpu()[members] * classes.confidence.cpu()[members]).double()
-    present, place = torch.unique(ids[known], return_inverse=True)
-    sums = torch.zeros(len(present), dtype=torch.float64).index_add_(0, place, votes[known])
+    present, index = torch.unique(ids[known], return_inverse=True)
+    sums = torch.zeros(len(present), dtype=torch.float64).index_add_(0, index, votes[known])
     return int(present[int(sums.argmax())])
 
 

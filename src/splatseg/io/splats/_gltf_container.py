@@ -76,7 +76,7 @@ class Gltf:
             raise entry["type"].error("SCALAR, VEC2, VEC3 or VEC4")
         if "sparse" in entry or "bufferView" not in entry:
             raise FileFormatError(
-                f"{self.path}: expected plain data in {entry.place}, got a "
+                f"{self.path}: expected plain data in {entry.location}, got a "
                 f"{'sparse' if 'sparse' in entry else 'compressed or empty'} accessor."
             )
         values = self._values(entry, _COMPONENTS[kind], _WIDTHS[shape])
@@ -98,7 +98,7 @@ class Gltf:
         needed = offset + (count - 1) * stride + item if count else 0
         if stride < item or needed > length or start + length > len(data):
             raise FileFormatError(
-                f"{self.path}: expected {needed} bytes for {entry.place}, got a view of "
+                f"{self.path}: expected {needed} bytes for {entry.location}, got a view of "
                 f"{length} bytes at byte {start} of {len(data)}, one row each {stride} bytes."
             )
         return np.ndarray((count, width), kind, data, start + offset, (stride, kind.itemsize))
@@ -117,7 +117,7 @@ class Gltf:
         length = entry["byteLength"].integer()
         if len(data) < length:
             raise FileFormatError(
-                f"{self.path}: expected {length} bytes in {entry.place}, got {len(data)}: "
+                f"{self.path}: expected {length} bytes in {entry.location}, got {len(data)}: "
                 "truncated."
             )
         self._buffers[index] = data
@@ -203,20 +203,20 @@ def _glb_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
 def _parent_from_node(node: Json) -> NDArray[np.float64]:
     """A node's transform: its matrix (stored by columns), or translation, rotation, scale."""
     if "matrix" in node:
-        return np.array(node["matrix"].numbers(least=16)).reshape(4, 4).T
+        return np.array(node["matrix"].numbers(min_count=16)).reshape(4, 4).T
     result = np.eye(4)
     if "rotation" in node:
         result[:3, :3] = _rotation(node["rotation"])
     if "scale" in node:
-        result[:3, :3] *= np.array(node["scale"].numbers(least=3))
+        result[:3, :3] *= np.array(node["scale"].numbers(min_count=3))
     if "translation" in node:
-        result[:3, 3] = node["translation"].numbers(least=3)
+        result[:3, 3] = node["translation"].numbers(min_count=3)
     return result
 
 
 def _rotation(entry: Json) -> NDArray[np.float64]:
     """The matrix of a quaternion (x, y, z, w)."""
-    quaternion = np.array(entry.numbers(least=4))
+    quaternion = np.array(entry.numbers(min_count=4))
     length = np.linalg.norm(quaternion)
     if length == 0:
         raise entry.error("a quaternion that is not zero")

@@ -12,10 +12,10 @@ from splatseg.errors import FileFormatError
 class Json:
     """A JSON value that knows its file and its place, for one-sentence errors."""
 
-    def __init__(self, path: Path, value: Any, place: str = "") -> None:
+    def __init__(self, path: Path, value: Any, location: str = "") -> None:
         self.path = path
         self.value = value
-        self.place = place
+        self.location = location
 
     @staticmethod
     def parse(path: Path, text: bytes) -> "Json":
@@ -38,7 +38,7 @@ class Json:
         shown = repr(self.value)
         shown = shown if len(shown) <= 60 else shown[:57] + "..."
         return FileFormatError(
-            f"{self.path}: expected {expected} at {self.place or 'the root'}, got {shown}."
+            f"{self.path}: expected {expected} at {self.location or 'the root'}, got {shown}."
         )
 
     def __contains__(self, name: str) -> bool:
@@ -49,9 +49,11 @@ class Json:
         if not isinstance(self.value, dict):
             raise self.error("an object")
         if name not in self.value:
-            place = self.place or "the root"
-            raise FileFormatError(f"{self.path}: expected a member {name!r} at {place}, got none.")
-        return Json(self.path, self.value[name], f"{self.place}.{name}".lstrip("."))
+            location = self.location or "the root"
+            raise FileFormatError(
+                f"{self.path}: expected a member {name!r} at {location}, got none."
+            )
+        return Json(self.path, self.value[name], f"{self.location}.{name}".lstrip("."))
 
     def names(self) -> list[str]:
         """The members of an object."""
@@ -64,7 +66,7 @@ class Json:
         if not isinstance(self.value, list):
             raise self.error("a list")
         for i, value in enumerate(self.value):
-            yield Json(self.path, value, f"{self.place}[{i}]")
+            yield Json(self.path, value, f"{self.location}[{i}]")
 
     def optional_items(self, name: str) -> list["Json"]:
         """The elements of a member that is a list; nothing if it is absent."""
@@ -74,7 +76,7 @@ class Json:
         """One element of a list, by an index that some file gave."""
         if not isinstance(self.value, list) or not 0 <= index < len(self.value):
             raise self.error(f"a list with an element {index}")
-        return Json(self.path, self.value[index], f"{self.place}[{index}]")
+        return Json(self.path, self.value[index], f"{self.location}[{index}]")
 
     def text(self) -> str:
         """A string."""
@@ -106,10 +108,12 @@ class Json:
             raise self.error("a finite number")
         return float(value)
 
-    def numbers(self, *, least: int, most: int | None = None) -> list[float]:
-        """A list of finite numbers, `least` to `most` of them (exactly `least` by default)."""
-        most = least if most is None else most
+    def numbers(self, *, min_count: int, max_count: int | None = None) -> list[float]:
+        """A list of finite numbers, `min_count` to `max_count` of them (`min_count` by default)."""
+        max_count = min_count if max_count is None else max_count
         result = [item.number() for item in self.items()]
-        if not least <= len(result) <= most:
-            raise self.error(f"{least if least == most else f'{least} to {most}'} numbers")
+        if not min_count <= len(result) <= max_count:
+            raise self.error(
+                f"{min_count if min_count == max_count else f'{min_count} to {max_count}'} numbers"
+            )
         return result

@@ -110,43 +110,43 @@ def _read(path: Path, load: Load, meta_name: str) -> Gaussians:
     if count > _MAX_COUNT:
         raise meta.error(f"at most {_MAX_COUNT} Gaussians")
 
-    def pictures(entry: Json, number: int) -> list[Pixels]:
+    def images(entry: Json, number: int) -> list[Pixels]:
         names = [item.text() for item in entry["files"].items()]
         if len(names) != number:
             raise entry["files"].error(f"{number} names of files")
-        return [_picture(path, load, name, count) for name in names]
+        return [_image(path, load, name, count) for name in names]
 
-    rest = _harmonics(path, load, meta["shN"], version) if "shN" in meta else None
+    rest = _sh(path, load, meta["shN"], version) if "shN" in meta else None
     rows = Rows.empty(count, 1 + (rest[1].shape[1] if rest else 0))
-    _positions(rows, meta["means"], pictures(meta["means"], 2))
-    (quats,) = pictures(meta["quats"], 1)
+    _positions(rows, meta["means"], images(meta["means"], 2))
+    (quats,) = images(meta["quats"], 1)
     _rotations(path, rows, quats)
     for name, target, width in (("scales", rows.scales, 3), ("sh0", rows.sh[:, 0], 4)):
-        (pixels,) = pictures(meta[name], 1)
+        (pixels,) = images(meta[name], 1)
         _bytes(rows, meta[name], pixels, target, width=width, version=version)
     if rest is not None:
         labels_name, palette = rest
-        _apply_palette(path, rows, _picture(path, load, labels_name, count), palette)
+        _apply_palette(path, rows, _image(path, load, labels_name, count), palette)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
     antialiased = "antialias" in meta and meta["antialias"].value is True
     return finish(path, rows, drawn=Filter(antialiased=antialiased))
 
 
-def _picture(path: Path, load: Load, name: str, least: int) -> Pixels:
-    """The pixels (n, 4) of a picture that has at least `least` of them."""
-    with _opened(path, name, load(name, 8 * least + (1 << 20))) as image:
-        if image.width * image.height < least:
+def _image(path: Path, load: Load, name: str, min_pixels: int) -> Pixels:
+    """The pixels (n, 4) of a picture that has at least `min_pixels` of them."""
+    with _opened(path, name, load(name, 8 * min_pixels + (1 << 20))) as image:
+        if image.width * image.height < min_pixels:
             raise FileFormatError(
-                f"{path}: expected at least {least} pixels in {name!r}, got "
+                f"{path}: expected at least {min_pixels} pixels in {name!r}, got "
                 f"{image.width} x {image.height}."
             )
-        if image.width * image.height > 2 * least + (1 << 22):
+        if image.width * image.height > 2 * min_pixels + (1 << 22):
             raise FileFormatError(
-                f"{path}: expected about {least} pixels in {name!r}, got "
+                f"{path}: expected about {min_pixels} pixels in {name!r}, got "
                 f"{image.width} x {image.height}."
             )
-        return _pixels(path, name, image).reshape(-1, 4)[:least]
+        return _pixels(path, name, image).reshape(-1, 4)[:min_pixels]
 
 
 def _opened(path: Path, name: str, data: bytes) -> Image.Image:
@@ -165,12 +165,12 @@ def _pixels(path: Path, name: str, image: Image.Image) -> Pixels:
         raise FileFormatError(f"{path}: the picture {name!r} is damaged: {error}.") from error
 
 
-def _positions(rows: Rows, entry: Json, pictures: list[Pixels]) -> None:
+def _positions(rows: Rows, entry: Json, images: list[Pixels]) -> None:
     """Positions: 16 bits between bounds, then the inverse of sign(x) log(1 + |x|)."""
-    low, high = (np.array(entry[name].numbers(least=3)) for name in ("mins", "maxs"))
+    low, high = (np.array(entry[name].numbers(min_count=3)) for name in ("mins", "maxs"))
     for part in blocks(len(rows.means)):
-        least, most = (picture[part, :3].astype(np.float64) for picture in pictures)
-        logs = low + (high - low) * ((least + 256 * most) / 65535)
+        low_bytes, high_bytes = (image[part, :3].astype(np.float64) for image in images)
+        logs = low + (high - low) * ((low_bytes + 256 * high_bytes) / 65535)
         with np.errstate(over="ignore"):
             rows.means[part] = np.sign(logs) * np.expm1(np.abs(logs))
 
@@ -193,11 +193,11 @@ def _bytes(
 ) -> None:
     """Log scales, or colours with the opacity in alpha, from bytes."""
     if version == 1:
-        low, high = (np.array(entry[name].numbers(least=width)) for name in ("mins", "maxs"))
+        low, high = (np.array(entry[name].numbers(min_count=width)) for name in ("mins", "maxs"))
         tables = low[:, None] + (high - low)[:, None] * (np.arange(256) / 255)
     else:
         tables = np.full((width, 256), np.nan)  # a byte beyond a short codebook is refused
-        codebook = entry["codebook"].numbers(least=1, most=256)
+        codebook = entry["codebook"].numbers(min_count=1, max_count=256)
         tables[:, : len(codebook)] = codebook
     for part in blocks(len(pixels)):
         for i in range(3):
@@ -211,7 +211,7 @@ def _bytes(
         rows.opacities[:] = alpha / np.float32(255)
 
 
-def _harmonics(path: Path, load: Load, entry: Json, version: int) -> tuple[str, Array]:
+def _sh(path: Path, load: Load, entry: Json, version: int) -> tuple[str, Array]:
     """The name of the labels' picture and the palette (entries, coefficients, 3)."""
     names = [item.text() for item in entry["files"].items()]
     if len(names) != 2:
@@ -234,7 +234,7 @@ def _harmonics(path: Path, load: Load, entry: Json, version: int) -> tuple[str, 
     if count > len(pixels):
         raise entry["count"].error(f"at most the {len(pixels)} entries of the palette")
     codebook = np.full(256, np.nan, np.float32)
-    numbers = entry["codebook"].numbers(least=1, most=256)
+    numbers = entry["codebook"].numbers(min_count=1, max_count=256)
     codebook[: len(numbers)] = numbers
     return names[1], codebook[pixels[:count]]
 

@@ -124,8 +124,8 @@ def _texture(lightness: Array) -> Array:
 def _soft_bins(values: Array, centres: Array) -> Array:
     """Linear interpolation into bins: at most two per pixel are filled, and sum to 1."""
     step = centres[1] - centres[0]
-    place = np.clip((values - centres[0]) / step, 0, len(centres) - 1)
-    distance = np.abs(place[..., None] - np.arange(len(centres), dtype=np.float32))
+    position = np.clip((values - centres[0]) / step, 0, len(centres) - 1)
+    distance = np.abs(position[..., None] - np.arange(len(centres), dtype=np.float32))
     return np.maximum(1 - distance, 0).astype(np.float32)
 
 

@@ -62,10 +62,10 @@ class MergeTree:
         count = np.ones(self.nodes, np.int64)
         for k, (left, right) in enumerate(zip(self.left, self.right, strict=True)):
             count[self.leaves + k] = count[left] + count[right]
-        place = 0
+        begin = 0
         for root in np.flatnonzero(np.isinf(self.death())).tolist():
-            first[root] = place
-            place += int(count[root])
+            first[root] = begin
+            begin += int(count[root])
         for k in range(len(self.cost) - 1, -1, -1):
             node, left, right = self.leaves + k, self.left[k], self.right[k]
             first[left] = first[node]
@@ -208,9 +208,9 @@ def _edges(
         codes.append(low * n + high)
         values.append(np.maximum(strength[here], strength[there])[differ].astype(np.float64))
     code = np.concatenate(codes)
-    pairs, place = np.unique(code, return_inverse=True)
-    lengths = np.bincount(place, minlength=len(pairs)).astype(np.float64)
-    sums = np.bincount(place, weights=np.concatenate(values), minlength=len(pairs))
+    pairs, index = np.unique(code, return_inverse=True)
+    lengths = np.bincount(index, minlength=len(pairs)).astype(np.float64)
+    sums = np.bincount(index, weights=np.concatenate(values), minlength=len(pairs))
     found: list[dict[int, tuple[float, float]]] = [{} for _ in range(size)]
     for pair, total, length in zip(pairs.tolist(), sums.tolist(), lengths.tolist(), strict=True):
         found[pair // n][pair % n] = (total, length)

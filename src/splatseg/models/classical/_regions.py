@@ -139,9 +139,9 @@ def _superpixels(strength: NDArray[np.float32], size: int) -> NDArray[np.int32]:
     for y0, y1 in zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True):
         for x0, x1 in zip(columns[:-1].tolist(), columns[1:].tolist(), strict=True):
             cell = smooth[y0:y1, x0:x1]
-            least = int(cell.argmin())
+            lowest = int(cell.argmin())
             number += 1
-            markers[y0 + least // cell.shape[1], x0 + least % cell.shape[1]] = number
+            markers[y0 + lowest // cell.shape[1], x0 + lowest % cell.shape[1]] = number
     return (np.asarray(watershed(smooth, markers)) - 1).astype(np.int32)
 
 
@@ -184,14 +184,14 @@ def _enlarged(labels: NDArray[np.int32], height: int, width: int) -> NDArray[np.
         (labels[bottom[:, None], right], down * across),
     ]
     best = corners[0][0]
-    most = np.full((height, width), -1.0, np.float32)
+    top_weight = np.full((height, width), -1.0, np.float32)
     for label, _ in corners:
         weight = np.zeros((height, width), np.float32)
         for other, share in corners:
             weight += np.where(other == label, share, np.float32(0))
-        better = weight > most
+        better = weight > top_weight
         best = np.where(better, label, best)
-        most = np.where(better, weight, most)
+        top_weight = np.where(better, weight, top_weight)
     return best
 
 
@@ -199,9 +199,9 @@ def _between(
     short: int, long: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
     """Of each of `long` pixel centres the two of `short` around it, and the share of the second."""
-    place = np.clip((np.arange(long) + 0.5) * short / long - 0.5, 0, short - 1)
-    first = np.floor(place).astype(np.int64)
-    return first, np.minimum(first + 1, short - 1), (place - first).astype(np.float32)
+    position = np.clip((np.arange(long) + 0.5) * short / long - 0.5, 0, short - 1)
+    first = np.floor(position).astype(np.int64)
+    return first, np.minimum(first + 1, short - 1), (position - first).astype(np.float32)
 
 
 def _encode(labels: NDArray[np.int32], tree: MergeTree, nodes: list[int]) -> list[Rle]:

@@ -207,10 +207,10 @@ def _wrong_sizes(content: Mapping[str, Any], folder: Path) -> dict[int, tuple[in
 
 
 def _size_fault(wrong: Mapping[int, tuple[int, int, str]]) -> Fault:
-    width, height, said = next(iter(wrong.values()))
+    width, height, declared = next(iter(wrong.values()))
     return Fault(
         name="image-size",
-        sentence=f"The intrinsics of {len(wrong)} photographs are for images of {said} pixels, "
+        sentence=f"The intrinsics of {len(wrong)} photographs are for images of {declared} pixels, "
         f"which is no scale of the photographs' {width}x{height}.",
         remedy="The size is the photographs' own.",
     )

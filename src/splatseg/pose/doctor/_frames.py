@@ -14,7 +14,7 @@ from splatseg.pose.doctor._points import (
     Photographs,
     PointScore,
     colour_score,
-    place_score,
+    position_score,
     sample_points,
 )
 
@@ -25,7 +25,7 @@ _AROUND = np.exp(np.linspace(-1.0, 1.0, 41))
 _COARSE = 0.05
 _FEW = 400
 _KEEP = 6
-_FEWEST = 30
+_MIN_MATCHES = 30
 _MATCHES = 50
 _FITTED_TO = 800
 _AS_GOOD = 0.97
@@ -50,8 +50,8 @@ class PointEvidence:
         """How well points agree after a correction."""
         moved = correction.apply(cloud)
         colour, seen = colour_score(self.photographs, self.cameras, sample_points(moved, 3000))
-        place = place_score(self.triangulated, self.depth, moved.points.double().numpy())
-        return PointScore(colour=colour, place=place, seen=seen)
+        position = position_score(self.triangulated, self.depth, moved.points.double().numpy())
+        return PointScore(colour=colour, position=position, seen=seen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,7 +84,7 @@ def search_points(
     best = _best(evidence, cloud, [unmoved(), *declared])
     for mirrored in (False, True):
         if len(evidence.triangulated) >= _MATCHES:
-            coarse = _by_place(evidence, cloud, mirrored=mirrored)
+            coarse = _by_position(evidence, cloud, mirrored=mirrored)
             fitted = [_fitted(evidence, cloud, c) for c in coarse]
             # The plain ones first: without an offset, with axes as they are.
             tried = [*coarse, *(plain for plain, _ in fitted), *(free for _, free in fitted)]
@@ -122,23 +122,23 @@ def _polished(evidence: PointEvidence, cloud: PointCloud, start: ScoredPoints) -
     return best
 
 
-def _by_place(
+def _by_position(
     evidence: PointEvidence, cloud: PointCloud, *, mirrored: bool
 ) -> list[PointCorrection]:
     rng = np.random.default_rng(0)
     chosen = rng.permutation(len(evidence.triangulated))[:_FEW]
-    places, near = evidence.triangulated[chosen], _COARSE * evidence.depth[chosen]
+    positions, near = evidence.triangulated[chosen], _COARSE * evidence.depth[chosen]
     points = sample_points(cloud, 20000).points.double().numpy()
     index = NeighbourIndex(torch.from_numpy(points))
-    middle_places, middle_points = np.median(places, axis=0), np.median(points, axis=0)
-    ratio = _extent(places, middle_places) / max(_extent(points, middle_points), 1e-12)
+    median_position, median_point = np.median(positions, axis=0), np.median(points, axis=0)
+    ratio = _extent(positions, median_position) / max(_extent(points, median_point), 1e-12)
     scales = (*_SCALES, *(float(ratio * a) for a in _AROUND))
     tried: list[tuple[float, int, PointCorrection]] = []
     for matrix in axis_rotations(mirrored=mirrored):
         for scale in scales:
             for centred in (False, True):
-                offset = middle_places - scale * matrix @ middle_points if centred else np.zeros(3)
-                moved = (places - offset) @ matrix / scale
+                offset = median_position - scale * matrix @ median_point if centred else np.zeros(3)
+                moved = (positions - offset) @ matrix / scale
                 reach = float(near.max()) / scale
                 found = index.nearest(torch.from_numpy(moved), 1, max_distance=reach)
                 distance = found.distances[:, 0].numpy()
@@ -163,13 +163,13 @@ def _by_colour(
             colour, seen = colour_score(
                 evidence.photographs, evidence.cameras, correction.apply(few)
             )
-            value = PointScore(colour=colour, place=None, seen=seen).value
+            value = PointScore(colour=colour, position=None, seen=seen).value
             tried.append((-value, len(tried), correction))
     return [correction for _, _, correction in sorted(tried)[:_KEEP]]
 
 
-def _extent(points: Array, middle: Array) -> float:
-    return float(np.median(np.linalg.norm(points - middle, axis=1)))
+def _extent(points: Array, centre: Array) -> float:
+    return float(np.median(np.linalg.norm(points - centre, axis=1)))
 
 
 def _fitted(
@@ -179,19 +179,19 @@ def _fitted(
     points = sample_points(cloud, 20000).points.double().numpy()
     index = NeighbourIndex(torch.from_numpy(points))
     chosen = np.random.default_rng(0).permutation(len(evidence.triangulated))[:_FITTED_TO]
-    places, depth = evidence.triangulated[chosen], evidence.depth[chosen]
+    positions, depth = evidence.triangulated[chosen], evidence.depth[chosen]
     plain, free = replace(start, offset=(0.0, 0.0, 0.0)), start
     for k in range(_ROUNDS):
         tolerance = _COARSE * max(0.3, 1 - k / 8)
         for fit_offset in (False, True):
             now = free if fit_offset else plain
-            moved = (places - np.array(now.offset)) @ now.matrix / now.scale
+            moved = (positions - np.array(now.offset)) @ now.matrix / now.scale
             reach = float(tolerance * depth.max() / now.scale)
             found = index.nearest(torch.from_numpy(moved), 1, max_distance=reach)
             good = found.distances[:, 0].numpy() * now.scale < tolerance * depth
-            if good.sum() < _FEWEST:
+            if good.sum() < _MIN_MATCHES:
                 continue
-            source, target = points[found.indices[:, 0].numpy()[good]], places[good]
+            source, target = points[found.indices[:, 0].numpy()[good]], positions[good]
             if fit_offset:
                 free = _umeyama(source, target, start)
             else:
@@ -206,8 +206,8 @@ def _umeyama(source: Array, target: Array, like: PointCorrection) -> PointCorrec
 
     Umeyama 1991, eq. 40 to 42.
     """
-    middle_source, middle_target = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - middle_source, target - middle_target
+    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - mean_source, target - mean_target
     u, d, vt = np.linalg.svd(b.T @ a / len(a))
     handed = np.linalg.det(u) * np.linalg.det(vt) * np.linalg.det(like.matrix)
     s = np.array([1.0, 1.0, np.sign(handed)])
@@ -215,5 +215,5 @@ def _umeyama(source: Array, target: Array, like: PointCorrection) -> PointCorrec
     scale = float((d * s).sum() / max(float((a * a).sum(axis=1).mean()), 1e-18))
     if scale <= 0:
         return like
-    x, y, z = (middle_target - scale * matrix @ middle_source).tolist()
+    x, y, z = (mean_target - scale * matrix @ mean_source).tolist()
     return replace(like, matrix=matrix, scale=scale, offset=(x, y, z))

@@ -15,10 +15,10 @@ _RATIO = 0.8
 # A fundamental matrix of a pair holds for matches this close to their epipolar lines, pixels of
 # the reduced photographs.
 _VERIFIED = 1.5
-_FEWEST = 24
+_MIN_KEYPOINTS = 24
 # Matches that hardly move between two photographs say little; median motion as a share of the
 # longest side.
-_LEAST_MOTION = 0.015
+_MIN_MOTION = 0.015
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,16 +42,16 @@ class Matches:
         return len(self.pair)
 
 
-def choose_views(count: int, most: int) -> list[int]:
-    """At most `most` of `count` views in short runs of neighbours, spread over all of them.
+def choose_views(count: int, max_views: int) -> list[int]:
+    """At most `max_views` of `count` views in short runs of neighbours, spread over all of them.
 
     Captures are sorted by name, which mostly is the order in which they were taken; a run has
     views 1, 2 and 4 apart, so that one of the pairs has parallax without losing the overlap.
     """
     run = (0, 1, 2, 4, 8)
-    if count <= most:
+    if count <= max_views:
         return list(range(count))
-    runs = max(1, most // len(run))
+    runs = max(1, max_views // len(run))
     starts = np.linspace(0, count - 1 - run[-1], runs).round().astype(int) if count > 8 else [0]
     return sorted({min(int(start) + step, count - 1) for start in starts for step in run})
 
@@ -80,7 +80,7 @@ def candidate_pairs(views: Sequence[View], chosen: Sequence[int]) -> list[tuple[
 def match_views(
     views: Sequence[View],
     *,
-    most_views: int,
+    max_views: int,
     longest: int,
     per_pair: int = 160,
     seed: int = 0,
@@ -89,14 +89,14 @@ def match_views(
 
     Args:
         views: Views with photographs.
-        most_views: How many of them to look at.
+        max_views: How many of them to look at.
         longest: Longest side at which features are found, pixels.
         per_pair: Most matches kept of a pair, so that no pair outvotes the others.
         seed: Of the choice of those.
     """
     import cv2
 
-    chosen = choose_views(len(views), most_views)
+    chosen = choose_views(len(views), max_views)
     features = {i: _features(views[i], longest) for i in chosen}
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     rng = np.random.default_rng(seed)
@@ -162,7 +162,7 @@ def _features(view: View, longest: int) -> _Features:
 
 def _match(first: _Features, second: _Features, matcher: Any, cv2: Any) -> NDArray[Any] | None:
     """(n, 2, 2) verified pixels of a pair; None where there are too few or they do not move."""
-    if min(len(first.pixels), len(second.pixels)) < _FEWEST:
+    if min(len(first.pixels), len(second.pixels)) < _MIN_KEYPOINTS:
         return None
     forward = matcher.knnMatch(first.descriptors, second.descriptors, k=2)
     back = {m.queryIdx: m.trainIdx for m in matcher.match(second.descriptors, first.descriptors)}
@@ -171,7 +171,7 @@ def _match(first: _Features, second: _Features, matcher: Any, cv2: Any) -> NDArr
         for best, other in forward
         if best.distance < _RATIO * other.distance and back.get(best.trainIdx) == best.queryIdx
     ]
-    if len(good) < _FEWEST:
+    if len(good) < _MIN_KEYPOINTS:
         return None
     index = np.array(good)
     pixels = np.stack([first.pixels[index[:, 0]], second.pixels[index[:, 1]]], axis=1)
@@ -186,7 +186,7 @@ def _match(first: _Features, second: _Features, matcher: Any, cv2: Any) -> NDArr
     if inliers is None:
         return None
     pixels = pixels[inliers[:, 0] > 0]
-    if len(pixels) < _FEWEST:
+    if len(pixels) < _MIN_KEYPOINTS:
         return None
     motion = np.median(np.linalg.norm(pixels[:, 0] - pixels[:, 1], axis=-1))
-    return pixels if motion >= _LEAST_MOTION * first.longest else None
+    return pixels if motion >= _MIN_MOTION * first.longest else None

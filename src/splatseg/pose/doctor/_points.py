@@ -37,7 +37,7 @@ class PointScore:
     colour: float | None
     """Agreement beyond chance (kappa): 0 is chance, 1 is all. None without colours."""
 
-    place: float | None
+    position: float | None
     """Share of triangulated matches that have a start point next to them. None without matches."""
 
     seen: float
@@ -46,7 +46,7 @@ class PointScore:
     @property
     def value(self) -> float:
         """One number: colours where seen, and places, averaged over what is known."""
-        parts = [p for p in (self.colour, self.place) if p is not None]
+        parts = [p for p in (self.colour, self.position) if p is not None]
         known = sum(parts) / len(parts) if parts else 0.0
         return known * min(1.0, 2.0 * self.seen)
 
@@ -68,12 +68,12 @@ def load_photographs(views: Sequence[View], chosen: Sequence[int], *, longest: i
     return Photographs(views=tuple(chosen), images=images)
 
 
-def sample_points(cloud: PointCloud, most: int, *, seed: int = 0) -> PointCloud:
-    """At most `most` points, drawn at random."""
-    if len(cloud) <= most:
+def sample_points(cloud: PointCloud, max_points: int, *, seed: int = 0) -> PointCloud:
+    """At most `max_points` points, drawn at random."""
+    if len(cloud) <= max_points:
         return cloud
     rng = np.random.default_rng(seed)
-    index = torch.from_numpy(np.sort(rng.permutation(len(cloud))[:most]))
+    index = torch.from_numpy(np.sort(rng.permutation(len(cloud))[:max_points]))
     colours = None if cloud.colours is None else cloud.colours[index]
     return PointCloud(points=cloud.points[index], colours=colours)
 
@@ -123,7 +123,7 @@ def colour_score(
     return (right - chance) / max(1 - chance, 1e-6), share
 
 
-def place_score(triangulated: Array, depth: Array, points: Array) -> float | None:
+def position_score(triangulated: Array, depth: Array, points: Array) -> float | None:
     """Share of triangulated places with a start point nearer than 2 % of their depth."""
     if len(triangulated) < 50 or len(points) == 0:
         return None

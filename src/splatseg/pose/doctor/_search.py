@@ -71,12 +71,12 @@ class MatchEvidence:
         rays = self.rays(correction)
         return 0.0 if rays is None else agreement(rays, correction.poses(self.poses))
 
-    def subset(self, most: int, *, seed: int = 0) -> "MatchEvidence":
+    def subset(self, max_matches: int, *, seed: int = 0) -> "MatchEvidence":
         """Fewer matches, drawn at random."""
         count = len(self.matches)
-        if count <= most:
+        if count <= max_matches:
             return self
-        index = np.sort(np.random.default_rng(seed).permutation(count)[:most])
+        index = np.sort(np.random.default_rng(seed).permutation(count)[:max_matches])
         matches = replace(
             self.matches, pair=self.matches.pair[index], pixels=self.matches.pixels[index]
         )

@@ -162,26 +162,26 @@ def _moved_poses(
 def _unexplained(
     capture: Capture, evidence: PointEvidence, given: PointScore, figures: dict[str, Any]
 ) -> Judged:
-    places = evidence.triangulated
-    enough = len(places) >= _ENOUGH
+    positions = evidence.triangulated
+    enough = len(positions) >= _ENOUGH
     fault = Fault(
         name="unexplained-points",
         sentence="The start points do not fit the cameras, and no change of axes or scale makes "
         f"them ({100 * given.seen:.0f} % lie in view of two photographs or more).",
-        remedy=f"They are replaced by {len(places)} matches that the cameras triangulate."
+        remedy=f"They are replaced by {len(positions)} matches that the cameras triangulate."
         if enough
         else "",
     )
     if not enough:
         return Judged(capture=capture, faults=[fault], figures=figures)
-    cloud = PointCloud(points=torch.from_numpy(places).float())
+    cloud = PointCloud(points=torch.from_numpy(positions).float())
     return Judged(capture=replace(capture, points=cloud), faults=[fault], figures=figures)
 
 
 def _point_figures(score: PointScore) -> dict[str, Any]:
     return {
         "colours": None if score.colour is None else round(score.colour, 4),
-        "places": None if score.place is None else round(score.place, 4),
+        "places": None if score.position is None else round(score.position, 4),
         "in_view": round(score.seen, 4),
         "value": round(score.value, 4),
     }

@@ -16,6 +16,7 @@ from splatseg.core import (
     Scene,
     View,
     camera_of_map,
+    map_ids,
 )
 from splatseg.evaluate.agreement import Agreement, agreement
 from splatseg.evaluate.overlaps import Overlaps, instance_score
@@ -23,14 +24,14 @@ from splatseg.io.evidence import Evidence
 from splatseg.io.images import image_camera, load_image, reduced_size
 from splatseg.lift import label_map
 from splatseg.render import prepare
-from splatseg.report.pictures import (
+from splatseg.report.images import (
     Gallery,
-    Picture,
-    colour_labels,
+    GalleryImage,
     colour_share,
     mark_errors,
     overlay_labels,
 )
+from splatseg.report.legend import colour_labels
 
 _LONGEST = 1024
 """Pixels at which views without a truth are drawn."""
@@ -40,12 +41,12 @@ _UNMATCHED = 1 << 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sight:
+class ViewPanel:
     """One view, looked at; all maps have one size."""
 
     name: str
     held_out: bool
-    picture: UInt8[Tensor, "height width 3"]
+    image: UInt8[Tensor, "height width 3"]
     """The photograph, or the rendering where there is none."""
 
     drawn: Int[Tensor, "height width"]
@@ -60,7 +61,7 @@ class Sight:
     """Of the evidence with the layer."""
 
 
-def look(
+def view_panel(
     scene: Scene,
     labels: Labels,
     view: View,
@@ -70,7 +71,7 @@ def look(
     truth: LabelSource | None,
     same_ids: bool,
     backend: str,
-) -> Sight:
+) -> ViewPanel:
     """Draw a view in the pixels of its truth, else of its photograph reduced.
 
     Raises:
@@ -90,15 +91,15 @@ def look(
     alpha = drawn.alpha.float().cpu()
     mean = drawn.image[..., 0].float().cpu() / alpha.clamp_min(1e-6)
     if colours is None:
-        picture = _resized(load_image(view, longest=max(size)), size)
+        image = _resized(load_image(view, longest=max(size)), size)
     else:
-        picture = (colours.image.float().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        image = (colours.image.float().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
     seen = _evidence_ids(evidence, view.name)
     seen = None if seen is None else _nearest(seen, size)
-    return Sight(
+    return ViewPanel(
         name=view.name,
         held_out=held_out,
-        picture=picture,
+        image=image,
         drawn=shown,
         confidence=torch.where(alpha > 0.02, mean.clamp(0, 1), -1.0),
         evidence=seen,
@@ -107,15 +108,15 @@ def look(
     )
 
 
-def rename_truth(sights: Sequence[Sight]) -> dict[int, int]:
+def rename_truth(panels: Sequence[ViewPanel]) -> dict[int, int]:
     """Ids of the layer by true id, matched over the views that are shown.
 
     A true id without a match gets one that no layer has.
     """
     total = Overlaps.none()
-    for sight in sights:
-        if sight.truth is not None:
-            total = total + Overlaps.of(sight.drawn, sight.truth)
+    for panel in panels:
+        if panel.truth is not None:
+            total = total + Overlaps.of(panel.drawn, panel.truth)
     if not len(total.pairs):
         return {}
     matches = instance_score(total).matches
@@ -125,14 +126,8 @@ def rename_truth(sights: Sequence[Sight]) -> dict[int, int]:
     }
 
 
-def renamed(ids: Int[Tensor, "height width"], names: dict[int, int]) -> Int[Tensor, "height width"]:
-    """A map under other ids; ids without another name, and -1, stay."""
-    found, at = torch.unique(ids.long(), return_inverse=True)
-    return torch.tensor([names.get(i, i) for i in found.tolist()], dtype=torch.int64)[at]
-
-
 def gallery(
-    sights: Sequence[Sight],
+    panels: Sequence[ViewPanel],
     classes: ClassTable,
     *,
     truth_names: dict[int, int] | None,
@@ -142,36 +137,36 @@ def gallery(
     """Rows of pictures, one a view: what came, what became of it, and the truth if there is one.
 
     Args:
-        sights: The views.
+        panels: The views.
         classes: Names and colours of the layer's ids.
         truth_names: Ids of the layer by true id where they differ, see `rename_truth`.
         evidence_has_same_ids: Evidence is coloured as the layer is; otherwise by its own ids.
         longest: Of the pictures, pixels.
     """
-    with_evidence = any(sight.evidence is not None for sight in sights)
-    with_truth = any(sight.truth is not None for sight in sights)
+    with_evidence = any(panel.evidence is not None for panel in panels)
+    with_truth = any(panel.truth is not None for panel in panels)
     columns = ["photograph", "labels on it", "confidence"]
     if with_evidence:
         columns.insert(1, "evidence as it came")
     if with_truth:
         columns += ["truth", "errors in red"]
-    rows: list[tuple[str, tuple[Picture, ...]]] = []
-    for sight in sights:
-        size = _size(sight.picture, longest)
-        photograph = _resized(sight.picture, size)
-        drawn = _nearest(sight.drawn, size)
-        pictures = [
-            Picture(image=photograph),
-            Picture(image=overlay_labels(photograph, drawn, classes)),
-            Picture(image=colour_share(_nearest(sight.confidence, size))),
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
+    for panel in panels:
+        size = _size(panel.image, longest)
+        photograph = _resized(panel.image, size)
+        drawn = _nearest(panel.drawn, size)
+        shown = [
+            GalleryImage(image=photograph),
+            GalleryImage(image=overlay_labels(photograph, drawn, classes)),
+            GalleryImage(image=colour_share(_nearest(panel.confidence, size))),
         ]
         if with_evidence:
             table = classes if evidence_has_same_ids else None
-            pictures.insert(1, _evidence_picture(sight, table, size))
+            shown.insert(1, _evidence_image(panel, table, size))
         if with_truth:
-            pictures += _truth_pictures(sight, classes, truth_names, photograph)
-        label = f"{sight.name}, held out" if sight.held_out else sight.name
-        rows.append((label, tuple(pictures)))
+            shown += _truth_images(panel, classes, truth_names, photograph)
+        label = f"{panel.name}, held out" if panel.held_out else panel.name
+        rows.append((label, tuple(shown)))
     return Gallery(
         title="What it looks like",
         columns=tuple(columns),
@@ -185,40 +180,42 @@ def gallery(
     )
 
 
-def _evidence_picture(sight: Sight, classes: ClassTable | None, size: tuple[int, int]) -> Picture:
-    if sight.evidence is None or sight.agreement is None:
+def _evidence_image(
+    panel: ViewPanel, classes: ClassTable | None, size: tuple[int, int]
+) -> GalleryImage:
+    if panel.evidence is None or panel.agreement is None:
         return _nothing(size)
-    return Picture(
-        image=colour_labels(_nearest(sight.evidence, size), classes),
+    return GalleryImage(
+        image=colour_labels(_nearest(panel.evidence, size), classes),
         kind="chart",
-        caption=f"{sight.agreement.differ:.1%} differs",
+        caption=f"{panel.agreement.differ:.1%} differs",
     )
 
 
-def _truth_pictures(
-    sight: Sight,
+def _truth_images(
+    panel: ViewPanel,
     classes: ClassTable,
     names: dict[int, int] | None,
     photograph: UInt8[Tensor, "height width 3"],
-) -> list[Picture]:
+) -> list[GalleryImage]:
     size = (int(photograph.shape[0]), int(photograph.shape[1]))
-    if sight.truth is None:
+    if panel.truth is None:
         return [_nothing(size), _nothing(size)]
-    truth = sight.truth if names is None else renamed(sight.truth, names)
+    truth = panel.truth if names is None else map_ids(panel.truth, names, default=None)
     known = truth != UNLABELLED
-    right = float((sight.drawn == truth)[known].double().mean()) if bool(known.any()) else 0.0
+    right = float((panel.drawn == truth)[known].double().mean()) if bool(known.any()) else 0.0
     marked = mark_errors(
-        photograph, _nearest(sight.drawn, size).long(), truth=_nearest(truth, size).long()
+        photograph, _nearest(panel.drawn, size).long(), truth=_nearest(truth, size).long()
     )
     return [
-        Picture(image=colour_labels(_nearest(truth, size), classes), kind="chart"),
-        Picture(image=marked, caption=f"{right:.1%} right"),
+        GalleryImage(image=colour_labels(_nearest(truth, size), classes), kind="chart"),
+        GalleryImage(image=marked, caption=f"{right:.1%} right"),
     ]
 
 
-def _nothing(size: tuple[int, int]) -> Picture:
+def _nothing(size: tuple[int, int]) -> GalleryImage:
     grey = torch.full((*size, 3), 128, dtype=torch.uint8)
-    return Picture(image=grey, kind="chart", caption="there is none of this view")
+    return GalleryImage(image=grey, kind="chart", caption="there is none of this view")
 
 
 def _evidence_ids(evidence: LabelSource | None, name: str) -> Int[Tensor, "height width"] | None:
@@ -230,11 +227,11 @@ def _evidence_ids(evidence: LabelSource | None, name: str) -> Int[Tensor, "heigh
     if evidence.kind != "masks":
         return None
     masks = evidence.masks(name)
-    paper = torch.full((masks.height, masks.width), UNLABELLED, dtype=torch.int32)
+    ids = torch.full((masks.height, masks.width), UNLABELLED, dtype=torch.int32)
     areas = [mask.area for mask in masks.masks]
     for i in sorted(range(len(areas)), key=lambda i: (-areas[i], i)):
-        paper[masks.masks[i].decode()] = i + 1
-    return LabelMap(ids=paper).ids
+        ids[masks.masks[i].decode()] = i + 1
+    return LabelMap(ids=ids).ids
 
 
 def _size(image: Tensor, longest: int) -> tuple[int, int]:

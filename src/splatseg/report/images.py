@@ -1,6 +1,5 @@
 """Label maps, depth and errors as pictures, and pictures side by side on one sheet."""
 
-import colorsys
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,11 +12,10 @@ from torch import Tensor
 from splatseg._check import check_shape
 from splatseg.core import ClassTable
 from splatseg.errors import InputError
+from splatseg.report.legend import NOTHING, Colour, colour_labels, colour_of
 
-Colour = tuple[int, int, int]
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
-_NOTHING: Colour = (24, 24, 28)
 _WRONG: Colour = (226, 48, 48)
 _UNKNOWN: Colour = (90, 120, 220)
 # From far to near: dark blue, teal, sand. Its brightness grows steadily.
@@ -31,7 +29,7 @@ _GAP = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Picture:
+class GalleryImage:
     """An image for a page or sheet."""
 
     image: UInt8[Tensor, "height width 3"]
@@ -55,46 +53,18 @@ class Gallery:
 
     title: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[Picture, ...]], ...]
+    rows: tuple[tuple[str, tuple[GalleryImage, ...]], ...]
     """Label and pictures of each row."""
 
     note: str = ""
 
     def __post_init__(self) -> None:
-        for label, pictures in self.rows:
-            if len(pictures) != len(self.columns):
+        for label, panels in self.rows:
+            if len(panels) != len(self.columns):
                 raise InputError(
                     f"rows: expected {len(self.columns)} pictures as there are columns, "
-                    f"row {label!r} has {len(pictures)}."
+                    f"row {label!r} has {len(panels)}."
                 )
-
-
-def colour_of(id: int, classes: ClassTable | None = None) -> Colour:
-    """The class table's colour of an id, else a colour of its own; -1 is nearly black.
-
-    Colours that are made up walk round the hues by the golden ratio, and through brightness by
-    another irrational step, so that no two of the first forty look alike.
-    """
-    if id < 0:
-        return _NOTHING
-    if classes is not None:
-        for row in classes.rows:
-            if row.id == id and row.colour is not None:
-                return row.colour
-    hue = (id * 0.6180339887) % 1.0
-    light = 0.40 + 0.38 * ((id * 0.7548776662) % 1.0)
-    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.62)
-    return round(255 * red), round(255 * green), round(255 * blue)
-
-
-def colour_labels(
-    ids: Int[Tensor, "height width"], classes: ClassTable | None = None
-) -> UInt8[Tensor, "height width 3"]:
-    """A label map in colours, see `colour_of`."""
-    check_shape("ids", ids, (None, None))
-    found, index = torch.unique(ids, return_inverse=True)
-    colours = [colour_of(int(id), classes) for id in found]
-    return torch.tensor(colours, dtype=torch.uint8)[index]
 
 
 def colour_depth(
@@ -111,14 +81,14 @@ def colour_depth(
     known = depth > 0
     values = depth[known].double()
     if not len(values):
-        return torch.tensor(_NOTHING, dtype=torch.uint8).expand(*depth.shape, 3).clone()
+        return torch.tensor(NOTHING, dtype=torch.uint8).expand(*depth.shape, 3).clone()
     if near is None:
         near = float(torch.quantile(_thinned(values), 0.01))
     if far is None:
         far = float(torch.quantile(_thinned(values), 0.99))
     share = ((far - depth.double()) / max(far - near, 1e-9)).clamp(0, 1)
     return torch.where(
-        known.unsqueeze(-1), _ramp(share).round(), torch.tensor(_NOTHING, dtype=torch.float64)
+        known.unsqueeze(-1), _ramp(share).round(), torch.tensor(NOTHING, dtype=torch.float64)
     ).to(torch.uint8)
 
 
@@ -144,7 +114,7 @@ def colour_share(values: Float[Tensor, "height width"]) -> UInt8[Tensor, "height
     """Values from dark blue (0) to sand (1); nearly black where they are negative, nothing."""
     check_shape("values", values, (None, None))
     mixed = _ramp(values.double().clamp(0, 1)).round()
-    nothing = torch.tensor(_NOTHING, dtype=torch.float64)
+    nothing = torch.tensor(NOTHING, dtype=torch.float64)
     return torch.where((values >= 0).unsqueeze(-1), mixed, nothing).to(torch.uint8)
 
 
@@ -215,12 +185,12 @@ def contact_sheet(
         x = _MARGIN + column * (cell_width + _GAP)
         draw.text((x, head - 22), name, fill=_INK, font=text_font)
     y = head
-    for (label, pictures), row_height in zip(gallery.rows, heights, strict=True):
-        for column, picture in enumerate(pictures):
+    for (label, panels), row_height in zip(gallery.rows, heights, strict=True):
+        for column, panel in enumerate(panels):
             x = _MARGIN + column * (cell_width + _GAP)
-            small = _resized(picture, cell_width)
+            small = _resized(panel, cell_width)
             sheet.paste(small, (x, y))
-            words = label if column == 0 else picture.caption
+            words = label if column == 0 else panel.caption
             words = _fitting(draw, words, label_font, cell_width)
             draw.text((x, y + row_height + 2), words, fill=_QUIET, font=label_font)
         y += row_height + label_height + _GAP
@@ -248,9 +218,9 @@ def _swatches(
 def _ramp(share: Tensor) -> Tensor:
     """Colours, as float64, of values in [0, 1]."""
     steps = torch.tensor(_DEPTH_STEPS, dtype=torch.float64)
-    place = share * (len(steps) - 1)
-    low = place.floor().long().clamp(max=len(steps) - 2)
-    return torch.lerp(steps[low], steps[low + 1], (place - low).unsqueeze(-1))
+    position = share * (len(steps) - 1)
+    low = position.floor().long().clamp(max=len(steps) - 2)
+    return torch.lerp(steps[low], steps[low + 1], (position - low).unsqueeze(-1))
 
 
 def _thinned(values: Tensor) -> Tensor:
@@ -258,15 +228,15 @@ def _thinned(values: Tensor) -> Tensor:
     return values[:: max(1, len(values) // 1_000_000)]
 
 
-def _scaled_height(picture: Picture, width: int) -> int:
-    return max(1, round(picture.image.shape[0] * width / picture.image.shape[1]))
+def _scaled_height(panel: GalleryImage, width: int) -> int:
+    return max(1, round(panel.image.shape[0] * width / panel.image.shape[1]))
 
 
-def _resized(picture: Picture, width: int) -> Image.Image:
+def _resized(panel: GalleryImage, width: int) -> Image.Image:
     """A photo smoothly, a chart without mixing its colours."""
-    method = Image.Resampling.LANCZOS if picture.kind == "photo" else Image.Resampling.NEAREST
-    image = Image.fromarray(picture.image.cpu().numpy())
-    return image.resize((width, _scaled_height(picture, width)), method)
+    method = Image.Resampling.LANCZOS if panel.kind == "photo" else Image.Resampling.NEAREST
+    image = Image.fromarray(panel.image.cpu().numpy())
+    return image.resize((width, _scaled_height(panel, width)), method)
 
 
 def _fitting(

@@ -1,0 +1,196 @@
+"""The page of a segmentation: what is told, and in which order."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from splatseg.core import UNLABELLED, ClassTable, Labels
+from splatseg.evaluate.metrics import SemanticScore
+from splatseg.evaluate.overlaps import InstanceScore
+from splatseg.report._common import count_text
+from splatseg.report._segment_panels import ViewPanel, gallery
+from splatseg.report._segment_tables import (
+    association_tables,
+    confidence_bars,
+    conflict_tables,
+    coverage_bars,
+    fact_rows,
+    id_table,
+    support_table,
+)
+from splatseg.report.html import Block, Commands, Figure, Legend, Report, Table
+
+_LEGEND = 40
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SegmentationReportData:
+    """Everything that the report of a segmentation tells."""
+
+    layer: str
+    """Its name."""
+
+    labels: Labels
+    classes: ClassTable
+    """Names and colours of the ids in use."""
+
+    panels: tuple[ViewPanel, ...]
+    """Views that are shown."""
+
+    compared: tuple[ViewPanel, ...]
+    """Views whose evidence was compared with the layer."""
+
+    seen: Int[Tensor, "n"]
+    """In how many views each Gaussian is seen."""
+
+    seen_of: int
+    """Views that were looked at for it."""
+
+    views: int
+    """Views that the layer was made from."""
+
+    score: SemanticScore | InstanceScore | None = None
+    """Of the views shown that have a truth, the held-out ones where there are some."""
+
+    scored: str = ""
+    """What was scored, in words: ``3 held-out views``."""
+
+    evidence_has_same_ids: bool = True
+    truth_names: dict[int, int] | None = None
+    """Ids of the layer by true id, where they differ."""
+
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Seconds by step."""
+
+    peak_bytes: int | None = None
+    """Largest resident memory of the process."""
+
+    command: str = ""
+    tree: tuple[Block, ...] = ()
+    """What there is to show of the levels above and below, see `tree_section`."""
+
+    facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+
+def segmentation_page(data: SegmentationReportData, *, longest: int) -> Report:
+    """The page.
+
+    Args:
+        data: The segmentation.
+        longest: Longest side of the pictures, pixels.
+    """
+    labels = data.labels
+    blocks: list[Block] = []
+    if data.panels:
+        blocks.append(
+            gallery(
+                data.panels,
+                data.classes,
+                truth_names=data.truth_names,
+                evidence_has_same_ids=data.evidence_has_same_ids,
+                longest=longest,
+            )
+        )
+        blocks.append(_legend(data))
+    blocks += data.tree
+    blocks += [support_table(labels), confidence_bars(labels)]
+    if data.seen_of:
+        blocks.append(coverage_bars(data.seen, views=data.seen_of))
+    blocks += conflict_tables(labels, data.compared, data.classes)
+    blocks += association_tables(labels.metadata)
+    scores = data.score.per_class if isinstance(data.score, SemanticScore) else {}
+    blocks.append(id_table(labels, data.classes, scores=scores, scored=data.scored))
+    blocks += _cost(data)
+    if data.command:
+        blocks.append(Commands(title="The same from the shell", lines=(data.command,)))
+    method = labels.metadata.get("method", "unknown")
+    return Report(
+        title=f"Segmentation {data.layer}",
+        summary=f"{len(data.classes.rows)} labels on {count_text(len(labels))} Gaussians, by "
+        f"{method} from {data.views} views. "
+        + (f"Scores are of {data.scored}." if data.scored else "There is no truth to score."),
+        figures=_figures(data),
+        blocks=tuple(blocks),
+        facts=data.facts,
+    )
+
+
+def _legend(data: SegmentationReportData) -> Legend:
+    """The labels that are seen most in the pictures."""
+    pixels: dict[int, int] = {}
+    for panel in data.panels:
+        ids, counts = torch.unique(panel.drawn, return_counts=True)
+        for id, count in zip(ids.tolist(), counts.tolist(), strict=True):
+            pixels[id] = pixels.get(id, 0) + count
+    ids = sorted((id for id in pixels if id != UNLABELLED), key=lambda id: (-pixels[id], id))
+    rows = {row.id: row for row in data.classes.rows}
+    kept = [rows[id] for id in ids[:_LEGEND] if id in rows]
+    more = f", the {len(kept)} seen most of {len(ids)}" if len(ids) > len(kept) else ""
+    return Legend(classes=ClassTable(rows=tuple(kept)), title=f"Colours of the labels{more}")
+
+
+def _figures(data: SegmentationReportData) -> tuple[Figure, ...]:
+    labels, score = data.labels, data.score
+    labelled = labels.ids != UNLABELLED
+    share = float(labelled.double().mean()) if len(labels) else 0.0
+    figures = [
+        Figure(
+            label="Gaussians with a label",
+            value=f"{share:.1%}",
+            note=f"{count_text(int(labelled.sum()))} of {count_text(len(labels))}",
+        ),
+        Figure(label="Labels", value=str(len(data.classes.rows)), note="ids in use"),
+    ]
+    if bool(labelled.any()):
+        mean = float(labels.confidence[labelled].double().mean())
+        figures.append(
+            Figure(label="Confidence", value=f"{mean:.3f}", note="mean of those with a label")
+        )
+    if data.compared:
+        pixels = sum(s.agreement.pixels for s in data.compared if s.agreement is not None)
+        differ = sum(
+            s.agreement.pixels * s.agreement.differ
+            for s in data.compared
+            if s.agreement is not None
+        )
+        figures.append(
+            Figure(
+                label="Evidence that differs from the layer",
+                value=f"{differ / max(pixels, 1):.1%}",
+                note=f"of the pixels of {len(data.compared)} views",
+            )
+        )
+    if isinstance(score, SemanticScore):
+        figures.append(
+            Figure(label="mIoU", value=f"{score.miou:.3f}", note=f"pooled, {data.scored}")
+        )
+    elif score is not None:
+        figures.append(
+            Figure(
+                label="mIoU of instances",
+                value=f"{score.miou:.3f}",
+                note=f"matched one to one, {data.scored}",
+            )
+        )
+    return tuple(figures)
+
+
+def _cost(data: SegmentationReportData) -> list[Table]:
+    rows: list[tuple[str, str]] = [
+        (step, f"{seconds:.1f} s") for step, seconds in data.timings.items()
+    ]
+    if len(data.timings) > 1:
+        rows.append(("together", f"{sum(data.timings.values()):.1f} s"))
+    if data.peak_bytes is not None:
+        rows.append(("largest memory", f"{data.peak_bytes / 2**30:.2f} GiB resident"))
+    tables = [Table(title="What it cost", columns=("what", "value"), rows=tuple(rows))]
+    options = fact_rows(data.labels.metadata.get("options"))
+    if options:
+        tables.append(
+            Table(title="Options of the method", columns=("option", "value"), rows=tuple(options))
+        )
+    return [table for table in tables if table.rows]
