@@ -227,16 +227,16 @@ def test_the_slope_in_the_projected_centres(rng, antialiased):
     options = RenderOptions(antialiased=antialiased)
     slopes = torch.randn(camera.height, camera.width, 3, generator=generator, dtype=torch.float64)
 
-    def loss(scene, camera, name, screen=None):
+    def loss(scene, camera, name, screen_offsets=None):
         backend = get_backend(name)
-        drawn = backend.render(scene, camera, None, options=options, screen=screen)
+        drawn = backend.render(scene, camera, None, options=options, screen_offsets=screen_offsets)
         return (drawn.image * slopes.to(drawn.image)).sum()
 
     found = {}
     for name, typed in (("reference", scene), ("cpu", scene.to(dtype=torch.float32))):
-        screen = torch.zeros_like(typed.means[:, :2]).requires_grad_()
-        loss(typed, camera, name, screen).backward()
-        found[name] = screen.grad.double()
+        screen_offsets = torch.zeros_like(typed.means[:, :2]).requires_grad_()
+        loss(typed, camera, name, screen_offsets).backward()
+        found[name] = screen_offsets.grad.double()
     reference = found["reference"]
     assert (found["cpu"] - reference).norm() <= 1e-4 * reference.norm()
 

@@ -55,14 +55,15 @@ class BackendView(ABC):
         self,
         signal: Float[Tensor, "n channels"] | None = None,
         *,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
 
         Args:
             signal: One row a Gaussian.
-            screen: Zeros, added to the projected centres, pixels: a leaf whose gradient is that
-                towards the centres on the image, which densification looks at.
+            screen_offsets: Zeros, added to the projected centres, pixels: a leaf whose gradient
+                is that of the projected centres (gsplat's ``means2d``), which densification
+                needs.
         """
 
     @abstractmethod
@@ -129,11 +130,11 @@ class Backend(ABC):
         signal: Float[Tensor, "n channels"] | None,
         *,
         options: RenderOptions,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """`BackendView.render` of a view that is used once."""
         with self.prepare(gaussians, camera, options=options) as view:
-            return view.render(signal, screen=screen)
+            return view.render(signal, screen_offsets=screen_offsets)
 
     def back_project(
         self,

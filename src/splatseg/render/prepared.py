@@ -27,7 +27,7 @@ from splatseg.render._values import (
     SparseImage,
 )
 from splatseg.render._view_weights import ViewWeights
-from splatseg.render.warp import WarpMode, straightened, warp_into_photograph
+from splatseg.render.warp import WarpMode, undistorted_camera, warp_into_photograph
 
 
 def prepare(
@@ -80,7 +80,7 @@ class PreparedView:
         """Take what `prepare` checked; nothing is projected before it is needed."""
         self._count = len(gaussians)
         self._camera = camera
-        self._view = backend.prepare(gaussians, straightened(camera), options=options)
+        self._view = backend.prepare(gaussians, undistorted_camera(camera), options=options)
 
     def __enter__(self) -> Self:
         return self
@@ -245,7 +245,7 @@ def _in_pinhole_image(camera: Camera, image: SparseImage) -> SparseImage:
     """The image in pinhole pixels, by the nearest warp, and how many pixels fell into each."""
     every = camera.pixel_centres().reshape(-1, 2).floor().long()
     source, valid = warp_into_photograph(camera, "nearest").nearest_sources(every)
-    pinhole = straightened(camera)
+    pinhole = undistorted_camera(camera)
     count = image.count + 1
     pixel = torch.where(valid, source[:, 1] * pinhole.width + source[:, 0], 0)
     row = torch.repeat_interleave(torch.arange(len(every)), image.indptr.diff())

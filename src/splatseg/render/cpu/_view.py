@@ -16,7 +16,7 @@ from splatseg import _native
 from splatseg.core import Camera
 from splatseg.render._options import RenderOptions
 
-NARROW = 3
+MAX_COLOUR_CHANNELS = 3
 """Signals of up to this many channels ride in the colour kernel."""
 
 _LANES = 16
@@ -34,7 +34,7 @@ class SceneGradients:
     opacities: Float[Tensor, "n"] | None
     sh: Float[Tensor, "n coefficients 3"] | None
     signal: Float[Tensor, "n channels"] | None
-    screen: Float[Tensor, "n 2"] | None
+    screen_offsets: Float[Tensor, "n 2"] | None
     """Towards the projected centres, per pixel: what densification looks at."""
 
     cam_from_world: Float[Tensor, "4 4"] | None
@@ -226,7 +226,7 @@ class CpuView:
         v_alpha: Float[Tensor, "height width"] | None = None,
         v_depth_sum: Float[Tensor, "height width"] | None = None,
         wanted: frozenset[str] = frozenset(
-            ("means", "rotations", "scales", "opacities", "sh", "screen")
+            ("means", "rotations", "scales", "opacities", "sh", "screen_offsets")
         ),
     ) -> SceneGradients:
         """Gradients of ``<v_image, image> + <v_alpha, alpha> + <v_depth_sum, depth_sum>``.
@@ -255,11 +255,15 @@ class CpuView:
 
         use_sh = "sh" in wanted and self._sh is not None and self._wide is None
         means, rotations, scales = zeros("means", 3), zeros("rotations", 4), zeros("scales", 3)
-        opacities, screen = zeros("opacities"), zeros("screen", 2)
+        opacities, screen_offsets = zeros("opacities"), zeros("screen_offsets", 2)
         sh = _zeros(*self._sh.shape) if use_sh and self._sh is not None else None
         pose = torch.zeros(15, dtype=torch.float64) if "pose" in wanted else None
-        if any(x is not None for x in (means, rotations, scales, opacities, sh, screen, pose)):
-            self._view.chain(self._cloud, means, rotations, scales, opacities, sh, screen, pose)
+        if any(
+            x is not None for x in (means, rotations, scales, opacities, sh, screen_offsets, pose)
+        ):
+            self._view.chain(
+                self._cloud, means, rotations, scales, opacities, sh, screen_offsets, pose
+            )
         return SceneGradients(
             means=means,
             rotations=rotations,
@@ -267,7 +271,7 @@ class CpuView:
             opacities=opacities,
             sh=sh,
             signal=v_signal,
-            screen=screen,
+            screen_offsets=screen_offsets,
             cam_from_world=None if pose is None else self._pose_gradient(pose),
         )
 

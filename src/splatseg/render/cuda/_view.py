@@ -156,7 +156,7 @@ class CudaView:
             columns.append(column)
         return torch.cat(columns, dim=1)
 
-    def only_seen(self, of_rows: Callable[[Tensor], Tensor]) -> Tensor:
+    def for_visible(self, of_rows: Callable[[Tensor], Tensor]) -> Tensor:
         """A column computed for the rows that are seen, 0 for the others.
 
         The others are left out of the formula, so that they give no NaN gradients.
@@ -215,4 +215,4 @@ def colours(view: CudaView, gaussians: Gaussians, camera: Camera, degree: int | 
         directions = rays / torch.linalg.vector_norm(rays, dim=1, keepdim=True)
         return evaluate_sh(gaussians.sh[rows], directions, degree=degree)
 
-    return view.only_seen(of_rows)
+    return view.for_visible(of_rows)

@@ -68,13 +68,13 @@ class ReferenceView(BackendView):
         self,
         signal: Float[Tensor, "n channels"] | None = None,
         *,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
         gaussians, camera, options = self._gaussians, self._camera, self._options
-        projected = self._project(graph=needs_graph(gaussians, camera, signal, screen))
-        if screen is not None:
-            moved = projected.centres + screen[projected.ids].double()
+        projected = self._project(graph=needs_graph(gaussians, camera, signal, screen_offsets))
+        if screen_offsets is not None:
+            moved = projected.centres + screen_offsets[projected.ids].double()
             projected = replace(projected, centres=moved)
         if signal is None:
             signal = _colours(gaussians, camera, projected, degree=options.sh_degree)
