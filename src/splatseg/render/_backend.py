@@ -30,7 +30,7 @@ from splatseg.render._view_weights import ImageWeights, ViewWeights
 Layout = Literal["csr", "blocks"]
 
 _CHANNELS = 64
-"""Channels of a sparse image that are spelt out at a time, where no kernel takes it as it is."""
+"""Channels of a sparse image that are made dense at a time, where there is no sparse kernel."""
 
 
 class BackendView(ABC):
@@ -48,7 +48,7 @@ class BackendView(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Give back what it holds. The view cannot be used afterwards."""
+        """Release its memory. The view cannot be used afterwards."""
 
     @abstractmethod
     def render(
@@ -57,7 +57,7 @@ class BackendView(ABC):
         *,
         screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+        """``W @ signal``; None is the colour of the SH. Differentiable in torch.
 
         Args:
             signal: One row a Gaussian.
@@ -121,7 +121,7 @@ class Backend(ABC):
     def prepare(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
     ) -> BackendView:
-        """A view, for any number of products."""
+        """A prepared view, for any number of products."""
 
     def render(
         self,

@@ -64,11 +64,11 @@ class _Render(torch.autograd.Function):
         return image, alpha, depth_sum, median
 
     @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         view = cast(CpuView, ctx.view)
         needs: tuple[bool, ...] = ctx.needs_input_grad
         wanted = frozenset(name for name, need in zip(_INPUTS, needs, strict=False) if need)
-        v_image, v_alpha, v_depth_sum = slopes[:3]
+        v_image, v_alpha, v_depth_sum = v_outputs[:3]
         found = view.backward(
             v_image,
             v_alpha=v_alpha,
@@ -100,7 +100,7 @@ class CpuBackend(Backend):
     def prepare(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
     ) -> "CpuBackendView":
-        """A view, for any number of products."""
+        """A prepared view, for any number of products."""
         return CpuBackendView(gaussians, camera, options)
 
 
@@ -130,7 +130,7 @@ class CpuBackendView(BackendView):
         *,
         screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+        """``W @ signal``; None is the colour of the SH. Differentiable in torch.
 
         `screen_offsets` is not added, only given its gradient: expected are zeros.
         """
@@ -139,7 +139,7 @@ class CpuBackendView(BackendView):
         elif signal is not None and signal.shape[1] > MAX_COLOUR_CHANNELS:
             found = self._prepared().render(signal)
         else:
-            # Colours ride in the projected Gaussians: the first ones are projected with them.
+            # Colours are stored with the projected Gaussians: the first are projected with them.
             fresh = self._view is None
             sh = self._gaussians.sh if signal is None else None
             view = self._prepared(sh=sh, signal=signal)

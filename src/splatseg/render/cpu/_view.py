@@ -17,7 +17,7 @@ from splatseg.core import Camera
 from splatseg.render._options import RenderOptions
 
 MAX_COLOUR_CHANNELS = 3
-"""Signals of up to this many channels ride in the colour kernel."""
+"""Signals of up to this many channels use the colour kernel."""
 
 _LANES = 16
 _free_views: list[_native.View] = []
@@ -35,7 +35,7 @@ class SceneGradients:
     sh: Float[Tensor, "n coefficients 3"] | None
     signal: Float[Tensor, "n channels"] | None
     screen_offsets: Float[Tensor, "n 2"] | None
-    """Towards the projected centres, per pixel: what densification looks at."""
+    """With respect to the projected centres, per pixel, for densification."""
 
     cam_from_world: Float[Tensor, "4 4"] | None
 
@@ -71,7 +71,7 @@ class CpuView:
         means, rotations, scales, opacities: Columns of `core.Gaussians`, on the CPU.
         camera: A pinhole camera.
         options: Switches of the blending model.
-        sh: Harmonics whose colour is rendered where no signal is given.
+        sh: Spherical harmonics, rendered where no signal is given.
         signal: A signal (n, up to 3) that takes their place.
 
     Values are not checked; rows that are not finite are left out rather than drawn.
@@ -116,7 +116,7 @@ class CpuView:
         self._wide: Tensor | None = None
 
     def _colour_with(self, sh: Tensor | None, signal: Tensor | None) -> int:
-        """What the Gaussians' colours are made of; gives the degree of the harmonics in use."""
+        """Set the source of the colours; returns the degree of the spherical harmonics in use."""
         self._narrow = 3 if signal is None else signal.shape[1]
         self._sh = None if sh is None else _plain(sh)
         self._cloud = _native.Cloud(
@@ -133,7 +133,7 @@ class CpuView:
         sh: Float[Tensor, "n coefficients 3"] | None = None,
         signal: Float[Tensor, "n channels"] | None = None,
     ) -> None:
-        """Take other harmonics or another narrow signal; the projection stays as it is.
+        """Take other spherical harmonics or another narrow signal; the projection stays as it is.
 
         Only for renders without a record: the backward pass knows the colours of the start.
         """
@@ -276,7 +276,7 @@ class CpuView:
         )
 
     def _pose_gradient(self, sums: Tensor) -> Tensor:
-        """From the rows of [R | t] and the camera centre c = -R^T t, which harmonics look from."""
+        """From the rows of [R | t] and the camera centre c = -R^T t, where SH directions begin."""
         gradient = torch.zeros(4, 4, dtype=torch.float64)
         gradient[:3] = sums[:12].reshape(3, 4)
         v_centre = sums[12:]

@@ -49,7 +49,7 @@ class CudaBackend(Backend):
     def prepare(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
     ) -> "CudaBackendView":
-        """A view, for any number of products.
+        """A prepared view, for any number of products.
 
         Raises:
             BackendError: If the options ask for what gsplat cannot do.
@@ -97,7 +97,7 @@ class CudaBackendView(BackendView):
         *,
         screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        """``W @ signal``; None is the colour of the SH. Differentiable in torch."""
         home, dtype = self._gaussians.device, self._gaussians.dtype
         graph = needs_graph(self._gaussians, self._camera, screen_offsets)
         gaussians, view = self._on_device(graph=graph)
