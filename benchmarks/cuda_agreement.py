@@ -100,14 +100,14 @@ def relative(a: Tensor, b: Tensor) -> float:
     return float(torch.linalg.vector_norm(a - b) / torch.linalg.vector_norm(b).clamp_min(1e-30))
 
 
-def gradients(name: str, scene: Gaussians, camera: Camera, slope: Tensor) -> dict[str, Tensor]:
+def gradients(name: str, scene: Gaussians, camera: Camera, v_image: Tensor) -> dict[str, Tensor]:
     """Of a random functional of colour, alpha and depth, towards everything."""
     leaves = {c: getattr(scene, c).clone().requires_grad_() for c in COLUMNS}
     pose = camera.cam_from_world.clone().requires_grad_()
     moved = replace(camera, cam_from_world=pose)
     drawn = get_backend(name).render(scene.replace(**leaves), moved, None, options=OPTIONS)
-    loss = (drawn.image * slope[..., :3]).sum() + (drawn.alpha * slope[..., 3]).sum()
-    (loss + (drawn.depth * slope[..., 4]).sum()).backward()
+    loss = (drawn.image * v_image[..., :3]).sum() + (drawn.alpha * v_image[..., 3]).sum()
+    (loss + (drawn.depth * v_image[..., 4]).sum()).backward()
     return {c: leaf.grad for c, leaf in leaves.items()} | {"pose": pose.grad}
 
 
@@ -140,8 +140,8 @@ def agreement(scene: Gaussians, camera: Camera, rng: np.random.Generator) -> boo
         good &= gap < (1e-5 if name == "cpu" else 1e-3)
         print(f"  identity {name:<5} |<Wf,g> - <f,W'g>| / sum |Wf g| = {gap:.2e}")
 
-    slope = _float(rng.normal(size=(*size, 5)))
-    both = [gradients(name, scene, camera, slope) for name in ("cpu", "cuda")]
+    v_image = _float(rng.normal(size=(*size, 5)))
+    both = [gradients(name, scene, camera, v_image) for name in ("cpu", "cuda")]
     for name, expected in both[0].items():
         error = relative(both[1][name], expected)
         good &= error < 5e-3

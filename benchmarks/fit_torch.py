@@ -258,7 +258,7 @@ def main() -> None:
     options = FitOptions(
         minutes=None, steps=10 * (arguments.before + arguments.our_steps),
         max_gaussians=arguments.gaussians, background="black", noise=0.0, quarter_until=0.0,
-        half_until=0.0, degree_interval=1e-9, grow_until=0.05,
+        half_until=0.0, sh_degree_interval=1e-9, grow_until=0.05,
     )  # fmt: skip
     photographs = Photographs(capture.train_views, longest=options.longest)
     run = FitRun(capture, options, get_backend("cpu"), photographs)

@@ -128,7 +128,7 @@ def fit_large(folder: Path) -> None:
     before = peak_gb()
     options = FitOptions(
         minutes=None, steps=24, max_gaussians=1_000_000, quarter_until=0.0, half_until=0.0,
-        densify_from=6, densify_every=6, degree_interval=0.01,
+        densify_from=6, densify_every=6, sh_degree_interval=0.01,
     )  # fmt: skip
     checkpoints = Checkpoints(path=folder / "checkpoint", steps=8)
     result = fit(capture, options=options, backend="cpu", checkpoints=checkpoints)

@@ -46,7 +46,7 @@ def ring_camera(
     fy: float = 60.0,
     **lens: object,
 ) -> Camera:
-    """A camera 3.2 from the middle, looking at it, a bit up and down as it goes round."""
+    """A camera 3.2 from the centre, directed at it, at varying heights around it."""
     centre = np.array([np.cos(angle), np.sin(angle), 0.4 * np.sin(3 * angle)])
     centre = 3.2 * centre / np.linalg.norm(centre)
     forward = -centre / np.linalg.norm(centre)
@@ -159,5 +159,5 @@ def photograph(tmp_path: Path) -> CaptureMaker:
 
 @pytest.fixture
 def scene_photographed() -> Gaussians:
-    """What `photograph` shows unless told otherwise."""
+    """What `photograph` shows by default."""
     return tiny_scene()

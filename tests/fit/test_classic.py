@@ -18,7 +18,7 @@ OPTIONS = FitOptions(strategy="classic", densify_gradient=0.1, clone_scale=0.01)
 
 
 def _parameters(scales, opacities=None) -> Parameters:
-    """Balls of these scales beside each other, with an opacity of a half unless said."""
+    """Balls of these scales beside each other, with an opacity of 0.5 by default."""
     count = len(scales)
     opacities = torch.full((count,), 0.5) if opacities is None else torch.tensor(opacities)
     rotations = torch.zeros(count, 4)
@@ -33,16 +33,16 @@ def _parameters(scales, opacities=None) -> Parameters:
 
 
 def _moments(like: Parameters) -> tuple[Parameters, Parameters]:
-    """No row is 0, so that a moment that was kept is told from a fresh one."""
+    """No row is 0, so that a moment that was kept is distinguished from a fresh one."""
     ones = Parameters(**{name: torch.ones_like(tensor) for name, tensor in like.tensors()})
     return ones, ones.rows(torch.arange(len(ones)))
 
 
-def _statistics(slopes, views=None, radii=None) -> ScreenStatistics:
-    views = [1.0] * len(slopes) if views is None else views
-    radii = [0.0] * len(slopes) if radii is None else radii
+def _statistics(per_view, views=None, radii=None) -> ScreenStatistics:
+    views = [1.0] * len(per_view) if views is None else views
+    radii = [0.0] * len(per_view) if radii is None else radii
     return ScreenStatistics(
-        gradients=torch.tensor(slopes), views=torch.tensor(views), radii=torch.tensor(radii)
+        gradients=torch.tensor(per_view), views=torch.tensor(views), radii=torch.tensor(radii)
     )
 
 
@@ -146,7 +146,7 @@ def test_how_low_a_reset_goes_is_asked_for():
     options = replace(options, reset_every=15)
     classic = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
     start = _parameters([0.1, 0.1], opacities=[0.1, 0.9])
-    found, _, _ = classic.after(
+    found, _, _ = classic.after_step(
         (start, *_moments(start)), steps=15, progress=0.14, generator=torch.Generator()
     )
     assert found.logits.sigmoid().squeeze(1).tolist() == pytest.approx([0.1, 0.2])
@@ -159,7 +159,7 @@ def test_a_scene_is_never_emptied():
 
 def test_a_reset_lowers_opacities_and_forgets_their_moments():
     start = _parameters([0.1, 0.1], opacities=[0.008, 0.9])
-    reset, first, second = with_reset_opacities(start, *_moments(start), most=0.01)
+    reset, first, second = with_reset_opacities(start, *_moments(start), max_opacity=0.01)
     assert reset.logits.sigmoid().squeeze(1).tolist() == pytest.approx([0.008, 0.01])
     assert start.logits.sigmoid()[1] == pytest.approx(0.9)
     for moment in (first, second):
@@ -167,7 +167,7 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments():
         assert moment.means.all()
 
 
-def test_slopes_count_in_half_image_sides_and_radii_are_three_deviations():
+def test_gradients_are_in_half_image_sides_and_radii_three_standard_deviations():
     statistics = ScreenStatistics.zeros(3, torch.device("cpu"))
     camera = Camera(
         width=200, height=100, fx=80.0, fy=50.0, cx=100, cy=50, cam_from_world=torch.eye(4).double()
@@ -176,9 +176,9 @@ def test_slopes_count_in_half_image_sides_and_radii_are_three_deviations():
         means=torch.tensor([[0.0, 0, 4], [0, 0, 2], [0, 0, 8]])
     )
     rows = torch.tensor([0, 2])
-    slopes = torch.tensor([[0.03, 0.0], [0.0, 0.04]])
-    statistics.add(rows, slopes, camera=camera, parameters=parameters)
-    statistics.add(rows[:1], slopes[:1], camera=camera, parameters=parameters)
+    per_view = torch.tensor([[0.03, 0.0], [0.0, 0.04]])
+    statistics.add(rows, per_view, camera=camera, parameters=parameters)
+    statistics.add(rows[:1], per_view[:1], camera=camera, parameters=parameters)
     assert statistics.gradients.tolist() == pytest.approx([6.0, 0.0, 2.0])
     assert statistics.views.tolist() == [2, 0, 1]
     # 3 * 80 * 0.5 / 4 and 3 * 80 * 0.25 / 8
@@ -202,7 +202,7 @@ def test_when_rounds_and_resets_come():
         classic = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
         start = _parameters([0.1, 0.1], opacities=[0.001, 0.9])
         state = (start, *_moments(start))
-        found, _, _ = classic.after(
+        found, _, _ = classic.after_step(
             state, steps=steps, progress=(steps - 1) / 100, generator=generator
         )
         return len(found), float(found.logits.sigmoid().max())
@@ -221,13 +221,13 @@ def test_statistics_go_on_after_a_restore():
     options = FitOptions(strategy="classic", steps=100, minutes=None, reset_every=41)
     one = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
     start = _parameters([0.1, 0.1])
-    state = one.after(
+    state = one.after_step(
         (start, *_moments(start)), steps=41, progress=0.4, generator=torch.Generator()
     )
     camera = Camera(
         width=2, height=2, fx=1.0, fy=1.0, cx=1, cy=1, cam_from_world=torch.eye(4).double()
     )
-    one.see(torch.tensor([1]), torch.ones(1, 2), camera=camera, parameters=state[0])
+    one.add_view(torch.tensor([1]), torch.ones(1, 2), camera=camera, parameters=state[0])
     other = Classic(options, start=2, extent=EXTENT, device=torch.device("cpu"))
     other.restore(one.state())
     assert other.state().keys() == {"gradients", "views", "radii", "resets"}

@@ -63,10 +63,10 @@ def test_a_scene_is_written_and_scored(folder: Path, tmp_path: Path, capsys) -> 
     scene_path = tmp_path / "scene"
     words = ["fit", str(folder), "-o", str(scene_path), "--steps", "60", "--seed", "4"]
     assert main([*words, "--max-gaussians", "80"]) == 0
-    said = capsys.readouterr().out
-    assert str(scene_path) in said
-    assert "11 training views, 3 held out, 60 start points" in said
-    assert "dB on 3 held-out views" in said
+    output = capsys.readouterr().out
+    assert str(scene_path) in output
+    assert "11 training views, 3 held out, 60 start points" in output
+    assert "dB on 3 held-out views" in output
 
     scene = load_scene(scene_path)
     assert 0 < len(scene.gaussians) <= 80
@@ -134,9 +134,9 @@ def test_ctrl_c_leaves_a_scene_that_loads(folder: Path, tmp_path: Path, capsys) 
     status = main(["fit", str(folder), "-o", str(tmp_path / "scene"), "--minutes", "5"])
     timer.join()
     assert status == 1
-    said = capsys.readouterr().out
-    assert "Gaussians stopped after" in said
-    assert "the same command with --resume goes on" in said
+    output = capsys.readouterr().out
+    assert "Gaussians stopped after" in output
+    assert "the same command with --resume goes on" in output
     scene = load_scene(tmp_path / "scene")
     assert scene.provenance["interrupted"] is True
     scene.gaussians.check_values()
@@ -206,9 +206,9 @@ def test_a_stopped_fit_is_resumed_or_begun_again(folder: Path, tmp_path: Path, c
     assert f"its fit was stopped at step {steps} (" in capsys.readouterr().out
 
     assert main([*words, "--minutes", "5"]) == 2
-    said = capsys.readouterr().err
-    assert f"got a fit that was stopped at step {steps} (" in said
-    assert "--resume continues it, --overwrite begins again" in said
+    output = capsys.readouterr().err
+    assert f"got a fit that was stopped at step {steps} (" in output
+    assert "--resume continues it, --overwrite begins again" in output
     assert main([*words, "--steps", str(steps + 9), "--resume", "--seed", "8"]) == 2
     assert "seed 0 instead of 8" in capsys.readouterr().err
     assert main([*words, "--resume", "--overwrite"]) == 2
@@ -256,13 +256,13 @@ def test_a_fit_that_an_older_build_left_stopped(
         assert main([*words, "--keep-checkpoint"]) == 0
     capsys.readouterr()
     assert main([*words, "--resume"]) == 2
-    said = capsys.readouterr().err
-    assert "this fit cannot be resumed" in said
-    assert len(said.strip().splitlines()) == 1
+    output = capsys.readouterr().err
+    assert "this fit cannot be resumed" in output
+    assert len(output.strip().splitlines()) == 1
     assert main(words) == 2
-    said = capsys.readouterr().err
-    assert "was stopped by another splatseg and cannot be resumed; --overwrite begins" in said
-    assert "--resume" not in said
+    output = capsys.readouterr().err
+    assert "was stopped by another splatseg and cannot be resumed; --overwrite begins" in output
+    assert "--resume" not in output
     assert main([*words, "--overwrite"]) == 0
 
 
@@ -277,9 +277,9 @@ def test_a_folder_with_a_checkpoint_alone_is_known(folder: Path, tmp_path: Path,
     (scene / ".splatseg-rest").mkdir()
     capsys.readouterr()
     assert main(["info", str(scene)]) == 0
-    said = capsys.readouterr().out
-    assert "unfinished fit, 100 % done: " in said
-    assert "Gaussians after 20 steps" in said
+    output = capsys.readouterr().out
+    assert "unfinished fit, 100 % done: " in output
+    assert "Gaussians after 20 steps" in output
     assert main([*words, "--resume"]) == 0
     assert load_scene(scene).provenance["steps"] == 20
     (scene / "scene.json").unlink()

@@ -1,4 +1,4 @@
-"""Relocation keeps the picture, and nothing given is changed."""
+"""Relocation keeps the render, and the arguments are not changed."""
 
 import pytest
 import torch

@@ -68,17 +68,17 @@ def test_the_gradient_is_that_of_the_value(tmp_path: Path, rng: np.random.Genera
     maps = _maps(tmp_path, rng.uniform(1, 9, (6, 8)), width=8, height=6)
     drawn = torch.from_numpy(rng.uniform(1, 9, (6, 8))).float()
     alpha = torch.ones(6, 8)
-    slope = maps.loss(0, drawn, alpha, progress=0.3).gradient
+    depth_gradient = maps.loss(0, drawn, alpha, progress=0.3).gradient
     move = torch.from_numpy(rng.normal(size=(6, 8))).float()
     h = 1e-3
     up, down = (maps.loss(0, drawn + s * h * move, alpha, progress=0.3).value for s in (1, -1))
-    assert (up - down) / (2 * h) == pytest.approx(float((slope * move).sum()), rel=2e-2)
+    assert (up - down) / (2 * h) == pytest.approx(float((depth_gradient * move).sum()), rel=2e-2)
 
 
 def test_a_gaussian_before_the_lens_does_not_drown_the_rest(tmp_path: Path) -> None:
     maps = _maps(tmp_path, np.full((1, 2), 4.0), width=2, height=1)
     loss = maps.loss(0, torch.tensor([[1e-6, 8.0]]), torch.ones(1, 2), progress=0.0)
-    # At a tenth of the median the slope is 4 / 0.4^2, and no more below.
+    # At a tenth of the median the gradient is 4 / 0.4^2, and no more below.
     assert float(loss.gradient[0, 0]) == pytest.approx(-0.25 * 4 / 0.16)
     assert loss.value == pytest.approx(0.25 * (10 - 1 + 0.5))
 

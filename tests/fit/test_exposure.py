@@ -13,11 +13,11 @@ from splatseg.fit._exposure import Exposures
 OPTIONS = FitOptions(minutes=None, steps=1, exposure=True, exposure_rate=0.1, exposure_prior=0.0)
 
 
-def _one_step(exposures: Exposures, index: int, slope: torch.Tensor) -> None:
-    """A step along the loss <slope, picture> of a picture of one half, covered by a quarter."""
+def _one_step(exposures: Exposures, index: int, gradient: torch.Tensor) -> None:
+    """A step along the loss <gradient, image> of an image of 0.5 with an alpha of 0.25."""
     image = torch.full((2, 3, 3), 0.5)
-    picture = exposures.applied(index, image, torch.full((2, 3), 0.25))
-    picture.backward(slope)
+    rendered = exposures.applied(index, image, torch.full((2, 3), 0.25))
+    rendered.backward(gradient)
     exposures.update(index, progress=0.0)
 
 
@@ -29,9 +29,9 @@ def test_nothing_is_changed_at_the_start() -> None:
 def test_a_step_by_hand() -> None:
     """Adam's first step is the rate times the sign; what one view gains, all give up a third."""
     exposures = Exposures(3, options=OPTIONS)
-    slope = torch.zeros(2, 3, 3)
-    slope[..., 0], slope[..., 1] = 1.0, -1.0
-    _one_step(exposures, 1, slope)
+    gradient = torch.zeros(2, 3, 3)
+    gradient[..., 0], gradient[..., 1] = 1.0, -1.0
+    _one_step(exposures, 1, gradient)
     step = 0.1
     log_gains = exposures.gains.log()
     expected = torch.tensor([[step / 3] * 3, [-2 * step / 3] * 3, [step / 3] * 3]).double()
@@ -52,13 +52,13 @@ def test_gradients_reach_picture_alpha_and_exposure() -> None:
     gain, bias = exposures.gains[0], exposures.biases[0]
     image = torch.rand(2, 3, 3, dtype=torch.float64).requires_grad_()
     alpha = torch.rand(2, 3, dtype=torch.float64).requires_grad_()
-    slope = torch.rand(2, 3, 3, dtype=torch.float64)
-    exposures.applied(0, image, alpha).backward(slope)
-    assert torch.allclose(image.grad, slope * gain, rtol=1e-6)
-    assert torch.allclose(alpha.grad, (slope * bias).sum(dim=2))
+    gradient = torch.rand(2, 3, 3, dtype=torch.float64)
+    exposures.applied(0, image, alpha).backward(gradient)
+    assert torch.allclose(image.grad, gradient * gain, rtol=1e-6)
+    assert torch.allclose(alpha.grad, (gradient * bias).sum(dim=2))
     found = exposures._leaf.grad
-    assert torch.allclose(found[:3], (slope * image.detach()).sum((0, 1)) * gain)
-    assert torch.allclose(found[3:], (slope * alpha.detach()[..., None]).sum((0, 1)))
+    assert torch.allclose(found[:3], (gradient * image.detach()).sum((0, 1)) * gain)
+    assert torch.allclose(found[3:], (gradient * alpha.detach()[..., None]).sum((0, 1)))
 
 
 def test_a_single_view_has_no_exposure_of_its_own() -> None:
@@ -68,7 +68,7 @@ def test_a_single_view_has_no_exposure_of_its_own() -> None:
 
 
 def test_the_prior_pulls_back() -> None:
-    """Where the picture does not care, what was learned is forgotten."""
+    """Where the image has no gradient, the exposure decays to the identity."""
     options = FitOptions(
         minutes=None, steps=1, exposure=True, exposure_rate=0.01, exposure_prior=1.0
     )
@@ -81,14 +81,14 @@ def test_the_prior_pulls_back() -> None:
 
 
 def test_a_restored_one_goes_on_as_if_nothing_had_been(rng) -> None:
-    slopes = [torch.from_numpy(rng.normal(size=(2, 3, 3))).float() for _ in range(6)]
+    gradients = [torch.from_numpy(rng.normal(size=(2, 3, 3))).float() for _ in range(6)]
     one, other = Exposures(3, options=OPTIONS), Exposures(3, options=OPTIONS)
-    for i, slope in enumerate(slopes[:3]):
-        _one_step(one, i, slope)
+    for i, gradient in enumerate(gradients[:3]):
+        _one_step(one, i, gradient)
     other.restore({name: tensor.clone() for name, tensor in one.state().items()})
-    for i, slope in enumerate(slopes[3:]):
-        _one_step(one, i, slope)
-        _one_step(other, i, slope)
+    for i, gradient in enumerate(gradients[3:]):
+        _one_step(one, i, gradient)
+        _one_step(other, i, gradient)
     assert torch.equal(one.gains, other.gains)
     assert torch.equal(one.biases, other.biases)
 

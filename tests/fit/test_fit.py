@@ -183,7 +183,7 @@ def test_penalties_make_gaussians_faint_and_small(capture: Capture) -> None:
 
 
 def test_harmonics_wait_for_their_turn(capture: Capture) -> None:
-    options = replace(OPTIONS, steps=30, sh_degree=2, degree_interval=0.5)
+    options = replace(OPTIONS, steps=30, sh_degree=2, sh_degree_interval=0.5)
     sh = fit(capture, options=options).gaussians.sh
     assert bool(sh[:, 1:4].any())
     assert not bool(sh[:, 4:].any())
@@ -261,7 +261,7 @@ def test_the_background_is_named() -> None:
 def test_photographs_with_alpha_are_blended_over_the_background(
     capture: Capture, tmp_path: Path, background: object
 ) -> None:
-    """A cut-out over a colour teaches what the same picture over that colour teaches."""
+    """A photograph with alpha over a colour has the loss of the same image over that colour."""
     from PIL import Image
 
     cut_out, blended = [], []

@@ -91,7 +91,7 @@ def test_killed_at_any_moment_nothing_is_lost(
         assert is_scene(scene) or is_unfinished(scene)
         assert ("nothing to go on from" if kill == 0 else "going on from step") in out
         if not (scene / CHECKPOINT_FILE).exists() and at > 0:
-            # It had finished, and was killed while it scored and told.
+            # It had finished, and was killed while it scored and reported.
             assert is_scene(scene)
             break
         now = _steps(scene)

@@ -16,13 +16,13 @@ def spoilt(scene_photographed, photograph, tmp_path):
     capture = photograph()
     views = []
     for number, view in enumerate(capture.views[:3]):
-        picture = load_image(view)
-        third = picture.shape[1] // 3
-        picture[:, :third] = 0
+        pixels = load_image(view)
+        third = pixels.shape[1] // 3
+        pixels[:, :third] = 0
         image, mask = tmp_path / f"{view.name}.png", tmp_path / f"{view.name}_mask.png"
-        keep = torch.ones(picture.shape[:2])
+        keep = torch.ones(pixels.shape[:2])
         keep[:, : third if number else None] = 0
-        save_png(picture, image)
+        save_png(pixels, image)
         save_png(keep, mask)
         views.append(replace(view, image=image, mask=mask))
     return views

@@ -137,7 +137,7 @@ def test_a_thing_is_cut_out_of_its_surroundings(before_a_wall, scene_photographe
         outside.append(float(drawn.alpha[true.alpha < 0.01].mean()))
     assert max(outside) < 0.06, outside
     assert max(errors) < 0.05, errors
-    # Cut out, the pictures are those of the photographs; as they are, the wall is missing.
+    # With alpha, the renders match the photographs; without, the wall is missing.
     as_cut = evaluate_photographs(cut, capture.test_views, masks="alpha")
     as_they_are = evaluate_photographs(cut, capture.test_views)
     assert as_cut.psnr > 20

@@ -10,10 +10,10 @@ from splatseg import _native
 from splatseg.core import Camera
 from splatseg.fit._parameters import (
     Parameters,
+    final_gaussians,
     gathered,
     rows_in_view,
     rows_in_view_torch,
-    settled_gaussians,
 )
 from splatseg.render import RenderOptions, get_backend
 
@@ -55,7 +55,7 @@ def _camera(seed: int) -> Camera:
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_what_is_left_out_does_not_show(seed: int) -> None:
-    """The picture of the rows in view is the picture of all, to the bit."""
+    """The render of the rows in view equals the render of all, to the bit."""
     parameters, camera = _random(seed, 60), _camera(seed)
     backend = get_backend("cpu")
     rows = rows_in_view(parameters, camera, near=0.01)
@@ -144,11 +144,11 @@ def test_settled_gaussians_do_not_depend_on_threads(rng) -> None:
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            found.append(settled_gaussians(parameters))
+            found.append(final_gaussians(parameters))
     finally:
         torch.set_num_threads(before)
     some = torch.arange(3, count, 7)
-    alone = settled_gaussians(parameters.rows(some))
+    alone = final_gaussians(parameters.rows(some))
     plain = parameters.gaussians()
     for name in ("means", "rotations", "scales", "opacities", "sh"):
         first = getattr(found[0], name)

@@ -1,4 +1,4 @@
-"""Photographs as a fit sees them: reduced, masked, straightened."""
+"""Photographs as a fit sees them: downsampled, masked, undistorted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ def test_full_size_is_the_photograph(tmp_path: Path, rng) -> None:
 
 
 def test_blocks_are_means_and_rays_stay(tmp_path: Path, rng) -> None:
-    """A point seen at the middle of a block is seen at the middle of the pixel it becomes."""
+    """A point seen at the centre of a block is seen at the centre of the pixel it becomes."""
     pixels = _pixels(rng, 13, 18)
     photographs = Photographs([_view(tmp_path, pixels)], longest=1600)
     full, small = photographs.camera(0), photographs.example(0, reduction=4)
@@ -59,7 +59,7 @@ def test_a_block_counts_if_all_its_pixels_do(tmp_path: Path, rng) -> None:
     assert small.mask.tolist() == [[True, False], [True, True]]
 
 
-def test_a_lens_is_straightened_with_its_corners(tmp_path: Path, rng) -> None:
+def test_a_lens_is_undistorted_with_its_corners(tmp_path: Path, rng) -> None:
     """A grey photograph stays grey where it is real; outside it nothing counts."""
     pixels = torch.full((30, 40, 3), 120, dtype=torch.uint8)
     view = _view(tmp_path, pixels, model="opencv", distortion=(-0.2,))
@@ -72,7 +72,7 @@ def test_a_lens_is_straightened_with_its_corners(tmp_path: Path, rng) -> None:
     assert not bool(example.photograph[~example.mask].any())
 
 
-def test_straightened_pixels_that_mix_masked_ones_do_not_count(tmp_path: Path) -> None:
+def test_undistorted_pixels_that_mix_masked_ones_do_not_count(tmp_path: Path) -> None:
     """White behind the mask never bleeds into the grey that is learnt from."""
     pixels = torch.full((30, 40, 3), 120, dtype=torch.uint8)
     pixels[:, 25:] = 255

@@ -31,7 +31,7 @@ def _camera(pose: torch.Tensor) -> Camera:
 
 
 def test_the_exponential_by_hand() -> None:
-    """A quarter turn about z; a screw moves along its axis as far as it is told."""
+    """A quarter turn about z; a screw moves along its axis by its pitch."""
     motion = exponential(torch.tensor([0, 0, math.pi / 2, 0, 0, 3.0], dtype=torch.float64))
     expected = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]])
     assert torch.allclose(motion, expected.double(), atol=1e-12)
@@ -62,8 +62,8 @@ def test_pixel_twists_move_the_points_by_a_pixel(rng: np.random.Generator) -> No
         there = replace(camera, cam_from_world=exponential(h * twist) @ camera.cam_from_world)
         return ((there.project(points)[0] - camera.project(points)[0]) / h).reshape(-1)
 
-    slopes = torch.stack([moved(column) for column in twists.T], dim=1)
-    values = torch.linalg.eigvalsh(slopes.T @ slopes / len(points))
+    gradients = torch.stack([moved(column) for column in twists.T], dim=1)
+    values = torch.linalg.eigvalsh(gradients.T @ gradients / len(points))
     # The strongest motion moves by one pixel in the root mean square, none by more.
     assert float(values[-1]) == pytest.approx(1, rel=1e-3)
     assert float(values[0]) > 0
@@ -76,7 +76,7 @@ def test_pixel_twists_move_the_points_by_a_pixel(rng: np.random.Generator) -> No
 
 
 def test_a_step_goes_down_the_slope_by_the_rate(rng: np.random.Generator) -> None:
-    """The first step is as long as the rate says, in pixels, whatever the slope's length."""
+    """The first step is as long as the rate says, in pixels, whatever the gradient's length."""
     camera = _camera(_pose(rng))
     points = camera.unproject(
         torch.from_numpy(rng.uniform(1, 47, (200, 2))), torch.from_numpy(rng.uniform(2, 4, 200))
@@ -146,10 +146,10 @@ def test_a_restored_one_goes_on_as_if_nothing_had_been(rng: np.random.Generator)
     cameras = [_camera(_pose(rng)) for _ in range(2)]
     points = torch.from_numpy(rng.normal(size=(50, 3)) + np.array([0.0, 0.0, 3.0]))
     one, other = (Poses(cameras, points=points, options=OPTIONS) for _ in range(2))
-    slopes = torch.from_numpy(rng.normal(size=(4, 4, 4)))
+    gradients = torch.from_numpy(rng.normal(size=(4, 4, 4)))
 
     def step(poses: Poses, i: int) -> None:
-        (poses.leaf(i % 2, cameras[0]).cam_from_world * slopes[i]).sum().backward()
+        (poses.leaf(i % 2, cameras[0]).cam_from_world * gradients[i]).sum().backward()
         poses.update(i % 2, progress=0.1)
 
     step(one, 0)

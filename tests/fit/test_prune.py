@@ -8,7 +8,7 @@ import torch
 from splatseg.core import Camera, Capture, Gaussians
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
-from splatseg.fit._prune import ViewOfPixels, needed, reduction_for
+from splatseg.fit._prune import MaskedView, needed, reduction_for
 
 
 def _camera(x: float = 0.0, *, width: int = 64, height: int = 48) -> Camera:
@@ -44,17 +44,17 @@ def _gaussians(*rows: tuple[tuple[float, float, float], float, float]) -> Gaussi
 WALL = [((x, y, z), 0.6, 0.99) for z in (10.0, 10.2) for x in range(-9, 10) for y in range(-6, 7)]
 
 
-def _kept(extra: tuple, views: list[ViewOfPixels], **words: object) -> bool:
+def _kept(extra: tuple, views: list[MaskedView], **words: object) -> bool:
     return bool(needed(_gaussians(*WALL, extra), views, backend="cpu", **words)[-1])
 
 
-THREE = [ViewOfPixels(camera=_camera(x)) for x in (-1.0, 0.0, 1.0)]
+THREE = [MaskedView(camera=_camera(x)) for x in (-1.0, 0.0, 1.0)]
 
 
 def test_what_is_seen_stays() -> None:
     kept = needed(_gaussians(*WALL), THREE, backend="cpu")
     front = kept[: len(WALL) // 2].reshape(19, 13)
-    assert bool(front[4:15, 2:11].all()), "in the middle of the pictures"
+    assert bool(front[4:15, 2:11].all()), "in the centre of the images"
     assert _kept(((0.0, 0, 8), 0.2, 0.8), THREE)
 
 
@@ -75,30 +75,30 @@ def test_one_pixel_in_all_is_enough() -> None:
 def test_lone_ones_close_to_a_camera_or_two_go() -> None:
     """Before the wall at 10: nearer than 5 counts as floating, if no third view sees it."""
     ball = ((0.0, 0, 1.0), 0.05, 0.8)
-    one = [ViewOfPixels(camera=_camera(x)) for x in (0.0, 3.0, 6.0)]
+    one = [MaskedView(camera=_camera(x)) for x in (0.0, 3.0, 6.0)]
     assert not _kept(ball, one)
-    assert not _kept(ball, [*one, ViewOfPixels(camera=_camera(0.2))])
-    assert _kept(ball, [*one, *(ViewOfPixels(camera=_camera(x)) for x in (0.2, -0.2))])
+    assert not _kept(ball, [*one, MaskedView(camera=_camera(0.2))])
+    assert _kept(ball, [*one, *(MaskedView(camera=_camera(x)) for x in (0.2, -0.2))])
     assert _kept(((0.0, 0, 6.0), 0.3, 0.8), one), "not much nearer than the wall"
 
 
 def test_what_fills_a_view_of_its_own_is_no_floater() -> None:
-    """Nothing is behind: the camera looks at it and at nothing else."""
+    """Nothing is behind: the camera sees it and nothing else."""
     lone = _gaussians(((0.0, 0, 2.0), 0.3, 0.99), ((0.0, 0, 2.1), 0.3, 0.99))
-    assert bool(needed(lone, [ViewOfPixels(camera=_camera())], backend="cpu")[0])
+    assert bool(needed(lone, [MaskedView(camera=_camera())], backend="cpu")[0])
 
 
 def test_pixels_that_taught_nothing_keep_nothing() -> None:
     mask = torch.ones(48, 64, dtype=torch.bool)
     mask[:, 20:44] = False
-    views = [ViewOfPixels(camera=view.camera, mask=mask) for view in THREE]
+    views = [MaskedView(camera=view.camera, mask=mask) for view in THREE]
     assert not _kept(((0.0, 0, 8), 0.2, 0.8), views)
     assert _kept(((3.0, 0, 8), 0.2, 0.8), views)
 
 
 def test_reduced_views_count_as_many_pixels() -> None:
     cameras = [_camera(x, width=16, height=12) for x in (-1.0, 0.0, 1.0)]
-    views = [ViewOfPixels(camera=camera) for camera in cameras]
+    views = [MaskedView(camera=camera) for camera in cameras]
     ball = ((0.0, 0, 8), 0.3, 0.04)  # about 0.2 reduced pixels in all, 16 times as many full ones
     assert not _kept(ball, views)
     assert _kept(ball, views, reduction=4)

@@ -25,7 +25,7 @@ GOLDEN = math.pi * (1 + math.sqrt(5))
 
 
 def spiral(count: int) -> np.ndarray:
-    """Places spread evenly over the unit sphere."""
+    """Positions spread evenly over the unit sphere."""
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     turn = GOLDEN * np.arange(count)
     flat = np.sqrt(1 - z * z)
@@ -63,7 +63,7 @@ def camera_at(centre: np.ndarray) -> Camera:
 
 
 def photographed(truth: Gaussians, folder: Path, rng: np.random.Generator) -> Capture:
-    """Photographs from all round, and start points whose places and colours are off."""
+    """Photographs from all round, and start points with wrong positions and colours."""
     views: list[View] = []
     for i, centre in enumerate(3.2 * spiral(VIEWS)):
         camera, path = camera_at(centre), folder / f"view_{i:02d}.png"
@@ -78,9 +78,9 @@ def photographed(truth: Gaussians, folder: Path, rng: np.random.Generator) -> Ca
     return Capture(path=folder, format="test", views=tuple(views), points=points)
 
 
-def errors(truth: Gaussians, places: torch.Tensor) -> np.ndarray:
-    """Distance of each true place to the nearest of some places."""
-    return KDTree(places.numpy()).query(truth.means.numpy())[0]
+def errors(truth: Gaussians, positions: torch.Tensor) -> np.ndarray:
+    """Distance of each true position to the nearest of some positions."""
+    return KDTree(positions.numpy()).query(truth.means.numpy())[0]
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "classic"])

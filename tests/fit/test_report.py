@@ -51,10 +51,10 @@ class Page(HTMLParser):
 
 def test_a_finished_fit(fitted) -> None:
     root, capture, result = fitted
-    said = score_and_report(root, capture, result, options=OPTIONS, backend="cpu", scoring=True)
+    message = score_and_report(root, capture, result, options=OPTIONS, backend="cpu", scoring=True)
     scores = evaluate_photographs(result.gaussians, capture.test_views, backend="cpu")
-    assert f"PSNR {scores.psnr:.2f} dB on 3 held-out views, SSIM {scores.ssim:.3f}\n" in said
-    assert str(root / "reports" / "fit.html") in said
+    assert f"PSNR {scores.psnr:.2f} dB on 3 held-out views, SSIM {scores.ssim:.3f}\n" in message
+    assert str(root / "reports" / "fit.html") in message
 
     record = json.loads((root / "reports" / "fit.json").read_text())
     assert record["steps"] == 120
@@ -77,7 +77,7 @@ def test_a_finished_fit(fitted) -> None:
     text = (root / "reports" / "fit.html").read_text()
     page = Page(text)
     words = " ".join(page.words)
-    assert page.tags.count("img") == 9, "photograph, picture, difference; worst, middle, best"
+    assert page.tags.count("img") == 9, "photograph, render, difference; worst, median, best"
     assert page.tags.count("svg") == 3
     assert "script" not in page.tags
     assert not re.search(r'(src|href)="(?!data:)', text), "nothing from elsewhere"
@@ -101,8 +101,10 @@ def test_a_finished_fit(fitted) -> None:
 def test_an_interrupted_fit_is_not_scored(fitted) -> None:
     root, capture, result = fitted
     stopped = replace(result, interrupted=True)
-    said = score_and_report(root, capture, stopped, options=OPTIONS, backend="cpu", scoring=False)
-    assert said == f"report: {root / 'reports' / 'fit.html'}\n"
+    message = score_and_report(
+        root, capture, stopped, options=OPTIONS, backend="cpu", scoring=False
+    )
+    assert message == f"report: {root / 'reports' / 'fit.html'}\n"
     record = json.loads((root / "reports" / "fit.json").read_text())
     assert record["interrupted"] is True
     assert record["held_out"] is None
@@ -114,15 +116,15 @@ def test_an_interrupted_fit_is_not_scored(fitted) -> None:
 
 def test_one_held_out_view_and_none(fitted) -> None:
     root, capture, result = fitted
-    for count, pictures, expected in ((1, 3, "PSNR"), (0, 0, "no held-out views to score\n")):
+    for count, images, expected in ((1, 3, "PSNR"), (0, 0, "no held-out views to score\n")):
         views = (*capture.train_views, *capture.test_views[:count])
         fewer = replace(capture, views=views)
-        said = score_and_report(
+        message = score_and_report(
             root, fewer, replace(result, views=views), options=OPTIONS, backend="cpu", scoring=True
         )
-        assert said.startswith(expected)
+        assert message.startswith(expected)
         page = Page((root / "reports" / "fit.html").read_text())
-        assert page.tags.count("img") == pictures
+        assert page.tags.count("img") == images
 
 
 def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:

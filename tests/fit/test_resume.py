@@ -33,7 +33,7 @@ OPTIONS = FitOptions(
     sh_degree=1,
     densify_from=20,
     densify_every=10,
-    degree_interval=0.4,
+    sh_degree_interval=0.4,
 )
 
 
@@ -187,16 +187,16 @@ def test_another_fit_is_refused_by_what_differs(capture: Capture, path: Path) ->
         assert str(caught.value).startswith(f"{path}: ")
         return str(caught.value)
 
-    said = refusal(capture, replace(OPTIONS, seed=3, dssim_weight=0.5))
-    assert "seed 0 instead of 3" in said
-    assert "dssim_weight 0.2 instead of 0.5" in said
-    assert "steps" not in said
-    said = refusal(capture, replace(OPTIONS, max_gaussians=130))
-    assert "max_gaussians 120 instead of 130" in said
-    said = refusal(capture, replace(OPTIONS, max_gaussians=130, steps=80, seed=3))
-    assert "max_gaussians" not in said, "it goes with the length"
-    assert "other photographs" not in said
-    assert "other cameras" not in said
+    message = refusal(capture, replace(OPTIONS, seed=3, dssim_weight=0.5))
+    assert "seed 0 instead of 3" in message
+    assert "dssim_weight 0.2 instead of 0.5" in message
+    assert "steps" not in message
+    message = refusal(capture, replace(OPTIONS, max_gaussians=130))
+    assert "max_gaussians 120 instead of 130" in message
+    message = refusal(capture, replace(OPTIONS, max_gaussians=130, steps=80, seed=3))
+    assert "max_gaussians" not in message, "it goes with the length"
+    assert "other photographs" not in message
+    assert "other cameras" not in message
     assert "backend 'cpu' instead of 'reference'" in refusal(capture, OPTIONS, "reference")
 
     moved = tuple(replace(v, camera=v.camera.resized(57, 48)) for v in capture.views)
@@ -207,9 +207,9 @@ def test_another_fit_is_refused_by_what_differs(capture: Capture, path: Path) ->
     points = PointCloud(points=capture.points.points + 1, colours=capture.points.colours)
     assert "other start points" in refusal(replace(capture, points=points), OPTIONS)
     masked = tuple(replace(v, mask=v.image) for v in capture.views)
-    said = refusal(replace(capture, views=masked), OPTIONS)
-    assert "other masks" in said
-    assert "cameras" not in said
+    message = refusal(replace(capture, views=masked), OPTIONS)
+    assert "other masks" in message
+    assert "cameras" not in message
     swapped = {v.name: v.image for v in capture.train_views}
     swapped["view_00"] = swapped["view_01"]
     views = tuple(replace(v, image=swapped.get(v.name, v.image)) for v in capture.views)
@@ -241,7 +241,7 @@ def test_options_that_came_later_count_as_their_defaults(capture: Capture, path:
     _recorded_otherwise(path, options={"gone": 3, "bent": [1]}, defaults={"gone": 3, "bent": [2]})
     with pytest.raises(InputError) as caught:
         fit(capture, options=OPTIONS, checkpoints=checkpoints)
-    assert "bent [1], which this splatseg has not" in str(caught.value)
+    assert "bent [1], an option that this splatseg does not have" in str(caught.value)
     assert "gone" not in str(caught.value)
 
     _recorded_otherwise(path, options={"bent": [2]})
@@ -272,10 +272,10 @@ def test_a_checkpoint_of_another_version_cannot_be_resumed(
                 lambda: checkpoint_summary(path)):  # fmt: skip
         with pytest.raises(CheckpointVersionError) as caught:
             ask()
-        said = str(caught.value)
-        assert said.startswith(f"{path}: this fit cannot be resumed")
-        assert "version 1, got version 0" in said
-        assert "\n" not in said
+        message = str(caught.value)
+        assert message.startswith(f"{path}: this fit cannot be resumed")
+        assert "version 1, got version 0" in message
+        assert "\n" not in message
 
 
 def test_data_that_moved_are_the_same_data(capture: Capture, path: Path, tmp_path: Path) -> None:
@@ -303,8 +303,8 @@ def test_a_file_that_is_no_whole_checkpoint_says_so(capture: Capture, path: Path
         assert str(caught.value).startswith(f"{path}: ")
         return str(caught.value)
 
-    assert "damaged or none" in refused(b"")
-    assert "damaged or none" in refused(b"not an archive")
+    assert "got a damaged file or another format" in refused(b"")
+    assert "got a damaged file or another format" in refused(b"not an archive")
     rng = np.random.default_rng(2)
     for cut in rng.integers(1, len(good), 12):
         refused(good[:cut])

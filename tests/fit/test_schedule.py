@@ -1,4 +1,4 @@
-"""What changes with progress, at the ends and in the middle."""
+"""What changes with progress, at the ends and half-way."""
 
 import pytest
 
@@ -16,7 +16,7 @@ OPTIONS = FitOptions(
     final_rate=0.25,
     quarter_until=0.1,
     half_until=0.3,
-    degree_interval=0.2,
+    sh_degree_interval=0.2,
     sh_degree=2,
     max_gaussians=1000,
     grow_until=0.5,
@@ -24,14 +24,14 @@ OPTIONS = FitOptions(
 
 
 def test_rates_fall_exponentially() -> None:
-    begin, middle, end = (rates_at(p, options=OPTIONS, extent=3.0) for p in (0.0, 0.5, 1.0))
+    begin, halfway, end = (rates_at(p, options=OPTIONS, extent=3.0) for p in (0.0, 0.5, 1.0))
     assert begin.means == pytest.approx(3e-2)
-    assert middle.means == pytest.approx(3e-3)
+    assert halfway.means == pytest.approx(3e-3)
     assert end.means == pytest.approx(3e-4)
-    assert (begin.log_scales, middle.log_scales, end.log_scales) == pytest.approx(
+    assert (begin.log_scales, halfway.log_scales, end.log_scales) == pytest.approx(
         (0.5, 0.25, 0.125)
     )
-    assert begin.colour == pytest.approx(20 * begin.harmonics)
+    assert begin.colour == pytest.approx(20 * begin.sh_rest)
     assert end.colour == pytest.approx(0.05)
     assert (begin.logits, end.logits) == pytest.approx((0.7, 0.25 * 0.7))
     assert (begin.rotations, end.rotations) == pytest.approx((0.3, 0.25 * 0.3))

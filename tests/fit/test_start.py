@@ -11,7 +11,7 @@ from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
 from splatseg.fit._photographs import Photographs
-from splatseg.fit._start import random_points, visible_region, with_start_points
+from splatseg.fit._start import depth_range_of_cameras, random_points, with_start_points
 from splatseg.io.images import save_png
 
 from .conftest import ring_camera, tiny_scene
@@ -32,19 +32,19 @@ def _drawn(photographs: Photographs, count: int, seed: int = 0) -> torch.Tensor:
 
 
 def test_cameras_around_one_thing_look_at_a_ball() -> None:
-    """They stand 3.2 from it; the shorter side of a picture has a half angle of atan(24 / 60)."""
-    region = visible_region([ring_camera(0.7 * i) for i in range(9)])
+    """They stand 3.2 from it; the shorter side of an image has a half angle of atan(24 / 60)."""
+    depth_range = depth_range_of_cameras([ring_camera(0.7 * i) for i in range(9)])
     radius = 3.2 * 24 / 60
-    assert region.core == pytest.approx((3.2 - radius, 3.2 + radius), rel=1e-3)
-    assert region.near == pytest.approx(3.2 / 3, rel=1e-3)
-    assert region.far == pytest.approx(64, rel=1e-3)
+    assert depth_range.object_range == pytest.approx((3.2 - radius, 3.2 + radius), rel=1e-3)
+    assert depth_range.near == pytest.approx(3.2 / 3, rel=1e-3)
+    assert depth_range.far == pytest.approx(64, rel=1e-3)
 
 
 def test_wide_cameras_have_the_whole_ball_in_front() -> None:
     wide = [ring_camera(0.7 * i, fx=10.0, fy=10.0) for i in range(9)]
-    region = visible_region(wide)
-    assert region.core == pytest.approx((0.32, 6.08), rel=1e-3)
-    assert region.near == pytest.approx(0.32, rel=1e-3)
+    depth_range = depth_range_of_cameras(wide)
+    assert depth_range.object_range == pytest.approx((0.32, 6.08), rel=1e-3)
+    assert depth_range.near == pytest.approx(0.32, rel=1e-3)
 
 
 def test_cameras_that_look_elsewhere_have_no_ball() -> None:
@@ -54,20 +54,20 @@ def test_cameras_that_look_elsewhere_have_no_ball() -> None:
         inward = ring_camera(0.8 * i)
         pose = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
         outwards.append(replace(inward, cam_from_world=pose @ inward.cam_from_world))
-    region = visible_region(outwards)
-    assert region.core is None
-    assert (region.near, region.far) == pytest.approx((0.32, 160), rel=0.05)
-    parallel = visible_region([_looking_along_z(x) for x in (-3.0, -1.0, 1.0, 3.0)])
-    assert parallel.core is None
+    depth_range = depth_range_of_cameras(outwards)
+    assert depth_range.object_range is None
+    assert (depth_range.near, depth_range.far) == pytest.approx((0.32, 160), rel=0.05)
+    parallel = depth_range_of_cameras([_looking_along_z(x) for x in (-3.0, -1.0, 1.0, 3.0)])
+    assert parallel.object_range is None
     assert parallel.near == pytest.approx(0.1)  # the lower median of 1, 1, 3, 3
-    spot = visible_region([_looking_along_z(0, 0, turn) for turn in (0.0, 0.5, 1.0)])
-    assert (spot.near, spot.far, spot.core) == pytest.approx((0.1, 50.0, None))
-    one = visible_region([_looking_along_z(0)])
-    assert one.core is None
+    spot = depth_range_of_cameras([_looking_along_z(0, 0, turn) for turn in (0.0, 0.5, 1.0)])
+    assert (spot.near, spot.far, spot.object_range) == pytest.approx((0.1, 50.0, None))
+    one = depth_range_of_cameras([_looking_along_z(0)])
+    assert one.object_range is None
 
 
 def test_points_lie_on_what_is_photographed(capture: Capture) -> None:
-    """Most pixels show blobs within 1.3 of the middle; others show black, which is anywhere."""
+    """Most pixels show blobs within 1.3 of the centre; others show black, which is ambiguous."""
     photographs = Photographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(1)
     cloud = random_points(photographs, count=2000, generator=generator)
@@ -105,7 +105,7 @@ def test_same_seed_same_points(capture: Capture) -> None:
 
 
 def test_masked_pixels_start_nothing(capture: Capture, tmp_path: Path) -> None:
-    """Only the middle column of each photograph counts."""
+    """Only the central column of each photograph is valid."""
     mask = torch.zeros(48, 56, dtype=torch.uint8)
     mask[:, 28] = 255
     save_png(mask, tmp_path / "mask.png")
@@ -196,8 +196,8 @@ def test_places_that_views_disagree_about_are_left_out(capture: Capture) -> None
     """Photographs that have nothing in common agree nowhere."""
     photographs = Photographs(capture.train_views, longest=1600)
     generator = torch.Generator().manual_seed(0)
-    none = random_points(photographs, count=500, generator=generator, agreed=0.0)
+    none = random_points(photographs, count=500, generator=generator, max_difference=0.0)
     assert len(none) == 0
     generator = torch.Generator().manual_seed(0)
-    some = random_points(photographs, count=500, generator=generator, agreed=0.02)
+    some = random_points(photographs, count=500, generator=generator, max_difference=0.02)
     assert 0 < len(some) < 500

@@ -13,7 +13,7 @@ from splatseg.fit._parameters import Parameters
 from splatseg.fit._schedule import Rates
 from splatseg.fit._update import UpdateSettings, update_rows, update_rows_torch
 
-RATES = Rates(means=0.01, log_scales=0.02, rotations=0.03, logits=0.04, colour=0.05, harmonics=0.06)
+RATES = Rates(means=0.01, log_scales=0.02, rotations=0.03, logits=0.04, colour=0.05, sh_rest=0.06)
 
 
 def _tensor(rng: np.random.Generator, *shape: int) -> torch.Tensor:
@@ -30,7 +30,7 @@ def _parameters(rng: np.random.Generator, count: int, coefficients: int = 4) -> 
     )
 
 
-def _slopes(rng: np.random.Generator, count: int, coefficients: int = 4) -> Gaussians:
+def _gradients(rng: np.random.Generator, count: int, coefficients: int = 4) -> Gaussians:
     return Gaussians(
         means=_tensor(rng, count, 3),
         rotations=_tensor(rng, count, 4),
@@ -60,16 +60,16 @@ def test_steps_match_torchs_adam_on_raw_values(rng, coefficients: int) -> None:
         {"params": [theirs["rotations"]], "lr": RATES.rotations},
         {"params": [theirs["logits"]], "lr": RATES.logits},
         {"params": [dc], "lr": RATES.colour},
-        {"params": [rest], "lr": RATES.harmonics},
+        {"params": [rest], "lr": RATES.sh_rest},
     ]
     optimiser = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
     for step in range(1, 16):
-        slopes = _slopes(rng, count, coefficients)
+        gradients = _gradients(rng, count, coefficients)
         update_rows(
             ours,
             first,
             second,
-            slopes,
+            gradients,
             rows=torch.arange(count),
             settings=UpdateSettings(rates=RATES, step=step, opacity_penalty=0.3, scale_penalty=0.2),
         )
@@ -77,7 +77,7 @@ def test_steps_match_torchs_adam_on_raw_values(rng, coefficients: int) -> None:
         values = Parameters(**(theirs | {"sh": torch.cat((dc, rest), dim=1)})).gaussians()
         loss = 0.3 * values.opacities.sum() + 0.2 * values.scales.sum()
         for name in ("means", "rotations", "scales", "opacities", "sh"):
-            loss = loss + (getattr(slopes, name).double() * getattr(values, name)).sum()
+            loss = loss + (getattr(gradients, name).double() * getattr(values, name)).sum()
         loss.backward()
         optimiser.step()
     expected = theirs | {"sh": torch.cat((dc, rest), dim=1)}
@@ -97,9 +97,9 @@ def test_rows_match_the_twin(rng, isa: str) -> None:
         fast[0].logits[::2] -= 3.5  # faint: these wander
         slow = [_copy(parameters) for parameters in fast]
         rows = torch.from_numpy(np.sort(rng.permutation(60)[:40]))
-        slopes = _slopes(rng, 40)
-        slopes.opacities[::3] = 0
-        slopes.sh[::6, 0] = 0
+        gradients = _gradients(rng, 40)
+        gradients.opacities[::3] = 0
+        gradients.sh[::6, 0] = 0
         settings = UpdateSettings(
             rates=RATES,
             step=4,
@@ -111,8 +111,8 @@ def test_rows_match_the_twin(rng, isa: str) -> None:
             beta2=0.97,
             epsilon=1e-3,
         )
-        update_rows(*fast, slopes, rows=rows, settings=settings)
-        update_rows_torch(*slow, slopes, rows=rows, settings=settings)
+        update_rows(*fast, gradients, rows=rows, settings=settings)
+        update_rows_torch(*slow, gradients, rows=rows, settings=settings)
         for mine, twin in zip(fast, slow, strict=True):
             for (name, tensor), (_, other) in zip(mine.tensors(), twin.tensors(), strict=True):
                 torch.testing.assert_close(tensor, other, rtol=2e-5, atol=2e-6, msg=name)
@@ -124,11 +124,11 @@ def test_what_no_pixel_shows_stays(rng) -> None:
     """Not listed, or listed without a gradient in opacity and mean colour."""
     state = [_parameters(rng, 5) for _ in range(3)]
     kept = [_copy(parameters) for parameters in state]
-    slopes = _slopes(rng, 3)
-    slopes.opacities[1] = 0
-    slopes.sh[1, 0] = 0
+    gradients = _gradients(rng, 3)
+    gradients.opacities[1] = 0
+    gradients.sh[1, 0] = 0
     settings = UpdateSettings(rates=RATES, step=1, opacity_penalty=1.0, noise=1.0)
-    update_rows(*state, slopes, rows=torch.tensor([0, 2, 4]), settings=settings)
+    update_rows(*state, gradients, rows=torch.tensor([0, 2, 4]), settings=settings)
     for after, before in zip(state, kept, strict=True):
         for (name, tensor), (_, old) in zip(after.tensors(), before.tensors(), strict=True):
             same = (tensor == old).all(dim=1)
@@ -144,7 +144,7 @@ def test_first_step_is_the_rate_against_the_gradient() -> None:
         logits=torch.zeros(1, 1),
         sh=torch.zeros(1, 12),
     )
-    slopes = Gaussians(
+    gradients = Gaussians(
         means=torch.tensor([[3.0, -0.01, 0.0]]),
         rotations=torch.tensor([[5.0, 0, 2.0, 0]]),
         scales=torch.tensor([[1.0, -1, 0]]),
@@ -155,7 +155,7 @@ def test_first_step_is_the_rate_against_the_gradient() -> None:
         parameters,
         parameters.zeros_like(),
         parameters.zeros_like(),
-        slopes,
+        gradients,
         rows=torch.tensor([0]),
         settings=UpdateSettings(rates=RATES, step=1),
     )
@@ -184,7 +184,7 @@ def _walked(opacity: float, count: int, **settings: object) -> torch.Tensor:
         opacities=torch.full((count,), 1e-20),
         sh=torch.zeros(count, 1, 3),
     )
-    still = Rates(means=0, log_scales=0, rotations=0, logits=0, colour=0, harmonics=0)
+    still = Rates(means=0, log_scales=0, rotations=0, logits=0, colour=0, sh_rest=0)
     chosen = replace(UpdateSettings(rates=still, step=3, noise=0.3, seed=5), **settings)
     moments = parameters.zeros_like(), parameters.zeros_like()
     update_rows(parameters, *moments, zero, rows=torch.arange(count), settings=chosen)
@@ -217,7 +217,7 @@ def test_the_walk_depends_on_seed_step_and_row_alone() -> None:
 def test_threads_do_not_change_a_bit(rng) -> None:
     start = [_parameters(rng, 3000) for _ in range(2)]
     second = Parameters(**{name: tensor.abs() for name, tensor in start[1].tensors()})
-    slopes, rows = _slopes(rng, 3000), torch.arange(3000)
+    gradients, rows = _gradients(rng, 3000), torch.arange(3000)
     settings = UpdateSettings(rates=RATES, step=2, noise=1.0)
     before = _native.threads()
     found = []
@@ -225,7 +225,7 @@ def test_threads_do_not_change_a_bit(rng) -> None:
         for count in (1, 2, 5):
             _native.set_threads(count)
             state = [_copy(p) for p in (*start, second)]
-            update_rows(*state, slopes, rows=rows, settings=settings)
+            update_rows(*state, gradients, rows=rows, settings=settings)
             found.append(state)
     finally:
         _native.set_threads(before)
@@ -239,8 +239,8 @@ def test_foreign_memory_is_never_touched(rng) -> None:
     state = [_parameters(rng, 3) for _ in range(3)]
     settings = UpdateSettings(rates=RATES, step=1)
     with pytest.raises(ValueError, match="rows do not fit"):
-        update_rows(*state, _slopes(rng, 1), rows=torch.tensor([3]), settings=settings)
+        update_rows(*state, _gradients(rng, 1), rows=torch.tensor([3]), settings=settings)
     with pytest.raises(ValueError, match="rows do not fit"):
-        update_rows(*state, _slopes(rng, 2), rows=torch.tensor([0]), settings=settings)
+        update_rows(*state, _gradients(rng, 2), rows=torch.tensor([0]), settings=settings)
     with pytest.raises(ValueError, match="rows do not fit"):
-        update_rows(*state, _slopes(rng, 1, 9), rows=torch.tensor([0]), settings=settings)
+        update_rows(*state, _gradients(rng, 1, 9), rows=torch.tensor([0]), settings=settings)

@@ -9,7 +9,7 @@ import torch
 
 from splatseg.core import Camera, Gaussians, LabelMap, View
 from splatseg.render import RenderOptions, get_backend
-from splatseg.render.warp import straightened
+from splatseg.render.warp import undistorted_camera
 from support.backends import each_backend as each_backend
 from support.backends import pytest_generate_tests as pytest_generate_tests
 
@@ -70,7 +70,7 @@ def matrix_of(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     """W of the pinhole view, (H, W, n), one column a Gaussian, in float64."""
     signal = torch.eye(len(gaussians))
     drawn = get_backend(BACKEND).render(
-        gaussians, straightened(camera), signal, options=RenderOptions()
+        gaussians, undistorted_camera(camera), signal, options=RenderOptions()
     )
     return drawn.image.double()
 

@@ -186,14 +186,14 @@ def test_gradients_reach_everything(cuda, reference, rng, scene, camera, inside)
     """gsplat's torch projection is differentiated by autograd, as its kernels are by hand."""
     scene = scene.replace(opacities=scene.opacities.clamp(max=0.95))
     band = bands(scene, camera, OPTIONS)
-    slope = float32(rng.normal(size=(camera.height, camera.width, 3)))
-    slope = slope * (~(band.threshold | band.swap))[..., None]
+    v_image = float32(rng.normal(size=(camera.height, camera.width, 3)))
+    v_image = v_image * (~(band.threshold | band.swap))[..., None]
     found = []
     for backend in (cuda, reference):
         names = ("means", "rotations", "scales", "opacities", "sh")
         leaves = {name: getattr(scene, name).clone().requires_grad_() for name in names}
         drawn = backend.render(scene.replace(**leaves), camera, None, options=OPTIONS)
-        ((drawn.image * slope).sum() + (drawn.depth * slope[..., 0]).sum()).backward()
+        ((drawn.image * v_image).sum() + (drawn.depth * v_image[..., 0]).sum()).backward()
         found.append({name: leaf.grad for name, leaf in leaves.items()})
     for name, expected in found[1].items():
         error = torch.linalg.vector_norm(found[0][name] - expected)

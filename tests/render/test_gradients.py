@@ -79,7 +79,7 @@ def test_the_harmonics_agree_with_finite_differences():
     assert torch.autograd.gradcheck(draw, inputs, atol=1e-6, rtol=1e-5, fast_mode=True)
 
 
-def _gradients(backend, scene, camera, signal, slopes, options) -> dict[str, torch.Tensor]:
+def _gradients(backend, scene, camera, signal, v_outputs, options) -> dict[str, torch.Tensor]:
     """Gradients of <image, slopes> + <alpha, ...> + <depth, ...> towards everything."""
     leaves = {name: getattr(scene, name).clone().requires_grad_() for name in COLUMNS}
     pose = camera.cam_from_world[:3].clone().requires_grad_()
@@ -94,7 +94,7 @@ def _gradients(backend, scene, camera, signal, slopes, options) -> dict[str, tor
         options=options,
         backend=backend,
     )
-    image, alpha, depth = (s.to(drawn.image) for s in slopes)
+    image, alpha, depth = (s.to(drawn.image) for s in v_outputs)
     loss = (drawn.image * image).sum() + (drawn.alpha * alpha).sum() + (drawn.depth * depth).sum()
     loss.backward()
     found = {name: leaf.grad for name, leaf in leaves.items()}
@@ -114,16 +114,16 @@ def test_gradients_match_the_reference(fast_backend, rng, channels, antialiased)
     certain = float32((~(band.threshold | band.swap)).numpy())
     assert certain.mean() > 0.9
     width = 3 if channels is None else channels
-    slopes = (
+    v_outputs = (
         float32(rng.normal(size=(33, 40, width))) * certain[..., None],
         float32(rng.normal(size=(33, 40))) * certain,
         float32(rng.normal(size=(33, 40))) * certain * 0.3,
     )
 
-    fast = _gradients(fast_backend.name, scene, camera, signal, slopes, options)
+    fast = _gradients(fast_backend.name, scene, camera, signal, v_outputs, options)
     wide = scene.to(dtype=torch.float64)
     slow_signal = None if signal is None else signal.double()
-    slow = _gradients("reference", wide, camera, slow_signal, slopes, options)
+    slow = _gradients("reference", wide, camera, slow_signal, v_outputs, options)
 
     assert fast.keys() == slow.keys()
     for name, expected in slow.items():
@@ -225,18 +225,20 @@ def test_the_slope_in_the_projected_centres(rng, antialiased):
     generator = torch.Generator().manual_seed(5)
     scene, camera = random_gaussians(rng, 40).to(dtype=torch.float64), random_camera(rng)
     options = RenderOptions(antialiased=antialiased)
-    slopes = torch.randn(camera.height, camera.width, 3, generator=generator, dtype=torch.float64)
+    v_outputs = torch.randn(
+        camera.height, camera.width, 3, generator=generator, dtype=torch.float64
+    )
 
-    def loss(scene, camera, name, screen=None):
+    def loss(scene, camera, name, screen_offsets=None):
         backend = get_backend(name)
-        drawn = backend.render(scene, camera, None, options=options, screen=screen)
-        return (drawn.image * slopes.to(drawn.image)).sum()
+        drawn = backend.render(scene, camera, None, options=options, screen_offsets=screen_offsets)
+        return (drawn.image * v_outputs.to(drawn.image)).sum()
 
     found = {}
     for name, typed in (("reference", scene), ("cpu", scene.to(dtype=torch.float32))):
-        screen = torch.zeros_like(typed.means[:, :2]).requires_grad_()
-        loss(typed, camera, name, screen).backward()
-        found[name] = screen.grad.double()
+        screen_offsets = torch.zeros_like(typed.means[:, :2]).requires_grad_()
+        loss(typed, camera, name, screen_offsets).backward()
+        found[name] = screen_offsets.grad.double()
     reference = found["reference"]
     assert (found["cpu"] - reference).norm() <= 1e-4 * reference.norm()
 

@@ -11,7 +11,9 @@ from scipy.interpolate import BSpline
 from splatseg.core import Camera, View
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import InputError, RangeError
-from splatseg.render.paths import _along_spline, _Poses, camera_path, is_forward_facing
+from splatseg.render._path_poses import Poses
+from splatseg.render._path_spline import poses_along_spline
+from splatseg.render.paths import camera_path, is_forward_facing
 
 UP = (0.0, 0.0, 1.0)
 
@@ -136,12 +138,12 @@ def test_a_film_looks_about_less_than_people_do(rng) -> None:
 
 def test_the_spline_is_the_uniform_cubic_b_spline(rng) -> None:
     """Against SciPy, through equally dense parameters instead of constant speed."""
-    from splatseg.render import paths
+    from splatseg.render import _path_spline
 
     places = torch.from_numpy(rng.normal(size=(9, 3)))
-    flat = _Poses(centres=places, quaternions=torch.eye(4).double()[:1].expand(9, 4))
+    flat = Poses(centres=places, quaternions=torch.eye(4).double()[:1].expand(9, 4))
     at = torch.linspace(0, 6, 31, dtype=torch.float64)
-    ours = paths._spline(flat, at).centres
+    ours = _path_spline._spline(flat, at).centres
     theirs = BSpline(np.arange(-3, 10), places.numpy(), 3)(at.numpy())
     np.testing.assert_allclose(ours.numpy(), theirs, atol=1e-12)
 
@@ -156,8 +158,8 @@ def test_quaternions_of_either_sign_are_the_same_path(rng) -> None:
     signs = torch.tensor([1, -1, -1, 1, -1, 1, 1, -1.0]).double()[:, None]
     for closed in (False, True):
         one, other = (
-            _along_spline(
-                _Poses(centres=centres, quaternions=q), frames=20, closed=closed, unit=1.0
+            poses_along_spline(
+                Poses(centres=centres, quaternions=q), frames=20, closed=closed, unit=1.0
             )
             for q in (quaternions, signs * quaternions)
         )

@@ -6,7 +6,7 @@ import torch
 from splatseg.core import Camera, Gaussians
 from splatseg.errors import InputError
 from splatseg.render import back_project, contributors, render, weights
-from splatseg.render.warp import Warp, straightened, warp_into_photograph
+from splatseg.render.warp import Warp, undistorted_camera, warp_into_photograph
 
 BACKEND = "reference"
 LENSES = [("opencv", (-0.2, 0.05, 1e-3, -2e-3)), ("fisheye", (0.02, -0.01))]
@@ -59,9 +59,9 @@ def test_back_project_is_the_adjoint_of_render(rng, gaussians, lens, mode) -> No
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_view_is_the_straight_view_seen_through_the_lens(gaussians, lens) -> None:
     camera = camera_of(lens)
-    straight = render(gaussians, straightened(camera), backend=BACKEND)
+    straight = render(gaussians, undistorted_camera(camera), backend=BACKEND)
     for mode in ("bilinear", "nearest"):
-        warp = Warp.between(camera, straightened(camera), mode)
+        warp = Warp.between(camera, undistorted_camera(camera), mode)
         drawn = render(gaussians, camera, backend=BACKEND, warp=mode)
         torch.testing.assert_close(drawn.image, warp.apply(straight.image))
         torch.testing.assert_close(drawn.alpha, warp.apply(straight.alpha[..., None])[..., 0])
@@ -108,7 +108,7 @@ def test_contributors_and_w_read_the_nearest_straight_pixel(gaussians) -> None:
     assert bool(found.all())
     assert not torch.equal(at, pixels)
     seen = contributors(gaussians, camera, pixels, 3, backend=BACKEND)
-    straight = contributors(gaussians, straightened(camera), at, 3, backend=BACKEND)
+    straight = contributors(gaussians, undistorted_camera(camera), at, 3, backend=BACKEND)
     assert torch.equal(seen.ids, straight.ids)
     assert torch.equal(seen.weights, straight.weights)
 
@@ -144,9 +144,9 @@ def test_rows_of_w_sum_to_the_alpha_of_the_nearest_warp(lens) -> None:
     torch.testing.assert_close(rows, alpha["nearest"], rtol=0, atol=2e-3)
     assert float((rows - alpha["bilinear"]).abs().max()) > 0.02
     # By hand: what bilinear reads is the mean of four rows, by how near they are.
-    straight = render(thing, straightened(camera), backend="cpu").alpha
+    straight = render(thing, undistorted_camera(camera), backend="cpu").alpha
     at = (
-        straightened(camera)
+        undistorted_camera(camera)
         .project(
             camera.unproject(camera.pixel_centres(), torch.ones(11, 15).double()).reshape(-1, 3)
         )[0]

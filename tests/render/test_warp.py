@@ -9,7 +9,7 @@ from splatseg.errors import InputError, ShapeError
 from splatseg.render.warp import (
     Warp,
     photograph_to_pinhole,
-    straightened,
+    undistorted_camera,
     warp_into_photograph,
 )
 
@@ -187,8 +187,8 @@ def test_cached_by_lens_and_not_by_pose() -> None:
         model=camera.model, distortion=camera.distortion,
     )  # fmt: skip
     assert warp_into_photograph(camera) is warp_into_photograph(moved)
-    assert torch.equal(straightened(moved).cam_from_world, pose)
-    assert straightened(moved).is_pinhole
+    assert torch.equal(undistorted_camera(moved).cam_from_world, pose)
+    assert undistorted_camera(moved).is_pinhole
 
 
 def test_bad_input_is_refused() -> None:

@@ -29,7 +29,7 @@ from splatseg.fit import (
     discard_checkpoint,
     exposures_record,
     fit,
-    random_start_count,
+    random_point_count,
     reduction_note,
 )
 from splatseg.io.scene import CHECKPOINT_FILE, save_scene
@@ -239,7 +239,7 @@ def _beginning(capture: Capture, options: FitOptions) -> str:
     train, test = len(capture.train_views), len(capture.test_views)
     points = 0 if capture.points is None else len(capture.points)
     drawn = ""
-    if (number := random_start_count(capture, options)) > 0:
+    if (number := random_point_count(capture, options)) > 0:
         where = "at" if points == 0 or options.start == "random" else "at these and up to"
         drawn = f"; starting {where} {number} places where photographs agree"
     return (

@@ -134,8 +134,8 @@ def undistort_fisheye(
         if not error.numel() or float(error.abs().max()) < _TOLERANCE:
             break
         t2 = theta * theta
-        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-        theta = theta - error / slope.clamp_min(1e-6)
+        derivative = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        theta = theta - error / derivative.clamp_min(1e-6)
     _require_converged(theta * _theta_polynomial(theta, parameters) - target)
     radius = torch.tan(theta)
     if bool(((theta >= torch.pi / 2 - 1e-3) | (theta < 0) | (radius > _MAX_RADIUS)).any()):

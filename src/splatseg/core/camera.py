@@ -29,7 +29,7 @@ _MAX_UNDISTORTED_GROWTH = 8.0
 class Camera:
     """One view: x right, y down, z forward (OpenCV); see ``docs/conventions.md``.
 
-    The centre of the top-left pixel is (0.5, 0.5), so that ``cx = width / 2`` is the middle.
+    The centre of the top-left pixel is (0.5, 0.5), so that ``cx = width / 2`` is the image centre.
     """
 
     width: int
@@ -240,7 +240,7 @@ class Camera:
         )
 
     def moved(self, new_from_old: Similarity) -> "Camera":
-        """The camera in a world that was moved by `new_from_old`; it sees the same picture."""
+        """The camera in a world that was moved by `new_from_old`; its image is the same."""
         old_from_new = new_from_old.inverse()
         pose = torch.eye(4, dtype=torch.float64)
         rotation = self.cam_from_world[:3, :3].double()

@@ -62,12 +62,12 @@ class Edited:
         """
         _check_rows(later.rows, len(self))
         known = later.rows != NEW
-        place = later.rows.clamp_min(0)
+        index = later.rows.clamp_min(0)
         if not len(self):
             rows, fractions = torch.full_like(later.rows, NEW), torch.ones(len(later))
         else:
-            rows = torch.where(known, self.rows[place], NEW)
-            fractions = torch.where(known, _fractions(self)[place], 1.0)
+            rows = torch.where(known, self.rows[index], NEW)
+            fractions = torch.where(known, _fractions(self)[index], 1.0)
         fractions = fractions * _fractions(later)
         without = self.fractions is None and later.fractions is None
         return Edited(

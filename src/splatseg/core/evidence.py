@@ -25,7 +25,7 @@ class MaskSet:
     """Run-length masks, each of height x width pixels."""
 
     scores: Float[Tensor, "m"]
-    """How sure the model is of each mask, in [0, 1]."""
+    """Confidence of the model in each mask, in [0, 1]."""
 
     levels: Int[Tensor, "m"]
     """Granularity, 0 the finest; all 0 where the model has no levels."""
@@ -79,7 +79,7 @@ class LabelMap:
     """int32 ids, -1 where a pixel has none."""
 
     confidence: Float[Tensor, "height width"] | None = None
-    """How sure the id is, in [0, 1]."""
+    """Confidence of the id, in [0, 1]."""
 
     def __post_init__(self) -> None:
         check_shape("ids", self.ids, (None, None))
@@ -134,7 +134,7 @@ class Segment:
     category: int
     isthing: bool
     score: float
-    """How sure the model is of it, in [0, 1]."""
+    """Confidence of the model, in [0, 1]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

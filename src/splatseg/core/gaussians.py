@@ -58,8 +58,8 @@ class Gaussians:
 
     antialiased: bool = False
     """Whether the opacities are meant for antialiased rendering (`RenderOptions.antialiased`):
-    Gaussians that were fitted one way look wrong the other way. It goes with them into files
-    that can say it."""
+    Gaussians fitted with one setting render wrongly with the other. It is written to files of
+    formats that can hold it."""
 
     low_pass: float = LOW_PASS
     """Variance of the filter that they are drawn with, square pixels
@@ -100,7 +100,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the harmonics, 0 to 3."""
+        """Degree of the spherical harmonics, 0 to 3."""
         return degree_of(self.sh.shape[1])
 
     @property
@@ -137,7 +137,7 @@ class Gaussians:
     def check_values(self) -> None:
         """Raise `RangeError` unless every row can be rendered.
 
-        Means, rotations, scales, opacities and harmonics are finite, scales are not negative,
+        Means, rotations, scales, opacities and SH are finite, scales are not negative,
         opacities lie in [0, 1] and no quaternion is zero.
         """
         check_finite("means", self.means)
@@ -154,9 +154,9 @@ class Gaussians:
             )
 
     def transformed(self, target_from_source: Similarity) -> "Gaussians":
-        """The Gaussians moved by a similarity: centres, axes, sizes and harmonics.
+        """The Gaussians moved by a similarity: centres, axes, scales and spherical harmonics.
 
-        Rendering the result from a camera moved the same way gives the same picture.
+        Rendering the result from a camera moved the same way gives the same image.
         """
         turn = quaternion_from_rotation(target_from_source.rotation.double()).to(self.means)
         return self.replace(
@@ -170,7 +170,7 @@ class Gaussians:
     def concatenate(parts: "Sequence[Gaussians]") -> "Gaussians":
         """Join scenes row by row.
 
-        All must have the same harmonics and extra columns, and be meant for the same rendering.
+        All must have the same SH degree, extra columns, `antialiased` and `low_pass`.
 
         Raises:
             InputError: If there is nothing to join or the columns differ.
@@ -186,7 +186,7 @@ class Gaussians:
                 )
             if part.sh.shape[1] != parts[0].sh.shape[1]:
                 raise ShapeError(
-                    f"parts[{i}]: expected harmonics of degree {parts[0].sh_degree}, "
+                    f"parts[{i}]: expected spherical harmonics of degree {parts[0].sh_degree}, "
                     f"got {part.sh_degree}."
                 )
             for name in ("antialiased", "low_pass"):

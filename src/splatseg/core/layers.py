@@ -15,7 +15,7 @@ from splatseg.errors import InputError, RangeError, ShapeError
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Labels:
-    """One id a Gaussian, with how sure it is."""
+    """One id a Gaussian, with its confidence."""
 
     ids: Int[Tensor, "n"]
     """int32 ids, -1 where there is none."""
@@ -33,7 +33,7 @@ class Labels:
     """Their shares of the evidence, which add up to at most 1."""
 
     evidence: Float[Tensor, "n"] | None = None
-    """How much spoke for any id: blending weight summed over voting pixels and views. One fully
+    """Total evidence for any id: blending weight summed over voting pixels and views. One fully
     visible pixel counts 1; 0 where no view saw the Gaussian."""
 
     effective_views: Float[Tensor, "n"] | None = None
@@ -100,7 +100,7 @@ class Features:
     values: Float[Tensor, "n channels"]
 
     weights: Float[Tensor, "n"] | None = None
-    """How much of it was seen: blending weight summed over pixels and views."""
+    """Visibility: blending weight summed over pixels and views."""
 
     metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """How it was made, in values that JSON holds."""

@@ -23,7 +23,7 @@ Image = UInt8[Tensor, "height width 3"]
 
 @runtime_checkable
 class Model(Protocol):
-    """What every model says of itself."""
+    """Name and settings of a model."""
 
     @property
     def name(self) -> str:
@@ -46,7 +46,7 @@ class Model(Protocol):
 
 @runtime_checkable
 class ModelWithDefaults(Model, Protocol):
-    """A model that knows its settings as they are when nobody chose any."""
+    """A model that knows the defaults of its settings."""
 
     @property
     def default_settings(self) -> Mapping[str, Any]:
@@ -160,10 +160,10 @@ class Embedding:
 
 @runtime_checkable
 class PromptableMasks(Model, Protocol):
-    """Answers a prompt with masks: the image is looked at once, prompts are cheap."""
+    """Answers a prompt with masks: the image is encoded once, prompts are cheap."""
 
     def embed(self, image: Image) -> Embedding:
-        """Look at an image."""
+        """Encode an image."""
         ...
 
     def prompted_masks(self, embedding: Embedding, prompt: Prompt) -> MaskSet:
@@ -231,7 +231,7 @@ class DeepFeatures:
 
 @runtime_checkable
 class DenseFeatures(Model, Protocol):
-    """Describes every place of an image by a vector; like places have like vectors."""
+    """Describes every patch of an image by a vector; similar patches have similar vectors."""
 
     def features(self, image: Image) -> DeepFeatures:
         """Features of an image."""
@@ -240,10 +240,10 @@ class DenseFeatures(Model, Protocol):
 
 @runtime_checkable
 class TextFeatures(Model, Protocol):
-    """Describes places of images and words in one space; compare by cosine."""
+    """Embeds image patches and words in one space; compare by cosine."""
 
     def text_features(self, image: Image) -> FeatureMap:
-        """Unit vectors of the places of an image."""
+        """Unit vectors of the patches of an image."""
         ...
 
     def encode_text(self, words: Sequence[str]) -> Float[Tensor, "n width"]:
@@ -262,7 +262,7 @@ class Boxes:
     """How sure each is, in [0, 1]."""
 
     words: tuple[int, ...]
-    """Which of the words asked for each box is, by place."""
+    """Index of the word that each box was found for."""
 
     def __post_init__(self) -> None:
         check_shape("boxes", self.boxes, (len(self.words), 4))

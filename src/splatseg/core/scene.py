@@ -70,7 +70,7 @@ class ClassInfo:
     """True where single objects are counted, False for stuff such as a wall."""
 
     colour: tuple[int, int, int] | None = None
-    """Red, green, blue, 0 to 255, for pictures."""
+    """Red, green, blue, 0 to 255, for images."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,10 +151,10 @@ class Capture(_WithViews):
     classes: ClassTable | None = None
 
     up: tuple[float, float, float] | None = None
-    """Direction away from the ground in the world, where the capture says."""
+    """Direction away from the ground in the world, where the capture records it."""
 
     metres_per_unit: float | None = None
-    """Length of a scene unit, where the capture says."""
+    """Length of a scene unit, where the capture records it."""
 
     splats: Path | None = None
     """A splat file that lies beside the photographs."""

@@ -1,7 +1,7 @@
 """Photographs with cameras and start points become Gaussians.
 
-`fit` is the whole of it; `FitOptions` are its switches. `refine` lets Gaussians that are there
-go on learning, from photographs and from anything else that can be drawn of them.
+`fit` runs the optimisation with `FitOptions`. `refine` optimises existing Gaussians further, from
+photographs and from any other differentiable loss.
 """
 
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
@@ -25,5 +25,5 @@ from splatseg.fit._records import FitResult as FitResult
 from splatseg.fit._refine import Refinement as Refinement
 from splatseg.fit._refine import refine as refine
 from splatseg.fit._resume import Checkpoints as Checkpoints
-from splatseg.fit._start import random_start_count as random_start_count
+from splatseg.fit._start import random_point_count as random_point_count
 from splatseg.fit._step import ExtraLoss as ExtraLoss

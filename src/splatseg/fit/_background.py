@@ -16,10 +16,10 @@ _HEX = re.compile(r"#[0-9a-fA-F]{6}")
 
 
 def fixed_colour(background: Background | Sequence[float]) -> tuple[float, float, float] | None:
-    """Red, green and blue of a background in [0, 1]; None if it is drawn anew each step.
+    """Red, green and blue of a background in [0, 1]; None if each step draws a random one.
 
     Raises:
-        InputError: If it is no background.
+        InputError: If it is not a valid background.
 
     Example:
         >>> fixed_colour("#ff8000")

@@ -1,9 +1,9 @@
-"""The state of a fit on disk: written now and then, read to go on from.
+"""Checkpoints: the state of a fit on disk, written at intervals and read to resume.
 
 An npz (a ZIP archive of NumPy arrays, uncompressed, nothing pickled) with a header of JSON. It is
-written beside the one before under a fixed second name and takes its place when it is complete,
-so a process that is killed at any moment leaves a whole one, and a rest that the next one
-overwrites. Each array has a checksum: a damaged file is not taken for a good one.
+written beside the previous one under a fixed second name and replaces it when it is complete,
+so a process that is killed at any moment leaves a complete one, and an unfinished file that the
+next one overwrites. Each array has a checksum, so damage is detected.
 """
 
 import zipfile
@@ -24,18 +24,18 @@ from splatseg.io.json_files import json_text, parse_object
 
 FORMAT = "splatseg-fit"
 VERSION = 1
-"""Version of the files written. No other is read: a fit is resumed by the program it began in."""
+"""Version of the files written. No other version is read."""
 
 _HEADER = "header"
 
 
 class CheckpointVersionError(FileFormatError):
-    """A checkpoint is whole, but of a version that cannot be gone on from."""
+    """A checkpoint is valid, but of a version that cannot be resumed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Checkpoint:
-    """A state, and what it is the state of."""
+    """A state, and the data and options that it belongs to."""
 
     state: FitState
 
@@ -44,10 +44,10 @@ class Checkpoint:
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; what is there before stays until the new one is complete.
+    """Write a checkpoint; the previous one stays until the new one is complete.
 
     Raises:
-        SplatsegError: If it cannot be written; the one before is still there.
+        SplatsegError: If it cannot be written; the previous one is kept.
     """
     header = {
         "format": FORMAT,
@@ -74,7 +74,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     Raises:
         MissingFileError: If there is no such file.
         CheckpointVersionError: If it is of another version.
-        FileFormatError: If it is no checkpoint or damaged.
+        FileFormatError: If it is not a checkpoint, or damaged.
     """
     with _opened(path) as archive:
         header = _header(path, archive)
@@ -90,7 +90,7 @@ class CheckpointSummary:
 
     steps: int
     progress: float
-    """Share that is done, [0, 1]."""
+    """Share of the fit that is done, [0, 1]."""
 
     seconds: float
     """Since the fit began, pauses left out."""
@@ -99,12 +99,12 @@ class CheckpointSummary:
 
 
 def checkpoint_summary(path: Path) -> CheckpointSummary:
-    """What a checkpoint says of itself. Reads no tensors.
+    """Steps, progress and size of a checkpoint. Reads no tensors.
 
     Raises:
         MissingFileError: If there is no such file.
         CheckpointVersionError: If it is of another version.
-        FileFormatError: If it is no checkpoint or damaged.
+        FileFormatError: If it is not a checkpoint, or damaged.
     """
     with _opened(path) as archive:
         content = _header(path, archive)["content"]
@@ -134,7 +134,7 @@ def _opened(path: Path) -> Generator[NpzFile]:
     if not path.is_file():
         raise MissingFileError(f"{path}: there is no such checkpoint.")
     try:
-        # NumPy takes a file that is no archive for a single array, or for a pickle.
+        # NumPy reads a file that is not an archive as a single array, or as a pickle.
         with zipfile.ZipFile(path):
             pass
         with np.load(path, allow_pickle=False) as archive:
@@ -143,13 +143,14 @@ def _opened(path: Path) -> Generator[NpzFile]:
         if isinstance(error, FileFormatError):
             raise
         raise FileFormatError(
-            f"{path}: expected the checkpoint of a fit, but it is damaged or none ({error})."
+            f"{path}: expected the checkpoint of a fit, got a damaged file or another format "
+            f"({error})."
         ) from error
 
 
 def _array(path: Path, archive: NpzFile, name: str) -> NDArray[Any]:
     array = cast(object, archive[name])
-    # A member that is no .npy comes as bytes.
+    # A member that is not .npy is read as bytes.
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
         raise FileFormatError(f"{path}: expected {name!r} to be an array of numbers.")
     return array

@@ -1,8 +1,8 @@
-"""Where Gaussians are needed: dead ones move to living ones, new ones come beside them.
+"""Density control of 3DGS-MCMC: dead Gaussians are relocated to live ones, and new ones are added.
 
-3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024): a Gaussian that is joined by others
-at its place shares its opacity and shrinks so that the picture hardly changes. (That faint ones
-wander is part of the update of each step, see `_update`.)
+3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024): when several Gaussians share one
+position, their opacities and scales are reduced so that the rendered image hardly changes. (The
+noise added to the centres is part of each step's update, see `_update`.)
 """
 
 from functools import cache
@@ -14,12 +14,12 @@ from torch import Tensor
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters
 
-_MOST_COPIES = 51
-# Opacities stay this far from 0 and 1 when they are shared, so that their logits are finite.
-_LEAST_OPACITY = 0.005
-_LEAST_TRANSPARENCY = 1e-6
-# Growth of one round, as a share of what is there: copies need steps to grow apart.
-_MOST_GROWTH = 0.5
+_MAX_COPIES = 51
+# Shared opacities are kept this far from 0 and 1, so that their logits are finite.
+_MIN_OPACITY = 0.005
+_MIN_TRANSPARENCY = 1e-6
+# Largest growth of one round, as a share of the current number: copies need steps to diverge.
+_MAX_GROWTH = 0.5
 
 
 def shared_shape(
@@ -38,10 +38,10 @@ def shared_shape(
         opacities: In (0, 1).
         copies: N, at least 1; more than 51 count as 51, where the alternating sum is exact.
     """
-    n = copies.clamp(1, _MOST_COPIES)
+    n = copies.clamp(1, _MAX_COPIES)
     opacity = opacities.double()
     shared = 1 - (1 - opacity) ** (1 / n)
-    k = torch.arange(_MOST_COPIES, dtype=torch.float64, device=opacity.device)
+    k = torch.arange(_MAX_COPIES, dtype=torch.float64, device=opacity.device)
     powers = shared[:, None] ** (k + 1) * (-1) ** k / (k + 1).sqrt()
     denominator = (powers * _binomial_sums().to(opacity.device)[n - 1]).sum(dim=1)
     return shared.to(opacities), (opacity / denominator).to(opacities)
@@ -50,9 +50,9 @@ def shared_shape(
 @cache
 def _binomial_sums() -> Tensor:
     """Row N - 1, column k: the sum over i = 1 .. N of binomial(i - 1, k)."""
-    rows = torch.zeros(_MOST_COPIES, _MOST_COPIES, dtype=torch.float64)
+    rows = torch.zeros(_MAX_COPIES, _MAX_COPIES, dtype=torch.float64)
     rows[:, 0] = 1
-    for i in range(1, _MOST_COPIES):
+    for i in range(1, _MAX_COPIES):
         rows[i, 1:] = rows[i - 1, 1:] + rows[i - 1, :-1]
     return rows.cumsum(dim=0)
 
@@ -66,24 +66,24 @@ def relocated(
     options: FitOptions,
     generator: torch.Generator,
 ) -> tuple[Parameters, Parameters, Parameters]:
-    """New parameters and moments with dead Gaussians moved and new ones added.
+    """Parameters and moments with dead Gaussians relocated and new ones added.
 
-    Where they go is drawn with the opacity as probability. Nothing given is changed, so an
-    interrupted call leaves the fit as it was.
+    Targets are sampled with probability proportional to opacity. The arguments are not changed,
+    so an interrupted call leaves the fit as it was.
 
     Args:
         parameters: The Gaussians.
         first: Adam's first moments.
         second: Adam's second moments.
         count: How many Gaussians there should be; never fewer than there are.
-        options: Opacity from which on one counts as dead.
+        options: Opacity up to which a Gaussian counts as dead.
         generator: Source of randomness, on the CPU.
     """
     opacities = parameters.logits.sigmoid().squeeze(1)
     dead = opacities <= options.dead_opacity
     if bool(dead.all()):
         return parameters, first, second
-    added = max(0, min(count - len(parameters), int(_MOST_GROWTH * len(parameters))))
+    added = max(0, min(count - len(parameters), int(_MAX_GROWTH * len(parameters))))
     targets = torch.cat(
         (
             dead.nonzero().squeeze(1),
@@ -92,12 +92,12 @@ def relocated(
     )
     if not len(targets):
         return parameters, first, second
-    sources = _draw(torch.where(dead, 0.0, opacities), len(targets), generator)
+    sources = _sampled_indices(torch.where(dead, 0.0, opacities), len(targets), generator)
 
     copies = torch.bincount(sources, minlength=len(parameters)) + 1
     chosen = (copies > 1).nonzero().squeeze(1)
     shared, factor = shared_shape(opacities[chosen], copies[chosen])
-    shared = shared.clamp(_LEAST_OPACITY, 1 - _LEAST_TRANSPARENCY)
+    shared = shared.clamp(_MIN_OPACITY, 1 - _MIN_TRANSPARENCY)
 
     grown = parameters.with_zeros(added)
     grown.logits[chosen] = shared.logit()[:, None]
@@ -112,10 +112,10 @@ def relocated(
     return grown, *moments
 
 
-def _draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def _sampled_indices(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices with probability proportional to `weights`, with replacement."""
     # torch.multinomial stops at 2^24 categories; the inverse of the distribution does not.
     total = weights.double().cumsum(dim=0)
-    at = torch.rand(count, generator=generator, dtype=torch.float64).to(weights.device)
-    drawn = torch.searchsorted(total, at * total[-1], right=True)
-    return drawn.clamp_max(len(weights) - 1)
+    quantiles = torch.rand(count, generator=generator, dtype=torch.float64).to(weights.device)
+    indices = torch.searchsorted(total, quantiles * total[-1], right=True)
+    return indices.clamp_max(len(weights) - 1)

@@ -1,4 +1,4 @@
-"""Where Gaussians come from and go to while a fit goes on: the two strategies as one interface."""
+"""Density control during a fit: both strategies behind one interface."""
 
 from typing import Protocol
 
@@ -17,27 +17,29 @@ State = tuple[Parameters, Parameters, Parameters]
 
 
 class Density(Protocol):
-    """Decides after each step how many Gaussians there are, and where."""
+    """Adds, moves and removes Gaussians after a step."""
 
-    looks_at_screen: bool
-    """True if `see` wants the slopes in the projected centres."""
+    needs_screen_gradients: bool
+    """True if `add_view` needs gradients with respect to the projected centres."""
 
-    def see(self, rows: Tensor, slopes: Tensor, *, camera: Camera, parameters: Parameters) -> None:
-        """Take note of one view: its rows, and the slopes (m, 2) in their centres per pixel."""
+    def add_view(
+        self, rows: Tensor, gradients: Tensor, *, camera: Camera, parameters: Parameters
+    ) -> None:
+        """Record a view: its rows, and gradients (m, 2) of their projected centres, per pixel."""
         ...
 
-    def after(
+    def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
     ) -> State:
-        """The state to go on with after `steps` steps. What is given is not changed."""
+        """The state to continue with after `steps` steps. The argument is not changed."""
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """All that `restore` needs."""
+        """The tensors that `restore` needs."""
         ...
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Restore what `state` returned."""
         ...
 
 
@@ -61,18 +63,20 @@ def _round_due(options: FitOptions, *, steps: int, progress: float) -> bool:
 
 
 class Relocation:
-    """Dead Gaussians move to living ones, and the number grows on a schedule (`_densify`)."""
+    """Relocate dead Gaussians to live ones, and grow the number on a schedule (`_densify`)."""
 
-    looks_at_screen = False
+    needs_screen_gradients = False
 
     def __init__(self, options: FitOptions, *, start: int) -> None:
         self._options = options
         self._start = start
 
-    def see(self, rows: Tensor, slopes: Tensor, *, camera: Camera, parameters: Parameters) -> None:
-        """Nothing that a view shows matters."""
+    def add_view(
+        self, rows: Tensor, gradients: Tensor, *, camera: Camera, parameters: Parameters
+    ) -> None:
+        """Views are not needed."""
 
-    def after(
+    def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
     ) -> State:
         """Relocate every `FitOptions.densify_every` steps."""
@@ -82,17 +86,17 @@ class Relocation:
         return relocated(*state, count=count, options=self._options, generator=generator)
 
     def state(self) -> dict[str, Tensor]:
-        """Nothing is kept from step to step."""
+        """There is no state."""
         return {}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Nothing is kept from step to step."""
+        """There is no state."""
 
 
 class Classic:
     """Clone, split, prune, and reset opacities (`_classic`)."""
 
-    looks_at_screen = True
+    needs_screen_gradients = True
 
     def __init__(
         self, options: FitOptions, *, start: int, extent: float, device: torch.device
@@ -102,11 +106,13 @@ class Classic:
         self._statistics = ScreenStatistics.zeros(start, device)
         self._resets = 0
 
-    def see(self, rows: Tensor, slopes: Tensor, *, camera: Camera, parameters: Parameters) -> None:
-        """Add to the slopes since the last round."""
-        self._statistics.add(rows, slopes, camera=camera, parameters=parameters)
+    def add_view(
+        self, rows: Tensor, gradients: Tensor, *, camera: Camera, parameters: Parameters
+    ) -> None:
+        """Add to the gradients since the last round."""
+        self._statistics.add(rows, gradients, camera=camera, parameters=parameters)
 
-    def after(
+    def after_step(
         self, state: State, *, steps: int, progress: float, generator: torch.Generator
     ) -> State:
         """A round every `FitOptions.densify_every` steps, a reset every `reset_every`."""
@@ -123,7 +129,7 @@ class Classic:
             self._statistics = ScreenStatistics.zeros(len(state[0]), state[0].means.device)
         if steps % options.reset_every == 0 and progress < options.densify_until:
             self._resets += 1
-            state = with_reset_opacities(*state, most=options.reset_opacity)
+            state = with_reset_opacities(*state, max_opacity=options.reset_opacity)
         return state
 
     def state(self) -> dict[str, Tensor]:
@@ -132,7 +138,7 @@ class Classic:
         return kept | {"resets": torch.tensor([self._resets])}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Restore what `state` returned."""
         self._resets = int(tensors["resets"])
         self._statistics = ScreenStatistics(
             **{name: tensors[name] for name in ScreenStatistics.__slots__}

@@ -1,12 +1,12 @@
-r"""Depth maps as a second teacher: the expected depth of a view is pulled to what was measured.
+r"""Depth supervision: the expected depth of a view is compared with its depth map.
 
 The loss of a view is
 
 .. math:: \frac{\lambda}{m} \sum_p \left| \frac{s}{d(p)} - \frac{s}{D(p)} \right|
 
-over the m pixels that have a measured depth D and are drawn (alpha at least 0.5); d is the
-expected depth and s the median of D, so that the unit of length does not matter. Inverse depth
-is what the 3DGS code regularises too: far things, whose depth is uncertain, count less.
+over the m pixels with a measured depth D and a rendered alpha of at least 0.5; d is the expected
+depth and s the median of D, so that the unit of length does not matter. The 3DGS code regularises
+inverse depth too: far surfaces, whose depth is uncertain, count less.
 """
 
 from collections.abc import Sequence
@@ -20,24 +20,24 @@ from splatseg.core import Camera, View
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 from splatseg.io.depths import load_depth
-from splatseg.render.warp import Warp, straightened
+from splatseg.render.warp import Warp, undistorted_camera
 
 _FINAL_WEIGHT = 0.01
-"""What is left of the weight at progress 1: at the end the photographs decide."""
+"""Factor of the weight at progress 1: the photographs dominate at the end."""
 
-_SOLID = 0.5
-_NEAREST = 0.1
-"""Drawn depths below this share of the median count as this share: the slope of 1 / d has no
-bound, and one Gaussian before the lens would drown the rest."""
+_MIN_ALPHA = 0.5
+_MIN_DEPTH_SHARE = 0.1
+"""Rendered depths are clamped to this share of the median: the gradient of 1 / d is unbounded, and
+one Gaussian before the lens would dominate the loss."""
 
-_ROUNDS = 10
-_FEWEST = 20
-"""Start points that a relative depth map must show to be aligned."""
+_ALIGNMENT_ROUNDS = 10
+_MIN_POINTS = 20
+"""Minimum number of start points in view to align a relative depth map."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthLoss:
-    """The depth loss of one rendering."""
+    """The depth loss of one render."""
 
     value: float
     gradient: Float[Tensor, "height width"]
@@ -45,15 +45,15 @@ class DepthLoss:
 
 
 class DepthMaps:
-    """Depth maps of the training views, read when first asked for.
+    """Depth maps of the training views, read at first use.
 
     Args:
         views: The training views; those without a depth map have no depth loss.
-        points: Points on what is shown, which relative maps are aligned to.
+        points: Points on the surfaces, to which relative maps are aligned.
         options: ``metric`` maps hold z-depth. ``relative`` ones hold inverse depth up to a scale
-            and a shift of each view, as networks that see one photograph give it; median and
-            mean deviation of the points in view settle the two (see `aligned_inverse`).
-        where: Messages begin with it.
+            and a shift of each view, as monocular depth networks predict it; the points in view
+            determine both (see `aligned_inverse`).
+        where: Prefix of messages.
 
     Raises:
         InputError: If no view has a depth map, or relative maps have no points to align to.
@@ -82,7 +82,7 @@ class DepthMaps:
                     f"{where}: expected start points to align relative depth maps to, got none."
                 )
             self._points = points
-        self._kept: dict[int, tuple[Tensor, float] | None] = {}
+        self._maps: dict[int, tuple[Tensor, float] | None] = {}
 
     def loss(
         self,
@@ -95,46 +95,46 @@ class DepthMaps:
     ) -> DepthLoss | None:
         """The loss of a view's expected depth; None where the view has no depth map.
 
-        Both are read at the coarser of the two resolutions, without interpolation: between a
-        thing and what is behind it there is no depth.
+        Both are sampled at the coarser of the two resolutions, without interpolation: between an
+        object and its background there is no depth.
 
         Args:
             index: Which training view.
-            depth: The rendering's expected depth, of any reduction.
+            depth: The render's expected depth, at any resolution.
             alpha: Its alpha.
-            progress: The weight falls exponentially with it.
-            mask: Pixels that count; None is all.
+            progress: The weight decays exponentially with it.
+            mask: Valid pixels; None is all.
         """
         known = self._map(index)
         if known is None:
             return None
         inverse, scale = known
-        rows, map_rows = _common(depth.shape[0], inverse.shape[0])
-        columns, map_columns = _common(depth.shape[1], inverse.shape[1])
+        rows, map_rows = _matching_indices(depth.shape[0], inverse.shape[0])
+        columns, map_columns = _matching_indices(depth.shape[1], inverse.shape[1])
         drawn = depth.detach()[rows][:, columns]
-        goal = inverse[map_rows][:, map_columns].to(drawn)
-        counts = (goal > 0) & (alpha.detach()[rows][:, columns] >= _SOLID)
+        target = inverse[map_rows][:, map_columns].to(drawn)
+        counts = (target > 0) & (alpha.detach()[rows][:, columns] >= _MIN_ALPHA)
         if mask is not None:
             counts &= mask[rows][:, columns]
         weight = self._weight * _FINAL_WEIGHT**progress / max(1, int(counts.sum()))
-        bounded = drawn.clamp_min(_NEAREST * scale)
-        difference = torch.where(counts, scale / bounded - scale * goal, 0.0)
-        slope = -weight * difference.sign() * scale / bounded.square()
+        bounded = drawn.clamp_min(_MIN_DEPTH_SHARE * scale)
+        difference = torch.where(counts, scale / bounded - scale * target, 0.0)
+        depth_gradient = -weight * difference.sign() * scale / bounded.square()
         gradient = torch.zeros_like(depth)
-        gradient[rows.unsqueeze(1), columns] = slope
+        gradient[rows.unsqueeze(1), columns] = depth_gradient
         return DepthLoss(value=weight * float(difference.abs().sum()), gradient=gradient)
 
     def _map(self, index: int) -> tuple[Tensor, float] | None:
         """Inverse depth in one over scene units (0 is unknown) and the median depth."""
-        if index not in self._kept:
+        if index not in self._maps:
             view = self._views[index]
-            self._kept[index] = None if view.depth is None else self._read(view)
-        return self._kept[index]
+            self._maps[index] = None if view.depth is None else self._read(view)
+        return self._maps[index]
 
     def _read(self, view: View) -> tuple[Tensor, float] | None:
         values = load_depth(view)
         if not view.camera.is_pinhole:
-            values = _straight(values, view.camera)
+            values = _undistorted_map(values, view.camera)
         if self._points is None:
             inverse = torch.where(values > 0, 1 / values.clamp_min(1e-12), 0.0)
         else:
@@ -149,53 +149,53 @@ class DepthMaps:
 def aligned_inverse(
     values: Float[Tensor, "rows columns"], camera: Camera, points: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "rows columns"] | None:
-    """A relative map as inverse depth, by the points that its view shows.
+    """Align a relative map to inverse depth, by the points in its view.
 
-    The line through medians and mean absolute deviations of both, as the 3DGS code has it; then
-    some rounds of least squares over the points that were nearest to the line, the nearer half,
-    because the others may be hidden. None where fewer than 20 points are in view, or the map is
-    flat.
+    Scale and shift are initialised from medians and mean absolute deviations, as in the 3DGS code,
+    and refined by ten rounds of least squares over the half of the points with the smallest
+    residuals, because the others may be occluded. None where fewer than 20 points are in view,
+    or the map is constant.
     """
-    straight = straightened(camera)
-    at, z = straight.project(points.double())
-    size = at.new_tensor([straight.width, straight.height])
-    inside = (z > 0) & (at >= 0).all(dim=1) & (at < size).all(dim=1)
-    cell = at[inside] / size * at.new_tensor([values.shape[1], values.shape[0]])
+    straight = undistorted_camera(camera)
+    pixels, z = straight.project(points.double())
+    size = pixels.new_tensor([straight.width, straight.height])
+    inside = (z > 0) & (pixels >= 0).all(dim=1) & (pixels < size).all(dim=1)
+    cell = pixels[inside] / size * pixels.new_tensor([values.shape[1], values.shape[0]])
     column, row = cell.long().unbind(1)
     seen = values[row, column].double()
-    wanted = 1 / z[inside][seen > 0]
+    point_values = 1 / z[inside][seen > 0]
     seen = seen[seen > 0]
-    if len(seen) < _FEWEST:
+    if len(seen) < _MIN_POINTS:
         return None
-    middle, goal = seen.median(), wanted.median()
-    spread = (seen - middle).abs().mean()
+    value_centre, target = seen.median(), point_values.median()
+    spread = (seen - value_centre).abs().mean()
     if float(spread) <= 0:
         return None
-    scale = (wanted - goal).abs().mean() / spread
-    for _ in range(_ROUNDS):
-        off = ((seen - middle) * scale + goal - wanted).abs()
-        near = off <= off.median()
-        middle, goal = seen[near].mean(), wanted[near].mean()
-        across = seen[near] - middle
-        if float(across.square().sum()) <= 0:
+    scale = (point_values - target).abs().mean() / spread
+    for _ in range(_ALIGNMENT_ROUNDS):
+        residuals = ((seen - value_centre) * scale + target - point_values).abs()
+        near = residuals <= residuals.median()
+        value_centre, target = seen[near].mean(), point_values[near].mean()
+        centred = seen[near] - value_centre
+        if float(centred.square().sum()) <= 0:
             return None
-        scale = (across * (wanted[near] - goal)).sum() / across.square().sum()
-    inverse = ((values.double() - middle) * scale + goal).float()
+        scale = (centred * (point_values[near] - target)).sum() / centred.square().sum()
+    inverse = ((values.double() - value_centre) * scale + target).float()
     return torch.where(values > 0, inverse.clamp_min(0), 0.0)
 
 
-def _straight(values: Tensor, camera: Camera) -> Tensor:
-    """A distorted photograph's depth map in the pixels of its straight image, nearest.
+def _undistorted_map(values: Tensor, camera: Camera) -> Tensor:
+    """A distorted photograph's depth map in the pixels of its undistorted image, nearest.
 
     Depth along the axis does not depend on the lens.
     """
     lens = camera.resized(values.shape[1], values.shape[0])
-    pinhole = straightened(lens)
+    pinhole = undistorted_camera(lens)
     return Warp.between(pinhole, lens, "nearest").apply(values.unsqueeze(-1)).squeeze(-1)
 
 
-def _common(size: int, other: int) -> tuple[Tensor, Tensor]:
-    """Indices into two rows of pixels that cover the same, at the coarser resolution."""
+def _matching_indices(size: int, other: int) -> tuple[Tensor, Tensor]:
+    """Indices of corresponding pixels along an axis of two sizes, at the coarser resolution."""
     count = min(size, other)
     step = torch.arange(count)
     return step * size // count, step * other // count

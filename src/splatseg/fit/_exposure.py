@@ -1,4 +1,4 @@
-"""Photographs of one scene are not equally bright: a gain and a bias for each of them.
+"""Exposure compensation: a gain and a bias for each training photograph.
 
 The 3DGS code has an affine map of the colour for each training view as an option (Kerbl et al.
 2023, ``exposure`` in its repository). Here it is diagonal: gain and bias of each channel, which
@@ -19,22 +19,22 @@ from splatseg.fit._options import FitOptions
 from splatseg.fit._view_adam import ViewAdam
 
 _FINAL_RATE = 0.1
-"""What is left of the rate at progress 1."""
+"""Factor of the learning rate at progress 1."""
 
 _BIAS_SHARE = 0.1
-"""Rate of the biases over that of the gains: cameras change gains, and where a view shows little
-contrast the two cannot be told apart."""
+"""Learning rate of the biases over that of the gains: cameras change gains, and where a view has
+little contrast the two cannot be distinguished."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exposure:
-    """How one photograph shows the scene's colours: ``gain * colour + alpha * bias``."""
+    """The colours of one photograph: ``gain * colour + alpha * bias``."""
 
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factor of red, green and blue, greater than 0."""
 
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What is added to red, green and blue, in [0, 1] units of the colour."""
+    """Offset of red, green and blue, in [0, 1] units of the colour."""
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) and value > 0 for value in self.gain):
@@ -48,15 +48,15 @@ class Exposures:
 
     .. math:: I' = e^{g} I + \alpha b
 
-    with g and b a number a channel, both 0 unless `start` says otherwise. The means of g and of
-    b over the views stay what they are at the start: the scene itself is what a photograph of
-    mean exposure shows, and views that were not trained on are drawn without either. A term
-    :math:`p (|g|^2 + |b|^2)` in the loss keeps them where the photographs do not say otherwise.
+    with one g and one b per channel, both 0 unless `start` is given. The means of g and of b over
+    the views stay at their initial values: the scene has the colours of a photograph of mean
+    exposure, and held-out views are rendered without either. A regulariser
+    :math:`p (|g|^2 + |b|^2)` in the loss keeps them small.
 
     Args:
         views: Number of training views.
-        options: Rate and weight p.
-        start: Where each view begins; None is nowhere brighter or darker.
+        options: Learning rate and weight p.
+        start: Initial exposure of each view; None is gain 1 and bias 0.
     """
 
     def __init__(
@@ -65,9 +65,9 @@ class Exposures:
         self._rate = options.exposure_rate
         self._prior = options.exposure_prior
         self._values = torch.zeros(views, 6, dtype=torch.float64)
-        for i, one in enumerate(start or ()):
-            logs = [math.log(gain) for gain in one.gain]
-            self._values[i] = torch.tensor([*logs, *one.bias], dtype=torch.float64)
+        for i, exposure in enumerate(start or ()):
+            logs = [math.log(gain) for gain in exposure.gain]
+            self._values[i] = torch.tensor([*logs, *exposure.bias], dtype=torch.float64)
         self._mean = self._values.mean(dim=0)
         self._adam = ViewAdam(views, 6)
         self._leaf: Tensor | None = None
@@ -79,7 +79,7 @@ class Exposures:
 
     @property
     def biases(self) -> Float[Tensor, "views 3"]:
-        """What is added to each channel in each view; the mean over views is 0."""
+        """Offset of each channel in each view; the mean over views is 0."""
         return self._values[:, 3:].clone()
 
     def applied(
@@ -88,42 +88,42 @@ class Exposures:
         image: Float[Tensor, "height width 3"],
         alpha: Float[Tensor, "height width"],
     ) -> Float[Tensor, "height width 3"]:
-        """The image as a view's exposure shows it. Differentiable, also towards the exposure."""
+        """The image in a view's exposure, differentiable in image, alpha and exposure."""
         leaf = self._values[index].to(image).requires_grad_()
         self._leaf = leaf
         return _apply(image, alpha, leaf[:3].exp(), leaf[3:])
 
     def update(self, index: int, *, progress: float) -> None:
-        """One step of Adam along the gradient of the last image that `applied` gave."""
+        """One step of Adam along the gradient of the last image that `applied` returned."""
         leaf = self._leaf
         if leaf is None or leaf.grad is None:
             return
-        slope = leaf.grad.double().cpu() + 2 * self._prior * self._values[index]
+        gradient = leaf.grad.double().cpu() + 2 * self._prior * self._values[index]
         rate = self._rate * _FINAL_RATE**progress
         values = self._values.clone()
-        move = rate * self._adam.direction(index, slope)
-        move[3:] *= _BIAS_SHARE
-        values[index] -= move
+        step = rate * self._adam.direction(index, gradient)
+        step[3:] *= _BIAS_SHARE
+        values[index] -= step
         self._values = values - (values.mean(dim=0) - self._mean)
         self._leaf = None
 
     def learned(self) -> tuple[Exposure, ...]:
-        """Those of all views, in their order."""
+        """The exposures of all views, in their order."""
         rows = torch.cat((self.gains, self.biases), dim=1).tolist()
         return tuple(Exposure(gain=(r, g, b), bias=(x, y, z)) for r, g, b, x, y, z in rows)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything it holds, by name."""
+        """Its tensors by name."""
         return {"values": self._values, **self._adam.state()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a `state`."""
+        """Restore what `state` returned."""
         self._values = tensors["values"].cpu().clone()
         self._adam.restore(tensors)
 
 
-class _Exposed(torch.autograd.Function):
-    """gain * image + bias * alpha, in half the time that autograd takes for it.
+class _ApplyExposure(torch.autograd.Function):
+    """gain * image + bias * alpha, in half the time of autograd.
 
     Rows of pixels are multiplied as rows of numbers: a broadcast over an axis of three is slow.
     """
@@ -136,9 +136,9 @@ class _Exposed(torch.autograd.Function):
         return exposed
 
     @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         image, alpha, gain, bias = ctx.saved_tensors
-        rows = slopes[0].flatten(1)
+        rows = gradients[0].flatten(1)
         pixels = rows.reshape(-1, 3)
         v_image = (rows * gain.repeat(image.shape[1])).view_as(image)
         v_alpha = (pixels @ bias).view_as(alpha)
@@ -146,4 +146,4 @@ class _Exposed(torch.autograd.Function):
         return v_image, v_alpha, v_gain, pixels.T @ alpha.flatten()
 
 
-_apply: Callable[..., Tensor] = _Exposed.apply  # pyright: ignore[reportAssignmentType]
+_apply: Callable[..., Tensor] = _ApplyExposure.apply  # pyright: ignore[reportAssignmentType]

@@ -1,4 +1,4 @@
-"""What a fit is of: its data, options and renderer. A checkpoint goes on only with the same."""
+"""Identity of a fit: its data, options and renderer. A checkpoint resumes only the same fit."""
 
 import hashlib
 import json
@@ -12,26 +12,26 @@ from splatseg.core.recorded_options import ABSENT, option_differences
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 
-# The length may differ: a fit can be made longer or shorter while it goes on. The number of
-# Gaussians goes with the length, and may differ with it.
+# The length may differ: a fit can be resumed with another one. The number of Gaussians depends on
+# the length, and may differ with it.
 _LENGTH = {"minutes", "steps"}
 _WITH_LENGTH = "max_gaussians"
-# Files are told apart by their size and so many of their first bytes.
+# Files are identified by their size and this many of their first bytes.
 _FILE_HEAD = 65_536
 
 
 def fit_identity(
     capture: Capture, views: Iterable[View], *, options: FitOptions, backend: str
 ) -> dict[str, Any]:
-    """Digests of what a fit learns from, its options, and its backend.
+    """Digests of a fit's data, its options, and its backend.
 
-    Paths are no part of it: data may move. A photograph that is not there counts as an empty
-    one; reading it says so.
+    Paths are not part of it: data may move. A photograph that is missing counts as empty; reading
+    it raises the error.
 
     Args:
-        capture: Its points are taken.
+        capture: The capture, for its start points.
         views: The training views.
-        options: All of them.
+        options: The options of the fit.
         backend: Name of the renderer in use.
     """
     views = tuple(views)
@@ -53,14 +53,14 @@ def fit_identity(
 
 
 def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise unless a checkpoint is of the fit that is to go on.
+    """Raise unless a checkpoint belongs to the fit that is to be resumed.
 
     Options that the checkpoint does not have count as their defaults (`option_differences`).
 
     Args:
-        path: Of the checkpoint.
+        path: The checkpoint, for messages.
         saved: Its identity.
-        now: The identity of what was asked for.
+        now: The identity of the fit to resume.
 
     Raises:
         InputError: Naming everything that differs.
@@ -72,7 +72,7 @@ def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any])
         differing.append(f"backend {saved.get('backend')!r} instead of {now.get('backend')!r}")
     if differing:
         raise InputError(
-            f"{path}: expected the data and options of the fit to resume, which has "
+            f"{path}: expected a checkpoint with the data and options of this fit, got one with "
             f"{', '.join(differing)}."
         )
 
@@ -92,7 +92,9 @@ def _other_options(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
         if one.name in free:
             continue
         if one.wanted is ABSENT:
-            found.append(f"{one.name} {json.dumps(one.recorded)}, which this splatseg has not")
+            found.append(
+                f"{one.name} {json.dumps(one.recorded)}, an option that this splatseg does not have"
+            )
         else:
             found.append(
                 f"{one.name} {json.dumps(one.recorded)} instead of {json.dumps(one.wanted)}"
@@ -101,7 +103,7 @@ def _other_options(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
 
 
 def _as_recorded(options: FitOptions) -> dict[str, Any]:
-    """Tuples come back from JSON as lists: compare what is written, not what was meant."""
+    """Options as JSON returns them: tuples become lists."""
     return json.loads(json.dumps(asdict(options)))
 
 

@@ -1,4 +1,4 @@
-"""From a capture's points to the Gaussians a fit starts from."""
+"""Initial Gaussians of a fit, from a capture's points."""
 
 import math
 
@@ -14,43 +14,44 @@ from splatseg.fit._parameters import Parameters
 from splatseg.neighbours import NeighbourIndex
 
 _NEIGHBOURS = 3
-# Points alone in space would start as balls that fill the view: none is larger than this share
-# of its distance to the nearest camera, nor smaller than the other, so that every one is drawn.
-_LARGEST_SHARE = 0.1
-_SMALLEST_SHARE = 1e-5
-# A capture from one spot has no extent of its own; the distance of what it shows stands for it.
-_LEAST_EXTENT_SHARE = 1e-3
+# Scales are clamped to these shares of the distance to the nearest camera: isolated points would
+# otherwise fill the view, and coincident ones would not be visible.
+_MAX_SCALE_SHARE = 0.1
+_MIN_SCALE_SHARE = 1e-5
+# The cameras of a capture from one position have no extent; the distance of the points replaces it.
+_MIN_EXTENT_SHARE = 1e-3
 
 
 def scene_size(views: tuple[View, ...], points: Float[Tensor, "n 3"]) -> float:
-    """Size of what is shown: its usual distance from the cameras' middle, at least their extent.
+    """Median distance of the points from the cameras' mean, at least `scene_extent`.
 
-    It scales with the scene, as everything that is to work in metres and in millimetres must.
+    It scales with the scene, so that a fit does not depend on the unit of length.
     """
     centres = torch.stack([view.camera.centre for view in views]).double()
-    reach = float((points.double() - centres.mean(dim=0)).norm(dim=1).median())
-    return max(scene_extent(views, points), reach)
+    median_distance = float((points.double() - centres.mean(dim=0)).norm(dim=1).median())
+    return max(scene_extent(views, points), median_distance)
 
 
 def scene_extent(views: tuple[View, ...], points: Float[Tensor, "n 3"]) -> float:
     """Size of a scene: 1.1 times the largest distance of a camera from their mean.
 
-    It is what 3DGS scales the position rate by. Where the cameras stand in one spot, it is a
-    thousandth of the median distance of the points.
+    3DGS scales the learning rate of positions by it. Where all cameras are in one position, it is
+    a thousandth of the median distance of the points.
     """
     centres = torch.stack([view.camera.centre for view in views]).double()
     mean = centres.mean(dim=0)
     radius = float((centres - mean).norm(dim=1).max())
-    reach = float((points.double() - mean).norm(dim=1).median())
-    return max(1.1 * radius, _LEAST_EXTENT_SHARE * reach, 1e-6)
+    median_distance = float((points.double() - mean).norm(dim=1).median())
+    return max(1.1 * radius, _MIN_EXTENT_SHARE * median_distance, 1e-6)
 
 
 def initial_parameters(
     capture: Capture, *, options: FitOptions, generator: torch.Generator
 ) -> Parameters:
-    """A ball at each start point: its colour, the mean distance of its three nearest as scale.
+    """An isotropic Gaussian at each start point, of the point's colour.
 
-    Of more points than `max_gaussians`, so many are drawn at random.
+    Its scale is the mean distance of the three nearest other points. If there are more points
+    than `max_gaussians`, a random subset is taken.
 
     Raises:
         InputError: If the capture has no start points.
@@ -59,7 +60,7 @@ def initial_parameters(
     if cloud is None or len(cloud) == 0:
         raise InputError(
             f"{capture.path}: expected a capture with start points (a COLMAP model, or "
-            "'ply_file_path' in transforms.json), got one without."
+            "'ply_file_path' in transforms.json), got one without points."
         )
     points = cloud.points.float()
     finite = points.isfinite().all(dim=1)
@@ -73,12 +74,12 @@ def initial_parameters(
         chosen = order[: options.max_gaussians].sort().values
         points, colours = points[chosen], colours[chosen]
 
-    spacing = _spacing(points)
+    spacing = _mean_neighbour_distances(points)
     centres = torch.stack([view.camera.centre for view in capture.train_views]).float()
-    to_camera = NeighbourIndex(centres).nearest(points, 1).distances[:, 0]
-    distance = to_camera.float().clamp_min(1e-6)
+    camera_distances = NeighbourIndex(centres).nearest(points, 1).distances[:, 0]
+    distance = camera_distances.float().clamp_min(1e-6)
     scales = torch.maximum(
-        torch.minimum(spacing, _LARGEST_SHARE * distance), _SMALLEST_SHARE * distance
+        torch.minimum(spacing, _MAX_SCALE_SHARE * distance), _MIN_SCALE_SHARE * distance
     )
     count, coefficients = len(points), (options.sh_degree + 1) ** 2
     rotations = torch.zeros(count, 4)
@@ -95,8 +96,8 @@ def initial_parameters(
     )
 
 
-def _spacing(points: Tensor) -> Tensor:
-    """Mean distance of each point to its three nearest others; infinite for a lone point."""
+def _mean_neighbour_distances(points: Tensor) -> Tensor:
+    """Mean distance of each point to its three nearest others; infinite if there is only one."""
     neighbours = min(_NEIGHBOURS, len(points) - 1)
     if neighbours == 0:
         return torch.full((len(points),), math.inf)

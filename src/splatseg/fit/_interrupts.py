@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM wait until a fit is between two steps."""
+"""Ctrl-C and SIGTERM are deferred until a fit is between two steps."""
 
 import signal
 import threading
@@ -7,30 +7,30 @@ from contextlib import contextmanager
 from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-# The third gives up at once: whatever it is that takes so long may never end.
-_PATIENCE = 3
+# This signal interrupts at once: the step in progress may never end.
+_MAX_REQUESTS = 3
 
 
 class Interrupts:
-    """How often the process was asked to stop."""
+    """Counts the requests to stop."""
 
     def __init__(self) -> None:
         self._count = 0
 
     @property
     def requested(self) -> bool:
-        """Whether it was asked at all."""
+        """Whether there was a request."""
         return self._count > 0
 
     @property
-    def impatient(self) -> bool:
-        """Whether it was asked so often that nothing more should be begun."""
-        return self._count >= _PATIENCE
+    def forced(self) -> bool:
+        """Whether there were so many requests that nothing further should be started."""
+        return self._count >= _MAX_REQUESTS
 
     def receive(self, number: int, frame: FrameType | None) -> None:
-        """What Python calls when a signal has come."""
+        """The signal handler."""
         self._count += 1
-        if self.impatient:
+        if self.forced:
             raise KeyboardInterrupt
 
 
@@ -39,11 +39,10 @@ _active: list[Interrupts] = []
 
 @contextmanager
 def deferred_interrupts() -> Generator[Interrupts]:
-    """While the block runs, SIGINT and SIGTERM are noted, not obeyed; the third raises.
+    """Record SIGINT and SIGTERM while the block runs; the third raises `KeyboardInterrupt`.
 
-    A block within a block shares what the outer one noted. Outside the main thread, which alone
-    receives signals, nothing is noted. The block ends as it likes: who was asked to stop says so
-    with a `KeyboardInterrupt` of its own.
+    A nested block shares the requests of the outer one. Outside the main thread, which alone
+    receives signals, nothing is recorded. The block itself decides how to stop.
     """
     if _active:
         yield _active[-1]
@@ -60,6 +59,6 @@ def deferred_interrupts() -> Generator[Interrupts]:
         yield interrupts
     finally:
         for number, handler in before.items():
-            # None stands for a handler that Python did not install and cannot put back.
+            # None is a handler that Python did not install and cannot restore.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         _active.remove(interrupts)

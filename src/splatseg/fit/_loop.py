@@ -1,4 +1,4 @@
-"""The fit itself: one view after another, render, compare, step."""
+"""The fit: one view after another is rendered, compared and optimised."""
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ import torch
 from splatseg.core import Capture
 from splatseg.errors import InputError
 from splatseg.fit._identity import fit_identity
-from splatseg.fit._interrupts import deferred_interrupts
+from splatseg.fit._interrupts import Interrupts, deferred_interrupts
 from splatseg.fit._options import FitOptions
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._prune import without_floaters
@@ -26,27 +26,26 @@ def fit(
     progress: Callable[[FitProgress], None] | None = None,
     checkpoints: Checkpoints | None = None,
 ) -> FitResult:
-    """Optimise Gaussians so that they look like the training photographs of a capture.
+    """Optimise Gaussians so that their renders match the training photographs of a capture.
 
     Starts from the capture's points, minimises L1 + D-SSIM with Adam, one view a step, from
-    coarse to fine, and moves and adds Gaussians as it goes. Test views are not looked at.
-    With `FitOptions.steps` the result depends on the seed alone, not on the number of threads
-    or on how fast the machine is.
+    coarse to fine, with density control. Test views are not used. With `FitOptions.steps` the
+    result depends on the seed alone, not on the number of threads or the speed of the machine.
 
     Args:
         capture: Photographs with cameras and start points.
-        options: Length, size and rates.
-        backend: Which renderer: ``auto``, ``cpu``, ``cuda`` or ``reference``.
-        progress: Called after every step. A `KeyboardInterrupt` out of it, Ctrl-C or SIGTERM
-            ends the fit after the step under way; it returns what it has. The third signal
-            does not wait for that.
-        checkpoints: Where the state is kept, to go on from after an interruption or a crash.
-            A fit that is resumed gives what it would have given uninterrupted. None keeps none.
+        options: Length, size and learning rates.
+        backend: Name of the renderer: ``auto``, ``cpu``, ``cuda`` or ``reference``.
+        progress: Called after every step. A `KeyboardInterrupt` raised by it, Ctrl-C or SIGTERM
+            ends the fit after the current step; the result so far is returned. The third signal
+            interrupts at once.
+        checkpoints: Where checkpoints are written, to resume after an interruption or a crash.
+            A resumed fit gives the result of an uninterrupted one. None writes none.
 
     Raises:
         InputError: If the capture has no training photographs or no start points, or the
-            checkpoint to resume from is of other data or options.
-        MissingFileError: If a photograph is not where it was.
+            checkpoint to resume from has other data or options.
+        MissingFileError: If a photograph is missing.
         FileFormatError: If the checkpoint to resume from is damaged.
         SplatsegError: If the loss is no longer a number, or a checkpoint cannot be written.
     """
@@ -65,39 +64,21 @@ def fit(
     saved = None if clock is None else clock.saved()
     with one_torch_thread():
         run = FitRun(capture, options, renderer, photographs, saved=saved)
-
-    def keep() -> None:
-        if clock is not None:
-            spent = clock.write(run.state())
-            run.stages["checkpoint"] = run.stages.get("checkpoint", 0.0) + spent
-
     with deferred_interrupts() as interrupts, one_torch_thread():
-        interrupted = False
-        try:
-            while not (run.finished or interrupts.requested):
-                status = run.step()
-                if progress is not None:
-                    progress(status)
-                if clock is not None and clock.due(run.steps):
-                    keep()
-        except KeyboardInterrupt:
-            interrupted = True
-        interrupted = not run.finished and (interrupted or interrupts.requested)
-        wanted = interrupted or (checkpoints is not None and checkpoints.at_end)
-        if wanted and run.between_steps and not interrupts.impatient:
-            keep()
+        interrupted = _run_steps(run, interrupts, clock=clock, progress=progress)
+        at_end = checkpoints is not None and checkpoints.at_end
+        if (interrupted or at_end) and run.between_steps and not interrupts.forced:
+            _write_checkpoint(run, clock)
     with one_torch_thread():
         gaussians, refined = run.gaussians(), run.views.refined(capture.views)
-    notes = run.views.notes()
-    if options.prune_floaters and not interrupted:
-        with one_torch_thread():
+        notes = run.views.notes()
+        if options.prune_floaters and not interrupted:
             pruned = without_floaters(gaussians, photographs, refined, backend=renderer.name)
-        notes = (
-            *notes,
-            f"{len(gaussians) - len(pruned)} of {len(gaussians)} Gaussians are left out, which "
-            "no photograph needs.",
-        )
-        gaussians = pruned
+            note = (
+                f"{len(gaussians) - len(pruned)} of {len(gaussians)} Gaussians are left out, which "
+                "no photograph needs."
+            )
+            gaussians, notes = pruned, (*notes, note)
     return FitResult(
         gaussians=gaussians,
         steps=run.steps,
@@ -111,9 +92,36 @@ def fit(
     )
 
 
+def _run_steps(
+    run: FitRun,
+    interrupts: Interrupts,
+    *,
+    clock: CheckpointClock | None,
+    progress: Callable[[FitProgress], None] | None,
+) -> bool:
+    """Step until the fit is finished or interrupted. Returns whether it was interrupted."""
+    interrupted = False
+    try:
+        while not (run.finished or interrupts.requested):
+            status = run.step()
+            if progress is not None:
+                progress(status)
+            if clock is not None and clock.due(run.steps):
+                _write_checkpoint(run, clock)
+    except KeyboardInterrupt:
+        interrupted = True
+    return not run.finished and (interrupted or interrupts.requested)
+
+
+def _write_checkpoint(run: FitRun, clock: CheckpointClock | None) -> None:
+    if clock is not None:
+        seconds = clock.write(run.state())
+        run.stages["checkpoint"] = run.stages.get("checkpoint", 0.0) + seconds
+
+
 @contextmanager
 def one_torch_thread() -> Generator[None]:
-    """Torch's own threads wait by spinning, on the cores that the kernels' threads need."""
+    """Limit torch to one thread: its idle threads spin on the cores that the kernels need."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""What a rendering is compared with its photograph by: L1 + D-SSIM, with its gradient."""
+"""Photometric loss: L1 + D-SSIM, with its gradient."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ _C2 = 0.03**2
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Loss:
-    """The loss of one rendering."""
+    """The loss of one render."""
 
     value: float
     """(1 - weight) mean \\|x - y\\| + weight (1 - mean SSIM)."""
@@ -27,7 +27,7 @@ class Loss:
     """Mean squared difference, from which PSNR is -10 log10."""
 
     gradient: Float[Tensor, "height width 3"]
-    """Derivative of `value` with respect to the rendering."""
+    """Derivative of `value` with respect to the render."""
 
 
 def l1_dssim(
@@ -43,10 +43,10 @@ def l1_dssim(
     is False, both images count as 0.
 
     Args:
-        image: The rendering, float32.
-        photograph: What it should be, [0, 1].
-        mask: Pixels that count; means run over them. None is all. If none counts, the loss
-            is 0.
+        image: The render, float32.
+        photograph: The target, [0, 1].
+        mask: Valid pixels, over which means are taken. None is all. If none is valid, the
+            loss is 0.
         dssim_weight: Share of D-SSIM, in [0, 1].
 
     Raises:
@@ -79,7 +79,7 @@ def l1_dssim_torch(
     mask: Bool[Tensor, "height width"] | None = None,
     dssim_weight: float = 0.2,
 ) -> Loss:
-    r"""The readable twin of `l1_dssim`, by autograd; any device and floating-point type.
+    r"""The readable reference of `l1_dssim`, by autograd; any device and floating-point type.
 
     With G the window and :math:`\mu_x = G x`, :math:`\sigma_x^2 = G x^2 - \mu_x^2`,
     :math:`\sigma_{xy} = G xy - \mu_x \mu_y` (Wang et al. 2004, eq. 13),

@@ -1,4 +1,4 @@
-"""What is optimised: raw tensors whose every value is a valid Gaussian, and Adam's moments."""
+"""The optimised parameters, unconstrained, and Adam's moments of them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -12,16 +12,16 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.activations import exponential, sigmoid
 
 # 2 ln 255: beyond this Mahalanobis distance squared even an opaque Gaussian's alpha is < 1/255.
-_REACH = 3.34
+_MAX_SIGMAS = 3.34
 # More than the square root of the low-pass variance of 0.3 square pixels.
-_LOW_PASS_REACH = 0.55
+_LOW_PASS_SIGMA = 0.55
 # The Jacobian is taken at most this far outside the image, in half image sizes.
 _FRUSTUM_MARGIN = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Parameters:
-    """Gaussians as the optimiser sees them, one row each.
+    """Unconstrained parameters of the Gaussians, one row each.
 
     Scales are exp(log_scales), opacities sigmoid(logits), rotations quaternions / length.
     """
@@ -31,7 +31,7 @@ class Parameters:
     rotations: Float[Tensor, "n 4"]
     logits: Float[Tensor, "n 1"]
     sh: Float[Tensor, "n coefficients_3"]
-    """Harmonics, the three channels of a coefficient side by side."""
+    """Spherical harmonics, the three channels of a coefficient side by side."""
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -48,7 +48,7 @@ class Parameters:
         )
 
     def with_zeros(self, count: int) -> "Parameters":
-        """The same with `count` rows of zeros behind."""
+        """The same with `count` rows of zeros appended."""
         return Parameters(
             **{
                 name: torch.cat((tensor, tensor.new_zeros(count, tensor.shape[1])))
@@ -57,14 +57,14 @@ class Parameters:
         )
 
     def joined(self, other: "Parameters") -> "Parameters":
-        """The same with the rows of `other` behind."""
+        """The same with the rows of `other` appended."""
         mine = dict(self.tensors())
         return Parameters(
             **{name: torch.cat((mine[name], tensor)) for name, tensor in other.tensors()}
         )
 
     def replaced(self, **columns: Tensor) -> "Parameters":
-        """The same with other tensors in some places."""
+        """The same with some tensors replaced."""
         return Parameters(**(dict(self.tensors()) | columns))
 
     def zeros_like(self) -> "Parameters":
@@ -72,7 +72,7 @@ class Parameters:
         return Parameters(**{name: torch.zeros_like(tensor) for name, tensor in self.tensors()})
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians these rows stand for. Differentiable."""
+        """The Gaussians of these parameters. Differentiable."""
         return Gaussians(
             means=self.means,
             rotations=torch.nn.functional.normalize(self.rotations, dim=1),
@@ -82,11 +82,11 @@ class Parameters:
         )
 
 
-def settled_gaussians(parameters: Parameters) -> Gaussians:
-    """The Gaussians at the end, detached and on the CPU; of a row, the same wherever it stands.
+def final_gaussians(parameters: Parameters) -> Gaussians:
+    """The Gaussians, detached and on the CPU; a row's values do not depend on its position.
 
-    `Parameters.gaussians` is differentiable, but the last bits of its opacities depend on how
-    many threads torch has.
+    `Parameters.gaussians` is differentiable, but the last bits of its opacities depend on the
+    number of torch's threads.
     """
     raw = {name: tensor.detach().cpu() for name, tensor in parameters.tensors()}
     return Gaussians(
@@ -99,11 +99,11 @@ def settled_gaussians(parameters: Parameters) -> Gaussians:
 
 
 def rows_in_view(parameters: Parameters, camera: Camera, *, near: float) -> Int64[Tensor, "m"]:
-    """Rows that may show in a pinhole view, ascending; none that does is left out.
+    """Rows that may be visible in a pinhole view, ascending (frustum culling, conservative).
 
-    A Gaussian reaches at most as far as a ball of its largest scale: its projected standard
-    deviation along x is at most ``fx / z * s * sqrt(1 + (x / z)^2)`` with x / z clamped as the
-    projection clamps it, plus the low-pass.
+    A Gaussian is bounded by a ball of its largest scale: its projected standard
+    deviation along x is at most ``fx / z * s * sqrt(1 + (x / z)^2)`` with x / z clamped as in
+    the projection, plus the low-pass.
     """
     if parameters.means.device.type != "cpu":
         return rows_in_view_torch(parameters, camera, near=near)
@@ -127,26 +127,28 @@ def rows_in_view(parameters: Parameters, camera: Camera, *, near: float) -> Int6
 def rows_in_view_torch(
     parameters: Parameters, camera: Camera, *, near: float
 ) -> Int64[Tensor, "m"]:
-    """The readable twin of `rows_in_view`."""
+    """The readable reference of `rows_in_view`."""
     pose = camera.cam_from_world.to(parameters.means)
     x, y, z = (parameters.means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
     inside = z > near
     inverse = 1 / torch.where(inside, z, 1.0)
-    largest = parameters.log_scales.amax(dim=1).exp() * inverse
+    max_scales = parameters.log_scales.amax(dim=1).exp() * inverse
     for along, focal, centre, size in (
         (x * inverse, camera.fx, camera.cx, camera.width),
         (y * inverse, camera.fy, camera.cy, camera.height),
     ):
         margin = _FRUSTUM_MARGIN * 0.5 * size / focal
-        slope = along.clamp(-centre / focal - margin, (size - centre) / focal + margin)
-        reach = _REACH * (largest * focal * (1 + slope * slope).sqrt() + _LOW_PASS_REACH)
+        tangent = along.clamp(-centre / focal - margin, (size - centre) / focal + margin)
+        radius = _MAX_SIGMAS * (
+            max_scales * focal * (1 + tangent * tangent).sqrt() + _LOW_PASS_SIGMA
+        )
         at = along * focal + centre
-        inside &= (at + reach >= 0) & (at - reach <= size)
+        inside &= (at + radius >= 0) & (at - radius <= size)
     return inside.nonzero().squeeze(1)
 
 
 def gathered(parameters: Parameters, rows: Int64[Tensor, "m"]) -> Gaussians:
-    """The Gaussians that some rows stand for, as leaves of a graph."""
+    """The Gaussians of some rows, as leaves of a graph."""
     if parameters.means.device.type != "cpu":
         return _as_leaves(parameters.rows(rows).gaussians())
     count, columns = len(rows), parameters.sh.shape[1]

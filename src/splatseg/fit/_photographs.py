@@ -1,4 +1,4 @@
-"""The photographs a fit learns from: straightened, in memory while there is room, and reduced."""
+"""The training photographs of a fit: undistorted, cached in memory, and downsampled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,39 +12,39 @@ from splatseg.core import Camera, View
 from splatseg.fit._background import fixed_colour
 from splatseg.fit._options import FitOptions
 from splatseg.io.images import image_camera, load_alpha, load_image, load_mask, reduced_size
-from splatseg.render.warp import photograph_to_pinhole, straightened
+from splatseg.render.warp import photograph_to_pinhole, undistorted_camera
 
 _MEMORY = 6 * 2**30
-"""Bytes of photographs that are kept; those that do not fit are read again each time."""
+"""Bytes of photographs that are cached; those that do not fit are read again each time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Example:
-    """One view to learn from."""
+    """One training view."""
 
     index: int
-    """Which of the training views."""
+    """Index of the training view."""
 
     camera: Camera
     """Pinhole."""
 
     photograph: Float[Tensor, "height width 3"]
-    """[0, 1]; 0 where the mask is False. With an alpha: colour times alpha."""
+    """[0, 1]; 0 where the mask is False. With an alpha channel: colour times alpha."""
 
     mask: Bool[Tensor, "height width"] | None
-    """Pixels that count; None is all."""
+    """Valid pixels; None is all."""
 
     alpha: Float[Tensor, "height width"] | None = None
-    """How opaque each pixel is, [0, 1]; None is opaque everywhere."""
+    """Opacity of each pixel, [0, 1]; None is opaque everywhere."""
 
 
 class Photographs:
-    """Training views by number. Pixels are read when they are first asked for.
+    """Training views by index. Pixels are read at first use.
 
-    Photographs with distortion are resampled into ``camera.undistorted()``; what lies outside
-    them has no loss. What is 0 in the view's own mask has none either, or is transparent, as
-    `FitOptions.masks` says. With `keep_alpha` an alpha channel of a photograph is kept, to be
-    blended over another colour than white.
+    Photographs with distortion are resampled into ``camera.undistorted()``; pixels outside the
+    photograph have no loss. Pixels that are 0 in the view's own mask have no loss either, or are
+    transparent (`FitOptions.masks`). With `keep_alpha` an alpha channel of a photograph is kept,
+    to be blended over a colour other than white.
 
     Example:
         photographs = Photographs(capture.train_views, longest=1600)
@@ -63,13 +63,13 @@ class Photographs:
         self._longest = longest
         self._masks = masks
         self._keep_alpha = keep_alpha
-        self._kept: dict[int, _Pixels] = {}
+        self._cache: dict[int, _Pixels] = {}
         self._bytes = 0
-        self._cameras = [straightened(image_camera(view, longest)) for view in self._views]
+        self._cameras = [undistorted_camera(image_camera(view, longest)) for view in self._views]
 
     @classmethod
     def of(cls, views: Sequence[View], *, options: FitOptions) -> "Photographs":
-        """The photographs of views as the options of a fit want them."""
+        """The photographs of views with the options of a fit."""
         return cls(
             views,
             longest=options.longest,
@@ -92,8 +92,8 @@ class Photographs:
     def example(self, index: int, *, reduction: int = 1) -> Example:
         """A view with its sides divided by `reduction`: means of square blocks of pixels.
 
-        Rows and columns that do not fill a block are cut off. A block counts if all its pixels
-        do.
+        Rows and columns that do not fill a block are dropped. A block is valid if all its pixels
+        are.
         """
         pixels, mask, opaque = self._pixels(index)
         photograph = pixels.float() / 255
@@ -105,8 +105,8 @@ class Photographs:
             )
         photograph = torch.nn.functional.avg_pool2d(photograph.movedim(-1, 0), reduction)
         if mask is not None:
-            least = torch.nn.functional.avg_pool2d(mask[None].float(), reduction)[0]
-            mask = least == 1
+            covered = torch.nn.functional.avg_pool2d(mask[None].float(), reduction)[0]
+            mask = covered == 1
         if alpha is not None:
             alpha = torch.nn.functional.avg_pool2d(alpha[None], reduction)[0]
         return Example(
@@ -118,12 +118,12 @@ class Photographs:
         )
 
     def _pixels(self, index: int) -> "_Pixels":
-        kept = self._kept.get(index)
+        kept = self._cache.get(index)
         if kept is None:
             kept = self._read(index)
             size = sum(tensor.nbytes for tensor in kept if tensor is not None)
             if self._bytes + size <= _MEMORY:
-                self._kept[index] = kept
+                self._cache[index] = kept
                 self._bytes += size
         return kept
 
@@ -134,30 +134,30 @@ class Photographs:
         if self._masks == "alpha" or (self._keep_alpha and view.mask is None):
             alpha = load_alpha(view, longest=self._longest)
             if alpha is not None:
-                return _cut_out(pixels, alpha, view, camera)
+                return _premultiplied(pixels, alpha, view, camera)
         own_mask = load_mask(view, longest=self._longest) if self._masks == "ignore" else None
         if camera.is_pinhole:
             if own_mask is None:
                 return pixels, None, None
             mask = own_mask.bool()
             return pixels * mask[..., None], mask, None
-        straight, mask = photograph_to_pinhole(pixels.float(), camera)
+        pinhole, mask = photograph_to_pinhole(pixels.float(), camera)
         if own_mask is not None:
             used, _ = photograph_to_pinhole(own_mask.float()[..., None], camera)
             mask = mask & (used[..., 0] > 1 - 1e-3)
-        straight = (straight + 0.5).clamp(0, 255).to(torch.uint8)
-        return straight * mask[..., None], mask, None
+        pinhole = (pinhole + 0.5).clamp(0, 255).to(torch.uint8)
+        return pinhole * mask[..., None], mask, None
 
 
 _Pixels = tuple[Tensor, Tensor | None, Tensor | None]
 """Photograph (uint8), mask and alpha (uint8)."""
 
 
-def _cut_out(pixels: Tensor, alpha: Tensor, view: View, camera: Camera) -> _Pixels:
-    """A photograph times its alpha, straightened, with the mask of where there is one."""
+def _premultiplied(pixels: Tensor, alpha: Tensor, view: View, camera: Camera) -> _Pixels:
+    """A photograph times its alpha, undistorted, with the mask of valid pixels."""
     opaque = alpha.float()[..., None]
     if view.mask is None:
-        # Its own alpha: it was blended over white, and what the white gave is taken off again.
+        # Its own alpha: it was blended over white, whose contribution is subtracted.
         colour = (pixels.float() - (255 - opaque)).clamp_min(0)
     else:
         colour = pixels.float() * opaque / 255
@@ -184,7 +184,7 @@ def reduced_camera(camera: Camera, reduction: int) -> Camera:
 
 
 def reduction_note(views: Sequence[View], *, longest: int) -> str | None:
-    """One sentence on photographs that are larger than the fit works at; None if none is."""
+    """One sentence on photographs that are downsampled for the fit; None if none is."""
     sizes = [(view.camera.width, view.camera.height) for view in views]
     larger = [size for size in sizes if max(size) > longest]
     if not larger:

@@ -1,4 +1,4 @@
-"""What a scene remembers of its fit, as far as a refinement needs it to go on."""
+"""What a scene records of its fit, for a later refinement."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -11,7 +11,7 @@ from splatseg.fit._options import FitOptions
 EXPOSURES = "exposures"
 """Key of a scene's provenance: gain and bias of each training view by its name."""
 
-_TAKEN = (
+_COMPARISON_OPTIONS = (
     "background",
     "longest",
     "masks",
@@ -21,49 +21,51 @@ _TAKEN = (
     "depth",
     "depth_weight",
 )
-"""Options that say how photographs are compared. The rates are a refinement's own, and so is the
-dissimilarity; poses are in the scene's cameras already."""
+"""Options of the comparison with photographs. Learning rates and the weight of D-SSIM are the
+refinement's own; refined poses are in the scene's cameras already."""
 
 
 def refinement_options(provenance: Mapping[str, Any]) -> FitOptions:
-    """How the photographs of a scene are to be compared when it is refined: as in its fit.
+    """Options to refine a scene with: photographs are compared as in its fit.
 
-    Poses are not refined further: layers and evidence were made with those that the scene has.
-    A scene that no fit made is taken as it is drawn: over black, masks without a meaning.
+    Poses are not refined further: layers and evidence were made with those of the scene. A scene
+    that was not made by a fit is rendered over black, and masks are not used.
 
     Args:
-        provenance: Of the scene.
+        provenance: The provenance of the scene.
 
     Raises:
-        InputError: If an option was recorded with a value that it cannot have.
+        InputError: If an option was recorded with an invalid value.
     """
     options = _table(provenance, "options")
     if not options:
         return FitOptions(background="black", masks="off")
-    taken = {"masks": "off"} | {name: options[name] for name in _TAKEN if name in options}
-    if isinstance(taken.get("background"), list):
-        taken["background"] = tuple(cast("list[float]", taken["background"]))
+    comparison = {"masks": "off"} | {
+        name: options[name] for name in _COMPARISON_OPTIONS if name in options
+    }
+    if isinstance(comparison.get("background"), list):
+        comparison["background"] = tuple(cast("list[float]", comparison["background"]))
     try:
-        return FitOptions(**cast("dict[str, Any]", taken))
+        return FitOptions(**cast("dict[str, Any]", comparison))
     except TypeError as error:
         raise InputError(
-            f"scene: expected the options of a fit as its provenance, got {taken!r:.200}."
+            f"scene: expected the options of a fit as its provenance, got {comparison!r:.200}."
         ) from error
 
 
 def exposures_record(exposures: Mapping[str, Exposure]) -> dict[str, Any]:
-    """Exposures as JSON holds them, for the key `EXPOSURES`."""
-    return {name: asdict(one) for name, one in exposures.items()}
+    """Exposures as JSON values, for the key `EXPOSURES`."""
+    return {name: asdict(exposure) for name, exposure in exposures.items()}
 
 
 def recorded_exposures(provenance: Mapping[str, Any]) -> dict[str, Exposure]:
-    """The exposures of a scene's training views; empty where its fit learned none.
+    """The exposures of a scene's training views; empty where its fit had none.
 
     Args:
-        provenance: Of the scene.
+        provenance: The provenance of the scene.
 
     Raises:
-        InputError: If something else is recorded in their place.
+        InputError: If the record has another form.
     """
     found: dict[str, Exposure] = {}
     for name, value in _table(provenance, EXPOSURES).items():

@@ -1,4 +1,4 @@
-"""What a fit says of itself: after a step, over some steps, and at its end."""
+"""Progress and result of a fit: after a step, over some steps, and at its end."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,19 +9,19 @@ from splatseg.fit._exposure import Exposure
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitProgress:
-    """Where a fit is, after a step."""
+    """Progress of a fit after a step."""
 
     step: int
     """Steps done."""
 
     progress: float
-    """Share of the whole that is done, [0, 1]."""
+    """Share of the fit that is done, [0, 1]."""
 
     seconds: float
     """Since the fit began."""
 
     seconds_left: float
-    """Estimate."""
+    """Estimated remaining time."""
 
     loss: float
     """Of this step's view."""
@@ -53,10 +53,10 @@ class FitRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitResult:
-    """What a fit gives."""
+    """Result of a fit."""
 
     gaussians: Gaussians
-    """On the CPU, float32, without those too faint to matter."""
+    """On the CPU, float32, without those of negligible opacity."""
 
     steps: int
     """Steps done."""
@@ -71,15 +71,15 @@ class FitResult:
     """True if Ctrl-C ended it early; the Gaussians are those of that moment."""
 
     stages: Mapping[str, float] = field(default_factory=dict[str, float])
-    """Seconds spent in each part of a step: read, gather, render, loss, backward, update,
+    """Seconds spent in each stage of a step: read, gather, render, loss, backward, update,
     densify."""
 
     views: tuple[View, ...] = ()
     """The capture's views; with `FitOptions.refine_poses` training views have the refined poses,
-    moved as one to where the given ones are."""
+    aligned to the given ones."""
 
     notes: tuple[str, ...] = ()
-    """Sentences on what was learned besides the Gaussians: exposures, poses."""
+    """Sentences on what was optimised besides the Gaussians: exposures, poses."""
 
     exposures: Mapping[str, Exposure] = field(default_factory=dict[str, Exposure])
-    """Of each training view, by its name; empty without `FitOptions.exposure`."""
+    """Exposure of each training view, by its name; empty without `FitOptions.exposure`."""

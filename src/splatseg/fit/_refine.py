@@ -1,6 +1,6 @@
-"""Gaussians that are there go on learning, from photographs and from anything else drawn of them.
+"""Refinement: existing Gaussians are optimised further, from photographs and from other losses.
 
-None is added, moved to another place or left out: row i stays row i, so that layers stay in step.
+None is added, relocated or removed: row i stays row i, so that layers stay aligned.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,41 +15,41 @@ from splatseg.fit._exposure import Exposure
 from splatseg.fit._initialise import scene_extent
 from splatseg.fit._loop import one_torch_thread
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters, settled_gaussians
+from splatseg.fit._parameters import Parameters, final_gaussians
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._schedule import rates_at
 from splatseg.fit._step import ExtraLoss, StepSettings, TrainingStep
 from splatseg.fit._update import UpdateSettings
-from splatseg.fit._view_parts import ViewParts
+from splatseg.fit._view_modules import ViewModules
 from splatseg.render import get_backend, options_for, render
-from splatseg.render.warp import straightened
+from splatseg.render.warp import undistorted_camera
 
 _MIN_SCALE = 1e-12
 _OPACITY_MARGIN = 1e-6
-"""Logs and logits of what lies at a limit would be infinite."""
+"""Clamps scales and opacities, whose logs and logits would be infinite at the limits."""
 
 _DEPTH_PIXELS = 64
-"""Longest side of the depth maps that stand for start points."""
+"""Longest side of the depth maps that replace start points."""
 
 
 class Refinement:
-    """Gaussians that go on learning, step by step, by the step of `fit` (`TrainingStep`).
+    """Optimises Gaussians step by step, with the training step of `fit` (`TrainingStep`).
 
-    What the Gaussians show stands for the start points: relative depth maps are aligned to it.
-    With `FitOptions.refine_poses` the poses of the views move too; `views` tells where to.
+    Points on the rendered surfaces replace the start points: relative depth maps are aligned to
+    them. With `FitOptions.refine_poses` the poses of the views are optimised too, see `views`.
 
     Args:
-        gaussians: Where to begin.
-        views: Views with photographs, each learned from as often as every other.
-        steps: How many steps there will be, for the rates.
+        gaussians: The initial Gaussians.
+        views: Views with photographs; each is used equally often.
+        steps: Number of steps, for the schedule of the learning rates.
         start: Progress, in [0, 1], of a fit whose learning rates the first step has; the last
-            has those of a fit's end.
-        options: Rates, loss, background, masks, exposures, depth and poses of `fit`. Its steps,
-            growth, penalties and random walk have no meaning here.
-        exposures: What the photographs of a fit were found to need (`FitResult.exposures`), by
-            name of the view: where `FitOptions.exposure` goes on from. Views without one, and
-            all where it is None, begin at none.
-        backend: Who renders.
+            step has those of the end of a fit.
+        options: Rates, loss, background, masks, exposures, depth and poses of `fit`. Its length,
+            density control, penalties and noise are not used.
+        exposures: Exposures of a fit (`FitResult.exposures`) by name of the view, the initial
+            values of `FitOptions.exposure`. Views without one begin with gain 1 and bias 0;
+            None is an empty mapping.
+        backend: Name of the renderer.
 
     Raises:
         InputError: If there are no Gaussians, no view with a photograph, or depth is asked for
@@ -78,11 +78,13 @@ class Refinement:
         self._options, self._steps, self._start = options, steps, start
         self._model = gaussians
         self._generator = torch.Generator().manual_seed(options.seed)
-        around = options.refine_poses or options.depth == "relative"
+        needs_points = options.refine_poses or options.depth == "relative"
         with one_torch_thread():
-            self._views = ViewParts.of(
+            self._views = ViewModules.of(
                 views,
-                points=_points_of(gaussians, views, backend=renderer.name) if around else None,
+                points=_points_of(gaussians, views, backend=renderer.name)
+                if needs_points
+                else None,
                 options=options,
                 where="refine",
                 exposures=exposures,
@@ -100,27 +102,27 @@ class Refinement:
         parameters = Parameters(**{name: part.to(device) for name, part in raw.tensors()})
         self._state = (parameters, parameters.zeros_like(), parameters.zeros_like())
         self._extent = scene_extent(tuple(views), raw.means)
-        self._done = 0
+        self._steps_done = 0
 
     @property
     def generator(self) -> torch.Generator:
-        """Where all chance comes from."""
+        """The source of randomness."""
         return self._generator
 
     @property
     def views(self) -> tuple[View, ...]:
-        """The views, with `FitOptions.refine_poses` where they are now."""
+        """The views, with `FitOptions.refine_poses` at their current poses."""
         return self._views.refined(self._views.views)
 
     @property
     def exposures(self) -> dict[str, Exposure]:
-        """By name of the view, as they are now; empty without `FitOptions.exposure`."""
+        """Current exposures by name of the view; empty without `FitOptions.exposure`."""
         return self._views.learned_exposures()
 
     def gaussians(self) -> Gaussians:
-        """As they are now, on the CPU, as many as at the start and in the same order."""
+        """The current Gaussians, on the CPU, in the rows of the initial ones."""
         with one_torch_thread():
-            now = self._views.settled(settled_gaussians(self._state[0]))
+            now = self._views.in_capture_frame(final_gaussians(self._state[0]))
         return self._model.replace(
             means=now.means,
             rotations=now.rotations,
@@ -130,7 +132,7 @@ class Refinement:
         )
 
     def step(self, extra_loss: ExtraLoss | None = None) -> None:
-        """Learn from the photograph of the next view, and from a further loss.
+        """One step on the photograph of the next view, and on a further loss.
 
         Raises:
             SplatsegError: If the loss is no longer a number.
@@ -139,45 +141,45 @@ class Refinement:
             self._step(extra_loss)
 
     def _step(self, extra_loss: ExtraLoss | None) -> None:
-        progress = self._start + (1 - self._start) * self._done / max(1, self._steps)
+        progress = self._start + (1 - self._start) * self._steps_done / max(1, self._steps)
         progress = min(1.0, progress)
         example = self._training.next_example()
         settings = StepSettings(
-            step=self._done,
+            step=self._steps_done,
             progress=progress,
             render_options=self._render_options,
             extra_loss=extra_loss,
         )
         found = self._training.gradients(self._state[0], example, settings=settings)
-        self._done += 1
+        self._steps_done += 1
         rates = rates_at(progress, options=self._options, extent=self._extent)
         with torch.no_grad():
-            update = UpdateSettings(rates=rates, step=self._done)
+            update = UpdateSettings(rates=rates, step=self._steps_done)
             self._training.update(self._state, found, settings=update)
             self._views.update(example.index, progress=progress)
 
 
 def _points_of(gaussians: Gaussians, views: Sequence[View], *, backend: str) -> Tensor:
-    """Points on the surfaces that the views show, as structure from motion would find them.
+    """Points on the visible surfaces, as structure from motion would find them.
 
-    Centres of Gaussians would not do: many lie inside of things.
+    Centres of Gaussians are not suitable: many lie inside objects.
     """
     found: list[Tensor] = []
     for view in views:
-        camera = straightened(view.camera)
+        camera = undistorted_camera(view.camera)
         longest = max(camera.width, camera.height)
         share = min(1.0, _DEPTH_PIXELS / longest)
         size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
         camera = camera.resized(*size)
         with torch.no_grad():
             depth = render(gaussians, camera, backend=backend).median_depth.cpu().double()
-        solid = depth > 0
-        found.append(camera.unproject(camera.pixel_centres()[solid], depth[solid]))
+        covered = depth > 0
+        found.append(camera.unproject(camera.pixel_centres()[covered], depth[covered]))
     return torch.cat(found).float()
 
 
 def _parameters(gaussians: Gaussians) -> Parameters:
-    """The raw values that stand for Gaussians, copied."""
+    """Unconstrained parameters of Gaussians, copied."""
     opacities = gaussians.opacities.clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
     return Parameters(
         means=gaussians.means.float().clone(),
@@ -200,7 +202,7 @@ def refine(
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Gaussians:
-    """Let Gaussians go on learning for some steps; see `Refinement`.
+    """Optimise Gaussians for some steps; see `Refinement`.
 
     With the same seed the result is the same, whatever the number of threads.
     """

@@ -1,4 +1,4 @@
-"""When a fit writes its state, and how it goes on from it."""
+"""When a fit writes checkpoints, and how it resumes."""
 
 import math
 import time
@@ -12,13 +12,13 @@ from splatseg.fit._checkpoint import Checkpoint, read_checkpoint, write_checkpoi
 from splatseg.fit._identity import check_identity
 from splatseg.fit._state import FitState
 
-# Checkpoints take at most one part in so many of the time.
-_LEAST_PAUSE = 60.0
+# The pause is at least this many times the time that writing a checkpoint took.
+_MIN_PAUSE_RATIO = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Checkpoints:
-    """Where a fit keeps its state, and how often. None of it changes the result.
+    """Where a fit writes checkpoints, and how often. The result does not depend on it.
 
     Example:
         >>> Checkpoints(path=Path("scene/fit/checkpoint.npz"), resume=True).seconds
@@ -26,19 +26,19 @@ class Checkpoints:
     """
 
     path: Path
-    """The file. Its folder is made when the first is written."""
+    """The file. Its folder is created with the first checkpoint."""
 
     seconds: float = 60.0
-    """Time between two, seconds; more where writing one takes over a sixtieth of it."""
+    """Time between two checkpoints, seconds; more where writing one takes over a sixtieth of it."""
 
     steps: int | None = None
-    """Steps between two, instead of seconds."""
+    """Steps between two checkpoints, instead of seconds."""
 
     resume: bool = False
-    """Go on from the file if it is there; begin if it is not."""
+    """Resume from the file if it exists; start a new fit if it does not."""
 
     at_end: bool = False
-    """Write one when the fit is finished too, from which a longer one can go on."""
+    """Write one at the end of the fit too, from which a longer fit can resume."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.seconds) and self.seconds > 0):
@@ -50,11 +50,11 @@ class Checkpoints:
 
 
 class CheckpointClock:
-    """Says when the next checkpoint is due, and writes it.
+    """Tracks when the next checkpoint is due, and writes it.
 
     Args:
         checkpoints: Where and how often.
-        identity: What the fit is of; see `_identity`.
+        identity: Identity of the fit; see `_identity`.
     """
 
     def __init__(self, checkpoints: Checkpoints, *, identity: Mapping[str, Any]) -> None:
@@ -63,11 +63,11 @@ class CheckpointClock:
         self._due = time.monotonic() + checkpoints.seconds
 
     def saved(self) -> FitState | None:
-        """The state to go on from; None if there is none, or the fit is to begin.
+        """The state to resume from; None if there is none, or a new fit was asked for.
 
         Raises:
             FileFormatError: If the checkpoint is damaged.
-            InputError: If it is of another fit.
+            InputError: If it belongs to another fit.
         """
         path = self._checkpoints.path
         if not (self._checkpoints.resume and path.is_file()):
@@ -77,15 +77,15 @@ class CheckpointClock:
         return found.state
 
     def due(self, steps: int) -> bool:
-        """Whether one is to be written after so many steps."""
+        """Whether a checkpoint is due after this many steps."""
         if self._checkpoints.steps is not None:
             return steps % self._checkpoints.steps == 0
         return time.monotonic() >= self._due
 
     def write(self, state: FitState) -> float:
-        """Write one now; gives the seconds it took."""
+        """Write a checkpoint. Returns the seconds it took."""
         begin = time.monotonic()
         write_checkpoint(self._checkpoints.path, Checkpoint(state=state, identity=self._identity))
         end = time.monotonic()
-        self._due = end + max(self._checkpoints.seconds, _LEAST_PAUSE * (end - begin))
+        self._due = end + max(self._checkpoints.seconds, _MIN_PAUSE_RATIO * (end - begin))
         return end - begin

@@ -1,4 +1,4 @@
-"""One fit under way: its state, and what a step of it adds to the shared one."""
+"""One fit in progress: its state, and its steps around the shared `TrainingStep`."""
 
 import math
 import time
@@ -13,29 +13,29 @@ from splatseg.fit._density import density_of
 from splatseg.fit._initialise import initial_parameters, scene_extent, scene_size
 from splatseg.fit._loss import Loss
 from splatseg.fit._options import FitOptions
-from splatseg.fit._parameters import Parameters, settled_gaussians
+from splatseg.fit._parameters import Parameters, final_gaussians
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._records import FitProgress, FitRecord
 from splatseg.fit._schedule import degree_at, rates_at, reduction_at
 from splatseg.fit._start import with_start_points
-from splatseg.fit._state import FitState, Part, named, parameters_of
+from splatseg.fit._state import FitState, StatefulModule, named, parameters_of
 from splatseg.fit._step import StepGradients, StepSettings, TrainingStep
 from splatseg.fit._update import UpdateSettings
-from splatseg.fit._view_parts import ViewParts
+from splatseg.fit._view_modules import ViewModules
 from splatseg.render import Backend, default_options
 
 _RECORD_EVERY = 50  # steps
-# Noise and the penalty on scales have the strength that they should in a scene of this size
-# (`scene_size`). In millimetres, unscaled, the walk threw four of five Gaussians out of all views.
+# Noise and the penalty on scales are tuned for a scene of this size (`scene_size`) and scaled to
+# others. In millimetres, unscaled, the noise moved four of five Gaussians out of all views.
 _REFERENCE_SIZE = 3.0
 
 
 class FitRun:
-    """State of a fit under way.
+    """State of a fit in progress.
 
     Every attribute is replaced as a whole or updated by rows, so that an interruption at any
-    moment leaves Gaussians that can be used. What a step changes is in `state`, or in that of
-    one of the parts: a fit that is resumed continues as if nothing had been.
+    moment leaves valid Gaussians. Everything that a step changes is in `state`, or in the state
+    of one of the modules, so a resumed fit gives the same result as an uninterrupted one.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class FitRun:
         self._begin = time.monotonic()
         self._options = options
         self._backend = backend
-        self.views = ViewParts.of(
+        self.views = ViewModules.of(
             photographs.views,
             points=None if capture.points is None else capture.points.points,
             options=options,
@@ -82,17 +82,17 @@ class FitRun:
             start = Parameters(**{name: tensor.to(device) for name, tensor in start.tensors()})
             self._state = (start, start.zeros_like(), start.zeros_like())
         else:
-            self._take_up(saved)
+            self._restore(saved)
         self._density = density_of(
             options, start=self._start_count, extent=self._extent, device=self._device
         )
         if saved is not None:
-            for name, part in self._parts().items():
-                part.restore(saved.group(name, part.state(), device=self._device))
+            for name, module in self._modules().items():
+                module.restore(saved.group(name, module.state(), device=self._device))
 
     @property
     def stages(self) -> dict[str, float]:
-        """Seconds spent in each part of a step; the caller may count further parts."""
+        """Seconds spent in each stage of a step; the caller may add further stages."""
         return self._training.stages
 
     @property
@@ -111,9 +111,9 @@ class FitRun:
         return self.progress >= 1.0
 
     def gaussians(self) -> Gaussians:
-        found = settled_gaussians(self._state[0])
+        found = final_gaussians(self._state[0])
         found = found[found.opacities > self._options.dead_opacity]
-        return self.views.settled(
+        return self.views.in_capture_frame(
             found.replace(
                 antialiased=self._options.antialiased, low_pass=self._options.low_pass_drawn
             )
@@ -127,15 +127,15 @@ class FitRun:
         return status
 
     def state(self) -> FitState:
-        """Everything that the steps to come depend on, while `between_steps`; not copied."""
+        """Everything that later steps depend on, valid while `between_steps`; not copied."""
         parameters, first, second = self._state
         tensors = named("parameters", dict(parameters.tensors()))
         tensors |= named("first", dict(first.tensors()))
         tensors |= named("second", dict(second.tensors()))
         tensors |= {"generator": self._generator.get_state()}
         tensors |= {"order": torch.tensor(self._training.order, dtype=torch.int64)}
-        for name, part in self._parts().items():
-            tensors |= named(name, part.state())
+        for name, module in self._modules().items():
+            tensors |= named(name, module.state())
         content = {
             "steps": self.steps,
             "seconds": self.seconds,
@@ -150,12 +150,12 @@ class FitRun:
         }
         return FitState(tensors=tensors, content=content)
 
-    def _parts(self) -> dict[str, Part]:
-        """What remembers something of its own, by the name of its group in the state."""
-        return {"density": self._density, **self.views.parts()}
+    def _modules(self) -> dict[str, StatefulModule]:
+        """Modules with state of their own, by the name of their group in the checkpoint."""
+        return {"density": self._density, **self.views.stateful_modules()}
 
-    def _take_up(self, saved: FitState) -> None:
-        """Go on from a state; the parts follow."""
+    def _restore(self, saved: FitState) -> None:
+        """Restore a state, except that of the modules."""
         device = self._device
         parameters = parameters_of(saved, "parameters", device)
         first, second = (parameters_of(saved, name, device) for name in ("first", "second"))
@@ -196,7 +196,7 @@ class FitRun:
                 antialiased=self._options.antialiased,
                 low_pass=self._options.low_pass_drawn,
             ),
-            screen=self._density.looks_at_screen,
+            screen_gradients=self._density.needs_screen_gradients,
         )
         found = self._training.gradients(parameters, example, settings=settings)
         with self._training.timed("update"), torch.no_grad():
@@ -204,11 +204,14 @@ class FitRun:
             self.views.update(example.index, progress=done)
         self.steps += 1
         with self._training.timed("densify"), torch.no_grad():
-            if found.screen is not None:
-                self._density.see(
-                    found.rows, found.screen, camera=example.camera, parameters=parameters
+            if found.screen_gradients is not None:
+                self._density.add_view(
+                    found.rows,
+                    found.screen_gradients,
+                    camera=example.camera,
+                    parameters=parameters,
                 )
-            self._state = self._density.after(
+            self._state = self._density.after_step(
                 self._state, steps=self.steps, progress=done, generator=self._generator
             )
         return self._report(found.loss)

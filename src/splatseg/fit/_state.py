@@ -1,4 +1,4 @@
-"""All that a fit remembers between two steps, as tensors by name and numbers for JSON."""
+"""State of a fit between two steps: tensors by name, and numbers in JSON."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,18 +11,18 @@ from splatseg.errors import FileFormatError
 from splatseg.fit._parameters import Parameters
 
 
-class Part(Protocol):
-    """Something of a fit that remembers: exposures, pose corrections, statistics.
+class StatefulModule(Protocol):
+    """A module of a fit with state: exposures, refined poses, densification statistics.
 
-    What is not in `state` is lost when a fit is resumed, and the resumed fit then differs.
+    A resumed fit equals an uninterrupted one only if `state` is complete.
     """
 
     def state(self) -> dict[str, Tensor]:
-        """Everything it remembers, by name. The names are always the same ones."""
+        """Its tensors by name. The names do not change."""
         ...
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave. The tensors are on the fit's device, and its own now."""
+        """Restore what `state` returned. The tensors are on the fit's device and may be kept."""
         ...
 
 
@@ -31,13 +31,13 @@ class FitState:
     """State of a fit between two steps."""
 
     tensors: Mapping[str, Tensor]
-    """By name, parts of a name divided by slashes."""
+    """By name, groups separated by slashes."""
 
     content: Mapping[str, Any]
-    """The rest; JSON holds it."""
+    """Everything else, in values that JSON holds."""
 
     where: str = "fit"
-    """What it was read from: messages begin with it."""
+    """The file that it was read from, for messages."""
 
     def group(
         self, name: str, expected: Iterable[str], *, device: torch.device
@@ -45,7 +45,7 @@ class FitState:
         """The tensors under ``name/`` without that prefix, on a device.
 
         Raises:
-            FileFormatError: If they are others than expected.
+            FileFormatError: If their names are not the expected ones.
         """
         prefix = f"{name}/"
         found = {
@@ -65,7 +65,7 @@ class FitState:
         """One tensor.
 
         Raises:
-            FileFormatError: If it is not there.
+            FileFormatError: If it is missing.
         """
         if name not in self.tensors:
             raise FileFormatError(f"{self.where}: expected a tensor {name!r}, got none.")
@@ -75,7 +75,7 @@ class FitState:
         """A number of the content.
 
         Raises:
-            FileFormatError: If it is not there, or no number.
+            FileFormatError: If it is missing, or not a number.
         """
         value = self.content.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -92,7 +92,7 @@ def parameters_of(state: FitState, group: str, device: torch.device) -> Paramete
     """Parameters or moments of a state.
 
     Raises:
-        FileFormatError: If their shapes do not fit each other.
+        FileFormatError: If their shapes do not agree.
     """
     widths = {"means": 3, "log_scales": 3, "rotations": 4, "logits": 1, "sh": None}
     tensors = state.group(group, widths, device=device)

@@ -1,4 +1,4 @@
-"""One step of learning from a photograph: all that fitting and refining have in common."""
+"""One training step on one photograph, shared by `fit` and `refine`."""
 
 import math
 import time
@@ -21,51 +21,51 @@ from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters, gathered, rows_in_view
 from splatseg.fit._photographs import Example, Photographs
 from splatseg.fit._update import UpdateSettings, gradients_of, update_rows
-from splatseg.fit._view_parts import ViewParts
+from splatseg.fit._view_modules import ViewModules
 from splatseg.render import Backend, Rendered, RenderOptions
 
 
 class ExtraLoss(Protocol):
-    """Something to learn from beside the photograph of a view."""
+    """A loss besides that of the photograph of a view."""
 
     def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
         """A scalar to be added to the loss.
 
         Args:
-            view: The view whose turn it is, with its present pose.
-            gaussians: Those that it may show, leaves that want a gradient.
-            rows: Which they are among all.
+            view: The view of this step, with its current pose.
+            gaussians: Those that may be visible in it, leaves that require a gradient.
+            rows: Their rows among all Gaussians.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepSettings:
-    """What may differ from step to step."""
+    """Settings of one step."""
 
     step: int
-    """Steps done before; messages name it."""
+    """Steps done before; used in messages."""
 
     progress: float
-    """In [0, 1]: rates and weights fall with it."""
+    """In [0, 1]: rates and weights decrease with it."""
 
     render_options: RenderOptions
-    """Filter and degree of the harmonics."""
+    """Low-pass filter and degree of the spherical harmonics."""
 
-    screen: bool = False
-    """Whether gradients in the projected centres are wanted."""
+    screen_gradients: bool = False
+    """Whether gradients with respect to the projected centres are computed."""
 
     extra_loss: ExtraLoss | None = None
-    """What else is learned from."""
+    """A further loss."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepGradients:
-    """What one view says about the Gaussians that it may show."""
+    """Gradients of one view's loss with respect to the Gaussians that may be visible in it."""
 
     example: Example
     rows: Int64[Tensor, "m"]
-    """Which Gaussians, among all."""
+    """Rows of these Gaussians among all."""
 
     gaussians: Gaussians
     """The Gaussians of these rows: leaves that hold gradients."""
@@ -73,22 +73,22 @@ class StepGradients:
     loss: Loss
     """Of the photograph alone."""
 
-    screen: Float[Tensor, "m 2"] | None
-    """Gradient in the projected centres, per pixel; None unless it was wanted and there is one."""
+    screen_gradients: Float[Tensor, "m 2"] | None
+    """Gradient with respect to the projected centres, per pixel; None unless it was asked for."""
 
 
 class TrainingStep:
-    """Renders a training view, compares it with its photograph, and gives gradients.
+    """Renders a training view, compares it with its photograph, and returns gradients.
 
-    Exposures, depth maps and poses of the views (`ViewParts`) take part wherever they are given,
-    and photographs with an alpha are blended over the background that the rendering is over. It
-    remembers the views that are still to come in this round; the Gaussians are the caller's.
+    Exposures, depth maps and poses of the views (`ViewModules`) are used where they are given, and
+    photographs with an alpha channel are blended over the same background as the render. The
+    order of the views left in this epoch is kept here; the Gaussians belong to the caller.
 
     Args:
         name: ``fit`` or ``refine``; messages begin with it.
         options: Loss and background.
-        backend: Who renders.
-        photographs: What is learned from.
+        backend: The renderer.
+        photographs: The training photographs.
         views: Exposures, depth maps and poses of the same views.
         generator: Source of the order of the views and of random backgrounds.
     """
@@ -100,7 +100,7 @@ class TrainingStep:
         options: FitOptions,
         backend: Backend,
         photographs: Photographs,
-        views: ViewParts,
+        views: ViewModules,
         generator: torch.Generator,
     ) -> None:
         self._name = name
@@ -111,15 +111,15 @@ class TrainingStep:
         self._generator = generator
         self.device = torch.device("cuda" if backend.name == "cuda" else "cpu")
         self.order: list[int] = []
-        """Views of this round that had no turn yet; the last is the next."""
+        """Indices of the views left in this epoch; the last is the next."""
         self.stages: dict[str, float] = {}
-        """Seconds spent in each part of a step."""
+        """Seconds spent in each stage of a step."""
 
     def next_example(self, reduction: Callable[[Camera], int] = lambda _: 1) -> Example:
-        """The next view: all of them in random order, then all again in another.
+        """The next view, in a new random order each epoch.
 
         Args:
-            reduction: By how much the photograph of a camera is to be reduced.
+            reduction: Downsampling factor of a camera's photograph.
         """
         with self.timed("read"):
             if not self.order:
@@ -140,7 +140,7 @@ class TrainingStep:
     def gradients(
         self, parameters: Parameters, example: Example, *, settings: StepSettings
     ) -> StepGradients:
-        """Render the view of an example and go back from the loss. Changes no parameters.
+        """Render the view of an example and back-propagate the loss. Changes no parameters.
 
         Raises:
             SplatsegError: If the loss is no longer a number.
@@ -150,16 +150,18 @@ class TrainingStep:
             rows = rows_in_view(parameters, example.camera, near=options.near)
             gaussians = gathered(parameters, rows)
             if settings.extra_loss is not None:
-                # Whoever draws them again draws them as they are drawn here.
+                # A further loss renders them with the same filter as here.
                 gaussians = gaussians.replace(
                     antialiased=options.antialiased, low_pass=options.low_pass
                 )
         with self.timed("render"):
-            screen = None
-            if settings.screen:
-                screen = torch.zeros_like(gaussians.means[:, :2]).requires_grad_()
-            camera = self._views.camera_to_draw(example.index, example.camera)
-            rendered = self._backend.render(gaussians, camera, None, options=options, screen=screen)
+            offsets = None
+            if settings.screen_gradients:
+                offsets = torch.zeros_like(gaussians.means[:, :2]).requires_grad_()
+            camera = self._views.differentiable_camera(example.index, example.camera)
+            rendered = self._backend.render(
+                gaussians, camera, None, options=options, screen_offsets=offsets
+            )
         with self.timed("loss"):
             image, photograph = self._over_background(rendered, example)
             loss = l1_dssim(
@@ -185,16 +187,16 @@ class TrainingStep:
             rows=rows,
             gaussians=gaussians,
             loss=loss,
-            screen=None if screen is None else screen.grad,
+            screen_gradients=None if offsets is None else offsets.grad,
         )
 
     def update(self, state: State, found: StepGradients, *, settings: UpdateSettings) -> None:
-        """Adam's step on the rows that the view showed, in place."""
+        """One step of Adam on the visible rows, in place."""
         update_rows(*state, gradients_of(found.gaussians), rows=found.rows, settings=settings)
 
     @contextmanager
     def timed(self, stage: str) -> Generator[None]:
-        """Count the time that is spent inside towards a stage."""
+        """Add the time spent inside to a stage."""
         begin = time.perf_counter()
         try:
             yield
@@ -202,7 +204,7 @@ class TrainingStep:
             self.stages[stage] = self.stages.get(stage, 0.0) + time.perf_counter() - begin
 
     def _over_background(self, rendered: Rendered, example: Example) -> tuple[Tensor, Tensor]:
-        """Rendering and photograph as they are compared: over one colour, in one exposure."""
+        """Render and photograph for comparison: over the same background, in the same exposure."""
         image, photograph = rendered.image, example.photograph
         if self._views.exposures is not None:
             image = self._views.exposures.applied(example.index, image, rendered.alpha)
@@ -235,6 +237,6 @@ class TrainingStep:
         value += 0.0 if extra is None else float(extra.detach())
         if not math.isfinite(value):
             raise SplatsegError(
-                f"{self._name}: expected a finite loss, got {value} at step {step}; lower rates "
-                "may help."
+                f"{self._name}: expected a finite loss, got {value} at step {step}; try "
+                "lower learning rates."
             )

@@ -1,4 +1,4 @@
-"""The optimiser's step on the Gaussians that a view showed."""
+"""The optimiser's step on the Gaussians that are visible in a view."""
 
 from dataclasses import dataclass
 
@@ -12,34 +12,34 @@ from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.fit._parameters import Parameters
 from splatseg.fit._schedule import Rates
 
-# Kheradmand et al. 2024, eq. 8, with the constants of their code: the walk fades from opacity
-# 0.005 on. Past 0.1 it is below 1e-4 of its largest and left out.
+# Kheradmand et al. 2024, eq. 8, with the constants of their code: the noise decays from opacity
+# 0.005 on. Above 0.1 it is below 1e-4 of its maximum and omitted.
 _NOISE_STEEPNESS = 100.0
 _NOISE_OPACITY = 0.005
-_FAINT = 0.1
+_MAX_NOISE_OPACITY = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UpdateSettings:
-    """What one step needs besides gradients. Constants of Adam are 3DGS's."""
+    """Settings of one step. Constants of Adam are 3DGS's."""
 
     rates: Rates
     """Learning rates."""
 
     step: int
-    """1 for the first. Moments are corrected for the steps of the fit, not of a row."""
+    """1 for the first. Bias correction counts the steps of the fit, not of a row."""
 
     opacity_penalty: float = 0.0
-    """Slope of the loss in every opacity."""
+    """Gradient of the opacity regulariser with respect to each opacity."""
 
     scale_penalty: float = 0.0
-    """Slope of the loss in every scale, one over scene units."""
+    """Gradient of the scale regulariser with respect to each scale, one over scene units."""
 
     noise: float = 0.0
-    """Strength of the walk of faint Gaussians: lambda times the position rate."""
+    """Strength of the noise added to centres: lambda times the learning rate of positions."""
 
     seed: int = 0
-    """The walk depends on this, the step and the row alone."""
+    """The noise depends on this, the step and the row alone."""
 
     beta1: float = 0.9
     beta2: float = 0.999
@@ -55,21 +55,21 @@ def update_rows(
     rows: Int64[Tensor, "m"],
     settings: UpdateSettings,
 ) -> None:
-    r"""Move rows of the parameters against their gradients, in place.
+    r"""Update rows of the parameters by one step of Adam, in place.
 
-    The chain rule from Gaussians to raw values, then Adam (Kingma and Ba 2015, algorithm 1),
-    then for Gaussians fainter than 0.1 a random step (Kheradmand et al. 2024, eq. 8)
+    The chain rule from Gaussians to raw parameters, then Adam (Kingma and Ba 2015, algorithm 1),
+    then for Gaussians of opacity below 0.1 the noise of 3DGS-MCMC (Kheradmand et al. 2024, eq. 8)
 
     .. math:: x \mathrel{+}= \lambda \, \frac{1}{1 + e^{100 (o - 0.005)}} \, \Sigma \eta.
 
-    Rows without a gradient towards opacity and mean colour, which no pixel shows, are left as
-    they are; so the cost is that of what a view shows.
+    Rows without a gradient of opacity and mean colour, which no pixel shows, are not updated, so
+    the cost is that of the visible Gaussians.
 
     Args:
         parameters: The raw parameters.
         first: First moments.
         second: Second moments.
-        gradients: Row j holds the slopes of the loss in the values of Gaussian ``rows[j]``.
+        gradients: Row j holds the loss's gradients with respect to Gaussian ``rows[j]``.
         rows: Distinct rows.
         settings: Rates and constants.
     """
@@ -81,7 +81,7 @@ def update_rows(
         tuple(tensor for _, tensor in parameters.tensors()),
         tuple(tensor for _, tensor in first.tensors()),
         tuple(tensor for _, tensor in second.tensors()),
-        tuple(slope.contiguous() for slope in _columns(gradients).values()),
+        tuple(gradient.contiguous() for gradient in _as_columns(gradients).values()),
         rows,
         (
             rates.means,
@@ -89,7 +89,7 @@ def update_rows(
             rates.rotations,
             rates.logits,
             rates.colour,
-            rates.harmonics,
+            rates.sh_rest,
         ),
         settings.beta1,
         settings.beta2,
@@ -111,7 +111,7 @@ def update_rows_torch(
     rows: Int64[Tensor, "m"],
     settings: UpdateSettings,
 ) -> None:
-    r"""The readable twin of `update_rows`; any device.
+    r"""The readable reference of `update_rows`; any device.
 
     .. math::
         m &= \beta_1 m + (1 - \beta_1) g, \qquad v = \beta_2 v + (1 - \beta_2) g^2 \\
@@ -119,34 +119,38 @@ def update_rows_torch(
     """
     shown = (gradients.opacities != 0) | (gradients.sh[:, 0] != 0).any(dim=1)
     rows = rows[shown]
-    slopes = {name: tensor[shown] for name, tensor in _columns(gradients).items()}
+    raw_gradients = {name: tensor[shown] for name, tensor in _as_columns(gradients).items()}
     raw = parameters.rows(rows)
 
-    slopes["log_scales"] = (slopes["log_scales"] + settings.scale_penalty) * raw.log_scales.exp()
+    raw_gradients["log_scales"] = (
+        raw_gradients["log_scales"] + settings.scale_penalty
+    ) * raw.log_scales.exp()
     opacities = raw.logits.sigmoid()
-    slopes["logits"] = (slopes["logits"] + settings.opacity_penalty) * opacities * (1 - opacities)
-    # The derivative of q / |q| keeps what is across q.
+    raw_gradients["logits"] = (
+        (raw_gradients["logits"] + settings.opacity_penalty) * opacities * (1 - opacities)
+    )
+    # The derivative of q / |q| projects onto the complement of q.
     length = torch.linalg.vector_norm(raw.rotations, dim=1, keepdim=True)
     unit = raw.rotations / length
-    along = (slopes["rotations"] * unit).sum(dim=1, keepdim=True)
-    slopes["rotations"] = (slopes["rotations"] - along * unit) / length
+    along = (raw_gradients["rotations"] * unit).sum(dim=1, keepdim=True)
+    raw_gradients["rotations"] = (raw_gradients["rotations"] - along * unit) / length
 
     moments = dict(first.tensors()), dict(second.tensors())
     rates = _rates_by_column(settings.rates, parameters)
     for name, value in parameters.tensors():
-        one, two, slope = moments[0][name], moments[1][name], slopes[name]
-        one[rows] = settings.beta1 * one[rows] + (1 - settings.beta1) * slope
-        two[rows] = settings.beta2 * two[rows] + (1 - settings.beta2) * slope.square()
-        mean = one[rows] / (1 - settings.beta1**settings.step)
-        spread = (two[rows] / (1 - settings.beta2**settings.step)).sqrt()
-        value[rows] -= rates[name] * mean / (spread + settings.epsilon)
+        m, v, gradient = moments[0][name], moments[1][name], raw_gradients[name]
+        m[rows] = settings.beta1 * m[rows] + (1 - settings.beta1) * gradient
+        v[rows] = settings.beta2 * v[rows] + (1 - settings.beta2) * gradient.square()
+        mean = m[rows] / (1 - settings.beta1**settings.step)
+        root = (v[rows] / (1 - settings.beta2**settings.step)).sqrt()
+        value[rows] -= rates[name] * mean / (root + settings.epsilon)
 
     if settings.noise > 0:
-        faint = opacities.squeeze(1) < _FAINT
-        _wander(parameters, rows[faint], opacities[faint], settings)
+        noisy = opacities.squeeze(1) < _MAX_NOISE_OPACITY
+        _add_noise(parameters, rows[noisy], opacities[noisy], settings)
 
 
-def _columns(gaussians: Gaussians) -> dict[str, Tensor]:
+def _as_columns(gaussians: Gaussians) -> dict[str, Tensor]:
     """Values of Gaussians under the names of the raw parameters, each (n, columns)."""
     return {
         "means": gaussians.means,
@@ -158,43 +162,41 @@ def _columns(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 def _rates_by_column(rates: Rates, parameters: Parameters) -> dict[str, Tensor]:
-    harmonics = parameters.sh.new_full((parameters.sh.shape[1],), rates.harmonics)
-    harmonics[:3] = rates.colour
+    sh_rest = parameters.sh.new_full((parameters.sh.shape[1],), rates.sh_rest)
+    sh_rest[:3] = rates.colour
     names = {
         "means": rates.means,
         "log_scales": rates.log_scales,
         "rotations": rates.rotations,
         "logits": rates.logits,
     }
-    return {name: torch.tensor(rate).to(harmonics) for name, rate in names.items()} | {
-        "sh": harmonics
-    }
+    return {name: torch.tensor(rate).to(sh_rest) for name, rate in names.items()} | {"sh": sh_rest}
 
 
-def _wander(
+def _add_noise(
     parameters: Parameters,
     rows: Int64[Tensor, "m"],
     opacities: Float[Tensor, "m 1"],
     settings: UpdateSettings,
 ) -> None:
-    """Random steps along the Gaussians' own axes: strength R diag(s^2) R^T eta."""
+    """Add noise shaped by the covariances: strength R diag(s^2) R^T eta."""
     strength = settings.noise * torch.sigmoid(-_NOISE_STEEPNESS * (opacities - _NOISE_OPACITY))
     axes = rotation_from_quaternion(parameters.rotations[rows])
-    noise = _bell(rows, settings).to(axes)
+    noise = _normal_noise(rows, settings).to(axes)
     local = (2 * parameters.log_scales[rows]).exp() * torch.einsum("nij,ni->nj", axes, noise)
     parameters.means[rows] += strength * torch.einsum("nij,nj->ni", axes, local)
 
 
-def _bell(rows: Int64[Tensor, "m"], settings: UpdateSettings) -> Float[Tensor, "m 3"]:
-    """Numbers of mean 0 and variance 1: four uniform ones of 16 bits, added."""
-    seed = _mixed(torch.tensor(settings.seed, device=rows.device))
-    base = _mixed(seed + settings.step)
-    bits = _mixed(base + 3 * rows[:, None] + torch.arange(3, device=rows.device))
+def _normal_noise(rows: Int64[Tensor, "m"], settings: UpdateSettings) -> Float[Tensor, "m 3"]:
+    """Approximately standard normal numbers: scaled sums of four uniform ones of 16 bits."""
+    seed = _split_mix(torch.tensor(settings.seed, device=rows.device))
+    base = _split_mix(seed + settings.step)
+    bits = _split_mix(base + 3 * rows[:, None] + torch.arange(3, device=rows.device))
     total = sum(((bits >> (16 * k)) & 0xFFFF).double() for k in range(4))
     return (torch.as_tensor(total) / 65536 - 2) * 3**0.5
 
 
-def _mixed(x: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
+def _split_mix(x: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
     """SplitMix64 (Steele et al. 2014). int64 wraps; its right shift is masked to be logical."""
 
     def shifted(value: Tensor, by: int) -> Tensor:
@@ -207,15 +209,15 @@ def _mixed(x: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:
 
 
 def gradients_of(leaves: Gaussians) -> Gaussians:
-    """Slopes of the loss where the values were; 0 where nothing depends on them."""
+    """Gradients of the leaves, as Gaussians; 0 where the loss does not depend on them."""
 
-    def slope(leaf: Tensor) -> Tensor:
+    def gradient(leaf: Tensor) -> Tensor:
         return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
 
     return Gaussians(
-        means=slope(leaves.means),
-        rotations=slope(leaves.rotations),
-        scales=slope(leaves.scales),
-        opacities=slope(leaves.opacities),
-        sh=slope(leaves.sh),
+        means=gradient(leaves.means),
+        rotations=gradient(leaves.rotations),
+        scales=gradient(leaves.scales),
+        opacities=gradient(leaves.opacities),
+        sh=gradient(leaves.sh),
     )

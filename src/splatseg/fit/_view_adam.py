@@ -1,4 +1,4 @@
-"""Adam for a few numbers of each training view, one view a step."""
+"""Adam for a few parameters of each training view, one view a step."""
 
 import torch
 from jaxtyping import Float
@@ -8,42 +8,42 @@ _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 
 
 class ViewAdam:
-    """Adam's moments (Kingma and Ba 2015, algorithm 1), a row a view.
+    """Adam's moments (Kingma and Ba 2015, algorithm 1), one row per view.
 
-    A row ages only when its view is seen: moments that faded while the others had their turn
-    would make each first step back too large.
+    The moments of a row decay only in steps of its view: if they decayed in all steps, each step
+    of a view after many others would be too large.
 
     Args:
         views: Number of rows.
-        width: Numbers of each view.
-        together: Divide all numbers of a view by one root mean square, so that the direction of
-            the gradient is kept; else each by its own.
+        width: Parameters of each view.
+        shared_scale: Divide all parameters of a view by one root mean square, so that the
+            direction of the gradient is kept; else each by its own.
     """
 
-    def __init__(self, views: int, width: int, *, together: bool = False) -> None:
-        self._together = together
+    def __init__(self, views: int, width: int, *, shared_scale: bool = False) -> None:
+        self._shared_scale = shared_scale
         self._first = torch.zeros(views, width, dtype=torch.float64)
         self._second = torch.zeros(views, width, dtype=torch.float64)
-        self._seen = torch.zeros(views, dtype=torch.int64)
+        self._step_counts = torch.zeros(views, dtype=torch.int64)
 
     def direction(self, index: int, gradient: Float[Tensor, "width"]) -> Float[Tensor, "width"]:
-        """What to subtract from a view's numbers, in units of the rate: about -1 to 1 each."""
-        slope = gradient.double()
-        self._seen[index] += 1
-        seen = int(self._seen[index])
-        self._first[index] += (1 - _BETA1) * (slope - self._first[index])
-        self._second[index] += (1 - _BETA2) * (slope.square() - self._second[index])
-        mean = self._first[index] / (1 - _BETA1**seen)
-        second = self._second[index] / (1 - _BETA2**seen)
-        spread = (second.mean() if self._together else second).sqrt()
-        return mean / (spread + _EPSILON)
+        """What to subtract from a view's parameters, in units of the learning rate."""
+        gradient = gradient.double()
+        self._step_counts[index] += 1
+        steps = int(self._step_counts[index])
+        self._first[index] += (1 - _BETA1) * (gradient - self._first[index])
+        self._second[index] += (1 - _BETA2) * (gradient.square() - self._second[index])
+        mean = self._first[index] / (1 - _BETA1**steps)
+        second = self._second[index] / (1 - _BETA2**steps)
+        root = (second.mean() if self._shared_scale else second).sqrt()
+        return mean / (root + _EPSILON)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything it holds, by name."""
-        return {"first": self._first, "second": self._second, "seen": self._seen}
+        """Its tensors by name."""
+        return {"first": self._first, "second": self._second, "seen": self._step_counts}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from what `state` gave."""
+        """Restore what `state` returned."""
         self._first = tensors["first"].cpu().clone()
         self._second = tensors["second"].cpu().clone()
-        self._seen = tensors["seen"].cpu().clone()
+        self._step_counts = tensors["seen"].cpu().clone()

@@ -20,7 +20,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, Labels
 from splatseg.errors import RangeError, ShapeError
 from splatseg.render import PreparedView, RenderOptions, prepare
-from splatseg.render.warp import straightened, warp_into_photograph
+from splatseg.render.warp import undistorted_camera, warp_into_photograph
 
 
 def label_map(
@@ -60,7 +60,7 @@ def label_map(
         )
     if channels < 1:
         raise RangeError(f"channels: expected at least 1, got {channels}.")
-    pinhole = straightened(camera)
+    pinhole = undistorted_camera(camera)
     with prepare(gaussians, pinhole, options=options, backend=backend) as view:
         draw = _Drawing(gaussians, view)
         winner, best = _strongest(draw, labels, _ids_to_draw(draw, labels, channels), channels)

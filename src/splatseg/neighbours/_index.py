@@ -19,7 +19,7 @@ MAX_COORDINATE = 1e150
 """Largest magnitude of a coordinate: squares of differences must not overflow float64."""
 
 MAX_PAIRS = 100_000_000
-"""Pairs that a radius search returns unless told otherwise: 1.6 GB."""
+"""Pairs that a radius search returns by default: 1.6 GB."""
 
 
 class NeighbourIndex:
@@ -209,7 +209,7 @@ class NeighbourIndex:
     ) -> Neighbours:
         _check_count("k", k)
         _check_distance("max_distance", max_distance)
-        count = self._asked(queries, rows)
+        count = self._query_count(queries, rows)
         indices = torch.empty(count, k, dtype=torch.int64)
         squared = torch.empty(count, k, dtype=torch.float64)
         self._native.nearest(queries, rows, max_distance * max_distance, indices, squared)
@@ -217,7 +217,7 @@ class NeighbourIndex:
 
     def _count(self, queries: Tensor | None, rows: Tensor | None, radius: float) -> Tensor:
         _check_distance("radius", radius)
-        counts = torch.empty(self._asked(queries, rows), dtype=torch.int64)
+        counts = torch.empty(self._query_count(queries, rows), dtype=torch.int64)
         self._native.count_within(queries, rows, radius * radius, counts)
         return counts
 
@@ -248,7 +248,7 @@ class NeighbourIndex:
         self._native.within(queries, rows, radius * radius, starts, indices, squared)
         return NeighbourLists(starts=starts, indices=indices, distances=square_root(squared))
 
-    def _asked(self, queries: Tensor | None, rows: Tensor | None) -> int:
+    def _query_count(self, queries: Tensor | None, rows: Tensor | None) -> int:
         if queries is not None:
             return len(queries)
         return len(self) if rows is None else len(rows)

@@ -1,4 +1,4 @@
-"""The readable twin: every query against every point, in torch."""
+"""The readable reference: every query against every point, in torch."""
 
 import math
 
@@ -30,11 +30,11 @@ def nearest(
     """What `NeighbourIndex.nearest` finds, and with `own` `nearest_others`.
 
     Args:
-        points: What is searched.
-        queries: What asks.
-        k: How many.
-        max_distance: How far they may be.
-        own: The point that each query leaves out.
+        points: The indexed points.
+        queries: The query positions.
+        k: Number of neighbours.
+        max_distance: Maximum distance of a neighbour.
+        own: The point that each query excludes.
     """
     squared, order = _ordered(points, queries, max_distance, own)
     short = max(0, k - len(points))
@@ -68,7 +68,7 @@ def within(
 def _ordered(
     points: Tensor, queries: Tensor, radius: float, own: Tensor | None
 ) -> tuple[Float64[Tensor, "m n"], Int64[Tensor, "m n"]]:
-    """Squared distances, least first, and whose they are; infinite of what is not found."""
+    """Squared distances, ascending, and the indices of the points; infinite where not found."""
     squared = squared_distances(queries, points)
     squared[squared > radius * radius] = math.inf
     if own is not None:

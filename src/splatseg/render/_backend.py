@@ -30,7 +30,7 @@ from splatseg.render._view_weights import ImageWeights, ViewWeights
 Layout = Literal["csr", "blocks"]
 
 _CHANNELS = 64
-"""Channels of a sparse image that are spelt out at a time, where no kernel takes it as it is."""
+"""Channels of a sparse image that are made dense at a time, where there is no sparse kernel."""
 
 
 class BackendView(ABC):
@@ -48,21 +48,22 @@ class BackendView(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Give back what it holds. The view cannot be used afterwards."""
+        """Release its memory. The view cannot be used afterwards."""
 
     @abstractmethod
     def render(
         self,
         signal: Float[Tensor, "n channels"] | None = None,
         *,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+        """``W @ signal``; None is the colour of the SH. Differentiable in torch.
 
         Args:
             signal: One row a Gaussian.
-            screen: Zeros, added to the projected centres, pixels: a leaf whose gradient is that
-                towards the centres on the image, which densification looks at.
+            screen_offsets: Zeros, added to the projected centres, pixels: a leaf whose gradient
+                is that of the projected centres (gsplat's ``means2d``), which densification
+                needs.
         """
 
     @abstractmethod
@@ -120,7 +121,7 @@ class Backend(ABC):
     def prepare(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
     ) -> BackendView:
-        """A view, for any number of products."""
+        """A prepared view, for any number of products."""
 
     def render(
         self,
@@ -129,11 +130,11 @@ class Backend(ABC):
         signal: Float[Tensor, "n channels"] | None,
         *,
         options: RenderOptions,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
         """`BackendView.render` of a view that is used once."""
         with self.prepare(gaussians, camera, options=options) as view:
-            return view.render(signal, screen=screen)
+            return view.render(signal, screen_offsets=screen_offsets)
 
     def back_project(
         self,

@@ -12,13 +12,13 @@ the low-pass are parameters (`RenderOptions`); the rest is fixed.
 | low-pass (square pixels)  | 0.3            | 0.3               | 0.3 (`eps2d`)                 |
 | alpha skipped             | < 1/255        | < 1/255           | < 1/255                       |
 | pixel stops, not blending | T' <= 1e-4     | T' < 1e-4         | T' <= 1e-4                    |
-| slopes of the Jacobian    | view + 0.3     | 1.3 (symmetric)   | view + 0.3                    |
+| x/z, y/z in the Jacobian  | view + 0.3     | 1.3 (symmetric)   | view + 0.3                    |
 | extent on screen          | exact ellipse  | square, 3 sigma   | box, min(3.33, exact) sigma   |
 | gradient at the cap       | 0              | as if not capped  | 0                             |
 
-Slopes x/z and y/z are clamped: "view + 0.3" is the view, wherever the principal point lies, and
-0.3 of its half width on either side; "1.3" is 1.3 half widths around the optical axis, the same
-where the principal point is in the middle.
+In the Jacobian, x/z and y/z are clamped: "view + 0.3" is the view, wherever the principal point
+lies, and 0.3 of its half width on either side; "1.3" is 1.3 half widths around the optical axis,
+the same where the principal point is the image centre.
 
 T' is the transmittance behind the Gaussian in question. A 3 sigma square (opacity 1) leaves out
 alphas up to 0.011; gsplat's 3.33 sigma box is exact to 1/255, because
@@ -26,8 +26,8 @@ alphas up to 0.011; gsplat's 3.33 sigma box is exact to 1/255, because
 """
 
 ALPHA_MIN = 1.0 / 255.0
-"""Least alpha that is blended, one step of an 8-bit image. Kerbl et al. 2023, appendix C. A
-Gaussian whose opacity is less is blended nowhere."""
+"""Minimum alpha that is blended, one step of an 8-bit image. Kerbl et al. 2023, appendix C. A
+Gaussian with a lower opacity is not blended."""
 
 TRANSMITTANCE_MIN = 1e-4
 """A Gaussian that would bring the transmittance to this or less ends the pixel and is not

@@ -1,4 +1,4 @@
-"""Switches of the blending model. The constants behind them are in `_constants`."""
+"""Options of the blending model. The constants behind them are in `_constants`."""
 
 import math
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ class RenderOptions:
     """Added to both variances of the projected Gaussian, square pixels."""
 
     antialiased: bool = False
-    """Scale opacity so that the low-pass adds no light (Mip-Splatting, eq. 9)."""
+    """Scale opacities to compensate for the low-pass filter (Mip-Splatting, eq. 9)."""
 
     sh_degree: int | None = None
-    """Highest degree of the harmonics in use; None is all there are."""
+    """Maximum degree of the spherical harmonics in use; None is all."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.near) and self.near > 0):

@@ -24,7 +24,7 @@ def render(
     backend: str = "auto",
     warp: WarpMode = "bilinear",
 ) -> Rendered:
-    r"""Draw any per-Gaussian signal as a view shows it: ``W @ signal``.
+    r"""Render any per-Gaussian signal in a view: ``W @ signal``.
 
     .. math:: I(p) = \sum_i f_i \, \alpha_i(p) \prod_{j < i} (1 - \alpha_j(p))
 
@@ -33,16 +33,16 @@ def render(
     in `render._constants`, conventions in ``docs/conventions.md``.
 
     Differentiable in torch towards the signal, and towards means, rotations, scales, opacities,
-    harmonics and ``camera.cam_from_world`` where they require a gradient.
+    spherical harmonics and ``camera.cam_from_world`` where they require a gradient.
 
     Args:
-        gaussians: What to draw.
-        camera: Where from; with distortion, the image is in the photograph's distorted pixels.
-        signal: One row a Gaussian, 1 to 1024 channels; None is the colour of the harmonics.
-        options: Switches of the blending model; None is what the Gaussians are
-            meant for, with the constants of the backend (`options_for`).
+        gaussians: The Gaussians to render.
+        camera: The camera; with distortion, the image is in the photograph's distorted pixels.
+        signal: One row a Gaussian, 1 to 1024 channels; None is the colour of the SH.
+        options: Switches of the blending model; None is what the Gaussians were
+            fitted with, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
-        warp: How distorted pixels read the straightened image: ``bilinear`` from the four
+        warp: How distorted pixels read the pinhole image: ``bilinear`` from the four
             pixels around, or ``nearest``, for ids and wherever the result is to agree with
             `weights` and `contributors`. Without distortion the two are the same.
 
@@ -77,16 +77,16 @@ def back_project(
     backend: str = "auto",
     warp: WarpMode = "bilinear",
 ) -> BackProjected:
-    """Collect an image on the Gaussians: ``W.T @ image``, the adjoint of `render`.
+    """Accumulate an image on the Gaussians: ``W.T @ image``, the adjoint of `render`.
 
     ``<render(f), g> == <f, back_project(g)>`` for every signal f and image g.
 
     Args:
-        gaussians: What the view shows.
+        gaussians: The Gaussians of the scene.
         camera: Whose pixels the image has, distortion included.
         image: 1 to 1024 channels, float.
-        options: Switches of the blending model; None is what the Gaussians are
-            meant for, with the constants of the backend (`options_for`).
+        options: Switches of the blending model; None is what the Gaussians were
+            fitted with, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
         warp: As for `render`.
 
@@ -110,15 +110,15 @@ def contributors(
     options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> Contributors:
-    """The k Gaussians that make most of each pixel, the front-most and the median one.
+    """The k Gaussians of largest weight in each pixel, the front-most and the median one.
 
     Args:
-        gaussians: What the view shows.
-        camera: Whose pixels are meant; with distortion, the nearest straightened pixel is read.
+        gaussians: The Gaussians of the scene.
+        camera: Whose pixels are meant; with distortion, the nearest pinhole pixel is read.
         pixels: Column and row of each pixel.
         k: How many, at least 1.
-        options: Switches of the blending model; None is what the Gaussians are
-            meant for, with the constants of the backend (`options_for`).
+        options: Switches of the blending model; None is what the Gaussians were
+            fitted with, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:
@@ -165,19 +165,19 @@ def weights(
     With lens distortion a row is that of the pinhole pixel which the photograph's pixel falls
     into, so that a row holds the Gaussians of one ray: its sum is the alpha of
     ``render(..., warp="nearest")``. ``render`` itself reads four pinhole pixels by default
-    (``warp="bilinear"``); at the edges of things its alpha differs from the row's sum by up to
-    a third. Take ``warp="nearest"`` in `render` and `back_project` where they are to agree with
-    rows of W.
+    (``warp="bilinear"``); at the edges of objects its alpha differs from the row's sum by up to
+    a third. Use ``warp="nearest"`` in `render` and `back_project` where they must agree with rows
+    of W.
 
     Args:
-        gaussians: What the view shows.
+        gaussians: The Gaussians of the scene.
         camera: Whose pixels are the rows.
         pixels: Column and row of each row; None is the whole image, row by row.
         k: Keep each pixel's k strongest entries; None keeps all.
         layout: ``csr`` has rows of single pixels; ``blocks`` has 4 x 4 pixel blocks and is
             faster, for whole images and all entries of pinhole cameras.
-        options: Switches of the blending model; None is what the Gaussians are
-            meant for, with the constants of the backend (`options_for`).
+        options: Switches of the blending model; None is what the Gaussians were
+            fitted with, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:

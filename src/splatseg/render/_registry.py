@@ -36,9 +36,9 @@ def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
 
 
 def options_for(gaussians: Gaussians, backend: str = "auto") -> RenderOptions:
-    """What Gaussians are drawn with when nobody says otherwise.
+    """The default options for Gaussians.
 
-    The `default_options` of the backend, with the filter that they are meant for.
+    The `default_options` of the backend, with the low-pass filter that they were fitted with.
     """
     return default_options(
         backend,
@@ -56,7 +56,7 @@ def default_options(
     antialiased: bool = False,
     low_pass: float = LOW_PASS,
 ) -> RenderOptions:
-    """What a backend draws with when nobody says otherwise.
+    """The default options of a backend.
 
     The defaults of `RenderOptions`, but for the opacity cap of ``cuda``, which gsplat has built
     in (``docs/decisions/0006-cuda-opacity-cap.md``).
@@ -64,7 +64,7 @@ def default_options(
     Args:
         name: As for `get_backend`.
         like: As for `get_backend`.
-        sh_degree: Highest degree of the harmonics in use; None is all there are.
+        sh_degree: Maximum degree of the spherical harmonics in use; None is all.
         antialiased: What the Gaussians are meant for, `Gaussians.antialiased`.
         low_pass: Likewise, `Gaussians.low_pass`.
     """

@@ -220,7 +220,7 @@ class SparseWeights(ViewWeights):
     ) -> "SparseWeights":
         """The same rows without their small weights. The strongest of a row always stays.
 
-        Half of the entries of a row carry 2 % of its light, so products take half the time.
+        Half of the entries of a row hold 2 % of its weight, so products take half the time.
 
         Args:
             min_weight: Weights below it are dropped, in (0, 1].

@@ -1,4 +1,4 @@
-"""What a view gives back: images, sums and contributors."""
+"""Results of products with W: images, sums and contributors."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ from splatseg.errors import InputError
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rendered:
-    """What a view shows."""
+    """Render of a view."""
 
     image: Float[Tensor, "height width channels"]
     """``W @ signal``, over black: a pixel that nothing covers is 0."""
 
     alpha: Float[Tensor, "height width"]
-    """Sum of the weights, ``W @ 1``; 1 minus it is the light that passes everything."""
+    """Sum of the weights, ``W @ 1``; 1 minus it is the transmittance behind all Gaussians."""
 
     depth: Float[Tensor, "height width"]
     """Expected z-depth, sum(w z) / sum(w), scene units; 0 where alpha is 0."""
@@ -30,13 +30,13 @@ class Rendered:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BackProjected:
-    """What an image says of each Gaussian."""
+    """An image accumulated on each Gaussian."""
 
     sums: Float[Tensor, "n channels"]
     """``W.T @ image``: the image summed over pixels with the blending weights."""
 
     weights: Float[Tensor, "n"]
-    """``W.T @ 1``: how much each Gaussian was seen; one fully visible pixel counts 1."""
+    """``W.T @ 1``: the visibility of each Gaussian; one fully visible pixel counts 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,7 +81,7 @@ class SparseImage:
                 )
 
     def dense(self, start: int, stop: int) -> Float[Tensor, "pixels part"]:
-        """Channels from `start` to before `stop`, spelt out."""
+        """Channels from `start` to before `stop`, dense."""
         row = torch.repeat_interleave(torch.arange(len(self.indptr) - 1), self.indptr.diff())
         mine = (self.channels >= start) & (self.channels < stop)
         image = torch.zeros(len(self.indptr) - 1, stop - start)
@@ -91,7 +91,7 @@ class SparseImage:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SparseBackProjected:
-    """What a `SparseImage` says of each Gaussian: the sums that are not 0."""
+    """A `SparseImage` accumulated on each Gaussian: the sums that are not 0."""
 
     gaussians: Int64[Tensor, "m"]
     """Gaussians, ascending."""
@@ -108,7 +108,7 @@ class SparseBackProjected:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Contributors:
-    """Which Gaussians make some pixels."""
+    """The Gaussians of largest weight in some pixels."""
 
     ids: Int32[Tensor, "p k"]
     """The strongest Gaussians of each pixel, strongest first; -1 where there are fewer."""

@@ -1,4 +1,4 @@
-r"""A view that is projected and sorted once, for any number of products with it.
+r"""A prepared view: projected and sorted once, for any number of products.
 
 For a camera with distortion the view is the product of two sparse matrices, :math:`R W` (see
 `render.warp`): the backend's pinhole image behind the lens's warp. For a pinhole camera R is the
@@ -27,7 +27,7 @@ from splatseg.render._values import (
     SparseImage,
 )
 from splatseg.render._view_weights import ViewWeights
-from splatseg.render.warp import WarpMode, straightened, warp_into_photograph
+from splatseg.render.warp import WarpMode, undistorted_camera, warp_into_photograph
 
 
 def prepare(
@@ -37,17 +37,17 @@ def prepare(
     options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> "PreparedView":
-    """A view of Gaussians, projected and sorted once and then used again and again.
+    """A view of Gaussians, projected and sorted once for any number of products.
 
-    What it gives is what `render`, `back_project`, `contributors` and `weights` give, bit for
-    bit; it only saves their preparation. Close it, or use it as a context: it holds tens of
+    Its results equal those of `render`, `back_project`, `contributors` and `weights`, bit for
+    bit; only their preparation is saved. Close it, or use it as a context: it holds tens of
     megabytes. The Gaussians and the camera must stay as they are until then.
 
     Args:
-        gaussians: What the view shows.
-        camera: Where from; with distortion, in the photograph's distorted pixels.
-        options: Switches of the blending model; None is what the Gaussians are
-            meant for, with the constants of the backend (`options_for`).
+        gaussians: The Gaussians of the scene.
+        camera: The camera; with distortion, in the photograph's distorted pixels.
+        options: Switches of the blending model; None is what the Gaussians were
+            fitted with, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:
@@ -80,7 +80,7 @@ class PreparedView:
         """Take what `prepare` checked; nothing is projected before it is needed."""
         self._count = len(gaussians)
         self._camera = camera
-        self._view = backend.prepare(gaussians, straightened(camera), options=options)
+        self._view = backend.prepare(gaussians, undistorted_camera(camera), options=options)
 
     def __enter__(self) -> Self:
         return self
@@ -89,12 +89,12 @@ class PreparedView:
         self.close()
 
     def close(self) -> None:
-        """Give back what it holds. The view cannot be used afterwards."""
+        """Release its memory. The view cannot be used afterwards."""
         self._view.close()
 
     @property
     def camera(self) -> Camera:
-        """Whose pixels are meant."""
+        """The camera of the view's pixels."""
         return self._camera
 
     def render(
@@ -110,11 +110,11 @@ class PreparedView:
         pinhole pixel's, because medians do not add up.
 
         Where the Gaussians, the pose or the signal require a gradient, the view is projected
-        anew for this render, which is then differentiable as ever.
+        anew for this render, which is differentiable.
 
         Args:
-            signal: One row a Gaussian, 1 to 1024 channels; None is the colour of the harmonics.
-            warp: How distorted pixels read the straightened image; ``nearest`` for ids.
+            signal: One row a Gaussian, 1 to 1024 channels; None is the colour of the SH.
+            warp: How distorted pixels read the pinhole image; ``nearest`` for ids.
         """
         if signal is not None:
             check_columns("signal", signal, (self._count, None))
@@ -245,7 +245,7 @@ def _in_pinhole_image(camera: Camera, image: SparseImage) -> SparseImage:
     """The image in pinhole pixels, by the nearest warp, and how many pixels fell into each."""
     every = camera.pixel_centres().reshape(-1, 2).floor().long()
     source, valid = warp_into_photograph(camera, "nearest").nearest_sources(every)
-    pinhole = straightened(camera)
+    pinhole = undistorted_camera(camera)
     count = image.count + 1
     pixel = torch.where(valid, source[:, 1] * pinhole.width + source[:, 0], 0)
     row = torch.repeat_interleave(torch.arange(len(every)), image.indptr.diff())

@@ -158,7 +158,7 @@ class Warp:
         return at.to(pixels.device), found.to(pixels.device)
 
 
-def straightened(camera: Camera) -> Camera:
+def undistorted_camera(camera: Camera) -> Camera:
     """The pinhole camera to draw for `camera`: it covers every pixel of the photograph."""
     if camera.is_pinhole:
         return replace(camera, model="pinhole", distortion=())

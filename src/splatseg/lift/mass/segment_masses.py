@@ -27,7 +27,7 @@ from splatseg.errors import ShapeError
 from splatseg.lift.mass.pieces import Pieces, pieces_of
 from splatseg.lift.mass.products import entries_of, sparse_product
 from splatseg.render import ImageWeights, RenderOptions, SparseWeights, options_for, weights
-from splatseg.render.warp import straightened, warp_into_photograph
+from splatseg.render.warp import undistorted_camera, warp_into_photograph
 
 _BAND = 1 << 19
 """Pixels whose rows of W are held at a time; a pixel of a dense scene has 150 entries of 6 bytes.
@@ -111,7 +111,7 @@ def _sums(
     backend: str,
 ) -> tuple[list[Any], Tensor | None]:
     """Sparse (pieces, Gaussians) of each band, and what all pixels see where pieces do not tell."""
-    pinhole = straightened(camera)
+    pinhole = undistorted_camera(camera)
     bands = list(_bands(pinhole.height * pinhole.width))
     if len(bands) == 1 and camera.is_pinhole and pieces.weight is None:
         return [_image_sums(pieces, gaussians, camera, options=options, backend=backend)], None
@@ -189,7 +189,7 @@ def _pinhole_pixels(camera: Camera) -> NDArray[np.int64]:
     """The pinhole pixel that each pixel of the photograph falls into, -1 where none."""
     pixels = camera.pixel_centres().reshape(-1, 2).floor().long()
     source, valid = warp_into_photograph(camera, "nearest").nearest_sources(pixels)
-    flat = source[:, 1] * straightened(camera).width + source[:, 0]
+    flat = source[:, 1] * undistorted_camera(camera).width + source[:, 0]
     return torch.where(valid, flat, -1).numpy()
 
 

@@ -19,10 +19,10 @@ from splatseg.render._values import (
     SparseImage,
 )
 from splatseg.render._view_weights import ImageWeights
-from splatseg.render.cpu._view import NARROW, CpuView
+from splatseg.render.cpu._view import MAX_COLOUR_CHANNELS, CpuView
 from splatseg.render.cpu._weights import CpuBlockWeights, rows_of_blocks
 
-_INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose", "screen")
+_INPUTS = ("means", "rotations", "scales", "opacities", "sh", "signal", "pose", "screen_offsets")
 
 
 class _Render(torch.autograd.Function):
@@ -38,12 +38,12 @@ class _Render(torch.autograd.Function):
         sh: Tensor | None,
         signal: Tensor | None,
         pose: Tensor,
-        screen: Tensor | None,
+        screen_offsets: Tensor | None,
         camera: Camera,
         options: RenderOptions,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         needs: tuple[bool, ...] = ctx.needs_input_grad[: len(_INPUTS)]
-        wide = signal is not None and signal.shape[1] > NARROW
+        wide = signal is not None and signal.shape[1] > MAX_COLOUR_CHANNELS
         view = CpuView(
             means,
             rotations,
@@ -58,17 +58,17 @@ class _Render(torch.autograd.Function):
         ctx.view = view if any(needs) else view.close()
         ctx.dtypes = tuple(
             None if t is None else t.dtype
-            for t in (means, rotations, scales, opacities, sh, signal, pose, screen)
+            for t in (means, rotations, scales, opacities, sh, signal, pose, screen_offsets)
         )
         ctx.mark_non_differentiable(median)
         return image, alpha, depth_sum, median
 
     @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *v_outputs: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         view = cast(CpuView, ctx.view)
         needs: tuple[bool, ...] = ctx.needs_input_grad
         wanted = frozenset(name for name, need in zip(_INPUTS, needs, strict=False) if need)
-        v_image, v_alpha, v_depth_sum = slopes[:3]
+        v_image, v_alpha, v_depth_sum = v_outputs[:3]
         found = view.backward(
             v_image,
             v_alpha=v_alpha,
@@ -83,7 +83,7 @@ class _Render(torch.autograd.Function):
             found.sh,
             found.signal,
             found.cam_from_world,
-            found.screen,
+            found.screen_offsets,
         )
         typed = [
             g.to(dtype) if need and g is not None else None
@@ -100,7 +100,7 @@ class CpuBackend(Backend):
     def prepare(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
     ) -> "CpuBackendView":
-        """A view, for any number of products."""
+        """A prepared view, for any number of products."""
         return CpuBackendView(gaussians, camera, options)
 
 
@@ -128,18 +128,18 @@ class CpuBackendView(BackendView):
         self,
         signal: Float[Tensor, "n channels"] | None = None,
         *,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch.
+        """``W @ signal``; None is the colour of the SH. Differentiable in torch.
 
-        `screen` is not added, only given its gradient: expected are zeros.
+        `screen_offsets` is not added, only given its gradient: expected are zeros.
         """
-        if needs_graph(self._gaussians, self._camera, signal, screen):
-            found = self._render_in_graph(signal, screen)
-        elif signal is not None and signal.shape[1] > NARROW:
+        if needs_graph(self._gaussians, self._camera, signal, screen_offsets):
+            found = self._render_in_graph(signal, screen_offsets)
+        elif signal is not None and signal.shape[1] > MAX_COLOUR_CHANNELS:
             found = self._prepared().render(signal)
         else:
-            # Colours ride in the projected Gaussians: the first ones are projected with them.
+            # Colours are stored with the projected Gaussians: the first are projected with them.
             fresh = self._view is None
             sh = self._gaussians.sh if signal is None else None
             view = self._prepared(sh=sh, signal=signal)
@@ -152,7 +152,7 @@ class CpuBackendView(BackendView):
         return Rendered(image=image, alpha=alpha, depth=depth, median_depth=median)
 
     def _render_in_graph(
-        self, signal: Tensor | None, screen: Tensor | None
+        self, signal: Tensor | None, screen_offsets: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         gaussians = self._gaussians
         return cast(
@@ -165,7 +165,7 @@ class CpuBackendView(BackendView):
                 gaussians.sh if signal is None else None,
                 signal,
                 self._camera.cam_from_world,
-                screen,
+                screen_offsets,
                 self._camera,
                 self._options,
             ),

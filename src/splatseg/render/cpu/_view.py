@@ -16,8 +16,8 @@ from splatseg import _native
 from splatseg.core import Camera
 from splatseg.render._options import RenderOptions
 
-NARROW = 3
-"""Signals of up to this many channels ride in the colour kernel."""
+MAX_COLOUR_CHANNELS = 3
+"""Signals of up to this many channels use the colour kernel."""
 
 _LANES = 16
 _free_views: list[_native.View] = []
@@ -34,8 +34,8 @@ class SceneGradients:
     opacities: Float[Tensor, "n"] | None
     sh: Float[Tensor, "n coefficients 3"] | None
     signal: Float[Tensor, "n channels"] | None
-    screen: Float[Tensor, "n 2"] | None
-    """Towards the projected centres, per pixel: what densification looks at."""
+    screen_offsets: Float[Tensor, "n 2"] | None
+    """With respect to the projected centres, per pixel, for densification."""
 
     cam_from_world: Float[Tensor, "4 4"] | None
 
@@ -71,7 +71,7 @@ class CpuView:
         means, rotations, scales, opacities: Columns of `core.Gaussians`, on the CPU.
         camera: A pinhole camera.
         options: Switches of the blending model.
-        sh: Harmonics whose colour is rendered where no signal is given.
+        sh: Spherical harmonics, rendered where no signal is given.
         signal: A signal (n, up to 3) that takes their place.
 
     Values are not checked; rows that are not finite are left out rather than drawn.
@@ -116,7 +116,7 @@ class CpuView:
         self._wide: Tensor | None = None
 
     def _colour_with(self, sh: Tensor | None, signal: Tensor | None) -> int:
-        """What the Gaussians' colours are made of; gives the degree of the harmonics in use."""
+        """Set the source of the colours; returns the degree of the spherical harmonics in use."""
         self._narrow = 3 if signal is None else signal.shape[1]
         self._sh = None if sh is None else _plain(sh)
         self._cloud = _native.Cloud(
@@ -133,7 +133,7 @@ class CpuView:
         sh: Float[Tensor, "n coefficients 3"] | None = None,
         signal: Float[Tensor, "n channels"] | None = None,
     ) -> None:
-        """Take other harmonics or another narrow signal; the projection stays as it is.
+        """Take other spherical harmonics or another narrow signal; the projection stays as it is.
 
         Only for renders without a record: the backward pass knows the colours of the start.
         """
@@ -226,7 +226,7 @@ class CpuView:
         v_alpha: Float[Tensor, "height width"] | None = None,
         v_depth_sum: Float[Tensor, "height width"] | None = None,
         wanted: frozenset[str] = frozenset(
-            ("means", "rotations", "scales", "opacities", "sh", "screen")
+            ("means", "rotations", "scales", "opacities", "sh", "screen_offsets")
         ),
     ) -> SceneGradients:
         """Gradients of ``<v_image, image> + <v_alpha, alpha> + <v_depth_sum, depth_sum>``.
@@ -255,11 +255,15 @@ class CpuView:
 
         use_sh = "sh" in wanted and self._sh is not None and self._wide is None
         means, rotations, scales = zeros("means", 3), zeros("rotations", 4), zeros("scales", 3)
-        opacities, screen = zeros("opacities"), zeros("screen", 2)
+        opacities, screen_offsets = zeros("opacities"), zeros("screen_offsets", 2)
         sh = _zeros(*self._sh.shape) if use_sh and self._sh is not None else None
         pose = torch.zeros(15, dtype=torch.float64) if "pose" in wanted else None
-        if any(x is not None for x in (means, rotations, scales, opacities, sh, screen, pose)):
-            self._view.chain(self._cloud, means, rotations, scales, opacities, sh, screen, pose)
+        if any(
+            x is not None for x in (means, rotations, scales, opacities, sh, screen_offsets, pose)
+        ):
+            self._view.chain(
+                self._cloud, means, rotations, scales, opacities, sh, screen_offsets, pose
+            )
         return SceneGradients(
             means=means,
             rotations=rotations,
@@ -267,12 +271,12 @@ class CpuView:
             opacities=opacities,
             sh=sh,
             signal=v_signal,
-            screen=screen,
+            screen_offsets=screen_offsets,
             cam_from_world=None if pose is None else self._pose_gradient(pose),
         )
 
     def _pose_gradient(self, sums: Tensor) -> Tensor:
-        """From the rows of [R | t] and the camera centre c = -R^T t, which harmonics look from."""
+        """From the rows of [R | t] and the camera centre c = -R^T t, where SH directions begin."""
         gradient = torch.zeros(4, 4, dtype=torch.float64)
         gradient[:3] = sums[:12].reshape(3, 4)
         v_centre = sums[12:]

@@ -49,7 +49,7 @@ class CudaBackend(Backend):
     def prepare(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
     ) -> "CudaBackendView":
-        """A view, for any number of products.
+        """A prepared view, for any number of products.
 
         Raises:
             BackendError: If the options ask for what gsplat cannot do.
@@ -95,20 +95,20 @@ class CudaBackendView(BackendView):
         self,
         signal: Float[Tensor, "n channels"] | None = None,
         *,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        """``W @ signal``; None is the colour of the SH. Differentiable in torch."""
         home, dtype = self._gaussians.device, self._gaussians.dtype
-        graph = needs_graph(self._gaussians, self._camera, screen)
+        graph = needs_graph(self._gaussians, self._camera, screen_offsets)
         gaussians, view = self._on_device(graph=graph)
-        if screen is not None and len(gaussians):
-            offsets = screen.to(device=self._device, dtype=torch.float32)
+        if screen_offsets is not None and len(gaussians):
+            offsets = screen_offsets.to(device=self._device, dtype=torch.float32)
             view = replace(view, centres=view.centres + offsets)
         if signal is None:
             signal = colours(view, gaussians, self._camera, self._options.sh_degree)
         else:
             signal = signal.to(device=self._device, dtype=torch.float32)
-        depths = view.only_seen(lambda rows: view.depths[0, rows, None])
+        depths = view.for_visible(lambda rows: view.depths[0, rows, None])
         drawn, alpha = view.product(torch.cat((signal, depths), dim=1))
         covered = alpha > 0
         depth = torch.where(covered, drawn[..., -1] / torch.where(covered, alpha, 1.0), 0.0)

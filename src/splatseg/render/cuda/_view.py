@@ -32,7 +32,7 @@ class CudaView:
     gsplat: ModuleType | Any
     width: int
     height: int
-    seen: Tensor
+    visible: Tensor
     """Rows that reach the image; the others' columns below hold no meaning."""
     centres: Tensor
     conics: Tensor
@@ -54,19 +54,7 @@ class CudaView:
         across, down = -(-camera.width // TILE), -(-camera.height // TILE)
         if len(gaussians) == 0:
             # gsplat divides by the number of Gaussians.
-            none = torch.zeros(1, 0, device=device)
-            return CudaView(
-                gsplat=gsplat,
-                width=camera.width,
-                height=camera.height,
-                seen=torch.zeros(0, dtype=torch.int64, device=device),
-                centres=torch.zeros(1, 0, 2, device=device),
-                conics=torch.zeros(1, 0, 3, device=device),
-                depths=none,
-                opacities=none,
-                tile_starts=torch.zeros(1, down, across, dtype=torch.int32, device=device),
-                tile_ids=torch.zeros(0, dtype=torch.int32, device=device),
-            )
+            return CudaView._empty(camera, gsplat=gsplat, device=device)
         pose = camera.cam_from_world.to(device=device, dtype=torch.float32)
         # gsplat keeps z >= near where we keep z > near.
         near = float(torch.nextafter(torch.tensor(options.near), torch.tensor(math.inf)))
@@ -86,9 +74,9 @@ class CudaView:
             opacities=gaussians.opacities,
         )
         opacities = gaussians.opacities[None]
-        seen = (radii[0] > 0).all(dim=-1)
+        visible = (radii[0] > 0).all(dim=-1)
         if options.antialiased:
-            opacities = opacities * torch.where(seen, compensations, 0.0)
+            opacities = opacities * torch.where(visible, compensations, 0.0)
         _, keys, tile_ids = gsplat.isect_tiles(
             centres, radii, depths, TILE, across, down, packed=False
         )
@@ -96,7 +84,7 @@ class CudaView:
             gsplat=gsplat,
             width=camera.width,
             height=camera.height,
-            seen=torch.nonzero(seen)[:, 0],
+            visible=torch.nonzero(visible)[:, 0],
             centres=centres,
             conics=conics,
             depths=depths,
@@ -105,13 +93,31 @@ class CudaView:
             tile_ids=tile_ids,
         )
 
+    @staticmethod
+    def _empty(camera: Camera, *, gsplat: ModuleType | Any, device: torch.device) -> "CudaView":
+        """The view of no Gaussians."""
+        across, down = -(-camera.width // TILE), -(-camera.height // TILE)
+        none = torch.zeros(1, 0, device=device)
+        return CudaView(
+            gsplat=gsplat,
+            width=camera.width,
+            height=camera.height,
+            visible=torch.zeros(0, dtype=torch.int64, device=device),
+            centres=torch.zeros(1, 0, 2, device=device),
+            conics=torch.zeros(1, 0, 3, device=device),
+            depths=none,
+            opacities=none,
+            tile_starts=torch.zeros(1, down, across, dtype=torch.int32, device=device),
+            tile_ids=torch.zeros(0, dtype=torch.int32, device=device),
+        )
+
     def detached(self) -> "CudaView":
         """The same view with its geometry frozen."""
         return CudaView(
             gsplat=self.gsplat,
             width=self.width,
             height=self.height,
-            seen=self.seen,
+            visible=self.visible,
             centres=self.centres.detach(),
             conics=self.conics.detach(),
             depths=self.depths.detach(),
@@ -122,7 +128,7 @@ class CudaView:
 
     def product(self, signal: Tensor) -> tuple[Tensor, Tensor]:
         """``W @ signal`` (height, width, channels) and ``W @ 1`` (height, width)."""
-        if len(self.seen) == 0:
+        if len(self.visible) == 0:
             # Connected to the signal, so that gradients are 0, not missing.
             nothing = 0 * signal.sum(dim=0).expand(self.height, self.width, -1)
             return nothing, signal.new_zeros(self.height, self.width)
@@ -156,19 +162,19 @@ class CudaView:
             columns.append(column)
         return torch.cat(columns, dim=1)
 
-    def only_seen(self, of_rows: Callable[[Tensor], Tensor]) -> Tensor:
-        """A column computed for the rows that are seen, 0 for the others.
+    def for_visible(self, of_rows: Callable[[Tensor], Tensor]) -> Tensor:
+        """A column computed for the rows that are visible, 0 for the others.
 
         The others are left out of the formula, so that they give no NaN gradients.
         """
-        values = of_rows(self.seen)
+        values = of_rows(self.visible)
         full = values.new_zeros(self.centres.shape[1], *values.shape[1:])
-        return full.index_copy(0, self.seen, values)
+        return full.index_copy(0, self.visible, values)
 
     @torch.no_grad()
     def entries(self) -> Entries:
         """All non-zero entries of W, pixel by pixel, front to back."""
-        if len(self.seen) == 0:
+        if len(self.visible) == 0:
             none = torch.zeros(0, dtype=torch.int64, device=self.centres.device)
             return Entries(pixels=none, ids=none, weights=none.double(), median=none.bool())
         ids, pixels, _ = self.gsplat.rasterize_to_indices_in_range(
@@ -207,7 +213,7 @@ class CudaView:
 
 
 def colours(view: CudaView, gaussians: Gaussians, camera: Camera, degree: int | None) -> Tensor:
-    """Colours of the harmonics along the rays to the Gaussians that are seen."""
+    """Colours of the harmonics along the rays to the Gaussians that are visible."""
     centre = camera.centre.to(device=gaussians.device, dtype=torch.float32)
 
     def of_rows(rows: Tensor) -> Tensor:
@@ -215,4 +221,4 @@ def colours(view: CudaView, gaussians: Gaussians, camera: Camera, degree: int | 
         directions = rays / torch.linalg.vector_norm(rays, dim=1, keepdim=True)
         return evaluate_sh(gaussians.sh[rows], directions, degree=degree)
 
-    return view.only_seen(of_rows)
+    return view.for_visible(of_rows)

@@ -32,7 +32,7 @@ class ReferenceBackend(Backend):
     def prepare(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions
     ) -> "ReferenceView":
-        """A view, for any number of products."""
+        """A prepared view, for any number of products."""
         return ReferenceView(gaussians, camera, options)
 
 
@@ -68,13 +68,13 @@ class ReferenceView(BackendView):
         self,
         signal: Float[Tensor, "n channels"] | None = None,
         *,
-        screen: Float[Tensor, "n 2"] | None = None,
+        screen_offsets: Float[Tensor, "n 2"] | None = None,
     ) -> Rendered:
-        """``W @ signal``; None is the colour of the harmonics. Differentiable in torch."""
+        """``W @ signal``; None is the colour of the SH. Differentiable in torch."""
         gaussians, camera, options = self._gaussians, self._camera, self._options
-        projected = self._project(graph=needs_graph(gaussians, camera, signal, screen))
-        if screen is not None:
-            moved = projected.centres + screen[projected.ids].double()
+        projected = self._project(graph=needs_graph(gaussians, camera, signal, screen_offsets))
+        if screen_offsets is not None:
+            moved = projected.centres + screen_offsets[projected.ids].double()
             projected = replace(projected, centres=moved)
         if signal is None:
             signal = _colours(gaussians, camera, projected, degree=options.sh_degree)
@@ -90,11 +90,11 @@ class ReferenceView(BackendView):
         alpha, depth_sum, median = zeros.clone(), zeros.clone(), zeros.clone()
         for tile in tiles(projected, camera.width, camera.height, alpha_max=options.alpha_max):
             weights, z = tile.matrix.weights, tile.projected.depths
-            place = (tile.rows, tile.columns)
-            image[place] = (weights @ signal[row[tile.projected.ids]]).reshape(*tile.size, -1)
-            alpha[place] = weights.sum(dim=1).reshape(tile.size)
-            depth_sum[place] = (weights @ z).reshape(tile.size)
-            median[place] = (tile.matrix.median.double() @ z.detach()).reshape(tile.size)
+            window = (tile.rows, tile.columns)
+            image[window] = (weights @ signal[row[tile.projected.ids]]).reshape(*tile.size, -1)
+            alpha[window] = weights.sum(dim=1).reshape(tile.size)
+            depth_sum[window] = (weights @ z).reshape(tile.size)
+            median[window] = (tile.matrix.median.double() @ z.detach()).reshape(tile.size)
         # Where nothing is visible the gradients are 0, not missing.
         nothing = 0 * (projected.centres.sum() + projected.covariances.sum())
         nothing = nothing + 0 * (projected.opacities.sum() + signal.sum())
@@ -148,7 +148,7 @@ class ReferenceView(BackendView):
 def _colours(
     gaussians: Gaussians, camera: Camera, projected: Projected, *, degree: int | None
 ) -> Tensor:
-    """Colours of the harmonics along the rays to the centres, for the rows of `projected`."""
+    """Colours by spherical harmonics along the rays to the centres, for the rows of `projected`."""
     centre = camera.centre.to(device=gaussians.device, dtype=torch.float64)
     rays = gaussians.means[projected.ids].double() - centre
     directions = rays / torch.linalg.vector_norm(rays, dim=1, keepdim=True)

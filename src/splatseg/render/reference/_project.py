@@ -103,17 +103,7 @@ def project(gaussians: Gaussians, camera: Camera, *, options: RenderOptions) -> 
     means_cam = means_cam[ids]
     x, y, z = means_cam.unbind(dim=1)
 
-    zeros = torch.zeros_like(z)
-    slope_x = _clamp_to_view(x / z, camera.width, focal=camera.fx, principal=camera.cx)
-    slope_y = _clamp_to_view(y / z, camera.height, focal=camera.fy, principal=camera.cy)
-    jacobian_u = torch.stack((camera.fx / z, zeros, -camera.fx * slope_x / z), dim=1)
-    jacobian_v = torch.stack((zeros, camera.fy / z, -camera.fy * slope_y / z), dim=1)
-
-    # Rows of M = J W R S, so that J W Sigma W' J' = M M'.
-    axes = rotation @ rotation_from_quaternion(gaussians.rotations[ids].double())
-    half_axes = axes * gaussians.scales[ids].double()[:, None, :]
-    row_u = torch.einsum("ni,nij->nj", jacobian_u, half_axes)
-    row_v = torch.einsum("ni,nij->nj", jacobian_v, half_axes)
+    row_u, row_v = _half_axes_on_image(gaussians[ids], means_cam, rotation, camera)
     var_u = (row_u * row_u).sum(dim=1)
     var_v = (row_v * row_v).sum(dim=1)
     cov_uv = (row_u * row_v).sum(dim=1)
@@ -131,7 +121,7 @@ def project(gaussians: Gaussians, camera: Camera, *, options: RenderOptions) -> 
     order = order[torch.argsort(z.detach()[order], stable=True)]
     det, det_sharp, opacities = det[order], det_sharp[order], opacities[order]
     if options.antialiased:
-        # The 2D Mip filter of Mip-Splatting (Yu et al. 2024): what is blurred keeps its light.
+        # The 2D Mip filter of Mip-Splatting (Yu et al. 2024) keeps the Gaussian's energy.
         opacities = opacities * torch.sqrt(det_sharp / det)
     return Projected(
         ids=ids[order],
@@ -145,10 +135,27 @@ def project(gaussians: Gaussians, camera: Camera, *, options: RenderOptions) -> 
     )
 
 
-def _clamp_to_view(slope: Tensor, size: int, *, focal: float, principal: float) -> Tensor:
+def _half_axes_on_image(
+    gaussians: Gaussians, means_cam: Tensor, rotation: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """The two rows of M = J W R S of each Gaussian, so that J W Sigma W' J' = M M'."""
+    x, y, z = means_cam.unbind(dim=1)
+    zeros = torch.zeros_like(z)
+    tan_x = _clamp_to_view(x / z, camera.width, focal=camera.fx, principal=camera.cx)
+    tan_y = _clamp_to_view(y / z, camera.height, focal=camera.fy, principal=camera.cy)
+    jacobian_u = torch.stack((camera.fx / z, zeros, -camera.fx * tan_x / z), dim=1)
+    jacobian_v = torch.stack((zeros, camera.fy / z, -camera.fy * tan_y / z), dim=1)
+    axes = rotation @ rotation_from_quaternion(gaussians.rotations.double())
+    half_axes = axes * gaussians.scales.double()[:, None, :]
+    row_u = torch.einsum("ni,nij->nj", jacobian_u, half_axes)
+    row_v = torch.einsum("ni,nij->nj", jacobian_v, half_axes)
+    return row_u, row_v
+
+
+def _clamp_to_view(tangent: Tensor, size: int, *, focal: float, principal: float) -> Tensor:
     """Clamp x/z (or y/z) to the view and `FRUSTUM_MARGIN` half widths on each side of it."""
     margin = FRUSTUM_MARGIN * (0.5 * size / focal)
     low, high = -principal / focal - margin, (size - principal) / focal + margin
     if not (math.isfinite(low) and math.isfinite(high)):
-        return slope
-    return slope.clamp(min=low, max=high)
+        return tangent
+    return tangent.clamp(min=low, max=high)

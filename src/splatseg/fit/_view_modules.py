@@ -1,4 +1,4 @@
-"""What a fit learns about single training views besides the scene: exposure, depth, pose."""
+"""Optional modules of a fit with data per training view: exposure, depth, pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,15 +12,15 @@ from splatseg.fit._depth import DepthMaps
 from splatseg.fit._exposure import Exposure, Exposures
 from splatseg.fit._options import FitOptions
 from splatseg.fit._poses import Poses
-from splatseg.fit._state import Part
+from splatseg.fit._state import StatefulModule
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ViewParts:
-    """The optional parts of a fit that go by view; None is one that is switched off."""
+class ViewModules:
+    """The optional modules of a fit with data per view; None is one that is switched off."""
 
     views: tuple[View, ...]
-    """The training views that are learned from."""
+    """The training views."""
 
     exposures: Exposures | None
     depths: DepthMaps | None
@@ -35,23 +35,23 @@ class ViewParts:
         options: FitOptions,
         where: str,
         exposures: Mapping[str, Exposure] | None = None,
-    ) -> "ViewParts":
-        """Those that the options ask for.
+    ) -> "ViewModules":
+        """The modules that the options ask for.
 
         Args:
             views: The training views.
-            points: Points on what is shown: they say how far things are.
-            options: Which parts, and their rates.
-            where: Messages begin with it.
-            exposures: Where exposures begin, by name of the view.
+            points: Points on the surfaces, for their distances.
+            options: Which modules, and their learning rates.
+            where: Prefix of messages.
+            exposures: Initial exposures, by name of the view.
 
         Raises:
             InputError: If depth is asked for and there are no depth maps.
         """
         poses = None
         if options.refine_poses:
-            around = torch.zeros(0, 3) if points is None else points
-            poses = Poses([view.camera for view in views], points=around, options=options)
+            surface_points = torch.zeros(0, 3) if points is None else points
+            poses = Poses([view.camera for view in views], points=surface_points, options=options)
         learned = None
         if options.exposure:
             known = exposures or {}
@@ -62,9 +62,9 @@ class ViewParts:
             depths = DepthMaps(views, points=points, options=options, where=where)
         return cls(views=tuple(views), exposures=learned, depths=depths, poses=poses)
 
-    def parts(self) -> dict[str, Part]:
-        """Those that remember something."""
-        found: dict[str, Part] = {}
+    def stateful_modules(self) -> dict[str, StatefulModule]:
+        """Modules with state, by name."""
+        found: dict[str, StatefulModule] = {}
         if self.exposures is not None:
             found["exposures"] = self.exposures
         if self.poses is not None:
@@ -72,45 +72,45 @@ class ViewParts:
         return found
 
     def camera(self, index: int, camera: Camera) -> Camera:
-        """A view's camera where it is now."""
+        """A view's camera at its current pose."""
         return camera if self.poses is None else self.poses.camera(index, camera)
 
-    def camera_to_draw(self, index: int, camera: Camera) -> Camera:
-        """The same, with a pose that learns from the gradient."""
+    def differentiable_camera(self, index: int, camera: Camera) -> Camera:
+        """The same, with a pose that requires a gradient."""
         return camera if self.poses is None else self.poses.leaf(index, camera)
 
     def view(self, index: int) -> View:
-        """A view where it is now."""
+        """A view at its current pose."""
         view = self.views[index]
         return view if self.poses is None else replace(view, camera=self.camera(index, view.camera))
 
     def update(self, index: int, *, progress: float) -> None:
-        """Take a step along the gradients of the last view."""
+        """One step along the gradients of the last view."""
         if self.exposures is not None:
             self.exposures.update(index, progress=progress)
         if self.poses is not None:
             self.poses.update(index, progress=progress)
 
-    def settled(self, gaussians: Gaussians) -> Gaussians:
-        """Gaussians of the fit in the world of the capture."""
+    def in_capture_frame(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of the fit in the world frame of the capture."""
         return gaussians if self.poses is None else gaussians.transformed(self.poses.aligned()[0])
 
     def refined(self, views: Sequence[View]) -> tuple[View, ...]:
-        """The given views, those that were learned from where they are now."""
+        """The given views, training views with their refined poses."""
         if self.poses is None:
             return tuple(views)
         moved = {view.name: view for view in self.poses.refined(self.views)}
         return tuple(moved.get(view.name, view) for view in views)
 
     def learned_exposures(self) -> dict[str, Exposure]:
-        """By name of the view; empty where exposures are not learned."""
+        """Exposures by name of the view; empty where they are not optimised."""
         if self.exposures is None:
             return {}
         names = (view.name for view in self.views)
         return dict(zip(names, self.exposures.learned(), strict=True))
 
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what was learned."""
+        """Sentences on exposures and poses."""
         found: list[str] = []
         if self.exposures is not None:
             gains = self.exposures.gains.mean(dim=1)
