@@ -155,7 +155,7 @@ def _cut_layer(task: _Task, named: Selection) -> tuple[Edited, Selection, int]:
         progress=task.progress,
     )
     edited = found.edited
-    judged = found.known > 0
+    judged = found.evidence > 0
     if cut.by == "layer":
         # What the layer draws says nothing new of a Gaussian that is still whole.
         judged &= (

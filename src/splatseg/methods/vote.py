@@ -43,7 +43,7 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.centres import Centres, centres_in, in_front, majority_map, own_weights
+from splatseg.lift.mass.centres import Centres, centre_weights, centres_in, majority_map, unoccluded
 from splatseg.lift.mass.vote_table import VoteTable
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import PreparedView, RenderOptions, options_for, prepare
@@ -163,10 +163,10 @@ def vote(
     options = options or VoteOptions()
     ordered = voting_views(views, evidence, "a label map")
     gaussians.check_values()
-    booth = _Booth(
+    voter = _CentreVoter(
         gaussians=gaussians,
         options=options,
-        drawing=render_options or options_for(gaussians, backend),
+        render_options=render_options or options_for(gaussians, backend),
         backend=backend,
     )
     slots = max(_SLOTS, options.candidates)
@@ -174,12 +174,16 @@ def vote(
     against = torch.zeros(len(gaussians))
     ids: set[int] = set()
     for done, view in enumerate(ordered):
-        paper = evidence.label_map(view.name)
-        cast = booth.cast(camera_of_map(view, paper.height, paper.width), paper)
-        labelled = cast.ids != UNLABELLED
-        table.add_sparse(cast.ids[labelled], cast.gaussians[labelled], cast.weights[labelled])
-        against.index_add_(0, cast.gaussians[~labelled], cast.weights[~labelled])
-        ids.update(torch.unique(cast.ids[labelled]).tolist())
+        label_map = evidence.label_map(view.name)
+        view_votes = voter.view_votes(
+            camera_of_map(view, label_map.height, label_map.width), label_map
+        )
+        labelled = view_votes.ids != UNLABELLED
+        table.add_sparse(
+            view_votes.ids[labelled], view_votes.gaussians[labelled], view_votes.weights[labelled]
+        )
+        against.index_add_(0, view_votes.gaussians[~labelled], view_votes.weights[~labelled])
+        ids.update(torch.unique(view_votes.ids[labelled]).tolist())
         if progress is not None:
             progress(done + 1, len(ordered))
     if not ids and len(gaussians):
@@ -187,11 +191,11 @@ def vote(
             f"evidence: expected a labelled pixel at a Gaussian's centre in {len(ordered)} views, "
             "found none."
         )
-    return _elected(table, against, options, views=ordered, names=_names(classes, ids))
+    return _decide(table, against, options, views=ordered, names=_names(classes, ids))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Cast:
+class _ViewVotes:
     """What one view says: at most one id a Gaussian, -1 for an unlabelled pixel."""
 
     gaussians: Tensor
@@ -200,43 +204,49 @@ class _Cast:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Booth:
+class _CentreVoter:
     """Where votes are cast."""
 
     gaussians: Gaussians
     options: VoteOptions
-    drawing: RenderOptions
+    render_options: RenderOptions
     backend: str
 
-    def cast(self, camera: Camera, paper: LabelMap) -> _Cast:
-        centres = centres_in(self.gaussians.means, camera, near=self.drawing.near)
-        with prepare(self.gaussians, camera, options=self.drawing, backend=self.backend) as view:
+    def view_votes(self, camera: Camera, label_map: LabelMap) -> _ViewVotes:
+        centres = centres_in(self.gaussians.means, camera, near=self.render_options.near)
+        with prepare(
+            self.gaussians, camera, options=self.render_options, backend=self.backend
+        ) as view:
             centres, weight = self._seen(centres, view)
         column, row = centres.pixels.unbind(dim=1)
-        say = torch.ones(len(weight))
+        vote_weight = torch.ones(len(weight))
         if self.options.weight == "transmittance":
-            say = weight
-        if paper.confidence is not None:
-            say = say * paper.confidence.cpu().float()[row, column]
-        ids = majority_map(paper.ids.cpu(), self.options.region)
-        return _Cast(gaussians=centres.gaussians, ids=ids[row, column].long(), weights=say)
+            vote_weight = weight
+        if label_map.confidence is not None:
+            vote_weight = vote_weight * label_map.confidence.cpu().float()[row, column]
+        ids = majority_map(label_map.ids.cpu(), self.options.region)
+        return _ViewVotes(
+            gaussians=centres.gaussians, ids=ids[row, column].long(), weights=vote_weight
+        )
 
     def _seen(self, centres: Centres, view: PreparedView) -> tuple[Centres, Tensor]:
         """The centres that pass the occlusion test, and their weights where they are needed."""
-        how = self.options.occlusion
-        if how == "depth":
-            front = in_front(centres, self.gaussians, view, tolerance=self.options.depth_tolerance)
-            centres = centres[front]
+        test = self.options.occlusion
+        if test == "depth":
+            visible = unoccluded(
+                centres, self.gaussians, view, tolerance=self.options.depth_tolerance
+            )
+            centres = centres[visible]
         weight = torch.ones(len(centres.gaussians))
-        if how == "weight" or self.options.weight == "transmittance":
-            weight = own_weights(centres, self.gaussians, view)
-            least = self.options.min_weight if how == "weight" else 0.0
-            seen = (weight > 0) & (weight >= least)
+        if test == "weight" or self.options.weight == "transmittance":
+            weight = centre_weights(centres, self.gaussians, view)
+            min_weight = self.options.min_weight if test == "weight" else 0.0
+            seen = (weight > 0) & (weight >= min_weight)
             centres, weight = centres[seen], weight[seen]
         return centres, weight
 
 
-def _elected(
+def _decide(
     table: VoteTable,
     against: Tensor,
     options: VoteOptions,
@@ -251,11 +261,11 @@ def _elected(
     shares = ranking.votes / torch.where(total > 0, total, 1.0).unsqueeze(1)
     # Sums in float32 may leave a lone id's share a hair above 1.
     shares = shares.clamp(0, 1)
-    sure = (ranking.ids[:, 0] != UNLABELLED) & (shares[:, 0] > options.needed_share)
+    has_label = (ranking.ids[:, 0] != UNLABELLED) & (shares[:, 0] > options.needed_share)
     soft = options.candidates > 1
     return Labels(
-        ids=torch.where(sure, ranking.ids[:, 0], UNLABELLED),
-        confidence=torch.where(sure, shares[:, 0], 0.0),
+        ids=torch.where(has_label, ranking.ids[:, 0], UNLABELLED),
+        confidence=torch.where(has_label, shares[:, 0], 0.0),
         candidates=ranking.ids if soft else None,
         shares=shares if soft else None,
         evidence=ranking.total,

@@ -33,7 +33,7 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.boundaries.geometry import (
     axes_of,
     directions_of_normals,
-    seen_along,
+    line_extent,
     unit_or_main,
 )
 from splatseg.lift.boundaries.mixture import MIXTURES
@@ -97,7 +97,7 @@ class Cut:
     share: Float[Tensor, "n"]
     """How much of each lies inside, in [0, 1]; 0 where nothing is known of it."""
 
-    known: Float[Tensor, "n"]
+    evidence: Float[Tensor, "n"]
     """How much that rests on: evidence in fully visible pixels, or 1 for a box."""
 
     inside: Selection
@@ -108,7 +108,7 @@ class Cut:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _TwoSides:
+class _InsideOutsideMaps:
     """Label maps in which some ids are INSIDE and all others OUTSIDE."""
 
     evidence: LabelSource
@@ -119,10 +119,12 @@ class _TwoSides:
         return self.evidence.view_names
 
     def label_map(self, name: str) -> LabelMap:
-        paper = self.evidence.label_map(name)
-        inside = torch.isin(paper.ids, torch.tensor(self.ids, dtype=paper.ids.dtype))
+        label_map = self.evidence.label_map(name)
+        inside = torch.isin(label_map.ids, torch.tensor(self.ids, dtype=label_map.ids.dtype))
         sides = torch.where(inside, INSIDE, OUTSIDE)
-        return replace(paper, ids=torch.where(paper.ids == UNLABELLED, UNLABELLED, sides).int())
+        return replace(
+            label_map, ids=torch.where(label_map.ids == UNLABELLED, UNLABELLED, sides).int()
+        )
 
 
 def cut_masks(
@@ -159,30 +161,30 @@ def cut_masks(
     _check_views(views, evidence)
     if not ids:
         raise InputError("ids: expected at least one, got none.")
-    maps = _TwoSides(evidence=evidence, ids=tuple(int(i) for i in ids))
+    maps = _InsideOutsideMaps(evidence=evidence, ids=tuple(int(i) for i in ids))
 
-    def look(now: Gaussians, step: Callable[[], None]) -> Sides:
-        ones = torch.ones(len(now), dtype=torch.int32)
+    def measure(current: Gaussians, step: Callable[[], None]) -> Sides:
+        ones = torch.ones(len(current), dtype=torch.int32)
         return sides_of(
-            now,
+            current,
             views,
             maps,
             ones * INSIDE,
             ones * OUTSIDE,
             border_weight=options.border_weight,
-            options=render_options or options_for(now, backend),
+            options=render_options or options_for(current, backend),
             backend=backend,
             step=step,
         )
 
-    edited, sides, count = _in_rounds(gaussians, views, look, options, progress)
+    edited, sides, count = _split_in_rounds(gaussians, views, measure, options, progress)
     if not bool((sides.inside > 0).any()):
         shown = ", ".join(map(str, ids))
         raise InputError(f"ids: none of {len(views)} views shows a Gaussian with id {shown}.")
     return Cut(
         edited=edited,
         share=sides.share,
-        known=sides.inside + sides.outside,
+        evidence=sides.inside + sides.outside,
         inside=Selection(mask=sides.share > options.keep_share),
         split=count,
     )
@@ -229,7 +231,7 @@ def cut_labels(
     if candidates is None or shares is None or candidates.shape[1] < 2:
         raise InputError("labels: expected a layer with two candidates a Gaussian or more.")
     rows = torch.arange(len(gaussians))
-    edited, now = Edited.unchanged(gaussians), labels
+    edited, current = Edited.unchanged(gaussians), labels
     total = (options.rounds + 1) * len(views)
     done = 0
 
@@ -239,7 +241,7 @@ def cut_labels(
         if progress is not None:
             progress(done, total)
 
-    for turn in range(options.rounds + 1):
+    for round_index in range(options.rounds + 1):
         first, second = candidates[rows, 0], candidates[rows, 1]
         sides = sides_of(
             edited.gaussians,
@@ -252,16 +254,16 @@ def cut_labels(
             backend=backend,
             step=step,
         )
-        now = _relabelled(now, sides, first, second, edited)
-        if turn == options.rounds:
+        current = _relabelled(current, sides, first, second, edited)
+        if round_index == options.rounds:
             break
         straddling = _straddling(edited.gaussians, sides, views, options)
         if not straddling.count:
             break
-        later = _split(edited.gaussians, straddling, sides, views, options)
-        edited, now = edited.then(later), apply_rows(now, later)
+        further = _split_across(edited.gaussians, straddling, sides, views, options)
+        edited, current = edited.then(further), apply_rows(current, further)
         rows = edited.rows
-    return edited, now
+    return edited, current
 
 
 def _relabelled(
@@ -331,27 +333,27 @@ def cut_box(
     lower, upper = box_corners(low, high)
     edited = Edited.unchanged(gaussians)
     first = torch.zeros(len(gaussians), dtype=torch.bool)
-    for turn in range(options.rounds):
-        now = edited.gaussians
-        mass, normals = _nearest_face(now, lower, upper)
-        directions = directions_of_normals(now, normals)
-        large = seen_along(now, directions, cameras).pixels >= options.min_pixels
-        mask = (mass >= max(options.min_share, 1e-6)) & large & (now.scales.amax(dim=1) > 0)
+    for round_index in range(options.rounds):
+        current = edited.gaussians
+        mass, normals = _nearest_face(current, lower, upper)
+        directions = directions_of_normals(current, normals)
+        large = line_extent(current, directions, cameras).pixels >= options.min_pixels
+        mask = (mass >= max(options.min_share, 1e-6)) & large & (current.scales.amax(dim=1) > 0)
         straddling = Selection(mask=mask if among is None else mask & among.mask[edited.rows])
-        if turn == 0:
+        if round_index == 0:
             first = straddling.mask
         if not straddling.count:
             break
-        later = split_along(
-            now, straddling, directions[straddling.mask], parts=options.parts, cameras=cameras
+        further = split_along(
+            current, straddling, directions[straddling.mask], parts=options.parts, cameras=cameras
         )
-        edited = edited.then(later)
+        edited = edited.then(further)
     centres = edited.gaussians.means.double()
     inside = ((centres >= lower) & (centres <= upper)).all(dim=1)
     return Cut(
         edited=edited,
         share=inside.float(),
-        known=torch.ones(len(edited)),
+        evidence=torch.ones(len(edited)),
         inside=Selection(mask=inside),
         split=int(first.sum()),
     )
@@ -380,7 +382,7 @@ def _nearest_face(gaussians: Gaussians, low: Tensor, high: Tensor) -> tuple[Tens
     below, above = (means - low) / deviations, (high - means) / deviations
     # How much of the mass lies between the two faces of each axis.
     within = torch.special.ndtr(below) + torch.special.ndtr(above) - 1
-    best = torch.zeros(len(gaussians), dtype=torch.float64)
+    largest_mass = torch.zeros(len(gaussians), dtype=torch.float64)
     axis_of = torch.zeros(len(gaussians), dtype=torch.int64)
     for axis in range(3):
         others = [other for other in range(3) if other != axis]
@@ -388,16 +390,16 @@ def _nearest_face(gaussians: Gaussians, low: Tensor, high: Tensor) -> tuple[Tens
         for t in (below[:, axis], above[:, axis]):
             # The face is only as large as the box: what passes beside it is not cut.
             mass = torch.special.ndtr(-t.abs()) * reach
-            better = mass > best
-            best = torch.where(better, mass, best)
+            better = mass > largest_mass
+            largest_mass = torch.where(better, mass, largest_mass)
             axis_of = torch.where(better, axis, axis_of)
-    return best, torch.nn.functional.one_hot(axis_of, 3).double()
+    return largest_mass, torch.nn.functional.one_hot(axis_of, 3).double()
 
 
-def _in_rounds(
+def _split_in_rounds(
     gaussians: Gaussians,
     views: Sequence[View],
-    look: Callable[[Gaussians, Callable[[], None]], Sides],
+    measure: Callable[[Gaussians, Callable[[], None]], Sides],
     options: CutOptions,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[Edited, Sides, int]:
@@ -411,15 +413,15 @@ def _in_rounds(
         if progress is not None:
             progress(done, total)
 
-    for turn in range(options.rounds):
-        sides = look(edited.gaussians, step)
+    for round_index in range(options.rounds):
+        sides = measure(edited.gaussians, step)
         straddling = _straddling(edited.gaussians, sides, views, options)
-        if turn == 0:
+        if round_index == 0:
             count = straddling.count
         if not straddling.count:
             return edited, sides, count
-        edited = edited.then(_split(edited.gaussians, straddling, sides, views, options))
-    return edited, look(edited.gaussians, step), count
+        edited = edited.then(_split_across(edited.gaussians, straddling, sides, views, options))
+    return edited, measure(edited.gaussians, step), count
 
 
 def _straddling(
@@ -433,12 +435,12 @@ def _straddling(
     if options.min_pixels > 0 and len(rows):
         chosen = gaussians[rows]
         directions = unit_or_main(chosen, sides.direction[rows])
-        size = seen_along(chosen, directions, [view.camera for view in views]).pixels
+        size = line_extent(chosen, directions, [view.camera for view in views]).pixels
         mask[rows] = size >= options.min_pixels
     return Selection(mask=mask)
 
 
-def _split(
+def _split_across(
     gaussians: Gaussians,
     straddling: Selection,
     sides: Sides,

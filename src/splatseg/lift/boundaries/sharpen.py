@@ -157,13 +157,15 @@ def sharpen(
     for view in ordered:
         if view.image is None:
             raise InputError(f"views: expected a photograph of each, {view.name} has none.")
-    papers = _Papers(evidence)
-    wanted = uplift_options or UpliftOptions()
-    many = max(wanted.candidates, 2 if confusion is None else _CANDIDATES)
-    wanted = replace(wanted, candidates=many, slots=max(wanted.slots, many))
+    label_maps = _CachedLabelMaps(evidence)
+    votes_options = uplift_options or UpliftOptions()
+    candidates = max(votes_options.candidates, 2 if confusion is None else _CANDIDATES)
+    votes_options = replace(
+        votes_options, candidates=candidates, slots=max(votes_options.slots, candidates)
+    )
 
-    def decided(now: Gaussians) -> tuple[Labels, float]:
-        votes = uplift(now, ordered, papers, options=wanted, backend=backend)
+    def decided(current: Gaussians) -> tuple[Labels, float]:
+        votes = uplift(current, ordered, label_maps, options=votes_options, backend=backend)
         labels = votes
         if confusion is not None:
             labels = correct_confusion(
@@ -173,15 +175,17 @@ def sharpen(
 
     labels, before = decided(gaussians)
     after = before
-    trusted = papers
+    trusted = label_maps
     if options.trust_pixels >= 0:
-        drawn = replace(labels, candidates=None, shares=None)
+        hard = replace(labels, candidates=None, shares=None)
         by_name = {view.name: view for view in ordered}
-        trusted = _Papers(
-            _Trusted(papers, gaussians, by_name, drawn, options.trust_pixels, backend)
+        trusted = _CachedLabelMaps(
+            _TrustedLabelMaps(
+                label_maps, gaussians, by_name, hard, options.trust_pixels, backend
+            )
         )
     base = fit_options or FitOptions()
-    run = Refinement(
+    refinement = Refinement(
         gaussians,
         ordered,
         steps=options.sharpen_steps,
@@ -191,11 +195,11 @@ def sharpen(
         backend=backend,
     )
     for done in range(options.sharpen_steps):
-        term = _LabelTerm(trusted, labels.ids.cpu(), options, run.generator, backend)
-        run.step(term)
+        loss = _LabelLoss(trusted, labels.ids.cpu(), options, refinement.generator, backend)
+        refinement.step(loss)
         last = done + 1 == options.sharpen_steps
         if last or (done + 1) % options.decide_every == 0:
-            gaussians = run.gaussians()
+            gaussians = refinement.gaussians()
             labels, after = decided(gaussians)
         if progress is not None:
             progress(done + 1, options.sharpen_steps)
@@ -206,7 +210,7 @@ def sharpen(
         gaussians=gaussians,
         labels=replace(labels, metadata=metadata),
         agreement=(before, after),
-        exposures=run.exposures,
+        exposures=refinement.exposures,
     )
 
 
@@ -221,7 +225,7 @@ def _agreement(votes: Labels, labels: Labels) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Papers:
+class _CachedLabelMaps:
     """Label maps, compressed once they were made: some take a drawing each time."""
 
     source: LabelSource
@@ -235,21 +239,27 @@ class _Papers:
 
     def label_map(self, name: str) -> LabelMap:
         if name not in self.kept:
-            paper = self.source.label_map(name)
-            self.ids.update(torch.unique(paper.ids).tolist())
-            shape = (paper.height, paper.width)
-            sure = None if paper.confidence is None else _packed(paper.confidence.float())
-            self.kept[name] = (shape, _packed(paper.ids), sure)
-        shape, ids, sure = self.kept[name]
-        confidence = None if sure is None else _unpacked(sure, np.float32, shape)
-        return LabelMap(ids=_unpacked(ids, np.int32, shape), confidence=confidence)
+            label_map = self.source.label_map(name)
+            self.ids.update(torch.unique(label_map.ids).tolist())
+            shape = (label_map.height, label_map.width)
+            packed_confidence = (
+                None if label_map.confidence is None else _compressed(label_map.confidence.float())
+            )
+            self.kept[name] = (shape, _compressed(label_map.ids), packed_confidence)
+        shape, ids, packed_confidence = self.kept[name]
+        confidence = (
+            None
+            if packed_confidence is None
+            else _decompressed(packed_confidence, np.float32, shape)
+        )
+        return LabelMap(ids=_decompressed(ids, np.int32, shape), confidence=confidence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Trusted:
+class _TrustedLabelMaps:
     """Label maps without the pixels that contradict what a layer shows around them."""
 
-    papers: _Papers
+    label_maps: _CachedLabelMaps
     gaussians: Gaussians
     views: Mapping[str, View]
     labels: Labels
@@ -258,23 +268,25 @@ class _Trusted:
 
     @property
     def view_names(self) -> Sequence[str]:
-        return self.papers.view_names
+        return self.label_maps.view_names
 
     def label_map(self, name: str) -> LabelMap:
-        paper = self.papers.label_map(name)
-        camera = camera_of_map(self.views[name], paper.height, paper.width)
-        drawn = label_map(self.gaussians, camera, self.labels, backend=self.backend).ids
-        near = shown_near(paper.ids, drawn, self.pixels)
-        return LabelMap(ids=torch.where(near, paper.ids, UNLABELLED), confidence=paper.confidence)
+        view_map = self.label_maps.label_map(name)
+        camera = camera_of_map(self.views[name], view_map.height, view_map.width)
+        rendered = label_map(self.gaussians, camera, self.labels, backend=self.backend).ids
+        shown = shown_near(view_map.ids, rendered, self.pixels)
+        return LabelMap(
+            ids=torch.where(shown, view_map.ids, UNLABELLED), confidence=view_map.confidence
+        )
 
 
 def shown_near(
-    ids: Int32[Tensor, "height width"], drawn: Int32[Tensor, "height width"], pixels: int
+    ids: Int32[Tensor, "height width"], rendered: Int32[Tensor, "height width"], pixels: int
 ) -> Bool[Tensor, "height width"]:
-    """Where `drawn` has the pixel's own id at most so many pixels away along each axis."""
+    """Where `rendered` has the pixel's own id at most so many pixels away along each axis."""
     height, width = ids.shape
     # No pixel has the id -2.
-    around = torch.nn.functional.pad(drawn, (pixels,) * 4, value=-2)
+    around = torch.nn.functional.pad(rendered, (pixels,) * 4, value=-2)
     found = torch.zeros(ids.shape, dtype=torch.bool)
     for down in range(2 * pixels + 1):
         for across in range(2 * pixels + 1):
@@ -282,28 +294,28 @@ def shown_near(
     return found
 
 
-def _packed(values: Tensor) -> bytes:
+def _compressed(values: Tensor) -> bytes:
     return zlib.compress(values.cpu().contiguous().numpy().tobytes(), 1)
 
 
-def _unpacked(packed: bytes, kind: type[np.generic], shape: tuple[int, ...]) -> Tensor:
-    return torch.from_numpy(np.frombuffer(zlib.decompress(packed), kind).reshape(shape).copy())
+def _decompressed(compressed: bytes, kind: type[np.generic], shape: tuple[int, ...]) -> Tensor:
+    return torch.from_numpy(np.frombuffer(zlib.decompress(compressed), kind).reshape(shape).copy())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _LabelTerm:
+class _LabelLoss:
     """The second term of the loss, for one step."""
 
-    papers: _Papers
+    label_maps: _CachedLabelMaps
     labels: Int32[Tensor, "n"]
     options: SharpenOptions
     generator: torch.Generator
     backend: str
 
     def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
-        paper = self.papers.label_map(view.name)
+        view_map = self.label_maps.label_map(view.name)
         own = self.labels[rows.cpu()]
-        known = self.papers.ids | {UNLABELLED, *torch.unique(own).tolist()}
+        known = self.label_maps.ids | {UNLABELLED, *torch.unique(own).tolist()}
         names = torch.tensor(sorted(known), dtype=torch.int32)
         codes = 2.0 * torch.randint(
             0, 2, (len(names), self.options.codes), generator=self.generator
@@ -312,16 +324,16 @@ class _LabelTerm:
         # What has no label agrees with nothing.
         codes[names == UNLABELLED] = 0
         signal = codes[torch.searchsorted(names, own)].to(gaussians.means)
-        drawn = render(
+        rendered = render(
             gaussians,
-            camera_of_map(view, paper.height, paper.width),
+            camera_of_map(view, view_map.height, view_map.width),
             signal,
             backend=self.backend,
         ).image
-        say = (paper.ids != UNLABELLED).float()
-        if paper.confidence is not None:
-            say = say * paper.confidence
-        wanted = codes[torch.searchsorted(names, paper.ids)] * say.unsqueeze(-1)
-        same = (drawn * wanted.to(drawn)).sum() / self.options.codes
-        worth = float(say.sum())
-        return self.options.label_weight * (1 - same / max(worth, 1.0))
+        weight = (view_map.ids != UNLABELLED).float()
+        if view_map.confidence is not None:
+            weight = weight * view_map.confidence
+        wanted = codes[torch.searchsorted(names, view_map.ids)] * weight.unsqueeze(-1)
+        agreement = (rendered * wanted.to(rendered)).sum() / self.options.codes
+        total_weight = float(weight.sum())
+        return self.options.label_weight * (1 - agreement / max(total_weight, 1.0))

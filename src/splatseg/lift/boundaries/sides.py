@@ -29,10 +29,10 @@ from splatseg.core import UNLABELLED, Camera, Gaussians, LabelSource, View, came
 from splatseg.lift.boundaries.geometry import axes_of
 from splatseg.render import RenderOptions, prepare
 
-_IDS = 10
+_IDS_AT_A_TIME = 10
 """Ids that one back-projection carries, with three channels each."""
 
-_LEAST = 1e-4
+_MIN_WEIGHT = 1e-4
 """Blending weight in one view, below which a mean place says nothing."""
 
 
@@ -90,21 +90,21 @@ def sides_of(
     direction = torch.zeros(count, 3, dtype=torch.float64)
     axes = axes_of(gaussians)
     for view in views:
-        paper = evidence.label_map(view.name)
-        camera = camera_of_map(view, *paper.ids.shape)
-        votes = (paper.ids != UNLABELLED).float()
-        if paper.confidence is not None:
-            votes *= paper.confidence.float()
+        label_map = evidence.label_map(view.name)
+        camera = camera_of_map(view, *label_map.ids.shape)
+        votes = (label_map.ids != UNLABELLED).float()
+        if label_map.confidence is not None:
+            votes *= label_map.confidence.float()
         if border_weight < 1:
-            votes *= torch.where(on_border(paper.ids), border_weight, 1.0)
+            votes *= torch.where(on_border(label_map.ids), border_weight, 1.0)
         moments = torch.zeros(count, 6)
         seen = torch.zeros(count)
         plane = _plane(camera)
-        ids = [int(i) for i in torch.unique(paper.ids).tolist() if i != UNLABELLED]
+        ids = [int(i) for i in torch.unique(label_map.ids).tolist() if i != UNLABELLED]
         with prepare(gaussians, camera, options=options, backend=backend) as prepared:
-            for start in range(0, len(ids), _IDS):
-                part = torch.tensor(ids[start : start + _IDS], dtype=torch.int32)
-                image = (paper.ids.unsqueeze(-1) == part).float() * votes.unsqueeze(-1)
+            for start in range(0, len(ids), _IDS_AT_A_TIME):
+                part = torch.tensor(ids[start : start + _IDS_AT_A_TIME], dtype=torch.int32)
+                image = (label_map.ids.unsqueeze(-1) == part).float() * votes.unsqueeze(-1)
                 image = (image.unsqueeze(-1) * plane.unsqueeze(2)).flatten(2)
                 with torch.no_grad():
                     sums = prepared.back_project(image.to(gaussians.means), warp="nearest").sums
@@ -117,9 +117,13 @@ def sides_of(
         totals[:, 0] += moments[:, 0]
         totals[:, 1] += moments[:, 3]
         totals[:, 2] += seen - moments[:, 0] - moments[:, 3]
-        both = torch.nonzero((moments[:, 0] > _LEAST) & (moments[:, 3] > _LEAST)).squeeze(1)
+        both = torch.nonzero((moments[:, 0] > _MIN_WEIGHT) & (moments[:, 3] > _MIN_WEIGHT)).squeeze(
+            1
+        )
         if len(both):
-            direction[both] += _pull(gaussians[both], axes[both], camera, moments[both], options)
+            direction[both] += _view_direction(
+                gaussians[both], axes[both], camera, moments[both], options
+            )
         step()
     return Sides(
         inside=totals[:, 0],
@@ -151,7 +155,7 @@ def _plane(camera: Camera) -> Float[Tensor, "height width 3"]:
     return torch.cat((torch.ones_like(z), flat), dim=-1).float()
 
 
-def _pull(
+def _view_direction(
     gaussians: Gaussians, axes: Tensor, camera: Camera, moments: Tensor, options: RenderOptions
 ) -> Tensor:
     """One view's term of g."""
@@ -167,7 +171,7 @@ def _pull(
     low_pass = torch.tensor([camera.fx, camera.fy], dtype=torch.float64) ** -2 * options.low_pass
     covariance = whitened @ whitened.transpose(1, 2) + torch.diag(low_pass)
     a, b = moments[:, 0].double(), moments[:, 3].double()
-    apart = moments[:, 1:3].double() / a[:, None] - moments[:, 4:6].double() / b[:, None]
-    normal = torch.linalg.solve(covariance, apart)
+    mean_difference = moments[:, 1:3].double() / a[:, None] - moments[:, 4:6].double() / b[:, None]
+    normal = torch.linalg.solve(covariance, mean_difference)
     weight = a * b / (a + b)
     return weight[:, None] * torch.einsum("nij,ni->nj", whitened, normal)

@@ -138,37 +138,41 @@ def correct_confusion(
         check_finite("labels.evidence", labels.evidence)
     if labels.effective_views is not None:
         check_finite("labels.effective_views", labels.effective_views)
-    most = options.effective_views
+    max_views = options.effective_views
     if view_correlation is not None:
         check_range("view_correlation", view_correlation, -math.inf, 1.0)
         if view_correlation > options.max_correlation:
-            most = min(most, options.correlated_views)
-    facts = {
+            max_views = min(max_views, options.correlated_views)
+    record = {
         "options": asdict(options),
         "view_correlation": view_correlation,
-        "effective_views": most,
+        "effective_views": max_views,
     }
     known = (labels.ids != UNLABELLED).cpu()
     rows = torch.nonzero(known).squeeze(1)
     if not len(rows):
-        return _described(labels, facts | {"changed": 0})
-    names, table = _shares(labels.ids.cpu(), labels.candidates.cpu(), labels.shares.cpu(), rows)
+        return _with_record(labels, record | {"changed": 0})
+    column_ids, table = _share_table(
+        labels.ids.cpu(), labels.candidates.cpu(), labels.shares.cpu(), rows
+    )
     mass = np.ones(len(rows))
     if labels.evidence is not None:
         mass = labels.evidence.cpu()[rows].double().clamp(0, options.max_evidence).numpy()
-    views = np.full(len(rows), most)
+    views = np.full(len(rows), max_views)
     if labels.effective_views is not None:
         # A Gaussian that has a vote was seen by a view.
         seen = labels.effective_views.cpu()[rows].double().clamp_min(1).numpy()
         views = np.minimum(views, seen)
-    prior, gains = _model(table, mass, options)
+    prior, log_ratios = _confusion_model(table, mass, options)
     ids = torch.full_like(labels.candidates.cpu().int(), UNLABELLED)
     shares = torch.zeros(ids.shape)
     for start in range(0, len(rows), _ROWS):
         block = slice(start, start + _ROWS)
-        columns, values = ranked(_posterior(table[block], views[block], prior, gains), ids.shape[1])
-        called = np.where(columns >= 0, names[np.maximum(columns, 0)], UNLABELLED)
-        ids[rows[block]] = torch.from_numpy(called.astype(np.int32))
+        columns, values = ranked(
+            _posterior(table[block], views[block], prior, log_ratios), ids.shape[1]
+        )
+        block_ids = np.where(columns >= 0, column_ids[np.maximum(columns, 0)], UNLABELLED)
+        ids[rows[block]] = torch.from_numpy(block_ids.astype(np.int32))
         shares[rows[block]] = torch.from_numpy(values).clamp(0, 1)
     changed = int((ids[:, 0] != labels.ids.cpu()).sum())
     decided = replace(
@@ -178,31 +182,34 @@ def correct_confusion(
         candidates=ids,
         shares=shares,
     )
-    return _described(decided, facts | {"changed": changed})
+    return _with_record(decided, record | {"changed": changed})
 
 
-def _shares(
+def _share_table(
     ids: Tensor, candidates: Tensor, shares: Tensor, rows: Tensor
 ) -> tuple[NDArray[np.int64], Any]:
     """Ids in use, ascending, and each row's shares of them, which add up to 1, sparse."""
     import scipy.sparse
 
-    called = candidates[rows].long().numpy()
+    candidate_ids = candidates[rows].long().numpy()
     values = shares[rows].double().clamp_min(0).numpy()
-    values = np.where(called != UNLABELLED, values, 0.0)
+    values = np.where(candidate_ids != UNLABELLED, values, 0.0)
     # A label without a share is its own whole share.
-    lone = values.sum(axis=1) <= 0
-    called[lone, 0], values[lone, 0] = ids[rows].long().numpy()[lone], 1.0
-    values /= values.sum(axis=1, keepdims=True)
-    real = values > 0
-    names, columns = np.unique(called[real], return_inverse=True)
-    table = scipy.sparse.csr_matrix(
-        (values[real], (np.nonzero(real)[0], columns)), shape=(len(rows), len(names))
+    without_shares = values.sum(axis=1) <= 0
+    candidate_ids[without_shares, 0], values[without_shares, 0] = (
+        ids[rows].long().numpy()[without_shares],
+        1.0,
     )
-    return names, table
+    values /= values.sum(axis=1, keepdims=True)
+    positive = values > 0
+    column_ids, columns = np.unique(candidate_ids[positive], return_inverse=True)
+    table = scipy.sparse.csr_matrix(
+        (values[positive], (np.nonzero(positive)[0], columns)), shape=(len(rows), len(column_ids))
+    )
+    return column_ids, table
 
 
-def _model(
+def _confusion_model(
     table: Any, mass: NDArray[np.float64], options: ConfusionOptions
 ) -> tuple[NDArray[np.float64], Any]:
     r"""Log of the prior, and :math:`\log(\max(\theta, \epsilon) / \epsilon)`, sparse (c, t)."""
@@ -210,23 +217,27 @@ def _model(
 
     count = table.shape[1]
     winner = ranked(table, 1)[0][:, 0]
-    chosen = scipy.sparse.csr_matrix(
+    winner_mass = scipy.sparse.csr_matrix(
         (mass, (winner, np.arange(len(winner)))), shape=(count, len(winner))
     )
-    taken = chosen @ table + options.diagonal_prior * scipy.sparse.identity(count, format="csr")
-    total = np.asarray(taken.sum(axis=1)).reshape(-1)
-    taken = (scipy.sparse.diags(1 / total) @ taken).tocsr()
-    taken.data = np.log(np.maximum(taken.data, options.min_confusion) / options.min_confusion)
-    taken.eliminate_zeros()
-    prior = 1 + np.asarray(chosen.sum(axis=1)).reshape(-1)
-    return np.log(prior / prior.sum()), taken.T.tocsr()
+    confusion = winner_mass @ table + options.diagonal_prior * scipy.sparse.identity(
+        count, format="csr"
+    )
+    total = np.asarray(confusion.sum(axis=1)).reshape(-1)
+    confusion = (scipy.sparse.diags(1 / total) @ confusion).tocsr()
+    confusion.data = np.log(
+        np.maximum(confusion.data, options.min_confusion) / options.min_confusion
+    )
+    confusion.eliminate_zeros()
+    prior = 1 + np.asarray(winner_mass.sum(axis=1)).reshape(-1)
+    return np.log(prior / prior.sum()), confusion.T.tocsr()
 
 
 def _posterior(
-    table: Any, views: NDArray[np.float64], prior: NDArray[np.float64], gains: Any
+    table: Any, views: NDArray[np.float64], prior: NDArray[np.float64], log_ratios: Any
 ) -> Any:
     """Probabilities of ids, sparse; rows add up to 1."""
-    posterior = (table @ gains).tocsr()
+    posterior = (table @ log_ratios).tocsr()
     sizes = np.diff(posterior.indptr)
     posterior.data *= np.repeat(views, sizes)
     posterior.data += prior[posterior.indices]
@@ -237,5 +248,5 @@ def _posterior(
     return posterior
 
 
-def _described(labels: Labels, facts: dict[str, Any]) -> Labels:
-    return replace(labels, metadata=dict(labels.metadata) | {"confusion": facts})
+def _with_record(labels: Labels, record: dict[str, Any]) -> Labels:
+    return replace(labels, metadata=dict(labels.metadata) | {"confusion": record})

@@ -38,7 +38,7 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.mass.adjoint import Engine, Light, near_an_edge, voting_views
+from splatseg.lift.mass.adjoint import LabelAdjoint, LabelMass, near_an_edge, voting_views
 from splatseg.lift.mass.decision import LabelRule, decide
 from splatseg.lift.mass.view_votes import ViewVotes
 from splatseg.lift.mass.vote_table import Ranking, VoteTable
@@ -165,7 +165,7 @@ def uplift(
     options = options or UpliftOptions()
     ordered = voting_views(views, evidence, "a label map")
     by_view = ViewVotes(gaussians.means) if options.candidates > 1 else None
-    engine = Engine(
+    adjoint = LabelAdjoint(
         gaussians=gaussians,
         options=render_options or options_for(gaussians, backend),
         backend=backend,
@@ -173,19 +173,21 @@ def uplift(
         by_view=by_view,
     )
     table = VoteTable(len(gaussians), memory=options.memory, slots=options.slots)
-    light = Light()
-    visible, squares = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+    label_mass = LabelMass()
+    visibility, squared_visibility = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
     for done, view in enumerate(ordered):
-        paper = evidence.label_map(view.name)
-        camera = camera_of_map(view, paper.height, paper.width)
-        shown = engine.cast(table, light, camera, _without_edges(paper, options))
-        visible += shown
-        squares += shown**2
+        label_map = evidence.label_map(view.name)
+        camera = camera_of_map(view, label_map.height, label_map.width)
+        view_visibility = adjoint.add_view(
+            table, label_mass, camera, _without_edges(label_map, options)
+        )
+        visibility += view_visibility
+        squared_visibility += view_visibility**2
         if by_view is not None:
             by_view.end_view(view.camera)
         if progress is not None:
             progress(done + 1, len(ordered))
-    if not light.cast:
+    if not label_mass.total:
         raise InputError(
             f"evidence: expected a labelled pixel in {len(ordered)} views, found none."
         )
@@ -196,9 +198,9 @@ def uplift(
         slackness=options.slackness,
         min_weight=options.min_weight,
         min_share=options.min_share,
-        against=visible - ranking.total if options.count_void else None,
+        against=visibility - ranking.total if options.count_void else None,
     )
-    background, facts = _background(light, options)
+    background, record = _background(label_mass, options)
     soft = options.candidates > 1
     return Labels(
         ids=decision.ids,
@@ -208,14 +210,16 @@ def uplift(
         shares=decision.shares if soft else None,
         evidence=ranking.total,
         # Kish's effective sample size: a view that shows hardly anything counts hardly anything.
-        effective_views=torch.where(squares > 0, visible**2 / squares, 0.0),
+        effective_views=torch.where(
+            squared_visibility > 0, visibility**2 / squared_visibility, 0.0
+        ),
         metadata={
             "method": "uplift",
             "options": asdict(options),
             "views": [view.name for view in ordered],
-            "names": _names(classes, light),
-            "background_votes": facts,
-            "largest_doubt": _largest_share(ranking.doubt, ranking.total),
+            "names": _names(classes, label_mass),
+            "background_votes": record,
+            "largest_error_bound": _largest_share(ranking.error_bound, ranking.total),
         }
         | _correlation(by_view, ranking),
     )
@@ -229,36 +233,39 @@ def _correlation(by_view: ViewVotes | None, ranking: Ranking) -> dict[str, float
     return {"view_correlation": by_view.correlation(ranking.ids, shares)}
 
 
-def _without_edges(paper: LabelMap, options: UpliftOptions) -> LabelMap:
+def _without_edges(label_map: LabelMap, options: UpliftOptions) -> LabelMap:
     """The same ids, in which pixels near an edge have less say."""
     if not options.edge_pixels or options.edge_vote == 1:
-        return paper
-    say = torch.where(near_an_edge(paper, options.edge_pixels), options.edge_vote, 1.0)
-    if paper.confidence is not None:
-        say = say * paper.confidence.cpu().float()
-    return LabelMap(ids=paper.ids, confidence=say)
+        return label_map
+    weight = torch.where(near_an_edge(label_map, options.edge_pixels), options.edge_vote, 1.0)
+    if label_map.confidence is not None:
+        weight = weight * label_map.confidence.cpu().float()
+    return LabelMap(ids=label_map.ids, confidence=weight)
 
 
-def _background(light: Light, options: UpliftOptions) -> tuple[int, dict[str, float]]:
+def _background(label_mass: LabelMass, options: UpliftOptions) -> tuple[int, dict[str, float]]:
     """The label of what no Gaussian covers, or -1, and what that rests on."""
-    voting = sum(light.cast[id] for id in sorted(light.cast))
+    total_mass = sum(label_mass.total[id] for id in sorted(label_mass.total))
     # Rounding may leave a hair less than nothing.
-    passing = {id: max(0.0, light.cast[id] - light.caught[id]) for id in sorted(light.cast)}
-    passed = sum(passing.values())
-    # `max` takes the first of equals, the smallest id.
-    strongest = max(passing, key=lambda id: passing[id])
-    facts = {
-        "light": passed / voting if voting > 0 else 0.0,
-        "share": passing[strongest] / passed if passed > 0 else 0.0,
+    uncovered = {
+        id: max(0.0, label_mass.total[id] - label_mass.on_gaussians[id])
+        for id in sorted(label_mass.total)
     }
-    enough = passed > 0 and facts["light"] >= options.min_background
-    sure = facts["share"] >= options.min_background_share
-    return (strongest if enough and sure else UNLABELLED), facts
+    total_uncovered = sum(uncovered.values())
+    # `max` takes the first of equals, the smallest id.
+    strongest = max(uncovered, key=lambda id: uncovered[id])
+    record = {
+        "light": total_uncovered / total_mass if total_mass > 0 else 0.0,
+        "share": uncovered[strongest] / total_uncovered if total_uncovered > 0 else 0.0,
+    }
+    enough = total_uncovered > 0 and record["light"] >= options.min_background
+    clear = record["share"] >= options.min_background_share
+    return (strongest if enough and clear else UNLABELLED), record
 
 
-def _names(classes: ClassTable | None, light: Light) -> dict[str, Any]:
+def _names(classes: ClassTable | None, label_mass: LabelMass) -> dict[str, Any]:
     known = () if classes is None else classes.rows
-    return {str(row.id): row.name for row in known if row.id in light.cast}
+    return {str(row.id): row.name for row in known if row.id in label_mass.total}
 
 
 def _largest_share(part: Tensor, whole: Tensor) -> float:
