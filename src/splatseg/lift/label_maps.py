@@ -70,7 +70,7 @@ def label_map(
 
 
 def _best_ids(
-    renderer: "_Drawing", labels: Labels, ids: Sequence[int], channels: int
+    renderer: "_ViewRenderer", labels: Labels, ids: Sequence[int], channels: int
 ) -> tuple[Tensor, Tensor]:
     """The id with the highest score of each pixel, and the score."""
     best = torch.full(renderer.size, -1.0)

@@ -55,14 +55,12 @@ def lift_labels(
     """
     options = options or UpliftOptions()
     relabel = confusion is not None and options.label_rule == "share"
-    wanted = options.candidates
-    if relabel and wanted < 2:
-        options = replace(options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES))
+    hard = options.candidates < 2
     labels = uplift(
         gaussians,
         views,
         evidence,
-        options=options,
+        options=_with_candidates(options) if relabel and hard else options,
         classes=classes,
         render_options=render_options,
         backend=backend,
@@ -72,8 +70,13 @@ def lift_labels(
         labels = correct_confusion(
             labels, options=confusion, view_correlation=labels.metadata["view_correlation"]
         )
-        if wanted < 2:
+        if hard:
             labels = replace(labels, candidates=None, shares=None)
     if completion is not None and bool((labels.ids != UNLABELLED).any()):
         labels = complete(gaussians, labels, options=completion)
     return labels
+
+
+def _with_candidates(options: UpliftOptions) -> UpliftOptions:
+    """The same votes for a soft layer, as relabelling needs it."""
+    return replace(options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES))

@@ -169,34 +169,43 @@ def vote(
         render_options=render_options or options_for(gaussians, backend),
         backend=backend,
     )
-    slots = max(_SLOTS, options.candidates)
-    table = VoteTable(len(gaussians), memory=options.memory, slots=slots)
-    against = torch.zeros(len(gaussians))
+    table, against, ids = _collected(voter, ordered, evidence, progress)
+    return _decide(table, against, options, views=ordered, names=_names(classes, ids))
+
+
+def _collected(
+    voter: "_CentreVoter",
+    ordered: Sequence[View],
+    evidence: LabelSource,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[VoteTable, Tensor, set[int]]:
+    """Votes for ids, votes of unlabelled pixels (n,), and the ids, of all views."""
+    count = len(voter.gaussians)
+    slots = max(_SLOTS, voter.options.candidates)
+    table = VoteTable(count, memory=voter.options.memory, slots=slots)
+    against = torch.zeros(count)
     ids: set[int] = set()
     for done, view in enumerate(ordered):
         label_map = evidence.label_map(view.name)
-        view_votes = voter.view_votes(
-            camera_of_map(view, label_map.height, label_map.width), label_map
-        )
-        labelled = view_votes.ids != UNLABELLED
-        table.add_sparse(
-            view_votes.ids[labelled], view_votes.gaussians[labelled], view_votes.weights[labelled]
-        )
-        against.index_add_(0, view_votes.gaussians[~labelled], view_votes.weights[~labelled])
-        ids.update(torch.unique(view_votes.ids[labelled]).tolist())
+        camera = camera_of_map(view, label_map.height, label_map.width)
+        votes = voter.view_votes(camera, label_map)
+        labelled = votes.ids != UNLABELLED
+        table.add_sparse(votes.ids[labelled], votes.gaussians[labelled], votes.weights[labelled])
+        against.index_add_(0, votes.gaussians[~labelled], votes.weights[~labelled])
+        ids.update(torch.unique(votes.ids[labelled]).tolist())
         if progress is not None:
             progress(done + 1, len(ordered))
-    if not ids and len(gaussians):
+    if not ids and count:
         raise InputError(
             f"evidence: expected a labelled pixel at a Gaussian's centre in {len(ordered)} views, "
             "found none."
         )
-    return _decide(table, against, options, views=ordered, names=_names(classes, ids))
+    return table, against, ids
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _ViewVotes:
-    """What one view says: at most one id a Gaussian, -1 for an unlabelled pixel."""
+    """Votes of one view: at most one id a Gaussian, -1 for an unlabelled pixel."""
 
     gaussians: Tensor
     ids: Tensor
@@ -205,7 +214,7 @@ class _ViewVotes:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _CentreVoter:
-    """Where votes are cast."""
+    """Reads label maps at the pixels of the centres of Gaussians."""
 
     gaussians: Gaussians
     options: VoteOptions

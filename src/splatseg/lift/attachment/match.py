@@ -138,7 +138,7 @@ class _Candidates:
     """(m, k, 5) of position, colour, opacity, sizes and orientation."""
 
     @classmethod
-    def search(cls, edited: Rows, source: Rows, wanted: Indices, count: int) -> "_Nearby":
+    def search(cls, edited: Rows, source: Rows, wanted: Indices, count: int) -> "_Candidates":
         count = min(count, len(source))
         index = NeighbourIndex(torch.from_numpy(source.means))
         found = index.nearest(torch.from_numpy(edited.means[wanted]), count)

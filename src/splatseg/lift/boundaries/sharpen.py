@@ -153,65 +153,104 @@ def sharpen(
         ShapeError: If a label map does not have its photograph's proportions.
     """
     options = options or SharpenOptions()
+    deciding = _Deciding(
+        views=_photographed(views, evidence),
+        label_maps=_CachedLabelMaps(evidence),
+        votes=_with_candidates(uplift_options or UpliftOptions(), confusion),
+        confusion=confusion,
+        backend=backend,
+    )
+    fit = replace(fit_options or FitOptions(), seed=seed, refine_poses=False)
+    return _refined(gaussians, deciding, options, fit, exposures=exposures, progress=progress)
+
+
+def _photographed(views: Sequence[View], evidence: LabelSource) -> list[View]:
+    """The views in the order of their names, if all have a label map and a photograph."""
     ordered = voting_views(views, evidence, "a label map")
     for view in ordered:
         if view.image is None:
             raise InputError(f"views: expected a photograph of each, {view.name} has none.")
-    label_maps = _CachedLabelMaps(evidence)
-    votes_options = uplift_options or UpliftOptions()
-    candidates = max(votes_options.candidates, 2 if confusion is None else _CANDIDATES)
-    votes_options = replace(
-        votes_options, candidates=candidates, slots=max(votes_options.slots, candidates)
-    )
+    return ordered
 
-    def decided(current: Gaussians) -> tuple[Labels, float]:
-        votes = uplift(current, ordered, label_maps, options=votes_options, backend=backend)
-        labels = votes
-        if confusion is not None:
-            labels = correct_confusion(
-                votes, options=confusion, view_correlation=votes.metadata["view_correlation"]
-            )
-        return labels, _agreement(votes, labels)
 
-    labels, before = decided(gaussians)
+def _refined(
+    gaussians: Gaussians,
+    deciding: "_Deciding",
+    options: SharpenOptions,
+    fit: FitOptions,
+    *,
+    exposures: Mapping[str, Exposure] | None,
+    progress: Callable[[int, int], None] | None,
+) -> Sharpened:
+    """Steps of the fit with the loss of the label maps, which are decided anew at times."""
+    labels, before = deciding.labels(gaussians)
     after = before
-    trusted = label_maps
-    if options.trust_pixels >= 0:
-        hard = replace(labels, candidates=None, shares=None)
-        by_name = {view.name: view for view in ordered}
-        trusted = _CachedLabelMaps(
-            _TrustedLabelMaps(
-                label_maps, gaussians, by_name, hard, options.trust_pixels, backend
-            )
-        )
-    base = fit_options or FitOptions()
+    trusted = deciding.trusted(gaussians, labels, options.trust_pixels)
     refinement = Refinement(
         gaussians,
-        ordered,
+        deciding.views,
         steps=options.sharpen_steps,
         start=options.rates_from,
-        options=replace(base, seed=seed, refine_poses=False),
+        options=fit,
         exposures=exposures,
-        backend=backend,
+        backend=deciding.backend,
     )
     for done in range(options.sharpen_steps):
-        loss = _LabelLoss(trusted, labels.ids.cpu(), options, refinement.generator, backend)
+        generator = refinement.generator
+        loss = _LabelLoss(trusted, labels.ids.cpu(), options, generator, deciding.backend)
         refinement.step(loss)
         last = done + 1 == options.sharpen_steps
         if last or (done + 1) % options.decide_every == 0:
             gaussians = refinement.gaussians()
-            labels, after = decided(gaussians)
+            labels, after = deciding.labels(gaussians)
         if progress is not None:
             progress(done + 1, options.sharpen_steps)
-    metadata = dict(labels.metadata) | {
-        "sharpened": {"options": asdict(options), "seed": seed, "agreement": [before, after]}
-    }
+    record = {"options": asdict(options), "seed": fit.seed, "agreement": [before, after]}
+    metadata = dict(labels.metadata) | {"sharpened": record}
     return Sharpened(
         gaussians=gaussians,
         labels=replace(labels, metadata=metadata),
         agreement=(before, after),
         exposures=refinement.exposures,
     )
+
+
+def _with_candidates(options: UpliftOptions, confusion: ConfusionOptions | None) -> UpliftOptions:
+    """The same votes for a soft layer, with the candidates that relabelling needs."""
+    candidates = max(options.candidates, 2 if confusion is None else _CANDIDATES)
+    return replace(options, candidates=candidates, slots=max(options.slots, candidates))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Deciding:
+    """How Gaussians get their labels, again and again."""
+
+    views: Sequence[View]
+    label_maps: "_CachedLabelMaps"
+    votes: UpliftOptions
+    confusion: ConfusionOptions | None
+    backend: str
+
+    def labels(self, gaussians: Gaussians) -> tuple[Labels, float]:
+        """Labels by the votes of all views, and how many of the votes agree with them."""
+        votes = uplift(
+            gaussians, self.views, self.label_maps, options=self.votes, backend=self.backend
+        )
+        labels = votes
+        if self.confusion is not None:
+            correlation = votes.metadata["view_correlation"]
+            labels = correct_confusion(votes, options=self.confusion, view_correlation=correlation)
+        return labels, _agreement(votes, labels)
+
+    def trusted(self, gaussians: Gaussians, labels: Labels, pixels: int) -> "_CachedLabelMaps":
+        """The label maps without what contradicts the layer; all of them where pixels is -1."""
+        if pixels < 0:
+            return self.label_maps
+        hard = replace(labels, candidates=None, shares=None)
+        by_name = {view.name: view for view in self.views}
+        return _CachedLabelMaps(
+            _TrustedLabelMaps(self.label_maps, gaussians, by_name, hard, pixels, self.backend)
+        )
 
 
 def _agreement(votes: Labels, labels: Labels) -> float:
@@ -239,19 +278,14 @@ class _CachedLabelMaps:
 
     def label_map(self, name: str) -> LabelMap:
         if name not in self.kept:
-            label_map = self.source.label_map(name)
-            self.ids.update(torch.unique(label_map.ids).tolist())
-            shape = (label_map.height, label_map.width)
-            packed_confidence = (
-                None if label_map.confidence is None else _compressed(label_map.confidence.float())
-            )
-            self.kept[name] = (shape, _compressed(label_map.ids), packed_confidence)
-        shape, ids, packed_confidence = self.kept[name]
-        confidence = (
-            None
-            if packed_confidence is None
-            else _decompressed(packed_confidence, np.float32, shape)
-        )
+            view_map = self.source.label_map(name)
+            self.ids.update(torch.unique(view_map.ids).tolist())
+            shape = (view_map.height, view_map.width)
+            confidence = view_map.confidence
+            packed = None if confidence is None else _compressed(confidence.float())
+            self.kept[name] = (shape, _compressed(view_map.ids), packed)
+        shape, ids, packed = self.kept[name]
+        confidence = None if packed is None else _decompressed(packed, np.float32, shape)
         return LabelMap(ids=_decompressed(ids, np.int32, shape), confidence=confidence)
 
 

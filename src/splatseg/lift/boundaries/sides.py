@@ -25,9 +25,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Camera, Gaussians, LabelSource, View, camera_of_map
+from splatseg.core import (
+    UNLABELLED,
+    Camera,
+    Gaussians,
+    LabelMap,
+    LabelSource,
+    View,
+    camera_of_map,
+)
 from splatseg.lift.boundaries.geometry import axes_of
-from splatseg.render import RenderOptions, prepare
+from splatseg.render import PreparedView, RenderOptions, prepare
 
 _IDS_AT_A_TIME = 10
 """Ids that one back-projection carries, with three channels each."""
@@ -92,37 +100,19 @@ def sides_of(
     for view in views:
         label_map = evidence.label_map(view.name)
         camera = camera_of_map(view, *label_map.ids.shape)
-        votes = (label_map.ids != UNLABELLED).float()
-        if label_map.confidence is not None:
-            votes *= label_map.confidence.float()
-        if border_weight < 1:
-            votes *= torch.where(on_border(label_map.ids), border_weight, 1.0)
-        moments = torch.zeros(count, 6)
-        seen = torch.zeros(count)
-        plane = _plane(camera)
-        ids = [int(i) for i in torch.unique(label_map.ids).tolist() if i != UNLABELLED]
+        weights = _pixel_weights(label_map, border_weight)
         with prepare(gaussians, camera, options=options, backend=backend) as prepared:
-            for start in range(0, len(ids), _IDS_AT_A_TIME):
-                part = torch.tensor(ids[start : start + _IDS_AT_A_TIME], dtype=torch.int32)
-                image = (label_map.ids.unsqueeze(-1) == part).float() * votes.unsqueeze(-1)
-                image = (image.unsqueeze(-1) * plane.unsqueeze(2)).flatten(2)
-                with torch.no_grad():
-                    sums = prepared.back_project(image.to(gaussians.means), warp="nearest").sums
-                sums = sums.cpu().reshape(count, len(part), 3)
-                seen += sums[:, :, 0].sum(dim=1)
-                for side, wanted in enumerate((first, second)):
-                    for column, id in enumerate(part.tolist()):
-                        rows = wanted == id
-                        moments[rows, 3 * side : 3 * side + 3] = sums[rows, column]
+            moments, seen = _moments(
+                prepared, gaussians.means, label_map.ids, weights, (first, second)
+            )
         totals[:, 0] += moments[:, 0]
         totals[:, 1] += moments[:, 3]
         totals[:, 2] += seen - moments[:, 0] - moments[:, 3]
-        both = torch.nonzero((moments[:, 0] > _MIN_WEIGHT) & (moments[:, 3] > _MIN_WEIGHT)).squeeze(
-            1
-        )
-        if len(both):
-            direction[both] += _view_direction(
-                gaussians[both], axes[both], camera, moments[both], options
+        on_both = (moments[:, 0] > _MIN_WEIGHT) & (moments[:, 3] > _MIN_WEIGHT)
+        rows = torch.nonzero(on_both).squeeze(1)
+        if len(rows):
+            direction[rows] += _view_direction(
+                gaussians[rows], axes[rows], camera, moments[rows], options
             )
         step()
     return Sides(
@@ -131,6 +121,42 @@ def sides_of(
         other=totals[:, 2].clamp_min(0),
         direction=direction,
     )
+
+
+def _pixel_weights(label_map: LabelMap, border_weight: float) -> Float[Tensor, "height width"]:
+    """What each pixel counts: its confidence, less at the border of a segment."""
+    weights = (label_map.ids != UNLABELLED).float()
+    if label_map.confidence is not None:
+        weights *= label_map.confidence.float()
+    if border_weight < 1:
+        weights *= torch.where(on_border(label_map.ids), border_weight, 1.0)
+    return weights
+
+
+def _moments(
+    view: PreparedView,
+    means: Float[Tensor, "n 3"],
+    ids: Int[Tensor, "height width"],
+    weights: Float[Tensor, "height width"],
+    ids_of_sides: tuple[Int[Tensor, "n"], Int[Tensor, "n"]],
+) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "n"]]:
+    """Weight and first moments on the plane z = 1 of either side, and the weight of all ids."""
+    moments, seen = torch.zeros(len(means), 6), torch.zeros(len(means))
+    plane = _plane(view.camera)
+    present = [int(i) for i in torch.unique(ids).tolist() if i != UNLABELLED]
+    for start in range(0, len(present), _IDS_AT_A_TIME):
+        part = torch.tensor(present[start : start + _IDS_AT_A_TIME], dtype=torch.int32)
+        image = (ids.unsqueeze(-1) == part).float() * weights.unsqueeze(-1)
+        image = (image.unsqueeze(-1) * plane.unsqueeze(2)).flatten(2)
+        with torch.no_grad():
+            sums = view.back_project(image.to(means), warp="nearest").sums
+        sums = sums.cpu().reshape(len(means), len(part), 3)
+        seen += sums[:, :, 0].sum(dim=1)
+        for side, wanted in enumerate(ids_of_sides):
+            for column, id in enumerate(part.tolist()):
+                rows = wanted == id
+                moments[rows, 3 * side : 3 * side + 3] = sums[rows, column]
+    return moments, seen
 
 
 def on_border(ids: Int[Tensor, "height width"]) -> Tensor:

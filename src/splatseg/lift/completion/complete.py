@@ -147,6 +147,21 @@ def complete(
     known = _known(labels, options)
     column_ids, shares = _shares(labels, known)
     kept = 1 if labels.candidates is None else labels.candidates.shape[1]
+    shares = _spread(gaussians, labels, shares, known, options=options, features=features)
+    return _completed(labels, options, known, _strongest_ids(shares, column_ids, kept))
+
+
+def _spread(
+    gaussians: Gaussians,
+    labels: Labels,
+    shares: Any,
+    known: NDArray[np.bool_],
+    *,
+    options: CompletionOptions,
+    features: Features | None,
+) -> Any:
+    """Shares after smoothing and label propagation over the neighbour graph, sparse (n, ids)."""
+    kept = 1 if labels.candidates is None else labels.candidates.shape[1]
     max_shares = max(_MAX_SHARES, kept)
     transition = transition_matrix(
         neighbour_graph(
@@ -167,7 +182,7 @@ def complete(
             max_shares=max_shares,
         )
     own_weight = np.where(known, np.inf, 0.0).astype(np.float32)
-    shares = diffuse(
+    return diffuse(
         transition,
         shares,
         own_weight,
@@ -175,7 +190,6 @@ def complete(
         steps=options.spread_steps,
         max_shares=max_shares,
     )
-    return _completed(labels, options, known, _strongest_ids(shares, column_ids, kept))
 
 
 def _check(

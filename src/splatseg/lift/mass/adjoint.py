@@ -81,7 +81,7 @@ class LabelMass:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LabelAdjoint:
+class RenderAdjoint:
     """The adjoint of rendering label maps."""
 
     gaussians: Gaussians
@@ -132,7 +132,9 @@ class LabelAdjoint:
         """A view, to be used more than once."""
         return prepare(self.gaussians, camera, options=self.options, backend=self.backend)
 
-    def collect(self, view: PreparedView, image: Float[Tensor, "h w c"]) -> tuple[Tensor, Tensor]:
+    def back_project(
+        self, view: PreparedView, image: Float[Tensor, "h w c"]
+    ) -> tuple[Tensor, Tensor]:
         """Sums (n, c) and weights (n,) of an image, on the CPU, by the nearest warp."""
         with torch.no_grad():
             projected = view.back_project(image.to(self.gaussians.means), warp="nearest")

@@ -128,9 +128,27 @@ def correct_confusion(
         tensor([2, 2], dtype=torch.int32)
     """
     options = options or ConfusionOptions()
+    max_views = _checked_max_views(labels, options, view_correlation)
+    record: dict[str, Any] = {
+        "options": asdict(options),
+        "view_correlation": view_correlation,
+        "effective_views": max_views,
+    }
+    rows = torch.nonzero((labels.ids != UNLABELLED).cpu()).squeeze(1)
+    if not len(rows):
+        return _with_record(labels, record | {"changed": 0})
+    decided = _relabelled(labels, rows, max_views, options)
+    changed = int((decided.ids != labels.ids.cpu()).sum())
+    return _with_record(decided, record | {"changed": changed})
+
+
+def _checked_max_views(
+    labels: Labels, options: ConfusionOptions, view_correlation: float | None
+) -> float:
+    """How many independent views votes amount to at most, once the input was found good."""
     if labels.candidates is None or labels.shares is None or labels.candidates.shape[1] < 2:
         raise InputError(
-            "labels: expected a soft layer with at least 2 candidates, whose shares tell what is "
+            "labels: expected a soft layer with at least 2 candidates, whose shares say what is "
             "taken for what, got a hard one; lift it with more candidates."
         )
     check_finite("labels.shares", labels.shares)
@@ -138,20 +156,20 @@ def correct_confusion(
         check_finite("labels.evidence", labels.evidence)
     if labels.effective_views is not None:
         check_finite("labels.effective_views", labels.effective_views)
-    max_views = options.effective_views
-    if view_correlation is not None:
-        check_range("view_correlation", view_correlation, -math.inf, 1.0)
-        if view_correlation > options.max_correlation:
-            max_views = min(max_views, options.correlated_views)
-    record = {
-        "options": asdict(options),
-        "view_correlation": view_correlation,
-        "effective_views": max_views,
-    }
-    known = (labels.ids != UNLABELLED).cpu()
-    rows = torch.nonzero(known).squeeze(1)
-    if not len(rows):
-        return _with_record(labels, record | {"changed": 0})
+    if view_correlation is None:
+        return options.effective_views
+    check_range("view_correlation", view_correlation, -math.inf, 1.0)
+    if view_correlation <= options.max_correlation:
+        return options.effective_views
+    return min(options.effective_views, options.correlated_views)
+
+
+def _relabelled(
+    labels: Labels, rows: Tensor, max_views: float, options: ConfusionOptions
+) -> Labels:
+    """The layer with the labelled `rows` decided anew; the others get none."""
+    if labels.candidates is None or labels.shares is None:
+        raise TypeError("labels: expected a soft layer.")
     column_ids, table = _share_table(
         labels.ids.cpu(), labels.candidates.cpu(), labels.shares.cpu(), rows
     )
@@ -168,21 +186,18 @@ def correct_confusion(
     shares = torch.zeros(ids.shape)
     for start in range(0, len(rows), _ROWS):
         block = slice(start, start + _ROWS)
-        columns, values = ranked(
-            _posterior(table[block], views[block], prior, log_ratios), ids.shape[1]
-        )
+        posterior = _posterior(table[block], views[block], prior, log_ratios)
+        columns, values = ranked(posterior, ids.shape[1])
         block_ids = np.where(columns >= 0, column_ids[np.maximum(columns, 0)], UNLABELLED)
         ids[rows[block]] = torch.from_numpy(block_ids.astype(np.int32))
         shares[rows[block]] = torch.from_numpy(values).clamp(0, 1)
-    changed = int((ids[:, 0] != labels.ids.cpu()).sum())
-    decided = replace(
+    return replace(
         labels,
         ids=ids[:, 0].clone(),
         confidence=shares[:, 0].clone(),
         candidates=ids,
         shares=shares,
     )
-    return _with_record(decided, record | {"changed": changed})
 
 
 def _share_table(

@@ -29,7 +29,7 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.adjoint import LabelAdjoint, voting_views
+from splatseg.lift.mass.adjoint import RenderAdjoint, voting_views
 from splatseg.render import RenderOptions, options_for
 
 FeatureNorm = Literal["none", "unit", "standard"]
@@ -105,27 +105,12 @@ def uplift_features(
     """
     options = options or FeatureUpliftOptions()
     ordered = voting_views(views, evidence, "features")
-    adjoint = LabelAdjoint(
+    adjoint = RenderAdjoint(
         gaussians=gaussians,
         options=render_options or options_for(gaussians, backend),
         backend=backend,
     )
-    weights = torch.zeros(len(gaussians))
-    values: Tensor | None = None
-    for done, view in enumerate(ordered):
-        grid = _checked(view, evidence.features(view.name))
-        if values is None:
-            values = torch.zeros(len(gaussians), grid.channels)
-        if grid.channels != values.shape[1]:
-            raise ShapeError(
-                f"evidence: expected {values.shape[1]} channels of view {view.name}, as of view "
-                f"{ordered[0].name}, got {grid.channels}."
-            )
-        weights += _add_view(adjoint, view, grid, options, values)
-        if progress is not None:
-            progress(done + 1, len(ordered))
-    if values is None:
-        raise InputError("views: expected at least one view with features, got none.")
+    values, weights = _weighted_sums(adjoint, ordered, evidence, options, progress)
     seen = weights > options.min_weight
     values /= torch.where(seen, weights, 1.0).unsqueeze(1)
     values[~seen] = 0
@@ -140,8 +125,36 @@ def uplift_features(
     )
 
 
+def _weighted_sums(
+    adjoint: RenderAdjoint,
+    ordered: Sequence[View],
+    evidence: FeatureSource,
+    options: FeatureUpliftOptions,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Tensor, Tensor]:
+    """Features (n, channels) summed with blending weights over all views, and the weights (n,)."""
+    count = len(adjoint.gaussians)
+    weights = torch.zeros(count)
+    values: Tensor | None = None
+    for done, view in enumerate(ordered):
+        grid = _checked(view, evidence.features(view.name))
+        if values is None:
+            values = torch.zeros(count, grid.channels)
+        if grid.channels != values.shape[1]:
+            raise ShapeError(
+                f"evidence: expected {values.shape[1]} channels of view {view.name}, as of view "
+                f"{ordered[0].name}, got {grid.channels}."
+            )
+        weights += _add_view(adjoint, view, grid, options, values)
+        if progress is not None:
+            progress(done + 1, len(ordered))
+    if values is None:
+        raise InputError("views: expected at least one view with features, got none.")
+    return values, weights
+
+
 def _add_view(
-    adjoint: LabelAdjoint,
+    adjoint: RenderAdjoint,
     view: View,
     grid: FeatureMap,
     options: FeatureUpliftOptions,

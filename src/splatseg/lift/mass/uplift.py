@@ -38,7 +38,7 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.mass.adjoint import LabelAdjoint, LabelMass, near_an_edge, voting_views
+from splatseg.lift.mass.adjoint import LabelMass, RenderAdjoint, near_an_edge, voting_views
 from splatseg.lift.mass.decision import LabelRule, decide
 from splatseg.lift.mass.view_votes import ViewVotes
 from splatseg.lift.mass.vote_table import Ranking, VoteTable
@@ -164,10 +164,49 @@ def uplift(
     """
     options = options or UpliftOptions()
     ordered = voting_views(views, evidence, "a label map")
+    votes = _collected(
+        gaussians,
+        ordered,
+        evidence,
+        options=options,
+        render_options=render_options or options_for(gaussians, backend),
+        backend=backend,
+        progress=progress,
+    )
+    return _labels(votes, ordered, options, _names(classes, votes.label_mass))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Votes:
+    """What all views together say."""
+
+    table: VoteTable
+    label_mass: LabelMass
+    visibility: Tensor
+    """(n,): how much of each Gaussian the views show."""
+
+    squared_visibility: Tensor
+    """(n,): the squares of what each view shows, summed."""
+
+    by_view: ViewVotes | None
+    """Only of soft layers."""
+
+
+def _collected(
+    gaussians: Gaussians,
+    ordered: Sequence[View],
+    evidence: LabelSource,
+    *,
+    options: UpliftOptions,
+    render_options: RenderOptions,
+    backend: str,
+    progress: Callable[[int, int], None] | None,
+) -> _Votes:
+    """Go through the views once and add up their votes."""
     by_view = ViewVotes(gaussians.means) if options.candidates > 1 else None
-    adjoint = LabelAdjoint(
+    adjoint = RenderAdjoint(
         gaussians=gaussians,
-        options=render_options or options_for(gaussians, backend),
+        options=render_options,
         backend=backend,
         equal_views=options.equal_views,
         by_view=by_view,
@@ -178,9 +217,8 @@ def uplift(
     for done, view in enumerate(ordered):
         label_map = evidence.label_map(view.name)
         camera = camera_of_map(view, label_map.height, label_map.width)
-        view_visibility = adjoint.add_view(
-            table, label_mass, camera, _without_edges(label_map, options)
-        )
+        weighted = _without_edges(label_map, options)
+        view_visibility = adjoint.add_view(table, label_mass, camera, weighted)
         visibility += view_visibility
         squared_visibility += view_visibility**2
         if by_view is not None:
@@ -191,17 +229,31 @@ def uplift(
         raise InputError(
             f"evidence: expected a labelled pixel in {len(ordered)} views, found none."
         )
-    ranking = table.rank(options.candidates)
+    return _Votes(
+        table=table,
+        label_mass=label_mass,
+        visibility=visibility,
+        squared_visibility=squared_visibility,
+        by_view=by_view,
+    )
+
+
+def _labels(
+    votes: _Votes, ordered: Sequence[View], options: UpliftOptions, names: dict[str, Any]
+) -> Labels:
+    """The layer that the votes decide."""
+    ranking = votes.table.rank(options.candidates)
     decision = decide(
         ranking,
         rule=options.label_rule,
         slackness=options.slackness,
         min_weight=options.min_weight,
         min_share=options.min_share,
-        against=visibility - ranking.total if options.count_void else None,
+        against=votes.visibility - ranking.total if options.count_void else None,
     )
-    background, record = _background(label_mass, options)
+    background, record = _background(votes.label_mass, options)
     soft = options.candidates > 1
+    squares = votes.squared_visibility
     return Labels(
         ids=decision.ids,
         confidence=decision.confidence,
@@ -210,18 +262,16 @@ def uplift(
         shares=decision.shares if soft else None,
         evidence=ranking.total,
         # Kish's effective sample size: a view that shows hardly anything counts hardly anything.
-        effective_views=torch.where(
-            squared_visibility > 0, visibility**2 / squared_visibility, 0.0
-        ),
+        effective_views=torch.where(squares > 0, votes.visibility**2 / squares, 0.0),
         metadata={
             "method": "uplift",
             "options": asdict(options),
             "views": [view.name for view in ordered],
-            "names": _names(classes, label_mass),
+            "names": names,
             "background_votes": record,
             "largest_error_bound": _largest_share(ranking.error_bound, ranking.total),
         }
-        | _correlation(by_view, ranking),
+        | _correlation(votes.by_view, ranking),
     )
 
 
