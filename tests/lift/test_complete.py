@@ -338,7 +338,7 @@ def test_bad_input_is_refused() -> None:
         complete(gaussians, hard([1, -1], confidence=[math.nan, 0.0]))
     with pytest.raises(RangeError, match="means"):
         complete(on_a_line([0.0, math.nan]), labels)
-    with pytest.raises(InputError, match="smoothing: expected a layer that says how much"):
+    with pytest.raises(InputError, match="smoothing: expected a layer with the evidence"):
         labelled(gaussians, hard([1, -1]), smoothing=1.0)
     for wrong in (
         {"neighbours": 0},

@@ -1,13 +1,13 @@
 r"""From a layer of labels to the label map of a view.
 
-A pixel's id is the one with most blending weight behind it:
+A pixel's id is the one with the largest blending weight:
 
 .. math:: s_c(p) = \sum_i w_{pi}\, a_{ic} + [c = b] \Bigl(1 - \sum_i w_{pi}\Bigr), \qquad
           \mathrm{id}(p) = \arg\max_c s_c(p)
 
 where :math:`a_{ic}` is 1 for the label of Gaussian i and 0 else (a hard layer), or its share of
 the evidence (a soft layer). No label, -1, competes as one more id: a hard layer's unlabelled
-Gaussians stand for it, a soft layer's missing shares. The light that passes every Gaussian
+Gaussians stand for it, a soft layer's missing shares. The transmittance behind all Gaussians
 stands for the layer's background label b, and for no label where it has none.
 """
 
@@ -32,10 +32,10 @@ def label_map(
     backend: str = "auto",
     channels: int = 32,
 ) -> LabelMap:
-    """The label map that a layer shows in a view, in the pixels of any camera.
+    """The label map that a layer has in a view, in the pixels of any camera.
 
-    Ids are drawn a few at a time with a running maximum, so that memory does not grow with
-    their number; of many ids only those with a Gaussian in this view are drawn. Ties go to the
+    Ids are rendered a few at a time with a running maximum, so that memory does not grow with
+    their number; of many ids only those with a Gaussian in this view are rendered. Ties go to the
     smaller id, and -1 loses every tie. With lens distortion a pixel of the photograph takes the
     id of the pinhole pixel that its centre falls into.
 
@@ -45,10 +45,10 @@ def label_map(
         labels: Their labels, one row a Gaussian; soft where it has candidates.
         options: Switches of the blending model.
         backend: Name of the rendering backend.
-        channels: Ids drawn at a time, at least 1.
+        channels: Ids rendered at a time, at least 1.
 
     Returns:
-        Ids, and as confidence the winner's score, its share of the pixel's light in [0, 1].
+        Ids, and as confidence the winner's score, its share of the pixel's weight in [0, 1].
 
     Raises:
         ShapeError: If `labels` has another number of rows than `gaussians`.
@@ -91,7 +91,7 @@ def _best_ids(
 
 
 class _ViewRenderer:
-    """One pinhole view, drawn with one signal after another."""
+    """Renders one signal after another in a pinhole view."""
 
     def __init__(self, gaussians: Gaussians, view: PreparedView) -> None:
         self._means = gaussians.means

@@ -28,9 +28,9 @@ def lift_labels(
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
-    """Label Gaussians by label maps as well as it is known how; what `segment` does by default.
+    """Label Gaussians by label maps: the default pipeline of `segment`.
 
-    The votes of `uplift`, decided anew under how often the evidence takes one id for another
+    The votes of `uplift`, relabelled by how often the evidence confuses ids
     (`correct_confusion`), and completed where no view sees anything (`complete`).
 
     Args:

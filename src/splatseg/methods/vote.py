@@ -1,7 +1,7 @@
-r"""Vote: every Gaussian asks each view for the id at the pixel that its centre falls into.
+r"""Vote: each view votes on a Gaussian by the id at the pixel that its centre falls into.
 
 The simplest way to lift labels, and the one of SA-GS and its followers; a baseline beside
-`uplift`, which asks all the pixels a Gaussian shows. With :math:`P_j` the projection of view j
+`uplift`, where all pixels that show a Gaussian vote. With :math:`P_j` the projection of view j
 and :math:`L_j` its label map,
 
 .. math:: v_{ic} = \sum_j u_{ij} \, [L_j(P_j \mu_i) = c], \qquad
@@ -10,7 +10,7 @@ and :math:`L_j` its label map,
 where :math:`u_{ij}` is 1, or the blending weight of the Gaussian at that pixel, and :math:`N_i`
 what all ids got from the views that see the Gaussian (``visible``) or the number of all views
 (``published``). Published, a view that does not see a Gaussian, or sees it on an unlabelled
-pixel, votes against every id, so that an object in less than 70 % of the views has no chance.
+pixel, votes against every id, so that an object in less than 70 % of the views is lost.
 
 A centre is seen through whatever hides it, unless the occlusion test is asked for.
 
@@ -94,7 +94,7 @@ class VoteOptions:
 
     candidates: int = 1
     """Ids kept for each Gaussian. 1 makes a hard layer; with more the layer keeps their shares
-    and is drawn softly."""
+    and is rendered softly."""
 
     memory: int = 1 << 30
     """Bytes of an exact table of votes, 4 for each id and Gaussian. With more ids than fit, each
@@ -153,7 +153,7 @@ def vote(
 
     Returns:
         The layer, with the sum of a Gaussian's votes as its evidence: views, not pixels. There is
-        no background label, because light that passes everything has no centre.
+        no background label, because what no Gaussian covers has no centre.
 
     Raises:
         InputError: If there are no views, if one has no label map, or no centre falls on a

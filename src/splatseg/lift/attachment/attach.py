@@ -1,8 +1,8 @@
-"""Labels find their Gaussians again after an editor had the splats.
+"""Re-attachment: labels are carried onto Gaussians that an editor changed.
 
 An editor may drop the columns it does not know, reorder rows, crop, move the scene or a part of
 it, duplicate a part, tint it, or round values on the way into a compressed format. `attach`
-tells which row of the scene each row of the edited file is; `Attached.carry` takes layers along.
+finds which row of the scene each row of the edited file is; `Attached.carry` takes layers along.
 """
 
 from collections.abc import Mapping
@@ -43,11 +43,11 @@ class AttachOptions:
     """How Gaussians are found again."""
 
     moves: int = 8
-    """Most similarities to look for: one for the whole scene, or one for each part that was
-    moved. 0 takes it that nothing was moved."""
+    """Upper bound of similarities to look for: one for the whole scene, or one for each part that
+    was moved. 0 takes it that nothing was moved."""
 
     min_part: int = 20
-    """Fewest Gaussians that may have been moved on their own."""
+    """Minimum of Gaussians that may have been moved on their own."""
 
     seed: int = 0
     """Of the random triples that moves are found from."""

@@ -1,4 +1,4 @@
-r"""Which row of a scene each row of an edited copy is, once both lie in the same place.
+r"""Which row of a scene each row of an edited copy is, once both lie in the same frame.
 
 Candidates are the nearest centres. A candidate's cost adds up what position, colour, opacity,
 sizes and orientation differ by, each in units of the noise that the data themselves show:
@@ -44,16 +44,18 @@ _MAX_TOLERANCE = np.array([np.inf, 0.03, 0.012, 0.1, 0.1])
 """What counts as agreement before the noise is known, and at most: beyond any format's steps,
 and little enough that a neighbour rarely agrees in sizes or orientation by chance."""
 _MIN_AGREEMENTS = ((3, 0.02), (2, 0.5))
-"""Agreements of four that make a row sure of itself, and the least share of sure rows that tells
-of the noise. A neighbour agrees in three by chance with less than one row in a hundred."""
+"""Agreements of four that make a row confident, and the minimum share of confident rows that the
+noise is estimated from. A neighbour agrees in three by chance with less than one row in a
+hundred."""
 _MIN_NOISE = np.array([0.0, 2e-3, 2e-3, 2e-3, 2e-3])
-"""Least noise: rounding of float32 through logs and logits. Of position it goes by the extent."""
+"""Lower bound of noise: rounding of float32 through logs and logits. Of position it goes by the
+extent."""
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Noise:
-    """How far a row is from itself after the edit."""
+    """Residuals of the same row before and after the edit."""
 
     sigma: Floats
     """(5,) of position, colour, opacity, sizes and orientation."""
@@ -64,7 +66,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matches:
-    """Edited rows and the source rows they are."""
+    """Edited rows and their source rows."""
 
     rows: Indices
     """(m,) source row of each edited row, -1 for none."""
@@ -162,7 +164,7 @@ class _Candidates:
         return cls(indices=indices, residuals=residuals)
 
     def costs(self, noise: Noise) -> Floats:
-        """(m, k), infinite where a candidate is somebody else."""
+        """(m, k), infinite where a candidate is not the same Gaussian."""
         costs = np.empty(self.indices.shape)
         for part in _blocks(len(costs), _BLOCK):
             residuals = self.residuals[part]
@@ -210,7 +212,7 @@ def keep_order(rows: Indices, exclusive: NDArray[np.bool_], source: Rows) -> Ind
 
 
 def _estimated_noise(candidates: _Candidates, min_noise: Floats) -> Noise | None:
-    """How far rows are from themselves, as told by those that are sure; None if few are."""
+    """Noise of the residuals, estimated from confident rows; None if there are few."""
     for min_agreements, min_share in _MIN_AGREEMENTS:
         agree = candidates.residuals[..., 1:] <= _MAX_TOLERANCE[1:]
         confident = agree.sum(axis=2) >= min_agreements
@@ -220,7 +222,7 @@ def _estimated_noise(candidates: _Candidates, min_noise: Floats) -> Noise | None
         if len(rows) < max(1.0, min_share * len(distance)):
             continue
         found = candidates.residuals[rows, first[rows]].astype(np.float64)
-        # Where an attribute was changed on purpose, most are beyond what it can tell.
+        # Where an attribute was changed on purpose, most residuals exceed its tolerance.
         sigma = np.clip(
             1.5 * np.median(found, axis=0), min_noise, np.maximum(_MAX_TOLERANCE / 2, min_noise)
         )

@@ -3,8 +3,8 @@ r"""The similarity that an editor moved a scene, or a part of it, by.
 Opacity, mean colour and the ratios of the three scales do not change under a similarity. Edited
 rows are paired with the source rows that are nearest in these; the log of the ratio of their
 sizes is the log of the similarity's scale, which most right pairs share and wrong ones do not.
-Of the pairs that are left, three make a similarity (Umeyama 1991); the one that most pairs agree
-with is refined on them.
+Of the pairs that are left, three make a similarity (Umeyama 1991); the one with most inliers is
+refined on them (RANSAC).
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class Hypothesis:
     edited_from_source: Similarity
     mirrored: bool
     pairs: int
-    """How many of the pairs looked at."""
+    """Number of inliers."""
 
 
 def find_move(edited: Rows, source: Rows, rng: np.random.Generator) -> Hypothesis | None:

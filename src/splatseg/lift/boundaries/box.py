@@ -33,7 +33,7 @@ def cut_box(
         high: Largest x, y and z inside.
         among: Only these are split; None is all.
         options: Which are split, and how.
-        cameras: Those that the picture matters to and that sizes in pixels are of; without
+        cameras: Cameras that rendered images matter for and that sizes in pixels are of; without
             any, size does not count.
 
     Returns:

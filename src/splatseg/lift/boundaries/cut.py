@@ -3,7 +3,7 @@ r"""Cuts: Gaussians that reach over a boundary are split, so that each side can 
 A boundary is that of masks in the photographs (`cut_masks` for some ids, `cut_labels` for a
 whole layer) or a box in the world (`cut_box`). A Gaussian straddles it if its lesser side has
 at least `CutOptions.min_share`: of the evidence that masks give, or of the Gaussian's mass
-beyond a plane. It is split in the direction that separates the two sides best (`_sides`,
+beyond a plane. It is split in the direction that separates the two sides best (`sides`,
 `split`), its parts are held against the same boundary, and those that still straddle are split
 again, for a few rounds.
 """
@@ -53,18 +53,18 @@ class CutOptions:
     """How often what still straddles is split again; 0 splits nothing."""
 
     min_share: float = 0.1
-    """Least share, in [0, 0.5], of the lesser side for a Gaussian to straddle the cut."""
+    """Minimum share, in [0, 0.5], of the lesser side for a Gaussian to straddle the cut."""
 
     min_pixels: float = 0.5
-    """Least standard deviation, pixels, that a Gaussian must have across the cut in some view;
+    """Minimum standard deviation, pixels, that a Gaussian must have across the cut in some view;
     smaller ones are not split. 0 splits all."""
 
     min_weight: float = 0.5
-    """Least evidence that a Gaussian must have to be split at a mask, in pixels that show it
+    """Minimum evidence that a Gaussian must have to be split at a mask, in pixels that show it
     fully, summed over views."""
 
     border_weight: float = 0.1
-    """What a pixel at the border of a mask counts, in [0, 1]: it shows both sides."""
+    """Weight of a pixel at the border of a mask, in [0, 1]: it shows both sides."""
 
     keep_share: float = 0.5
     """Share of its evidence, in [0, 1], that must lie inside for a Gaussian to count as inside.
@@ -96,7 +96,7 @@ class Cut:
     """How much of each lies inside, in [0, 1]; 0 where nothing is known of it."""
 
     evidence: Float[Tensor, "n"]
-    """How much that rests on: evidence in fully visible pixels, or 1 for a box."""
+    """What the share rests on: evidence in fully visible pixels, or 1 for a box."""
 
     inside: Selection
     """Those that count as inside."""
@@ -141,11 +141,11 @@ def cut_masks(
     Args:
         gaussians: The Gaussians of the scene.
         views: Those that vote, best all that the layer was lifted from.
-        evidence: Label maps of them; pixels at -1 say nothing.
+        evidence: Label maps of them; pixels at -1 do not count.
         ids: The ids that are inside.
         options: Which are split, and how.
         render_options: Switches of the blending model.
-        backend: Who renders.
+        backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
     Returns:
@@ -204,7 +204,7 @@ def cut_labels(
         evidence: Label maps of them, the ones that the layer was lifted from.
         options: Which are split, and how.
         render_options: Switches of the blending model.
-        backend: Who renders.
+        backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
     Returns:
@@ -244,7 +244,7 @@ def cut_labels(
 def _relabelled(
     labels: Labels, sides: Sides, first: Tensor, second: Tensor, edited: Edited
 ) -> Labels:
-    """The layer with what the pixels say of parts: of rows whose fraction is below 1."""
+    """The layer with the labels of parts, the rows whose fraction is below 1, from their pixels."""
     if edited.fractions is None or labels.candidates is None or labels.shares is None:
         return labels
     seen = sides.inside + sides.outside + sides.other

@@ -16,7 +16,7 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.rigid import rotation_from_quaternion
 
 _MIN_SCALE_RATIO = 1e-4
-"""Least scale, as a part of the largest, that a division is made with. A Gaussian of no
+"""Minimum scale, as a part of the largest, that a division is made with. A Gaussian of no
 thickness is taken for one that is very thin."""
 
 _SPHERE_DIRECTIONS = 64
@@ -61,11 +61,11 @@ class LineExtent:
     """How cameras see a line through each Gaussian."""
 
     across: Float[Tensor, "n"]
-    """Root of the mean of rho squared, see `_mixture`: 1 across the views, 0 along them."""
+    """Root of the mean of rho squared, see `mixture`: 1 across the views, 0 along them."""
 
     pixels: Float[Tensor, "n"]
     """Largest standard deviation along the line in any image, pixels; infinite where there
-    are no cameras, 0 where none has the centre in its picture."""
+    are no cameras, 0 where none has the centre in its image."""
 
 
 def line_extent(
@@ -75,13 +75,13 @@ def line_extent(
 
     Seen along a ray d, whitened :math:`d_w = L^{-1} d`, the projected Gaussian is that of z
     along :math:`d_w`, so that :math:`\rho^2 = 1 - (e \cdot d_w)^2 / |d_w|^2`. Cameras that have
-    the centre in their picture count by the Gaussian's area in it, :math:`|d_w| |L| / z^2`.
+    the centre in their image count by the Gaussian's area in it, :math:`|d_w| |L| / z^2`.
     Without any, directions all over the sphere do.
 
     Args:
         gaussians: The Gaussians.
         directions: Unit vectors e, each in its Gaussian's frame.
-        cameras: Any cameras; distortion is not looked at.
+        cameras: Any cameras; distortion is ignored.
     """
     e = directions.double()
     axes = axes_of(gaussians)
@@ -121,7 +121,7 @@ def line_extent(
 
 
 def _inside(camera: Camera, points: Tensor) -> Tensor:
-    """Which points in the camera's frame lie in its picture, distortion left aside."""
+    """Which points in the camera's frame lie in its image, distortion left aside."""
     z = points[:, 2]
     positive_z = z.clamp_min(_NEAR)
     u = camera.fx * points[:, 0] / positive_z + camera.cx
@@ -140,7 +140,7 @@ def _inverse_axes(gaussians: Gaussians) -> Tensor:
 
 
 def _area_and_share(inverse: Tensor, rays: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
-    """|d_w| |L|, which is the area of the picture, and rho squared."""
+    """|d_w| |L|, which is the area of the projection, and rho squared."""
     whitened = torch.einsum("nij,nj->ni", inverse, rays)
     area = torch.linalg.vector_norm(whitened, dim=1)
     along = (whitened * e).sum(dim=1) / area.clamp_min(1e-300)

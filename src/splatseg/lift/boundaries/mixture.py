@@ -1,12 +1,12 @@
 r"""A normal distribution as a few narrower ones, and the opacities that look like one.
 
-**Places, widths and weights.** The standard normal density is replaced by N of the same standard
-deviation r < 1 at places :math:`m_c` with weights :math:`w_c`, symmetric about 0, such that its
+**Offsets, widths and weights.** The standard normal density is replaced by N of the same standard
+deviation r < 1 at offsets :math:`m_c` with weights :math:`w_c`, symmetric about 0, such that its
 moments up to the third stay what they are:
 
 .. math:: \sum_c w_c = 1, \qquad \sum_c w_c m_c = 0, \qquad r^2 + \sum_c w_c m_c^2 = 1
 
-What freedom is left for a given r (the weights and the ratios of the places) makes the squared
+What freedom is left for a given r (the weights and the ratios of the offsets) makes the squared
 difference of the two densities smallest; a test finds the constants below again.
 
 **Opacities.** Along the direction of the split a Gaussian's alpha is :math:`o\, e^{-u^2 / 2}`
@@ -20,7 +20,7 @@ opacities :math:`o_c` (symmetric like the weights) are those that make
           - o\, e^{-u^2 / 2} \Bigr)^2 du
 
 smallest. For a faint Gaussian seen across that is about :math:`o\, w_c / r_\rho`, the plain
-statement that a part of the mass has a part of the light; parts of an opaque one cover each
+statement that a part of the mass has a part of the weight; parts of an opaque one cover each
 other and need more, and those of one seen end-on lie over each other and need less. The
 opacities depend on o and :math:`\rho` only and are found by Gauss-Newton steps on a grid of u,
 with a slight pull towards that statement where it is all the same.
@@ -67,7 +67,7 @@ class Mixture:
 
 
 def _symmetric(offsets: tuple[float, ...], weights: tuple[float, ...]) -> Mixture:
-    """From the part of the constants at and right of 0 (a place of 0 stands first)."""
+    """From the part of the constants at and right of 0 (an offset of 0 stands first)."""
     skip = 1 if offsets[0] == 0 else 0
     return Mixture(
         offsets=(*(-m for m in reversed(offsets[skip:])), *offsets),
@@ -81,7 +81,7 @@ MIXTURES: dict[int, Mixture] = {
     3: _symmetric((0.0, 1.12773), (0.57728, 0.21136)),
 }
 """By number of parts. Two parts differ by 4.5 % of the density's root mean square and three, that
-are narrower, by 2.1 %: a part in the middle is what an opaque Gaussian needs. More parts are had
+are narrower, by 2.1 %: a part at the centre is what an opaque Gaussian needs. More parts are had
 by splitting again."""
 
 
@@ -101,7 +101,7 @@ def opacities_of_parts(
         alpha_max: Largest alpha of the blending model.
 
     Returns:
-        :math:`o_c` of each part, in [0, 1], in the order of the places.
+        :math:`o_c` of each part, in [0, 1], in the order of the offsets.
     """
     batches = zip(opacities.double().split(_ROWS), across.double().split(_ROWS), strict=True)
     blocks = [_solved(o, rho, mixture, alpha_max) for o, rho in batches]

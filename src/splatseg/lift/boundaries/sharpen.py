@@ -1,9 +1,9 @@
-r"""Gaussians that take sides: labels sharpen the geometry.
+r"""Sharpening: positions, shapes and opacities refined by photographs and label maps.
 
 A fit on photographs alone does not care whether a Gaussian reaches from one thing over another
 of the same colour, or whether a thing lets a little of what is behind it through. Labels do. So
-Gaussians go on learning from the photographs and, beside them, from the label maps: of the light
-of a pixel as much as possible shall come from Gaussians of the pixel's id,
+Gaussians go on learning from the photographs and, beside them, from the label maps: of the weight
+of a pixel as much as possible shall be that of Gaussians of the pixel's id,
 
 .. math:: L = L_{\mathrm{photo}} + \lambda \, \frac{1}{|P|} \sum_{p \in P}
           \Bigl(1 - \sum_{i:\, l_i = y(p)} w_{pi}\Bigr)
@@ -13,8 +13,8 @@ Gaussian by this loss for one mask, splits those that both sides pull at, and fi
 Here the labels are decided in closed form (`uplift`), all of them at once, and the loss is one
 of positions, shapes and opacities: what two sides pull at moves, shrinks or becomes opaque.
 
-With more than a few ids the sum is not drawn for each of them. Every step gives each id a random
-code c of +1 and -1 in K channels and draws the codes of the Gaussians' labels; as
+With more than a few ids the sum is not rendered for each of them. Every step gives each id a random
+code c of +1 and -1 in K channels and renders the codes of the Gaussians' labels; as
 :math:`E[c_a \cdot c_b] = K [a = b]`,
 
 .. math:: \sum_{i:\, l_i = y} w_{pi} =
@@ -22,7 +22,7 @@ code c of +1 and -1 in K channels and draws the codes of the Gaussians' labels; 
 
 so that K channels have the right gradient on average, whatever the number of ids.
 
-Pixels whose id the layer does not show anywhere near say nothing: a model that errs alike in many
+Pixels whose id the layer does not show anywhere near do not count: a model that errs alike in many
 views would bend the geometry to its errors.
 
 References:
@@ -62,16 +62,16 @@ class SharpenOptions:
     """Steps, each from one photograph and its label map; 0 leaves the Gaussians as they are."""
 
     label_weight: float = 0.1
-    """Lambda: weight of the label maps beside the photographs. 1 is cleanest, and costs most of
-    the picture."""
+    """Lambda: weight of the label maps beside the photographs. 1 is cleanest, and costs most
+    image quality."""
 
     decide_every: int = 200
-    """Steps after which labels are decided anew."""
+    """Steps after which labels are decided again."""
 
     trust_pixels: int = 2
     """Pixels of the label maps count if the layer, as it was, shows their id at most so many
-    pixels away along each axis: they move a boundary, and what contradicts all other views says
-    nothing. -1 lets all count."""
+    pixels away along each axis: they move a boundary, and what contradicts all other views does not
+    count. -1 lets all count."""
 
     codes: int = 4
     """K: channels of the random codes. More is less noise for more time."""
@@ -96,7 +96,7 @@ class SharpenOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sharpened:
-    """Gaussians that took sides, row by row those of before."""
+    """Refined Gaussians, row by row those of before."""
 
     gaussians: Gaussians
 
@@ -104,7 +104,7 @@ class Sharpened:
     """Their labels, soft, decided from the same label maps."""
 
     agreement: tuple[float, float]
-    """Before and after: share of the light of labelled pixels, in [0, 1], that comes from
+    """Before and after: share of the weight of labelled pixels, in [0, 1], that is that of
     Gaussians of the pixel's id."""
 
     exposures: Mapping[str, Exposure] = field(default_factory=dict[str, Exposure])
@@ -132,19 +132,19 @@ def sharpen(
 
     Args:
         gaussians: The Gaussians of the scene.
-        views: Views with photographs and label maps. Only these are looked at.
+        views: Views with photographs and label maps. Only these are used.
         evidence: Their label maps, with ids that mean the same in all views (`MatchedMaps` for
-            segments); pixels at -1 say nothing.
+            segments); pixels at -1 do not count.
         options: How long, and how much labels count.
         uplift_options: How Gaussians get labels; candidates are at least 8 where confusion
             is corrected.
         confusion: How the evidence errs, see `correct_confusion`; None takes the majority.
         fit_options: How the photographs are compared (see `refinement_options`), and rates. Its
             seed is not used, and the poses of the views stay as they are: the label maps are
-            drawn with them.
+            rendered with them.
         exposures: Where exposures begin, for ``fit_options.exposure``, by name of the view.
         seed: Order of views and codes.
-        backend: Who renders.
+        backend: Name of the rendering backend.
         progress: Called with the steps done and all there are.
 
     Raises:
@@ -182,7 +182,7 @@ def _refined(
     exposures: Mapping[str, Exposure] | None,
     progress: Callable[[int, int], None] | None,
 ) -> Sharpened:
-    """Steps of the fit with the loss of the label maps, which are decided anew at times."""
+    """Fit with the loss of the label maps; labels are decided again every few steps."""
     labels, before = deciding.labels(gaussians)
     after = before
     trusted = deciding.trusted(gaussians, labels, options.trust_pixels)
@@ -223,7 +223,7 @@ def _with_candidates(options: UpliftOptions, confusion: ConfusionOptions | None)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Deciding:
-    """How Gaussians get their labels, again and again."""
+    """Decides labels from the votes of views, whenever Gaussians changed."""
 
     views: Sequence[View]
     label_maps: "_CachedLabelMaps"
@@ -265,7 +265,7 @@ def _agreement(votes: Labels, labels: Labels) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CachedLabelMaps:
-    """Label maps, compressed once they were made: some take a drawing each time."""
+    """Label maps, compressed once they were made: some are rendered each time."""
 
     source: LabelSource
     kept: dict[str, tuple[tuple[int, ...], bytes, bytes | None]] = field(default_factory=dict)
@@ -350,14 +350,12 @@ class _LabelLoss:
         view_map = self.label_maps.label_map(view.name)
         own = self.labels[rows.cpu()]
         known = self.label_maps.ids | {UNLABELLED, *torch.unique(own).tolist()}
-        names = torch.tensor(sorted(known), dtype=torch.int32)
-        codes = 2.0 * torch.randint(
-            0, 2, (len(names), self.options.codes), generator=self.generator
-        )
+        ids = torch.tensor(sorted(known), dtype=torch.int32)
+        codes = 2.0 * torch.randint(0, 2, (len(ids), self.options.codes), generator=self.generator)
         codes -= 1
         # What has no label agrees with nothing.
-        codes[names == UNLABELLED] = 0
-        signal = codes[torch.searchsorted(names, own)].to(gaussians.means)
+        codes[ids == UNLABELLED] = 0
+        signal = codes[torch.searchsorted(ids, own)].to(gaussians.means)
         rendered = render(
             gaussians,
             camera_of_map(view, view_map.height, view_map.width),
@@ -367,7 +365,7 @@ class _LabelLoss:
         weight = (view_map.ids != UNLABELLED).float()
         if view_map.confidence is not None:
             weight = weight * view_map.confidence
-        wanted = codes[torch.searchsorted(names, view_map.ids)] * weight.unsqueeze(-1)
+        wanted = codes[torch.searchsorted(ids, view_map.ids)] * weight.unsqueeze(-1)
         agreement = (rendered * wanted.to(rendered)).sum() / self.options.codes
         total_weight = float(weight.sum())
         return self.options.label_weight * (1 - agreement / max(total_weight, 1.0))

@@ -1,12 +1,12 @@
-r"""On which side of a boundary the pixels see each Gaussian, and across which direction it runs.
+r"""Mass of each Gaussian on either side of a boundary, and the direction that separates them.
 
 Every Gaussian i has two ids between which it may stand, a (inside) and b (outside). The pixels
-of label maps say how much of it they see with each, and where:
+of label maps measure how much of it they show with each, and where:
 
 .. math:: A_i = \sum_{views} \sum_p w_{pi} [\mathrm{id}(p) = a_i], \qquad
           c^A_i = \frac{\sum_p w_{pi} [\mathrm{id}(p) = a_i]\, x_p}{\sum_p w_{pi} [\ldots]}
 
-with x the pixel's place on the plane z = 1 of a view. In that view the Gaussian is a 2D normal
+with x the pixel's position on the plane z = 1 of a view. In that view the Gaussian is a 2D normal
 distribution of covariance :math:`S = J \Sigma J^\top + \epsilon`, and the line that separates
 two groups of its pixels best has the normal :math:`S^{-1} (c^A - c^B)` (Fisher's discriminant).
 The plane through the camera and that line, pulled back into the Gaussian's own frame, is
@@ -41,12 +41,12 @@ _IDS_AT_A_TIME = 10
 """Ids that one back-projection carries, with three channels each."""
 
 _MIN_WEIGHT = 1e-4
-"""Blending weight in one view, below which a mean place says nothing."""
+"""Blending weight in one view, below which a mean position is not used."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sides:
-    """What label maps say of each Gaussian and its two ids."""
+    """Mass of each Gaussian on the pixels of its two ids."""
 
     inside: Float[Tensor, "n"]
     """Blending weight summed over pixels and views that show its first id."""
@@ -84,13 +84,13 @@ def sides_of(
     Args:
         gaussians: The Gaussians.
         views: Those that vote.
-        evidence: Label maps of them; pixels at -1 say nothing.
+        evidence: Label maps of them; pixels at -1 do not count.
         first: The id of each Gaussian that is called inside.
         second: The id called outside, -1 where there is none.
         border_weight: What a pixel counts whose eight neighbours are not all of its id. Such a
             pixel shows both sides, and its id is that of one of them.
         options: Switches of the blending model.
-        backend: Who renders.
+        backend: Name of the rendering backend.
         step: Called after each view.
     """
     count = len(gaussians)
@@ -160,7 +160,7 @@ def _moments(
 
 
 def on_border(ids: Int[Tensor, "height width"]) -> Tensor:
-    """Pixels that have a neighbour, of eight, with another id; the picture's edge is none."""
+    """Pixels that have a neighbour, of eight, with another id; the image's edge is none."""
     padded = torch.nn.functional.pad(ids[None, None].double(), (1, 1, 1, 1), mode="replicate")[0, 0]
     height, width = ids.shape
     mixed = torch.zeros(height, width, dtype=torch.bool)
@@ -176,7 +176,7 @@ def _plane(camera: Camera) -> Float[Tensor, "height width 3"]:
     rotation = camera.cam_from_world.double()[:3, :3]
     rays = rays.double() @ rotation.T
     z = rays[..., 2:]
-    # A fisheye's pixel may look sideways, where there is no place on the plane.
+    # A fisheye's pixel may look sideways, where there is no point on the plane.
     flat = torch.where(z > 1e-3, rays[..., :2] / z.clamp_min(1e-3), 0.0)
     return torch.cat((torch.ones_like(z), flat), dim=-1).float()
 

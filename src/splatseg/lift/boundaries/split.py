@@ -1,7 +1,7 @@
 r"""Splitting Gaussians: one becomes several narrower ones that together look like it.
 
 With :math:`x = \mu + L z`, :math:`L = R\,\mathrm{diag}(s)`, and a unit direction e in z, the
-parts of a mixture (`_mixture`, places m, weights w, width r) are
+parts of a mixture (`mixture`, offsets m, weights w, width r) are
 
 .. math:: \mu_c = \mu + m_c L e, \qquad
           \Sigma_c = L \bigl( I - (1 - r^2)\, e e^\top \bigr) L^\top
@@ -58,7 +58,7 @@ def split(
         normals: For each selected one, in the order of rows, the normal of the cut in the
             world, of any length. None splits along the longest axis.
         parts: 2 or 3. Three are narrower and look more like the whole.
-        cameras: Those that the picture matters to; without any, all directions do alike.
+        cameras: Cameras that rendered images matter for; without any, all directions do alike.
 
     Returns:
         The Gaussians that stay, in order, and behind them the parts, those of one Gaussian

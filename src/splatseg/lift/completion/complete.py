@@ -11,14 +11,15 @@ them.
 with the known ones held at their own shares. The value that arrives for an id is the probability
 that a random walk over the graph first meets evidence for that id.
 
-With ``smoothing`` known Gaussians listen too, the more the weaker their own evidence e is:
+With ``smoothing`` known Gaussians are averaged with their neighbours too, the more the weaker
+their own evidence e is:
 
 .. math:: x_i \leftarrow \frac{e_i\, y_i + s \sum_j P_{ij} x_j}{e_i + s}
 
 References:
     Zhu and Ghahramani, Learning from Labeled and Unlabeled Data with Label Propagation (2002),
     section 2.2: known nodes are held.
-    Zhou et al., Learning with Local and Global Consistency (2004), eq. 4: they listen.
+    Zhou et al., Learning with Local and Global Consistency (2004), eq. 4: known nodes change too.
     Marrie et al., LUDVIG (2024), section 3.3: diffusion on a graph of Gaussians.
 """
 
@@ -56,17 +57,17 @@ class CompletionOptions:
     """How neighbours' labels spread."""
 
     neighbours: int = 12
-    """Nearest Gaussians that each one listens to."""
+    """Nearest Gaussians of each one in the neighbour graph."""
 
     spread_steps: int = 50
-    """How many neighbours far labels spread at most."""
+    """Upper bound of the steps over the graph that labels spread."""
 
     own_evidence: float = 0.0
-    """Evidence, in pixels' worth of blending weight, that a Gaussian must exceed to speak for
-    itself; with less it is labelled by its neighbours. Layers without evidence ignore it."""
+    """Evidence, in fully visible pixels, that a Gaussian must exceed to keep
+    its own label; with less it is labelled by its neighbours. Layers without evidence ignore it."""
 
     min_inferred: float = 0.0
-    """Least confidence in [0, 1] that an inferred label needs; below it there is none."""
+    """Minimum confidence in [0, 1] that an inferred label needs; below it there is none."""
 
     colour_width: float = 0.1
     """Standard deviation of colours in [0, 1] that count as alike."""
@@ -75,11 +76,11 @@ class CompletionOptions:
     """Width of the feature affinity, in squared median distances of features along edges."""
 
     smoothing: float = 0.0
-    """How much the neighbours of a Gaussian count together beside its own evidence, in pixels'
-    worth of blending weight; 50 is a good start. 0 leaves labels with evidence as they are."""
+    """How much the neighbours of a Gaussian count together beside its own evidence, in fully
+    visible pixels; 50 is a good start. 0 leaves labels with evidence as they are."""
 
     smoothing_steps: int = 5
-    """How many neighbours far known labels are smoothed."""
+    """Steps over the graph that known labels are smoothed."""
 
     completed_layer: CompletedLayer = "as_given"
     """as_given: a soft layer stays soft. hard: shares are smoothed and spread, and only the
@@ -123,14 +124,14 @@ def complete(
     Returns:
         The layer with `inferred` set where an id comes from neighbours: where there was none, or
         where smoothing chose another one. Their confidence is the share that arrived. Gaussians
-        that no evidence reaches in `spread_steps` keep the id -1. The metadata says how many
+        that no evidence reaches in `spread_steps` keep the id -1. The metadata holds how many
         there were of each.
 
     Raises:
         ShapeError: If the numbers of Gaussians, labels and features differ.
         RangeError: If a value is NaN or infinite.
-        InputError: If smoothing is asked for and the layer does not say how much evidence each
-            Gaussian has.
+        InputError: If smoothing is asked for and the layer does not hold the evidence of each
+            Gaussian.
 
     Example:
         >>> row = torch.arange(4.0).unsqueeze(1) * torch.tensor([[1.0, 0.0, 0.0]])
@@ -207,8 +208,8 @@ def _check(
         check_finite("labels.evidence", labels.evidence)
     elif options.smoothing > 0:
         raise InputError(
-            "smoothing: expected a layer that says how much evidence each Gaussian has, "
-            "got one without; make it anew, or set smoothing to 0."
+            "smoothing: expected a layer with the evidence of each Gaussian, got one without; "
+            "make the layer again, or set smoothing to 0."
         )
     if features is not None:
         if len(features) != len(gaussians):

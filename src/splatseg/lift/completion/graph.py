@@ -66,7 +66,7 @@ def neighbour_graph(
     if neighbours < 1:
         return scipy.sparse.csr_matrix((count, count), dtype=np.float32)
     nearest, distance = _nearest(nodes.positions, neighbours)
-    # Where neighbours share a place all of them are as near as can be.
+    # Where neighbours share a position all of them are as near as can be.
     local_width = np.maximum(distance[:, -1].astype(np.float64), 1e-30)
     exponent = np.empty((count, neighbours), dtype=np.float32)
     for rows in _blocks(count):
@@ -156,17 +156,17 @@ def diffuse(
     steps: int,
     max_shares: int,
 ) -> Any:
-    r"""Shares after some steps of giving neighbours a say.
+    r"""Shares after some steps of diffusion (label propagation).
 
     .. math:: x_i \leftarrow \frac{o_i\, y_i + s \sum_j P_{ij} x_j}{o_i + s}
 
     for nodes with finite o; a node with infinite o keeps its shares. The fixed point balances
-    what a node has seen itself against what its neighbours say.
+    a node's own evidence against the shares of its neighbours.
 
     Args:
         transition: P, sparse (n, n), rows that add up to at most 1.
         shares: y, sparse (n, ids), rows that add up to at most 1.
-        own_weight: o, (n,): how much a node's own shares count; 0 for a node that knows nothing.
+        own_weight: o, (n,): how much a node's own shares count; 0 for a node without evidence.
         neighbour_weight: s, how much neighbours count, positive.
         steps: How often.
         max_shares: Largest shares of a node that are carried on, at least 1.
@@ -185,7 +185,7 @@ def diffuse(
         scipy.sparse.diags((neighbour_weight / (free_weight + neighbour_weight)).astype(np.float32))
         @ transition[free_rows]
     )
-    # What free nodes hear of themselves and of those that are bound never changes.
+    # The part of free nodes' own shares and of clamped neighbours never changes.
     source = (
         scipy.sparse.diags((free_weight / (free_weight + neighbour_weight)).astype(np.float32))
         @ shares[free_rows]

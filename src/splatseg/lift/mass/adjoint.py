@@ -1,4 +1,4 @@
-"""Evidence of views, read once each, and carried onto the Gaussians by the adjoint."""
+"""The adjoint of rendering: evidence of views, read once each, summed onto Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ def voting_views(views: Sequence[View], evidence: ViewNames, what: str) -> list[
 
 
 def pixel_votes(label_map: LabelMap) -> tuple[Int64[Tensor, "ids"], Tensor, Float[Tensor, "ids"]]:
-    """Ids of a map ascending without -1, each pixel's place among them (or -1), and their votes.
+    """Ids of a map ascending without -1, each pixel's index among them (or -1), and their votes.
 
     A pixel counts 1, or its confidence.
     """
@@ -66,10 +66,13 @@ def near_an_edge(label_map: LabelMap, width: int) -> Bool[Tensor, "height width"
 
 @dataclass(kw_only=True)
 class LabelMass:
-    """How much voting light there was for each id, and how much of it Gaussians caught."""
+    """Mass of each id: of all its pixels, and the part of it that lies on Gaussians."""
 
     total: dict[int, float] = field(default_factory=dict[int, float])
+    """Pixels of each id, or their confidences, summed over views."""
+
     on_gaussians: dict[int, float] = field(default_factory=dict[int, float])
+    """Blending weight of all Gaussians on these pixels; the rest passes all Gaussians."""
 
     def add(self, ids: Sequence[int], total: Tensor, on_gaussians: Tensor) -> None:
         """Add one view's."""
@@ -82,7 +85,7 @@ class LabelMass:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RenderAdjoint:
-    """The adjoint of rendering label maps."""
+    """The adjoint of rendering: images of views summed onto Gaussians by blending weight."""
 
     gaussians: Gaussians
     options: RenderOptions
@@ -141,7 +144,7 @@ class RenderAdjoint:
         return projected.sums.float().cpu(), projected.weights.float().cpu()
 
     def _view_weight(self, visible: Float[Tensor, "n"]) -> Float[Tensor, "n"] | None:
-        """What a unit of this view's light on each Gaussian counts; None is 1 everywhere."""
+        """Factor of this view's weight on each Gaussian; None is 1 everywhere."""
         if not self.equal_views:
             return None
         return torch.where(visible > 0, visible, 1.0) ** -self.equal_views

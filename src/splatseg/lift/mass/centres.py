@@ -1,4 +1,4 @@
-"""Where the centres of Gaussians fall in a view, and what the view has to say there."""
+"""Pixels of the centres of Gaussians in a view, occlusion, and label maps at these pixels."""
 
 from dataclasses import dataclass, replace
 
@@ -59,10 +59,10 @@ def centres_in(means: Float[Tensor, "n 3"], camera: Camera, *, near: float) -> C
 def unoccluded(
     centres: Centres, gaussians: Gaussians, view: PreparedView, *, tolerance: float
 ) -> Tensor:
-    """Which centres are not behind what the view shows, bool (m,).
+    """Which centres are not behind the surface that the view shows, bool (m,).
 
-    What a pixel shows is where half of its light is spent (`Rendered.median_depth`); a pixel
-    whose light mostly passes hides nothing.
+    A pixel's surface is at its median depth (`Rendered.median_depth`), where transmittance falls
+    to one half; a pixel without one occludes nothing.
     """
     with torch.no_grad():
         signal = gaussians.means.new_zeros(len(gaussians), 1)

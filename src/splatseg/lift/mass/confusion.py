@@ -3,13 +3,14 @@ r"""Confusion-aware relabelling: the labels that make the votes most likely (Daw
 A 2D model misses a mouse on a desk in most views and calls it desk; it hardly ever calls a desk
 mouse. So a Gaussian with a third of its votes for mouse is part of a mouse, although desk has
 the majority. How often which id is taken for which, the confusion matrix :math:`\theta`, is read
-off the layer itself: Gaussians of one winner t tell what else was said of them,
+off the layer itself: Gaussians of one winner t show what else the
+evidence calls them,
 
 .. math:: \theta_{tc} \propto d\,[t = c] + \sum_{i:\, \arg\max y_i = t} m_i\, y_{ic}, \qquad
           \pi_t \propto 1 + \sum_{i:\, \arg\max y_i = t} m_i
 
 with y the shares, :math:`m_i = \min(e_i, \bar m)` the evidence of a Gaussian, bounded so that
-what fills the images does not decide alone, and d a little that speaks for every id. Then
+what fills the images does not decide alone, and d a prior on the diagonal. Then
 
 .. math:: p_i(t) \propto \pi_t \prod_c \max(\theta_{tc}, \epsilon)^{k_i\, y_{ic}}
 
@@ -21,10 +22,10 @@ rounds drift, because the votes are not as independent as the model takes them t
 The model takes every Gaussian of an id to be confused alike, and views to err independently. It
 harms where that is wrong: where one piece of a surface is called something else in many of its
 views (the wall between two windows), and where two ids are taken for each other about as often as
-not. Errors that hold over ranges of views are told by `view_votes`, and then votes amount to few
-views (`ConfusionOptions.correlated_views`): with three of them the prior weighs against changes
-that the votes do not speak for strongly. Errors of one place that come and go from view to view,
-and swaps, cannot be told from votes.
+not. Errors that hold over ranges of views are measured by `view_votes`, and then votes amount to
+few views (`ConfusionOptions.correlated_views`): with three of them the prior weighs against changes
+that the votes do not support strongly. Local errors that come and go from view to view, and swaps,
+cannot be found from votes.
 
 References:
     Dawid and Skene, Maximum Likelihood Estimation of Observer Error-Rates Using the EM
@@ -54,25 +55,26 @@ class ConfusionOptions:
     """How the evidence errs."""
 
     effective_views: float = 10.0
-    """Most independent views that a Gaussian's votes amount to; fewer where fewer saw it."""
+    """Upper bound of independent views that a Gaussian's votes count as; fewer where fewer saw
+    it."""
 
     max_correlation: float = 0.27
     """Highest correlation of neighbouring views, in [-1, 1], at which views count as independent.
     Above it errors hold over ranges of views."""
 
     correlated_views: float = 3.0
-    """Most independent views that votes amount to above `max_correlation`."""
+    """Upper bound of independent views above `max_correlation`."""
 
     min_confusion: float = 3e-3
-    """Epsilon: every id is taken for every other at least this often, in (0, 0.5]."""
+    """Epsilon: lower bound of the confusion of any two ids, in (0, 0.5]."""
 
     diagonal_prior: float = 5.0
-    """d: evidence on the diagonal of the confusion matrix that every id starts with, in pixels'
-    worth of blending weight."""
+    """d: evidence added to the diagonal of the confusion matrix for every id, in fully visible
+    pixels."""
 
     max_evidence: float = 20.0
-    """Most evidence that one Gaussian counts with in the confusion matrix, in pixels' worth of
-    blending weight."""
+    """Upper bound of the evidence of one Gaussian in the confusion matrix, in fully visible
+    pixels."""
 
     def __post_init__(self) -> None:
         for name in ("effective_views", "correlated_views", "diagonal_prior", "max_evidence"):
@@ -92,23 +94,23 @@ def correct_confusion(
     options: ConfusionOptions | None = None,
     view_correlation: float | None = None,
 ) -> Labels:
-    """Decide a soft layer anew under how often its ids are taken for one another.
+    """Relabel a soft layer by how often the evidence confuses its ids (Dawid and Skene).
 
     Ids must mean the same in all views, as classes do. Only ids that are ever confused with what
     a Gaussian was called can become its label. Nothing is random.
 
     Args:
         labels: A soft layer: shares of two or more candidates, such as `uplift` gives with
-            ``candidates=8``. Where it says how much evidence there is and how many views it comes
-            from, that is used.
+            ``candidates=8``. Its evidence and effective views are used where it
+            has them.
         options: How the evidence errs.
-        view_correlation: How much better the nearest view tells what a held-out view says than
-            other views do, at most 1: `uplift` measures it on the training views and records it
-            in the metadata. None where that is not known: views count as independent.
+        view_correlation: How much better the nearest view predicts the votes of a held-out view
+            than other views do, at most 1: `uplift` measures it on the training views and records
+            it in the metadata. None where that is not known: views count as independent.
 
     Returns:
         The layer with ids, candidates and shares by probability, as many as before. Gaussians
-        without a label keep none. The metadata says how many labels changed, and how
+        without a label keep none. The metadata holds how many labels changed, and how
         many independent views votes amounted to at most.
 
     Raises:
@@ -117,8 +119,8 @@ def correct_confusion(
             infinite.
 
     Example:
-        Of 21 Gaussians 19 are surely desk (1) and one is surely mouse (2), though half of what
-        was said of it is desk. The last is mouse by a third:
+        Of 21 Gaussians 19 are surely desk (1) and one is surely mouse (2), though half of
+        its votes are desk. The last is mouse by a third:
 
         >>> shares = torch.tensor([[1.0, 0.0]] * 19 + [[0.55, 0.45], [0.65, 0.35]])
         >>> ids = torch.tensor([[1, -1]] * 19 + [[2, 1], [1, 2]])
@@ -145,11 +147,11 @@ def correct_confusion(
 def _checked_max_views(
     labels: Labels, options: ConfusionOptions, view_correlation: float | None
 ) -> float:
-    """How many independent views votes amount to at most, once the input was found good."""
+    """Upper bound of independent views per Gaussian, after a check of the input."""
     if labels.candidates is None or labels.shares is None or labels.candidates.shape[1] < 2:
         raise InputError(
-            "labels: expected a soft layer with at least 2 candidates, whose shares say what is "
-            "taken for what, got a hard one; lift it with more candidates."
+            "labels: expected a soft layer with at least 2 candidates, whose shares show which "
+            "ids are confused, got a hard one; lift it with more candidates."
         )
     check_finite("labels.shares", labels.shares)
     if labels.evidence is not None:
@@ -167,7 +169,7 @@ def _checked_max_views(
 def _relabelled(
     labels: Labels, rows: Tensor, max_views: float, options: ConfusionOptions
 ) -> Labels:
-    """The layer with the labelled `rows` decided anew; the others get none."""
+    """The layer with the labelled `rows` relabelled; the others get no label."""
     if labels.candidates is None or labels.shares is None:
         raise TypeError("labels: expected a soft layer.")
     column_ids, table = _share_table(

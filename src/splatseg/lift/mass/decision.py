@@ -1,7 +1,7 @@
 r"""From the votes on a Gaussian to its label.
 
-With :math:`v_c` the votes for id c, V their sum (and, where light on unlabelled pixels counts
-against every id, that light too) and :math:`\gamma` the slackness:
+With :math:`v_c` the votes for id c, V their sum (and, where mass on unlabelled pixels counts
+against every id, that mass too) and :math:`\gamma` the slackness:
 
 - share: the id with most votes.
 - flashsplat: c against everything else is a binary problem, whose two-vector is L2-normalised;
@@ -69,7 +69,7 @@ def decide(
         slackness: :math:`\gamma`; plain shares have none.
         min_weight: Votes that a Gaussian must exceed to get anything.
         min_share: Least share of V that the label needs.
-        against: Light that speaks against every id, (n,).
+        against: Mass that counts against every id, (n,).
     """
     seen = ranking.total > min_weight
     total = ranking.total if against is None else ranking.total + against.clamp_min(0)

@@ -40,7 +40,7 @@ def pieces_of(segments: LabelMap | MaskSet) -> Pieces:
         pixels = [_pixels_of(segments, i) for i in range(len(segments))]
         piece = refined(pixels, segments.height * segments.width)
         count = int(piece.max(initial=-1)) + 1
-        # Any one pixel of a piece tells which segments all of it lies in.
+        # Any one pixel of a piece shows which segments all of it lies in.
         first = np.zeros(count, np.int64)
         first[piece[::-1]] = np.arange(len(piece))[::-1]
         is_first = np.zeros(len(piece), bool)

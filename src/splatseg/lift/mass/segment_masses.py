@@ -39,7 +39,7 @@ class ViewMasses:
     """The nonzero masses of one view, sorted by segment and then by Gaussian."""
 
     segment: Int64[Tensor, "m"]
-    """Id of a label map, or place of a mask in its set."""
+    """Id of a label map, or index of a mask in its set."""
 
     gaussian: Int64[Tensor, "m"]
     """Row of a Gaussian."""
@@ -112,7 +112,7 @@ def _sums(
     options: RenderOptions,
     backend: str,
 ) -> tuple[list[Any], Tensor | None]:
-    """Sparse (pieces, Gaussians) of each band, and what all pixels see where pieces do not tell."""
+    """Sparse (pieces, Gaussians) of each band, and the visibility where pieces lack it."""
     pinhole = straightened(camera)
     bands = list(_bands(pinhole.height * pinhole.width))
     if len(bands) == 1 and camera.is_pinhole and pieces.weight is None:

@@ -7,8 +7,8 @@ A pixel votes for its id on every Gaussian that it shows, with the weight it sho
 
 which is :math:`W^\top` of the one-hot label map, normalised by how much of the Gaussian the
 voting pixels saw. The strongest id is the Gaussian's label and its share the confidence; other
-rules are in `lift.mass.decision`. Light that passes every Gaussian votes alike for the label of
-what none covers, such as the sky:
+rules are in `lift.mass.decision`. The transmittance behind all Gaussians votes alike for the label
+of what none covers, such as the sky:
 
 .. math:: b_c = \sum_{views} \sum_p \Bigl(1 - \sum_i w_{pi}\Bigr) [\mathrm{id}(p) = c]
               = \sum_{views} \sum_p [\mathrm{id}(p) = c] - \sum_i v_{ic}
@@ -51,14 +51,14 @@ class UpliftOptions:
 
     candidates: int = 1
     """Ids kept for each Gaussian. 1 makes a hard layer; with more the layer keeps their shares
-    and is drawn softly."""
+    and is rendered softly."""
 
     min_weight: float = 0.0
     """Blending weight, summed over voting pixels, that a Gaussian must exceed to be labelled.
     One fully visible pixel counts 1."""
 
     min_share: float = 0.0
-    """Least share of the votes, in [0, 1], that the winner needs; below it there is no label."""
+    """Minimum share of the votes, in [0, 1], that the winner needs; below it there is no label."""
 
     label_rule: LabelRule = "share"
     """Who wins. share: the id with most votes. flashsplat: an id with more votes than all
@@ -66,16 +66,16 @@ class UpliftOptions:
     same after L1 normalisation; with a negative slackness several ids may win."""
 
     slackness: float = 0.0
-    """FlashSplat's gamma, in [-1, 1], added to what speaks against an id: above 0 labels are
+    """FlashSplat's gamma, in [-1, 1], added to the votes against an id: above 0 labels are
     cut tight around what was seen, below 0 generously."""
 
     count_void: bool = False
-    """Light on unlabelled pixels counts against every id: for masks of single objects, whose
+    """Mass on unlabelled pixels counts against every id: for masks of single objects, whose
     outside has no label."""
 
     equal_views: float = 0.0
     """How far views are made equal, in [0, 1]: a view's votes on a Gaussian are divided by how
-    much the view shows of it, to this power. At 0 every pixel has the same say, at 1 every view,
+    much the view shows of it, to this power. At 0 every pixel has the same weight, at 1 every view,
     however far away."""
 
     edge_pixels: int = 0
@@ -85,11 +85,11 @@ class UpliftOptions:
     """Weight of a pixel near an edge, in [0, 1]."""
 
     min_background: float = 1e-3
-    """Least share of the light of all voting pixels, in [0, 1], that must pass the Gaussians
+    """Minimum share of the weight of all voting pixels, in [0, 1], that must pass the Gaussians
     for there to be a background label. A closed room has none."""
 
     min_background_share: float = 0.5
-    """Least share of that light, in [0, 1], that the background label needs."""
+    """Minimum share of that weight, in [0, 1], that the background label needs."""
 
     memory: int = 1 << 30
     """Bytes of an exact table of votes, 4 for each id and Gaussian. With more ids than fit,
@@ -97,7 +97,7 @@ class UpliftOptions:
 
     slots: int = 32
     """Ids remembered of each Gaussian then, 8 bytes each; more than 1. Exact for Gaussians that
-    no more ids spoke for; of others an id with more than 1 / (slots + 1) of the votes is never
+    have votes for no more ids; of others an id with more than 1 / (slots + 1) of the votes is never
     lost."""
 
     def __post_init__(self) -> None:
@@ -155,8 +155,8 @@ def uplift(
     Returns:
         The layer, with the votes of each Gaussian as its evidence. Gaussians that no voting
         pixel saw have the id -1 and confidence 0. The metadata holds the method, its options,
-        the views, what the background rests on, and the largest share of the votes by which
-        a count may be too small (0 where the table was exact).
+        the views, what the background rests on, and the largest error bound of a count, as a share
+        of the Gaussian's votes (0 where the table was exact).
 
     Raises:
         InputError: If there are no views, if one has no label map, or no pixel has a label.
@@ -178,7 +178,7 @@ def uplift(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Votes:
-    """What all views together say."""
+    """Votes of all views."""
 
     table: VoteTable
     label_mass: LabelMass
@@ -284,7 +284,7 @@ def _correlation(by_view: ViewVotes | None, ranking: Ranking) -> dict[str, float
 
 
 def _without_edges(label_map: LabelMap, options: UpliftOptions) -> LabelMap:
-    """The same ids, in which pixels near an edge have less say."""
+    """The same ids, in which pixels near an edge have less weight."""
     if not options.edge_pixels or options.edge_vote == 1:
         return label_map
     weight = torch.where(near_an_edge(label_map, options.edge_pixels), options.edge_vote, 1.0)

@@ -1,9 +1,9 @@
-r"""Whether views err independently of each other: what each says of a sample of Gaussians.
+r"""Whether views err independently of each other: the votes of each on a sample of Gaussians.
 
 A vote over many views removes errors that are independent from view to view, and a model of
-such errors can tell what is usually missed (`confusion`). A network that calls a desk a
+such errors can infer what is usually missed (`confusion`). A network that calls a desk a
 nightstand from one side does so in all neighbouring views, and there both fail. So each view is
-held out in turn: is what it says of a Gaussian told better by its nearest view than by any other?
+held out in turn: is its vote on a Gaussian predicted better by its nearest view than by any other?
 
 .. math:: \rho = \frac{\sum_i (a_i - e_i)}{\sum_i (1 - e_i)}
 
@@ -27,10 +27,10 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Camera
 
 _SAMPLE = 32768
-"""Gaussians that are listened to, in even steps through their order."""
+"""Gaussians that are sampled, in even steps through their order."""
 
 _CONTESTED = 2048
-"""Contested ones among them that are looked at, in even steps too."""
+"""Contested ones among them that are compared, in even steps too."""
 
 _CONTESTED_SHARE = 0.2
 """Least share of the second strongest id of a Gaussian on which views disagree."""
@@ -39,7 +39,7 @@ _MIN_VIEWS = 3
 """Views that must give a Gaussian one of its two ids."""
 
 _MIN_GAUSSIANS = 30
-"""Contested Gaussians below which nothing can be said."""
+"""Contested Gaussians below which there is no estimate."""
 
 
 class ViewVotes:
@@ -68,9 +68,9 @@ class ViewVotes:
         """Take in votes of the view at hand, one column an id."""
         index = self._index[rows]
         known = torch.nonzero(index >= 0).squeeze(1)
-        row, name = torch.nonzero(sums[known] > 0, as_tuple=True)
-        names = torch.tensor(list(ids), dtype=torch.int64)
-        self._parts.append((index[known][row], names[name], sums[known][row, name]))
+        row, column = torch.nonzero(sums[known] > 0, as_tuple=True)
+        column_ids = torch.tensor(list(ids), dtype=torch.int64)
+        self._parts.append((index[known][row], column_ids[column], sums[known][row, column]))
 
     def add_sparse(
         self, ids: Int64[Tensor, "m"], gaussians: Int64[Tensor, "m"], weights: Float[Tensor, "m"]
@@ -129,7 +129,7 @@ class ViewVotes:
         return excess / max_excess if used >= _MIN_GAUSSIANS else None
 
     def _votes_of(self, chosen: NDArray[np.int64]) -> NDArray[np.int32]:
-        """What each view says of the chosen, (chosen, views), -1 where it says nothing."""
+        """The id each view votes for, (chosen, views), -1 where it has no vote."""
         row_of = np.full(len(self._rows), -1)
         row_of[chosen] = np.arange(len(chosen))
         votes = np.full((len(chosen), len(self._views)), UNLABELLED, np.int32)
@@ -140,7 +140,7 @@ class ViewVotes:
 
 
 def _agreement_by_chance(votes_second: NDArray[np.bool_]) -> float:
-    """Share of all pairs of views that say the same."""
+    """Share of all pairs of views that vote for the same id."""
     count, seconds = len(votes_second), int(votes_second.sum())
     firsts = count - seconds
     return (seconds * (seconds - 1) + firsts * (firsts - 1)) / (count * (count - 1))

@@ -13,7 +13,7 @@ in :math:`[s, s + E]` (s is 0 where it has no slot), and, since each c is taken 
 .. math:: E \le \frac{\sum_c v_c - \sum_j s_j}{K + 1} \le \frac{\sum_c v_c}{K + 1}
 
 whatever the order: an id with more than that share of the votes is never lost. A Gaussian that
-only K ids or fewer spoke for has E = 0, and its votes are exact.
+has votes for K ids or fewer has E = 0, and its votes are exact.
 
 References:
     Misra and Gries, Finding repeated elements, Science of Computer Programming 2 (1982).
