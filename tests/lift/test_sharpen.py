@@ -325,7 +325,7 @@ def test_agreement_of_the_label_and_not_of_the_majority() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"sharpen_steps": -1}, "sharpen_steps"),
         ({"label_weight": float("nan")}, "label_weight"),
@@ -337,8 +337,8 @@ def test_agreement_of_the_label_and_not_of_the_majority() -> None:
         ({"rates_from": 1.1}, "rates_from"),
     ],
 )
-def test_options_are_checked(change, says) -> None:
-    with pytest.raises(RangeError, match=says):
+def test_options_are_checked(change, message) -> None:
+    with pytest.raises(RangeError, match=message):
         SharpenOptions(**change)
 
 
