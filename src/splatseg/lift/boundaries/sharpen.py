@@ -153,7 +153,7 @@ def sharpen(
         ShapeError: If a label map does not have its photograph's proportions.
     """
     options = options or SharpenOptions()
-    deciding = _Deciding(
+    update = _LabelUpdate(
         views=_photographed(views, evidence),
         label_maps=_CachedLabelMaps(evidence),
         votes=_with_candidates(uplift_options or UpliftOptions(), confusion),
@@ -161,7 +161,7 @@ def sharpen(
         backend=backend,
     )
     fit = replace(fit_options or FitOptions(), seed=seed, refine_poses=False)
-    return _refined(gaussians, deciding, options, fit, exposures=exposures, progress=progress)
+    return _refined(gaussians, update, options, fit, exposures=exposures, progress=progress)
 
 
 def _photographed(views: Sequence[View], evidence: LabelSource) -> list[View]:
@@ -175,7 +175,7 @@ def _photographed(views: Sequence[View], evidence: LabelSource) -> list[View]:
 
 def _refined(
     gaussians: Gaussians,
-    deciding: "_Deciding",
+    update: "_LabelUpdate",
     options: SharpenOptions,
     fit: FitOptions,
     *,
@@ -183,26 +183,26 @@ def _refined(
     progress: Callable[[int, int], None] | None,
 ) -> Sharpened:
     """Fit with the loss of the label maps; labels are decided again every few steps."""
-    labels, before = deciding.labels(gaussians)
+    labels, before = update.labels(gaussians)
     after = before
-    trusted = deciding.trusted(gaussians, labels, options.trust_pixels)
+    trusted = update.trusted(gaussians, labels, options.trust_pixels)
     refinement = Refinement(
         gaussians,
-        deciding.views,
+        update.views,
         steps=options.sharpen_steps,
         start=options.rates_from,
         options=fit,
         exposures=exposures,
-        backend=deciding.backend,
+        backend=update.backend,
     )
     for done in range(options.sharpen_steps):
         generator = refinement.generator
-        loss = _LabelLoss(trusted, labels.ids.cpu(), options, generator, deciding.backend)
+        loss = _LabelLoss(trusted, labels.ids.cpu(), options, generator, update.backend)
         refinement.step(loss)
         last = done + 1 == options.sharpen_steps
         if last or (done + 1) % options.decide_every == 0:
             gaussians = refinement.gaussians()
-            labels, after = deciding.labels(gaussians)
+            labels, after = update.labels(gaussians)
         if progress is not None:
             progress(done + 1, options.sharpen_steps)
     record = {"options": asdict(options), "seed": fit.seed, "agreement": [before, after]}
@@ -222,7 +222,7 @@ def _with_candidates(options: UpliftOptions, confusion: ConfusionOptions | None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Deciding:
+class _LabelUpdate:
     """Decides labels from the votes of views, whenever Gaussians changed."""
 
     views: Sequence[View]
