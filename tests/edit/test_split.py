@@ -10,7 +10,7 @@ from splatseg.core import Gaussians, Selection, apply_rows
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import split
-from splatseg.lift.boundaries.geometry import seen_along
+from splatseg.lift.boundaries.geometry import line_extent
 from splatseg.lift.boundaries.mixture import MIXTURES, opacities_of_parts
 from splatseg.render import render
 
@@ -56,34 +56,34 @@ def test_mass_mean_and_covariance_stay(rng, parts, cut) -> None:
 def test_the_constants_are_the_closest_mixture_of_their_width(parts) -> None:
     mixture = MIXTURES[parts]
     assert sum(mixture.weights) == pytest.approx(1, abs=1e-12)
-    assert mixture.places == tuple(-m for m in reversed(mixture.places))
+    assert mixture.offsets == tuple(-m for m in reversed(mixture.offsets))
     r = mixture.width
     x = np.linspace(-7, 7, 2801)
 
-    def density(places, weights):
-        bells = np.exp(-((x[:, None] - places) ** 2) / (2 * r * r)) / (r * math.sqrt(2 * math.pi))
+    def density(offsets, weights):
+        bells = np.exp(-((x[:, None] - offsets) ** 2) / (2 * r * r)) / (r * math.sqrt(2 * math.pi))
         return bells @ weights
 
     def constants(free):
         """Weights and ratios of the places; the scale of the places follows from r."""
         outer = parts // 2
         w, q = np.abs(free[:outer]), np.abs([*free[outer:], 1.0])
-        middle = [1 - 2 * w.sum()] if parts % 2 else []
-        if not middle:
+        centre_weight = [1 - 2 * w.sum()] if parts % 2 else []
+        if not centre_weight:
             w = w / (2 * w.sum())
-        places = np.array([*(-q[::-1]), *([0.0] if parts % 2 else []), *q])
-        weights = np.array([*w[::-1], *middle, *w])
-        spread = (weights * places**2).sum()
-        return places * math.sqrt((1 - r * r) / spread), weights
+        offsets = np.array([*(-q[::-1]), *([0.0] if parts % 2 else []), *q])
+        weights = np.array([*w[::-1], *centre_weight, *w])
+        spread = (weights * offsets**2).sum()
+        return offsets * math.sqrt((1 - r * r) / spread), weights
 
     normal = np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
 
     def error(free) -> float:
         return float(((density(*constants(free)) - normal) ** 2).sum())
 
-    outer = np.array([m for m in mixture.places if m > 0])
+    outer = np.array([m for m in mixture.offsets if m > 0])
     free = np.array([*mixture.weights[-len(outer) :], *(outer[:-1] / outer[-1])])
-    np.testing.assert_allclose(mixture.places, constants(free)[0], atol=1e-4)
+    np.testing.assert_allclose(mixture.offsets, constants(free)[0], atol=1e-4)
     for k in range(parts % 2 == 0 and len(outer) == 1, len(free)):
         for change in (-1e-3, 1e-3):
             other = free.copy()
@@ -103,7 +103,7 @@ def test_the_opacities_are_the_best_ones(parts, opacity, across) -> None:
     )[0].numpy()
     u = np.linspace(-4, 4, 401)
     width = math.sqrt(1 - across**2 * (1 - mixture.width**2))
-    bells = np.exp(-((u[:, None] - across * np.array(mixture.places)) ** 2) / (2 * width**2))
+    bells = np.exp(-((u[:, None] - across * np.array(mixture.offsets)) ** 2) / (2 * width**2))
     wanted = opacity * np.exp(-(u**2) / 2)
 
     def error(opacities) -> float:
@@ -133,19 +133,19 @@ def test_seen_across_and_along_by_hand() -> None:
         sh=torch.zeros(1, 1, 3),
     )
     x = torch.tensor([[1.0, 0, 0]])
-    front = seen_along(rod, x, [camera()])
+    front = line_extent(rod, x, [camera()])
     assert float(front.across) == pytest.approx(1)
     assert float(front.pixels) == pytest.approx(1.1 * 48 / 4)
-    end = seen_along(rod, x, [camera(turn=math.pi / 2)])
+    end = line_extent(rod, x, [camera(turn=math.pi / 2)])
     assert float(end.across) == pytest.approx(0, abs=1e-6)
     assert float(end.pixels) == pytest.approx(0, abs=1e-6)
-    slanted = seen_along(rod, x, [camera(turn=math.pi / 4)])
+    slanted = line_extent(rod, x, [camera(turn=math.pi / 4)])
     # d = (1, 0, 1)/sqrt 2 whitens to (1, 0, 10)/sqrt 2: rho^2 = 1 - 1/101.
     assert float(slanted.across) ** 2 == pytest.approx(100 / 101)
-    away = seen_along(rod, x, [camera(turn=math.pi, distance=-4.0)])
+    away = line_extent(rod, x, [camera(turn=math.pi, distance=-4.0)])
     assert float(away.pixels) == 0
-    assert float(away.across) == pytest.approx(float(seen_along(rod, x).across))
-    assert math.isinf(float(seen_along(rod, x).pixels))
+    assert float(away.across) == pytest.approx(float(line_extent(rod, x).across))
+    assert math.isinf(float(line_extent(rod, x).pixels))
 
 
 def one_disc(opacity: float) -> Gaussians:

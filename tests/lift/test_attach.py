@@ -264,8 +264,8 @@ def test_extreme_values() -> None:
         attach(g, g.replace(means=g.means * float("nan")))
     with pytest.raises(RangeError, match="moves"):
         AttachOptions(moves=-1)
-    with pytest.raises(RangeError, match="least_part"):
-        AttachOptions(least_part=2)
+    with pytest.raises(RangeError, match="min_part"):
+        AttachOptions(min_part=2)
 
 
 def test_the_same_every_time_and_with_any_number_of_threads(scene, rng) -> None:

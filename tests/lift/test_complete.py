@@ -11,14 +11,20 @@ import torch
 from splatseg.core import Features, Gaussians, Labels
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import CompletionOptions, complete
-from splatseg.lift.completion.graph import NodeAttributes, diffuse, neighbour_graph, ranked, walk
+from splatseg.lift.completion.graph import (
+    NodeAttributes,
+    diffuse,
+    neighbour_graph,
+    ranked,
+    transition_matrix,
+)
 
 from .conftest import gaussians_at
 
 
-def on_a_line(places, *, colours=None) -> Gaussians:
-    means = torch.zeros(len(places), 3)
-    means[:, 0] = torch.as_tensor(places, dtype=torch.float32)
+def on_a_line(positions, *, colours=None) -> Gaussians:
+    means = torch.zeros(len(positions), 3)
+    means[:, 0] = torch.as_tensor(positions, dtype=torch.float32)
     gaussians = gaussians_at(means)
     if colours is None:
         return gaussians
@@ -75,7 +81,9 @@ def test_a_graph_keeps_its_edges_when_the_unit_of_length_changes(rng) -> None:
     assert np.array_equal(reference, reference.T)
     assert not reference.diagonal().any()
     np.testing.assert_allclose(graph(1000.0), reference, rtol=1e-4)
-    np.testing.assert_allclose(np.asarray(walk(graph_of(reference)).sum(axis=1)), 1, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(transition_matrix(graph_of(reference)).sum(axis=1)), 1, rtol=1e-6
+    )
 
 
 def graph_of(dense: np.ndarray) -> scipy.sparse.csr_matrix:
@@ -92,21 +100,27 @@ def test_many_in_one_place_and_few_at_all(count: int) -> None:
 
 def test_diffusion_is_the_formula(rng) -> None:
     """Against dense matrices: some nodes held, some that know nothing, some that listen."""
-    count, ids, strength = 30, 4, 0.7
+    count, ids, neighbour_weight = 30, 4, 0.7
     nodes = NodeAttributes(positions=rng.normal(size=(count, 3)))
-    step = walk(neighbour_graph(nodes, neighbours=4, colour_width=1, feature_width=1))
-    own = rng.uniform(0.1, 3.0, count).astype(np.float32)
-    own[::3] = np.inf
-    own[1::3] = 0
+    transition = transition_matrix(
+        neighbour_graph(nodes, neighbours=4, colour_width=1, feature_width=1)
+    )
+    own_weight = rng.uniform(0.1, 3.0, count).astype(np.float32)
+    own_weight[::3] = np.inf
+    own_weight[1::3] = 0
     shares = rng.dirichlet(np.ones(ids), count).astype(np.float32)
     expected = shares.astype(np.float64)
     for _ in range(7):
-        heard = step.toarray() @ expected
+        of_neighbours = transition.toarray() @ expected
         with np.errstate(invalid="ignore"):
-            told = (own[:, None] * shares + strength * heard) / (own[:, None] + strength)
-        expected = np.where(np.isinf(own)[:, None], shares, told)
+            averaged = (own_weight[:, None] * shares + neighbour_weight * of_neighbours) / (
+                own_weight[:, None] + neighbour_weight
+            )
+        expected = np.where(np.isinf(own_weight)[:, None], shares, averaged)
     sparse = scipy.sparse.csr_matrix(shares)
-    result = diffuse(step, sparse, own, strength=strength, steps=7, kept=ids)
+    result = diffuse(
+        transition, sparse, own_weight, neighbour_weight=neighbour_weight, steps=7, max_shares=ids
+    )
     np.testing.assert_allclose(result.toarray(), expected, atol=1e-6)
     columns, values = ranked(result, 2)
     np.testing.assert_array_equal(columns[:, 0], expected.argmax(axis=1))
@@ -115,10 +129,17 @@ def test_diffusion_is_the_formula(rng) -> None:
 
 def test_only_the_strongest_shares_are_carried() -> None:
     """A node that hears of three ids alike passes on the two with the smaller names."""
-    step = scipy.sparse.csr_matrix(np.array([[0, 1 / 3, 1 / 3, 1 / 3], *np.zeros((3, 4))]))
+    transition = scipy.sparse.csr_matrix(np.array([[0, 1 / 3, 1 / 3, 1 / 3], *np.zeros((3, 4))]))
     shares = scipy.sparse.csr_matrix(np.array([[0, 0, 0], *np.eye(3)], dtype=np.float32))
-    own = np.array([0, np.inf, np.inf, np.inf], dtype=np.float32)
-    result = diffuse(step.astype(np.float32), shares, own, strength=1.0, steps=1, kept=2)
+    own_weight = np.array([0, np.inf, np.inf, np.inf], dtype=np.float32)
+    result = diffuse(
+        transition.astype(np.float32),
+        shares,
+        own_weight,
+        neighbour_weight=1.0,
+        steps=1,
+        max_shares=2,
+    )
     np.testing.assert_allclose(result.toarray()[0], [1 / 3, 1 / 3, 0], atol=1e-6)
     columns, _ = ranked(result, 3)
     assert columns[0].tolist() == [0, 1, -1]
@@ -164,14 +185,14 @@ def test_labels_go_no_farther_than_asked() -> None:
 
 def test_colour_and_features_say_to_whom_a_gaussian_belongs() -> None:
     """The unknown lies in the middle of two known ones."""
-    places, labels = [0.0, 1.0, 2.0], hard([1, -1, 2])
+    positions, labels = [0.0, 1.0, 2.0], hard([1, -1, 2])
     red, blue = [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]
     for left, right, wanted in ((red, blue, 1), (blue, red, 2)):
-        gaussians = on_a_line(places, colours=[left, red, right])
+        gaussians = on_a_line(positions, colours=[left, red, right])
         assert labelled(gaussians, labels, neighbours=2).ids.tolist() == [1, wanted, 2]
         wide = labelled(gaussians, labels, neighbours=2, colour_width=1e3)
         assert wide.confidence[1] == pytest.approx(0.5, abs=1e-3)
-    gaussians = on_a_line(places)
+    gaussians = on_a_line(positions)
     for values, wanted in (([[2, 0], [3, 0.1], [0, 1]], 1), ([[0, 1], [3, 0.1], [2, 0]], 2)):
         features = Features(values=torch.tensor(values, dtype=torch.float32))
         completed = labelled(gaussians, labels, features, neighbours=2)
@@ -223,13 +244,13 @@ def test_soft_layers_stay_soft_and_known_rows_stay_as_they_are() -> None:
 
 def smoothed_by_hand(labels: Labels, *, strength: float) -> torch.Tensor:
     """Three in a row with equal edges and ids 1 and 2, iterated in full precision."""
-    step = torch.tensor([[0.0, 1, 0], [0.5, 0, 0.5], [0, 1, 0]], dtype=torch.float64)
+    transition = torch.tensor([[0.0, 1, 0], [0.5, 0, 0.5], [0, 1, 0]], dtype=torch.float64)
     own = labels.evidence.double().unsqueeze(1)
     given = (labels.ids.unsqueeze(1) == torch.tensor([1, 2])).double()
     given = given * labels.confidence.double().unsqueeze(1)
     now = given
     for _ in range(5):
-        now = (own * given + strength * step @ now) / (own + strength)
+        now = (own * given + strength * transition @ now) / (own + strength)
     return now
 
 
@@ -317,7 +338,7 @@ def test_bad_input_is_refused() -> None:
         complete(gaussians, hard([1, -1], confidence=[math.nan, 0.0]))
     with pytest.raises(RangeError, match="means"):
         complete(on_a_line([0.0, math.nan]), labels)
-    with pytest.raises(InputError, match="smoothing: expected a layer that says how much"):
+    with pytest.raises(InputError, match="smoothing: expected a layer with the evidence"):
         labelled(gaussians, hard([1, -1]), smoothing=1.0)
     for wrong in (
         {"neighbours": 0},

@@ -87,8 +87,8 @@ def test_the_posterior_is_the_formula(rng, options, seen) -> None:
     for row in range(40):
         for id, share in zip(result.candidates[row].tolist(), result.shares[row], strict=True):
             if id != -1:
-                place = int(np.searchsorted(names, id))
-                assert float(share) == pytest.approx(expected[row, place], abs=1e-5)
+                column = int(np.searchsorted(names, id))
+                assert float(share) == pytest.approx(expected[row, column], abs=1e-5)
     changed = int((expected.argmax(axis=1) != dense.argmax(axis=1)).sum())
     assert result.metadata["confusion"]["changed"] == changed
 

@@ -170,8 +170,8 @@ def test_faint_gaussians_get_nothing() -> None:
     grids = Grids({"v": grid_of(torch.ones(3, 4, 2), 4)})
     weight = float(matrix_of(gaussians, view.camera).sum())
 
-    def lift(least: float) -> list[float]:
-        options = FeatureUpliftOptions(min_weight=least)
+    def lift(min_weight: float) -> list[float]:
+        options = FeatureUpliftOptions(min_weight=min_weight)
         found = uplift_features(gaussians, [view], grids, options=options, backend=BACKEND)
         assert found.weights.tolist() == pytest.approx([weight, 0], rel=1e-5)
         return found.values[:, 0].tolist()

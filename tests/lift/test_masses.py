@@ -61,9 +61,9 @@ def test_label_maps_keep_their_ids_and_confidence(rng) -> None:
     names = [0, 5, 2_000_000_000]
     assert found.segment.unique().tolist() == names
     images = torch.stack([(ids == i) * confidence for i in names])
-    place = torch.searchsorted(torch.tensor(names), found.segment)
+    row = torch.searchsorted(torch.tensor(names), found.segment)
     table = torch.zeros(3, len(gaussians))
-    table[place, found.gaussian] = found.weight
+    table[row, found.gaussian] = found.weight
     torch.testing.assert_close(table, expected(gaussians, camera, images), **TOLERANCE)
 
 

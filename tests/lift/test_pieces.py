@@ -24,9 +24,9 @@ def test_masks_are_made_of_whole_pieces(rng) -> None:
     masks[2] = False
     masks[4] = masks[3] | masks[5]
     pieces = pieces_of(MaskSet.from_dense(masks))
-    drawn = pieces.segments.toarray()[:, pieces.piece].reshape(9, 12, 16)
-    assert np.array_equal(drawn, masks.numpy().astype(np.float32))
-    assert pieces.names.tolist() == list(range(9))
+    masks_drawn = pieces.segments.toarray()[:, pieces.piece].reshape(9, 12, 16)
+    assert np.array_equal(masks_drawn, masks.numpy().astype(np.float32))
+    assert pieces.segment_ids.tolist() == list(range(9))
     assert pieces.weight is None
 
 
@@ -34,10 +34,10 @@ def test_pieces_of_a_label_map_are_its_segments(rng) -> None:
     ids = torch.from_numpy(rng.choice([-1, 0, 5, 2_000_000_000], (12, 16)))
     confidence = torch.from_numpy(rng.random((12, 16))).float()
     pieces = pieces_of(LabelMap(ids=ids, confidence=confidence))
-    assert pieces.names.tolist() == [0, 5, 2_000_000_000]
-    drawn = pieces.segments.toarray()[:, pieces.piece].reshape(3, 12, 16)
-    for mask, name in zip(drawn, pieces.names.tolist(), strict=True):
-        assert np.array_equal(mask == 1, (ids == name).numpy())
+    assert pieces.segment_ids.tolist() == [0, 5, 2_000_000_000]
+    masks_drawn = pieces.segments.toarray()[:, pieces.piece].reshape(3, 12, 16)
+    for mask, segment_id in zip(masks_drawn, pieces.segment_ids.tolist(), strict=True):
+        assert np.array_equal(mask == 1, (ids == segment_id).numpy())
     assert pieces.weight is not None
     assert np.array_equal(pieces.weight, confidence.numpy().reshape(-1))
 

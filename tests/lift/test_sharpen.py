@@ -10,7 +10,7 @@ from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
 from splatseg.io.images import save_png
 from splatseg.lift import SharpenOptions, UpliftOptions, correct_confusion, sharpen, uplift
-from splatseg.lift.boundaries.sharpen import _LabelTerm, _Papers
+from splatseg.lift.boundaries.sharpen import _CachedLabelMaps, _LabelLoss
 from splatseg.render import back_project, render
 from splatseg.render.cpu import set_threads, threads
 
@@ -57,9 +57,9 @@ def exact_share(gaussians, views, maps, labels) -> float:
     """Light of labelled pixels from Gaussians of their id, over all light that reaches them."""
     own = whole = 0.0
     for view in views:
-        paper = maps.label_map(view.name)
+        label_map = maps.label_map(view.name)
         for id in (LEFT, RIGHT):
-            mask = (paper.ids == id).float().unsqueeze(-1)
+            mask = (label_map.ids == id).float().unsqueeze(-1)
             sums = back_project(gaussians, view.camera, mask, backend="cpu", warp="nearest").sums
             own += float(sums[labels.ids == id].sum())
             whole += float(sums.sum())
@@ -78,8 +78,10 @@ def test_what_straddles_takes_a_side(scene) -> None:
     # Of the light on the wrong side about half is left.
     assert 1 - after < 0.55 * (1 - before)
     assert len(found.gaussians) == len(gaussians)
-    middle = slice(10, 15)
-    assert bool((found.gaussians.means[middle, 0] > gaussians.means[middle, 0] + 0.004).all())
+    straddling = slice(10, 15)
+    assert bool(
+        (found.gaussians.means[straddling, 0] > gaussians.means[straddling, 0] + 0.004).all()
+    )
     facts = found.labels.metadata["sharpened"]
     assert facts["agreement"] == [before, after]
     assert facts["options"]["sharpen_steps"] == 200
@@ -149,25 +151,25 @@ def test_codes_have_the_exact_value_and_gradient_on_average(scene) -> None:
         return float(value.detach()), leaf.opacities.grad
 
     def exact(leaf):
-        paper = maps.label_map(view.name).ids
+        label_map = maps.label_map(view.name).ids
         same = 0.0
         for id in (LEFT, RIGHT):
             signal = (labels == id).float().unsqueeze(1)
-            drawn = render(leaf, view.camera, signal, backend="cpu").image[..., 0]
-            same = same + (drawn * (paper == id)).sum()
-        return 0.3 * (1 - same / paper.numel())
+            rendered = render(leaf, view.camera, signal, backend="cpu").image[..., 0]
+            same = same + (rendered * (label_map == id)).sum()
+        return 0.3 * (1 - same / label_map.numel())
 
     options = SharpenOptions(label_weight=0.3, codes=1)
     generator = torch.Generator().manual_seed(0)
-    term = _LabelTerm(_Papers(maps), labels, options, generator, "cpu")
-    value, slope = 0.0, torch.zeros(len(gaussians))
+    loss = _LabelLoss(_CachedLabelMaps(maps), labels, options, generator, "cpu")
+    value, mean_gradient = 0.0, torch.zeros(len(gaussians))
     for _ in range(400):
-        one, gradient = gradient_of(lambda leaf: term(view, leaf, rows))
-        value, slope = value + one / 400, slope + gradient / 400
-    wanted, wanted_slope = gradient_of(exact)
+        one, one_gradient = gradient_of(lambda leaf: loss(view, leaf, rows))
+        value, mean_gradient = value + one / 400, mean_gradient + one_gradient / 400
+    wanted, wanted_gradient = gradient_of(exact)
     # The codes of two ids agree or do not: the mean of 400 is within 4 / sqrt(400) of its own.
     assert value == pytest.approx(wanted, abs=0.2 * 0.3)
-    error = (slope - wanted_slope).norm() / wanted_slope.norm()
+    error = (mean_gradient - wanted_gradient).norm() / wanted_gradient.norm()
     assert float(error) < 0.2
 
 
@@ -180,10 +182,12 @@ def test_pixels_and_gaussians_without_a_label_say_nothing(scene) -> None:
     ids = torch.full((24, 32), LEFT, dtype=torch.int32)
     all_left = torch.full((len(gaussians),), LEFT, dtype=torch.int32)
 
-    def value(paper, labels) -> float:
-        papers = _Papers(Maps({view.name: paper}))
+    def value(label_map, labels) -> float:
+        label_maps = _CachedLabelMaps(Maps({view.name: label_map}))
         options = SharpenOptions(label_weight=1.0)
-        return float(_LabelTerm(papers, labels, options, generator, "cpu")(view, gaussians, rows))
+        return float(
+            _LabelLoss(label_maps, labels, options, generator, "cpu")(view, gaussians, rows)
+        )
 
     alpha = float(render(gaussians, view.camera, backend="cpu").alpha.mean())
     assert value(LabelMap(ids=ids), all_left) == pytest.approx(1 - alpha, abs=1e-5)
@@ -193,13 +197,13 @@ def test_pixels_and_gaussians_without_a_label_say_nothing(scene) -> None:
     sure = torch.zeros(24, 32)
     sure[:, :16] = 0.5
     left_alpha = float(render(gaussians, view.camera, backend="cpu").alpha[:, :16].mean())
-    paper = LabelMap(ids=ids, confidence=sure)
-    assert value(paper, all_left) == pytest.approx(1 - left_alpha, abs=1e-5)
+    label_map = LabelMap(ids=ids, confidence=sure)
+    assert value(label_map, all_left) == pytest.approx(1 - left_alpha, abs=1e-5)
 
 
 def test_distorted_and_reduced_maps_count_in_their_own_pixels(tmp_path) -> None:
     gaussians, views, maps = photographed(tmp_path, *wall(**BARREL))
-    half = {name: LabelMap(ids=paper.ids[::2, ::2]) for name, paper in maps.maps.items()}
+    half = {name: LabelMap(ids=label_map.ids[::2, ::2]) for name, label_map in maps.maps.items()}
     for source in (maps, Maps(half)):
         found = sharpen(
             gaussians, views, source, options=OPTIONS, fit_options=BLACK, confusion=None,
@@ -229,13 +233,13 @@ def test_neither_threads_nor_the_order_of_views_matter_but_the_seed(scene) -> No
 
 def test_steps_are_reported_and_none_leaves_everything(scene) -> None:
     gaussians, views, maps = scene
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     options = replace(OPTIONS, sharpen_steps=3)
     sharpen(
         gaussians, views, maps, options=options, backend="cpu",
-        progress=lambda done, total: told.append((done, total)),
+        progress=lambda done, total: reported.append((done, total)),
     )  # fmt: skip
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert reported == [(1, 3), (2, 3), (3, 3)]
     found = sharpen(
         gaussians, views, maps, options=replace(OPTIONS, sharpen_steps=0), confusion=None,
         backend="cpu",
@@ -321,7 +325,7 @@ def test_agreement_of_the_label_and_not_of_the_majority() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"sharpen_steps": -1}, "sharpen_steps"),
         ({"label_weight": float("nan")}, "label_weight"),
@@ -333,8 +337,8 @@ def test_agreement_of_the_label_and_not_of_the_majority() -> None:
         ({"rates_from": 1.1}, "rates_from"),
     ],
 )
-def test_options_are_checked(change, says) -> None:
-    with pytest.raises(RangeError, match=says):
+def test_options_are_checked(change, message) -> None:
+    with pytest.raises(RangeError, match=message):
         SharpenOptions(**change)
 
 

@@ -84,7 +84,7 @@ def test_candidates_are_exact_whatever_the_memory(rng, views, memory) -> None:
     assert torch.equal(labels.candidates[real].long(), torch.tensor(IDS)[order[:, :3]][real])
     assert bool((labels.candidates[~real] == -1).all())
     assert calls == [(1, 3), (2, 3), (3, 3)]
-    assert labels.metadata["largest_doubt"] == 0
+    assert labels.metadata["largest_error_bound"] == 0
 
 
 def test_voids_cast_no_vote_and_unseen_gaussians_have_no_label(views) -> None:

@@ -16,7 +16,7 @@ def ranked(ids, votes, total) -> Ranking:
         ids=torch.tensor(ids, dtype=torch.int32),
         votes=torch.tensor(votes),
         total=torch.tensor(total),
-        doubt=torch.zeros(len(total)),
+        error_bound=torch.zeros(len(total)),
     )
 
 

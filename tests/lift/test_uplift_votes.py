@@ -65,7 +65,7 @@ def test_columns_are_exact(rng, sparse) -> None:
         assert float(ranking.total[row]) == pytest.approx(sum(votes.values()), rel=1e-5)
         assert ranking.votes[row].tolist() == sorted(ranking.votes[row].tolist(), reverse=True)
     assert ranking.ids[COUNT - 1].tolist() == [-1] * 6
-    assert float(ranking.total[COUNT - 1]) == float(ranking.doubt.sum()) == 0
+    assert float(ranking.total[COUNT - 1]) == float(ranking.error_bound.sum()) == 0
 
 
 def test_few_ids_stay_exact_in_slots(rng) -> None:
@@ -80,7 +80,7 @@ def test_few_ids_stay_exact_in_slots(rng) -> None:
     ranking = table.rank(4)
     for row, votes in readable(batches).items():
         assert as_dict(ranking, row) == pytest.approx(votes, rel=1e-5)
-    assert float(ranking.doubt.max()) == 0
+    assert float(ranking.error_bound.max()) == 0
 
 
 def test_slots_follow_the_textbook(rng) -> None:
@@ -97,7 +97,7 @@ def test_slots_follow_the_textbook(rng) -> None:
     ranking = table.rank(size)
     for row, kept in slots.items():
         assert as_dict(ranking, row) == pytest.approx(kept, rel=1e-4, abs=1e-4)
-        assert float(ranking.doubt[row]) == pytest.approx(lost[row], rel=1e-4)
+        assert float(ranking.error_bound[row]) == pytest.approx(lost[row], rel=1e-4)
 
 
 @pytest.mark.parametrize("memory", [1, 4 * COUNT * 20])
@@ -111,16 +111,16 @@ def test_what_is_lost_is_bounded(rng, memory) -> None:
     assert not table.exact
     ranking = table.rank(slots)
     votes = readable(batches)
-    assert float(ranking.doubt.max()) > 0
+    assert float(ranking.error_bound.max()) > 0
     for row, true in votes.items():
         kept = as_dict(ranking, row)
-        doubt = float(ranking.doubt[row])
+        error_bound = float(ranking.error_bound[row])
         for id, weight in true.items():
             assert kept.get(id, 0.0) <= weight + 1e-4
-            assert kept.get(id, 0.0) + doubt >= weight - 1e-4
+            assert kept.get(id, 0.0) + error_bound >= weight - 1e-4
         total = sum(true.values())
         assert float(ranking.total[row]) == pytest.approx(total, rel=1e-5)
-        assert doubt <= (total - sum(kept.values())) / (slots + 1) + 1e-4
+        assert error_bound <= (total - sum(kept.values())) / (slots + 1) + 1e-4
 
 
 def test_a_heavy_id_survives_any_number_of_light_ones() -> None:
@@ -131,7 +131,7 @@ def test_a_heavy_id_survives_any_number_of_light_ones() -> None:
         table.add_sparse(names, torch.zeros(2, dtype=torch.int64), torch.tensor([0.6, 1.0]))
     ranking = table.rank(1)
     assert ranking.ids.tolist() == [[7]]
-    assert float(ranking.votes[0, 0]) + float(ranking.doubt[0]) >= 60 - 1e-3
+    assert float(ranking.votes[0, 0]) + float(ranking.error_bound[0]) >= 60 - 1e-3
 
 
 def test_names_of_ids_change_nothing_but_their_names(rng) -> None:

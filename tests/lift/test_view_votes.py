@@ -31,13 +31,13 @@ def angle_of(camera: Camera) -> float:
     return float(np.arctan2(y, x) % (2 * np.pi))
 
 
-def correlation(says, *, views=24, count=80, dense=True) -> float | None:
-    """Of Gaussians at the origin of which a view says `says(row, camera)`."""
+def correlation(votes_for_second, *, views=24, count=80, dense=True) -> float | None:
+    """Rho of Gaussians at the origin, for the second id where `votes_for_second(row, camera)`."""
     votes = ViewVotes(torch.zeros(count, 3))
     total = torch.zeros(count, 2)
     rows = torch.arange(count)
     for camera in ring(views):
-        second = torch.tensor([bool(says(row, camera)) for row in range(count)])
+        second = torch.tensor([bool(votes_for_second(row, camera)) for row in range(count)])
         sums = torch.stack((~second, second), dim=1).float()
         total += sums
         if dense:
@@ -54,7 +54,7 @@ def correlation(says, *, views=24, count=80, dense=True) -> float | None:
 @pytest.mark.parametrize("dense", [True, False])
 def test_errors_of_a_range_of_views_correlate(dense) -> None:
     """A third of the ring calls it nightstand. Of 24 views only those at the two ends of the
-    range may have a nearest view that says otherwise."""
+    range may have a nearest view that votes otherwise."""
     found = correlation(lambda _, camera: angle_of(camera) < 2 * np.pi / 3 - 0.01, dense=dense)
     assert found is not None
     by_chance = (8 * 7 + 16 * 15) / (24 * 23)
@@ -74,7 +74,7 @@ def test_every_second_view_is_the_opposite() -> None:
     assert found == pytest.approx(-by_chance / (1 - by_chance))
 
 
-def test_too_little_that_is_contested_says_nothing() -> None:
+def test_too_little_that_is_contested_gives_none() -> None:
     def third(row: int, camera: Camera) -> bool:
         return angle_of(camera) < 2
 

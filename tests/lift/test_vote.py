@@ -9,7 +9,7 @@ import torch
 
 from splatseg.core import Camera, ClassInfo, ClassTable, LabelMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.centres import centres_in, majority_map, own_weights
+from splatseg.lift.mass.centres import centre_weights, centres_in, majority_map
 from splatseg.methods.vote import VoteOptions, vote
 from splatseg.render import RenderOptions, prepare, weights
 
@@ -31,9 +31,9 @@ def halves(left: int, right: int, *, confidence=None) -> LabelMap:
     return LabelMap(ids=ids, confidence=confidence)
 
 
-def ballots(*maps: LabelMap) -> tuple[list[View], Maps]:
+def votes_of(*maps: LabelMap) -> tuple[list[View], Maps]:
     views = [View(name=f"v{i}", camera=camera_at()) for i in range(len(maps))]
-    return views, Maps({view.name: paper for view, paper in zip(views, maps, strict=True)})
+    return views, Maps({view.name: label_map for view, label_map in zip(views, maps, strict=True)})
 
 
 def voted(gaussians, views, maps, **changes):
@@ -75,7 +75,7 @@ def test_each_view_votes_for_the_id_at_the_centre(rng, lens, memory) -> None:
 
 def test_published_votes_are_of_all_views() -> None:
     """Id 1 in three of four views; in the fourth the camera looks away."""
-    views, maps = ballots(*(halves(1, 2),) * 4)
+    views, maps = votes_of(*(halves(1, 2),) * 4)
     away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
     views[3] = View(name="v3", camera=replace(camera_at(), cam_from_world=away))
     gaussians = gaussians_at([LEFT])
@@ -96,7 +96,7 @@ def test_published_votes_are_of_all_views() -> None:
 
 
 def test_void_pixels_say_nothing_or_no() -> None:
-    views, maps = ballots(halves(1, -1), halves(-1, -1), halves(-1, -1))
+    views, maps = votes_of(halves(1, -1), halves(-1, -1), halves(-1, -1))
     gaussians = gaussians_at([LEFT, RIGHT])
     labels = voted(gaussians, views, maps)
     assert labels.ids.tolist() == [1, -1]
@@ -152,22 +152,22 @@ def test_transmittance_weighs_the_votes(rng, views) -> None:
     torch.testing.assert_close(labels.shares.double(), expected, rtol=0, atol=5e-3)
     unseen = votes.sum(dim=1) == 0
     assert bool((labels.ids[unseen] == -1).all())
-    least = voted(gaussians, views, maps, occlusion="weight", min_weight=0.5)
+    minimum = voted(gaussians, views, maps, occlusion="weight", min_weight=0.5)
     strong = sum(
         float(matrix_of(gaussians, view.camera)[v, u, 3]) >= 0.5
         for view in views
         for u, v in [view.camera.project(gaussians.means.double())[0][3].floor().long().tolist()]
         if 0 <= u < 16 and 0 <= v < 12
     )
-    assert least.evidence is not None
-    assert float(least.evidence[3]) == strong
+    assert minimum.evidence is not None
+    assert float(minimum.evidence[3]) == strong
 
 
 def test_own_weights_are_entries_of_w(rng) -> None:
     gaussians, camera = random_gaussians(rng, 40), camera_at(**BARREL)
     centres = centres_in(gaussians.means, camera, near=0.01)
     with prepare(gaussians, camera, options=RenderOptions(), backend=BACKEND) as view:
-        found = own_weights(centres, gaussians, view)
+        found = centre_weights(centres, gaussians, view)
     rows = weights(gaussians, camera, centres.pixels, backend=BACKEND)
     for m, i in enumerate(centres.gaussians.tolist()):
         span = slice(int(rows.indptr[m]), int(rows.indptr[m + 1]))
@@ -204,7 +204,7 @@ def test_regions_vote_for_their_commonest_id() -> None:
     whole = torch.where(torch.rand(12, 16, generator=torch.Generator().manual_seed(1)) < 0.6, 7, 2)
     assert bool((majority_map(whole, 20) == 7).all())
     speck = halves(1, 2).ids.clone()
-    views, maps = ballots(LabelMap(ids=speck))
+    views, maps = votes_of(LabelMap(ids=speck))
     gaussians = gaussians_at([LEFT])
     column, row = views[0].camera.project(gaussians.means)[0][0].floor().long().tolist()
     speck[row, column] = 9
@@ -215,7 +215,7 @@ def test_regions_vote_for_their_commonest_id() -> None:
 
 def test_confidence_and_reduced_maps() -> None:
     sure = torch.full((12, 16), 0.9)
-    views, maps = ballots(
+    views, maps = votes_of(
         halves(1, 1, confidence=sure), halves(2, 2, confidence=0.5 * sure), halves(2, 2)
     )
     labels = voted(gaussians_at([LEFT]), views, maps, candidates=2)
@@ -259,7 +259,7 @@ def test_metadata_says_how_it_was_made(rng, views) -> None:
 
 
 def test_an_empty_scene_has_no_votes() -> None:
-    views, maps = ballots(halves(1, 2))
+    views, maps = votes_of(halves(1, 2))
     assert len(voted(gaussians_at(torch.zeros(0, 3)), views, maps)) == 0
 
 

@@ -24,7 +24,8 @@ from splatseg.edit.document import Document
 from splatseg.errors import InputError
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import label_map
-from splatseg.lift.boundaries.cut import cut_box, cut_masks
+from splatseg.lift.boundaries.box import cut_box
+from splatseg.lift.boundaries.cut import cut_masks
 
 Progress = Callable[[int, int], None]
 MOVES = ("duplicate", "transform", "merge", "remove", "extract")
@@ -155,7 +156,7 @@ def _cut_layer(task: _Task, named: Selection) -> tuple[Edited, Selection, int]:
         progress=task.progress,
     )
     edited = found.edited
-    judged = found.known > 0
+    judged = found.evidence > 0
     if cut.by == "layer":
         # What the layer draws says nothing new of a Gaussian that is still whole.
         judged &= (

@@ -18,7 +18,7 @@ from splatseg.core import (
     layer_address,
 )
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.boundaries.cut import box_corners
+from splatseg.lift.boundaries.box import box_corners
 
 _BOX = 6
 

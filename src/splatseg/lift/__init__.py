@@ -3,9 +3,9 @@
 from splatseg.lift.attachment.attach import Attached as Attached
 from splatseg.lift.attachment.attach import AttachOptions as AttachOptions
 from splatseg.lift.attachment.attach import attach as attach
+from splatseg.lift.boundaries.box import cut_box as cut_box
 from splatseg.lift.boundaries.cut import Cut as Cut
 from splatseg.lift.boundaries.cut import CutOptions as CutOptions
-from splatseg.lift.boundaries.cut import cut_box as cut_box
 from splatseg.lift.boundaries.cut import cut_labels as cut_labels
 from splatseg.lift.boundaries.cut import cut_masks as cut_masks
 from splatseg.lift.boundaries.sharpen import Sharpened as Sharpened

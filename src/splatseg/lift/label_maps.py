@@ -1,13 +1,13 @@
 r"""From a layer of labels to the label map of a view.
 
-A pixel's id is the one with most blending weight behind it:
+A pixel's id is the one with the largest blending weight:
 
 .. math:: s_c(p) = \sum_i w_{pi}\, a_{ic} + [c = b] \Bigl(1 - \sum_i w_{pi}\Bigr), \qquad
           \mathrm{id}(p) = \arg\max_c s_c(p)
 
 where :math:`a_{ic}` is 1 for the label of Gaussian i and 0 else (a hard layer), or its share of
 the evidence (a soft layer). No label, -1, competes as one more id: a hard layer's unlabelled
-Gaussians stand for it, a soft layer's missing shares. The light that passes every Gaussian
+Gaussians stand for it, a soft layer's missing shares. The transmittance behind all Gaussians
 stands for the layer's background label b, and for no label where it has none.
 """
 
@@ -32,10 +32,10 @@ def label_map(
     backend: str = "auto",
     channels: int = 32,
 ) -> LabelMap:
-    """The label map that a layer shows in a view, in the pixels of any camera.
+    """The label map that a layer has in a view, in the pixels of any camera.
 
-    Ids are drawn a few at a time with a running maximum, so that memory does not grow with
-    their number; of many ids only those with a Gaussian in this view are drawn. Ties go to the
+    Ids are rendered a few at a time with a running maximum, so that memory does not grow with
+    their number; of many ids only those with a Gaussian in this view are rendered. Ties go to the
     smaller id, and -1 loses every tie. With lens distortion a pixel of the photograph takes the
     id of the pinhole pixel that its centre falls into.
 
@@ -45,10 +45,10 @@ def label_map(
         labels: Their labels, one row a Gaussian; soft where it has candidates.
         options: Switches of the blending model.
         backend: Name of the rendering backend.
-        channels: Ids drawn at a time, at least 1.
+        channels: Ids rendered at a time, at least 1.
 
     Returns:
-        Ids, and as confidence the winner's score, its share of the pixel's light in [0, 1].
+        Ids, and as confidence the winner's score, its share of the pixel's weight in [0, 1].
 
     Raises:
         ShapeError: If `labels` has another number of rows than `gaussians`.
@@ -62,60 +62,62 @@ def label_map(
         raise RangeError(f"channels: expected at least 1, got {channels}.")
     pinhole = undistorted_camera(camera)
     with prepare(gaussians, pinhole, options=options, backend=backend) as view:
-        draw = _Drawing(gaussians, view)
-        winner, best = _strongest(draw, labels, _ids_to_draw(draw, labels, channels), channels)
-    return _in_photograph(camera, winner, best.clamp(0, 1))
+        renderer = _ViewRenderer(gaussians, view)
+        winner, best = _best_ids(
+            renderer, labels, _possible_ids(renderer, labels, channels), channels
+        )
+    return _warped(camera, winner, best.clamp(0, 1))
 
 
-def _strongest(
-    draw: "_Drawing", labels: Labels, ids: Sequence[int], channels: int
+def _best_ids(
+    renderer: "_ViewRenderer", labels: Labels, ids: Sequence[int], channels: int
 ) -> tuple[Tensor, Tensor]:
     """The id with the highest score of each pixel, and the score."""
-    best = torch.full(draw.size, -1.0)
-    winner = torch.full(draw.size, UNLABELLED, dtype=torch.int32)
+    best = torch.full(renderer.size, -1.0)
+    winner = torch.full(renderer.size, UNLABELLED, dtype=torch.int32)
     residual: Tensor | None = None
     for start in range(0, len(ids), channels):
-        part = ids[start : start + channels]
-        scores, alpha = draw.scores(_signal(labels, part))
+        chunk = ids[start : start + channels]
+        scores, alpha = renderer.scores(_signal(labels, chunk))
         if residual is None:
             residual = (1 - alpha).clamp_min(0)
-        if labels.background in part:
-            scores[..., part.index(labels.background)] += residual
+        if labels.background in chunk:
+            scores[..., chunk.index(labels.background)] += residual
         score, column = scores.max(dim=-1)
         better = score > best
         best = torch.where(better, score, best)
-        winner = torch.where(better, torch.tensor(part, dtype=torch.int32)[column], winner)
+        winner = torch.where(better, torch.tensor(chunk, dtype=torch.int32)[column], winner)
     return winner, best
 
 
-class _Drawing:
-    """One pinhole view, drawn with one signal after another."""
+class _ViewRenderer:
+    """Renders one signal after another in a pinhole view."""
 
     def __init__(self, gaussians: Gaussians, view: PreparedView) -> None:
-        self._like = gaussians.means
+        self._means = gaussians.means
         self._view = view
         self.size = (view.camera.height, view.camera.width)
 
     def scores(self, signal: Float[Tensor, "n ids"]) -> tuple[Tensor, Tensor]:
         """Scores (H, W, ids) and alpha (H, W) of the view."""
         with torch.no_grad():
-            drawn = self._view.render(signal.to(self._like))
-        return drawn.image.float().cpu(), drawn.alpha.float().cpu()
+            rendered = self._view.render(signal.to(self._means))
+        return rendered.image.float().cpu(), rendered.alpha.float().cpu()
 
     def visible(self) -> Bool[Tensor, "n"]:
         """Which Gaussians have any weight in the view."""
         with torch.no_grad():
-            seen = self._view.back_project(self._like.new_zeros(*self.size, 1))
+            seen = self._view.back_project(self._means.new_zeros(*self.size, 1))
         return seen.weights.cpu() > 0
 
 
-def _ids_to_draw(draw: _Drawing, labels: Labels, channels: int) -> list[int]:
+def _possible_ids(renderer: _ViewRenderer, labels: Labels, channels: int) -> list[int]:
     """Ids that can win a pixel, ascending, with -1 behind them so that it loses ties."""
     labels_cpu = labels.ids.cpu() if labels.candidates is None else labels.candidates.cpu()
-    present = torch.unique(labels_cpu)
-    if len(present) > channels:
-        present = torch.unique(labels_cpu[draw.visible()])
-    ids = {int(i) for i in present.tolist()} | {labels.background}
+    present_ids = torch.unique(labels_cpu)
+    if len(present_ids) > channels:
+        present_ids = torch.unique(labels_cpu[renderer.visible()])
+    ids = {int(i) for i in present_ids.tolist()} | {labels.background}
     return [*sorted(ids - {UNLABELLED}), UNLABELLED]
 
 
@@ -137,10 +139,10 @@ def _signal(labels: Labels, ids: Sequence[int]) -> Float[Tensor, "n ids"]:
     return signal
 
 
-def _in_photograph(camera: Camera, ids: Tensor, confidence: Tensor) -> LabelMap:
+def _warped(camera: Camera, ids: Tensor, confidence: Tensor) -> LabelMap:
     if camera.is_pinhole:
         return LabelMap(ids=ids, confidence=confidence)
     # float64 holds every int32 exactly.
-    lens = warp_into_photograph(camera, "nearest")
-    both = lens.apply(torch.stack((ids.double(), confidence.double()), dim=-1))
+    warp = warp_into_photograph(camera, "nearest")
+    both = warp.apply(torch.stack((ids.double(), confidence.double()), dim=-1))
     return LabelMap(ids=both[..., 0].to(torch.int32), confidence=both[..., 1].float())

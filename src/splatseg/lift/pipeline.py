@@ -28,9 +28,9 @@ def lift_labels(
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Labels:
-    """Label Gaussians by label maps as well as it is known how; what `segment` does by default.
+    """Label Gaussians by label maps: the default pipeline of `segment`.
 
-    The votes of `uplift`, decided anew under how often the evidence takes one id for another
+    The votes of `uplift`, relabelled by how often the evidence confuses ids
     (`correct_confusion`), and completed where no view sees anything (`complete`).
 
     Args:
@@ -55,14 +55,12 @@ def lift_labels(
     """
     options = options or UpliftOptions()
     relabel = confusion is not None and options.label_rule == "share"
-    wanted = options.candidates
-    if relabel and wanted < 2:
-        options = replace(options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES))
+    hard = options.candidates < 2
     labels = uplift(
         gaussians,
         views,
         evidence,
-        options=options,
+        options=_with_candidates(options) if relabel and hard else options,
         classes=classes,
         render_options=render_options,
         backend=backend,
@@ -72,8 +70,13 @@ def lift_labels(
         labels = correct_confusion(
             labels, options=confusion, view_correlation=labels.metadata["view_correlation"]
         )
-        if wanted < 2:
+        if hard:
             labels = replace(labels, candidates=None, shares=None)
     if completion is not None and bool((labels.ids != UNLABELLED).any()):
         labels = complete(gaussians, labels, options=completion)
     return labels
+
+
+def _with_candidates(options: UpliftOptions) -> UpliftOptions:
+    """The same votes for a soft layer, as relabelling needs it."""
+    return replace(options, candidates=_CANDIDATES, slots=max(options.slots, _CANDIDATES))

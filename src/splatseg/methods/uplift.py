@@ -29,7 +29,7 @@ def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
     """Label Gaussians by votes of pixels, see `lift.pipeline.lift_labels`."""
     confusion = options.confusion if options.correct_confusion else None
     if confusion is not None and inputs.evidence.kind != "labels":
-        # A tracker's names for one thing follow each other by ranges of views: to gather them is
+        # A tracker's ids of one thing follow each other by ranges of views: to gather them is
         # what relabelling is for.
         confusion = replace(confusion, max_correlation=1.0)
     return lift_labels(

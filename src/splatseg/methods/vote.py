@@ -1,7 +1,7 @@
-r"""Vote: every Gaussian asks each view for the id at the pixel that its centre falls into.
+r"""Vote: each view votes on a Gaussian by the id at the pixel that its centre falls into.
 
 The simplest way to lift labels, and the one of SA-GS and its followers; a baseline beside
-`uplift`, which asks all the pixels a Gaussian shows. With :math:`P_j` the projection of view j
+`uplift`, where all pixels that show a Gaussian vote. With :math:`P_j` the projection of view j
 and :math:`L_j` its label map,
 
 .. math:: v_{ic} = \sum_j u_{ij} \, [L_j(P_j \mu_i) = c], \qquad
@@ -10,7 +10,7 @@ and :math:`L_j` its label map,
 where :math:`u_{ij}` is 1, or the blending weight of the Gaussian at that pixel, and :math:`N_i`
 what all ids got from the views that see the Gaussian (``visible``) or the number of all views
 (``published``). Published, a view that does not see a Gaussian, or sees it on an unlabelled
-pixel, votes against every id, so that an object in less than 70 % of the views has no chance.
+pixel, votes against every id, so that an object in less than 70 % of the views is lost.
 
 A centre is seen through whatever hides it, unless the occlusion test is asked for.
 
@@ -43,7 +43,7 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import voting_views
-from splatseg.lift.mass.centres import Centres, centres_in, in_front, majority_map, own_weights
+from splatseg.lift.mass.centres import Centres, centre_weights, centres_in, majority_map, unoccluded
 from splatseg.lift.mass.vote_table import VoteTable
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import PreparedView, RenderOptions, options_for, prepare
@@ -94,7 +94,7 @@ class VoteOptions:
 
     candidates: int = 1
     """Ids kept for each Gaussian. 1 makes a hard layer; with more the layer keeps their shares
-    and is drawn softly."""
+    and is rendered softly."""
 
     memory: int = 1 << 30
     """Bytes of an exact table of votes, 4 for each id and Gaussian. With more ids than fit, each
@@ -153,7 +153,7 @@ def vote(
 
     Returns:
         The layer, with the sum of a Gaussian's votes as its evidence: views, not pixels. There is
-        no background label, because light that passes everything has no centre.
+        no background label, because what no Gaussian covers has no centre.
 
     Raises:
         InputError: If there are no views, if one has no label map, or no centre falls on a
@@ -163,36 +163,49 @@ def vote(
     options = options or VoteOptions()
     ordered = voting_views(views, evidence, "a label map")
     gaussians.check_values()
-    booth = _Booth(
+    voter = _CentreVoter(
         gaussians=gaussians,
         options=options,
-        drawing=render_options or options_for(gaussians, backend),
+        render_options=render_options or options_for(gaussians, backend),
         backend=backend,
     )
-    slots = max(_SLOTS, options.candidates)
-    table = VoteTable(len(gaussians), memory=options.memory, slots=slots)
-    against = torch.zeros(len(gaussians))
+    table, against, ids = _collected(voter, ordered, evidence, progress)
+    return _decide(table, against, options, views=ordered, names=_names(classes, ids))
+
+
+def _collected(
+    voter: "_CentreVoter",
+    ordered: Sequence[View],
+    evidence: LabelSource,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[VoteTable, Tensor, set[int]]:
+    """Votes for ids, votes of unlabelled pixels (n,), and the ids, of all views."""
+    count = len(voter.gaussians)
+    slots = max(_SLOTS, voter.options.candidates)
+    table = VoteTable(count, memory=voter.options.memory, slots=slots)
+    against = torch.zeros(count)
     ids: set[int] = set()
     for done, view in enumerate(ordered):
-        paper = evidence.label_map(view.name)
-        cast = booth.cast(camera_of_map(view, paper.height, paper.width), paper)
-        labelled = cast.ids != UNLABELLED
-        table.add_sparse(cast.ids[labelled], cast.gaussians[labelled], cast.weights[labelled])
-        against.index_add_(0, cast.gaussians[~labelled], cast.weights[~labelled])
-        ids.update(torch.unique(cast.ids[labelled]).tolist())
+        label_map = evidence.label_map(view.name)
+        camera = camera_of_map(view, label_map.height, label_map.width)
+        votes = voter.view_votes(camera, label_map)
+        labelled = votes.ids != UNLABELLED
+        table.add_sparse(votes.ids[labelled], votes.gaussians[labelled], votes.weights[labelled])
+        against.index_add_(0, votes.gaussians[~labelled], votes.weights[~labelled])
+        ids.update(torch.unique(votes.ids[labelled]).tolist())
         if progress is not None:
             progress(done + 1, len(ordered))
-    if not ids and len(gaussians):
+    if not ids and count:
         raise InputError(
             f"evidence: expected a labelled pixel at a Gaussian's centre in {len(ordered)} views, "
             "found none."
         )
-    return _elected(table, against, options, views=ordered, names=_names(classes, ids))
+    return table, against, ids
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Cast:
-    """What one view says: at most one id a Gaussian, -1 for an unlabelled pixel."""
+class _ViewVotes:
+    """Votes of one view: at most one id a Gaussian, -1 for an unlabelled pixel."""
 
     gaussians: Tensor
     ids: Tensor
@@ -200,43 +213,49 @@ class _Cast:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Booth:
-    """Where votes are cast."""
+class _CentreVoter:
+    """Reads label maps at the pixels of the centres of Gaussians."""
 
     gaussians: Gaussians
     options: VoteOptions
-    drawing: RenderOptions
+    render_options: RenderOptions
     backend: str
 
-    def cast(self, camera: Camera, paper: LabelMap) -> _Cast:
-        centres = centres_in(self.gaussians.means, camera, near=self.drawing.near)
-        with prepare(self.gaussians, camera, options=self.drawing, backend=self.backend) as view:
+    def view_votes(self, camera: Camera, label_map: LabelMap) -> _ViewVotes:
+        centres = centres_in(self.gaussians.means, camera, near=self.render_options.near)
+        with prepare(
+            self.gaussians, camera, options=self.render_options, backend=self.backend
+        ) as view:
             centres, weight = self._seen(centres, view)
         column, row = centres.pixels.unbind(dim=1)
-        say = torch.ones(len(weight))
+        vote_weight = torch.ones(len(weight))
         if self.options.weight == "transmittance":
-            say = weight
-        if paper.confidence is not None:
-            say = say * paper.confidence.cpu().float()[row, column]
-        ids = majority_map(paper.ids.cpu(), self.options.region)
-        return _Cast(gaussians=centres.gaussians, ids=ids[row, column].long(), weights=say)
+            vote_weight = weight
+        if label_map.confidence is not None:
+            vote_weight = vote_weight * label_map.confidence.cpu().float()[row, column]
+        ids = majority_map(label_map.ids.cpu(), self.options.region)
+        return _ViewVotes(
+            gaussians=centres.gaussians, ids=ids[row, column].long(), weights=vote_weight
+        )
 
     def _seen(self, centres: Centres, view: PreparedView) -> tuple[Centres, Tensor]:
         """The centres that pass the occlusion test, and their weights where they are needed."""
-        how = self.options.occlusion
-        if how == "depth":
-            front = in_front(centres, self.gaussians, view, tolerance=self.options.depth_tolerance)
-            centres = centres[front]
+        test = self.options.occlusion
+        if test == "depth":
+            visible = unoccluded(
+                centres, self.gaussians, view, tolerance=self.options.depth_tolerance
+            )
+            centres = centres[visible]
         weight = torch.ones(len(centres.gaussians))
-        if how == "weight" or self.options.weight == "transmittance":
-            weight = own_weights(centres, self.gaussians, view)
-            least = self.options.min_weight if how == "weight" else 0.0
-            seen = (weight > 0) & (weight >= least)
+        if test == "weight" or self.options.weight == "transmittance":
+            weight = centre_weights(centres, self.gaussians, view)
+            min_weight = self.options.min_weight if test == "weight" else 0.0
+            seen = (weight > 0) & (weight >= min_weight)
             centres, weight = centres[seen], weight[seen]
         return centres, weight
 
 
-def _elected(
+def _decide(
     table: VoteTable,
     against: Tensor,
     options: VoteOptions,
@@ -251,11 +270,11 @@ def _elected(
     shares = ranking.votes / torch.where(total > 0, total, 1.0).unsqueeze(1)
     # Sums in float32 may leave a lone id's share a hair above 1.
     shares = shares.clamp(0, 1)
-    sure = (ranking.ids[:, 0] != UNLABELLED) & (shares[:, 0] > options.needed_share)
+    has_label = (ranking.ids[:, 0] != UNLABELLED) & (shares[:, 0] > options.needed_share)
     soft = options.candidates > 1
     return Labels(
-        ids=torch.where(sure, ranking.ids[:, 0], UNLABELLED),
-        confidence=torch.where(sure, shares[:, 0], 0.0),
+        ids=torch.where(has_label, ranking.ids[:, 0], UNLABELLED),
+        confidence=torch.where(has_label, shares[:, 0], 0.0),
         candidates=ranking.ids if soft else None,
         shares=shares if soft else None,
         evidence=ranking.total,

@@ -1,8 +1,8 @@
-"""Labels find their Gaussians again after an editor had the splats.
+"""Re-attachment: labels are carried onto Gaussians that an editor changed.
 
 An editor may drop the columns it does not know, reorder rows, crop, move the scene or a part of
 it, duplicate a part, tint it, or round values on the way into a compressed format. `attach`
-tells which row of the scene each row of the edited file is; `Attached.carry` takes layers along.
+finds which row of the scene each row of the edited file is; `Attached.carry` takes layers along.
 """
 
 from collections.abc import Mapping
@@ -26,14 +26,14 @@ from splatseg.core import (
     Similarity,
 )
 from splatseg.errors import RangeError, ShapeError
-from splatseg.lift.attachment.match import Matches, in_order, match
+from splatseg.lift.attachment.match import Matches, keep_order, match
 from splatseg.lift.attachment.move import Hypothesis, find_move, fit_similarity
 from splatseg.lift.attachment.rows import Rows, extent_of, rows_of
 
 _Layer = TypeVar("_Layer", bound=Layer)
 
 _ROUNDS = 3
-_LEAST_SHARE = 0.02
+_MIN_SHARE = 0.02
 _PROBE = 2000
 """Rows that a move is tried on before all are."""
 
@@ -43,11 +43,11 @@ class AttachOptions:
     """How Gaussians are found again."""
 
     moves: int = 8
-    """Most similarities to look for: one for the whole scene, or one for each part that was
-    moved. 0 takes it that nothing was moved."""
+    """Upper bound of similarities to look for: one for the whole scene, or one for each part that
+    was moved. 0 takes it that nothing was moved."""
 
-    least_part: int = 20
-    """Fewest Gaussians that may have been moved on their own."""
+    min_part: int = 20
+    """Minimum of Gaussians that may have been moved on their own."""
 
     seed: int = 0
     """Of the random triples that moves are found from."""
@@ -55,8 +55,8 @@ class AttachOptions:
     def __post_init__(self) -> None:
         if self.moves < 0:
             raise RangeError(f"moves: expected 0 or more, got {self.moves}.")
-        if self.least_part < 3:
-            raise RangeError(f"least_part: expected at least 3, got {self.least_part}.")
+        if self.min_part < 3:
+            raise RangeError(f"min_part: expected at least 3, got {self.min_part}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -124,7 +124,7 @@ class Attached:
 
     def carry_columns(self, columns: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Further columns of the source, one row an edited Gaussian; 0 where it was not found."""
-        return {name: _taken(column, self.rows, 0) for name, column in columns.items()}
+        return {name: _gathered(column, self.rows, 0) for name, column in columns.items()}
 
 
 def attach(
@@ -160,8 +160,8 @@ def attach(
     options = options or AttachOptions()
     source.check_values()
     edited.check_values()
-    ours, theirs = rows_of(edited), rows_of(source)
-    search = _Search(ours, theirs, np.random.default_rng(options.seed), options)
+    edited_rows, source_rows = rows_of(edited), rows_of(source)
+    search = _Search(edited_rows, source_rows, np.random.default_rng(options.seed), options)
     search.run()
     return search.result()
 
@@ -186,60 +186,64 @@ class _Search:
 
     def run(self) -> None:
         """Where it was first, then elsewhere, then where it was for what a move explains worse."""
-        least = _LEAST_SHARE * len(self._edited)
+        min_found = _MIN_SHARE * len(self._edited)
         stays = (Similarity.identity(), False)
-        in_place = self._try(stays, least=max(1.0, least))
+        in_place = self._match_left(stays, min_found=max(1.0, min_found))
         for _ in range(self._options.moves):
-            left = np.flatnonzero(self._rows < 0)
-            if len(left) < min(self._options.least_part, len(self._edited)):
+            unmatched = np.flatnonzero(self._rows < 0)
+            if len(unmatched) < min(self._options.min_part, len(self._edited)):
                 break
-            if not (self._elsewhere(left, self._free) or self._elsewhere(left, None)):
+            if not (
+                self._find_further(unmatched, self._free) or self._find_further(unmatched, None)
+            ):
                 break
         if not in_place and (self._rows < 0).any():
-            self._try(stays, least=1.0)
+            self._match_left(stays, min_found=1.0)
         if self._ambiguous.any():
-            self._rows = in_order(self._rows, ~self._copies, self._source)
+            self._rows = keep_order(self._rows, ~self._copies, self._source)
 
-    def _elsewhere(self, left: NDArray[np.int64], free: NDArray[np.bool_] | None) -> bool:
+    def _find_further(self, unmatched: NDArray[np.int64], free: NDArray[np.bool_] | None) -> bool:
         """Look for a move of what is left from free source rows, or from any (copies)."""
         pool = np.arange(len(self._source)) if free is None else np.flatnonzero(free)
-        found = find_move(self._edited[left], self._source[pool], self._rng)
+        found = find_move(self._edited[unmatched], self._source[pool], self._rng)
         if found is None:
             return False
-        least = min(self._options.least_part, len(self._edited))
-        return self._try(_of(found), least=least, copies=free is None)
+        min_found = min(self._options.min_part, len(self._edited))
+        return self._match_left(_move(found), min_found=min_found, copies=free is None)
 
-    def _try(self, move: tuple[Similarity, bool], *, least: float, copies: bool = False) -> bool:
+    def _match_left(
+        self, move: tuple[Similarity, bool], *, min_found: float, copies: bool = False
+    ) -> bool:
         """Match what is left under a move, refine it, and keep both if they find enough."""
-        left = np.flatnonzero(self._rows < 0)
-        edited = self._edited[left]
-        if len(left) > _PROBE:
-            few = edited[np.sort(self._rng.permutation(len(left))[:_PROBE])]
-            if (self._matched(few, move, copies).rows < 0).all():
+        unmatched = np.flatnonzero(self._rows < 0)
+        edited = self._edited[unmatched]
+        if len(unmatched) > _PROBE:
+            probe = edited[np.sort(self._rng.permutation(len(unmatched))[:_PROBE])]
+            if (self._match(probe, move, copies).rows < 0).all():
                 return False
-        found = self._matched(edited, move, copies)
+        found = self._match(edited, move, copies)
         for _ in range(_ROUNDS):
             better = self._refitted(edited, move, found)
             if better is None:
                 break
-            again = self._matched(edited, better, copies)
+            again = self._match(edited, better, copies)
             if (again.rows >= 0).sum() < (found.rows >= 0).sum():
                 break
             move, found = better, again
         hit = found.rows >= 0
-        if hit.sum() < least:
+        if hit.sum() < min_found:
             return False
-        rows = left[hit]
+        rows = unmatched[hit]
         self._rows[rows] = found.rows[hit]
         self._move_of[rows] = len(self._moves)
         self._copies[rows] = found.copies[hit] | ~self._free[found.rows[hit]]
         self._ambiguous[rows] = found.ambiguous[hit]
         self._free[found.rows[hit]] = False
         self._moves.append(move)
-        self._noise.append(found.noise.usual.tolist())
+        self._noise.append(found.noise.sigma.tolist())
         return True
 
-    def _matched(self, edited: Rows, move: tuple[Similarity, bool], copies: bool) -> Matches:
+    def _match(self, edited: Rows, move: tuple[Similarity, bool], copies: bool) -> Matches:
         moved = self._source.moved(move[0], mirrored=move[1])
         return match(edited, moved, free=None if copies else self._free)
 
@@ -264,8 +268,8 @@ class _Search:
     def result(self) -> Attached:
         counts = np.bincount(self._move_of[self._move_of >= 0], minlength=len(self._moves))
         order = np.argsort(-counts, kind="stable")
-        place = np.empty(len(order) + 1, np.int64)
-        place[order], place[-1] = np.arange(len(order)), -1
+        rank_of = np.empty(len(order) + 1, np.int64)
+        rank_of[order], rank_of[-1] = np.arange(len(order)), -1
         moves = tuple(
             Move(
                 edited_from_source=self._moves[i][0],
@@ -289,13 +293,13 @@ class _Search:
         }
         return Attached(
             rows=torch.from_numpy(self._rows),
-            move_of=torch.from_numpy(place[self._move_of]),
+            move_of=torch.from_numpy(rank_of[self._move_of]),
             moves=moves,
             report=report,
         )
 
 
-def _of(found: Hypothesis) -> tuple[Similarity, bool]:
+def _move(found: Hypothesis) -> tuple[Similarity, bool]:
     return found.edited_from_source, found.mirrored
 
 
@@ -332,32 +336,32 @@ def _carried(layer: Layer, rows: Tensor) -> Layer:
         case Labels():
             return replace(
                 layer,
-                ids=_taken(layer.ids, rows, UNLABELLED),
-                confidence=_taken(layer.confidence, rows, 0.0),
-                candidates=_taken_if(layer.candidates, rows, UNLABELLED),
-                shares=_taken_if(layer.shares, rows, 0.0),
-                evidence=_taken_if(layer.evidence, rows, 0.0),
-                effective_views=_taken_if(layer.effective_views, rows, 0.0),
-                inferred=_taken_if(layer.inferred, rows, False),  # noqa: FBT003  (a value)
+                ids=_gathered(layer.ids, rows, UNLABELLED),
+                confidence=_gathered(layer.confidence, rows, 0.0),
+                candidates=_gathered_if(layer.candidates, rows, UNLABELLED),
+                shares=_gathered_if(layer.shares, rows, 0.0),
+                evidence=_gathered_if(layer.evidence, rows, 0.0),
+                effective_views=_gathered_if(layer.effective_views, rows, 0.0),
+                inferred=_gathered_if(layer.inferred, rows, False),  # noqa: FBT003  (a value)
             )
         case Features():
             return replace(
                 layer,
-                values=_taken(layer.values, rows, 0.0),
-                weights=_taken_if(layer.weights, rows, 0.0),
+                values=_gathered(layer.values, rows, 0.0),
+                weights=_gathered_if(layer.weights, rows, 0.0),
             )
         case Selection():
-            return replace(layer, mask=_taken(layer.mask, rows, False))  # noqa: FBT003
+            return replace(layer, mask=_gathered(layer.mask, rows, False))  # noqa: FBT003
         case InstanceTree():
             return replace(layer, labels=cast("Labels", _carried(layer.labels, rows)))
 
 
-def _taken(column: Tensor, rows: Tensor, blank: float) -> Tensor:
-    out = column.new_full((len(rows), *column.shape[1:]), blank)
+def _gathered(column: Tensor, rows: Tensor, fill: float) -> Tensor:
+    out = column.new_full((len(rows), *column.shape[1:]), fill)
     found = rows >= 0
     out[found] = column[rows[found]]
     return out
 
 
-def _taken_if(column: Tensor | None, rows: Tensor, blank: float) -> Tensor | None:
-    return None if column is None else _taken(column, rows, blank)
+def _gathered_if(column: Tensor | None, rows: Tensor, fill: float) -> Tensor | None:
+    return None if column is None else _gathered(column, rows, fill)

@@ -1,4 +1,4 @@
-r"""Which row of a scene each row of an edited copy is, once both lie in the same place.
+r"""Which row of a scene each row of an edited copy is, once both lie in the same frame.
 
 Candidates are the nearest centres. A candidate's cost adds up what position, colour, opacity,
 sizes and orientation differ by, each in units of the noise that the data themselves show:
@@ -35,36 +35,38 @@ FURTHER = 64
 """Candidates of a row that found none."""
 
 _BLOCK = 65536
-_FAR = 30.0
-_CLOSE_COST = 1.0
+_MAX_POSITION_FACTOR = 30.0
+_AMBIGUITY_COST = 1.0
 
 # Position, colour, opacity, sizes, orientation.
-_VALUES = np.array([3.0, 3.0, 1.0, 3.0, 2.0])
-_LOOSE = np.array([np.inf, 0.03, 0.012, 0.1, 0.1])
+_DIMENSIONS = np.array([3.0, 3.0, 1.0, 3.0, 2.0])
+_MAX_TOLERANCE = np.array([np.inf, 0.03, 0.012, 0.1, 0.1])
 """What counts as agreement before the noise is known, and at most: beyond any format's steps,
 and little enough that a neighbour rarely agrees in sizes or orientation by chance."""
-_SURE = ((3, 0.02), (2, 0.5))
-"""Agreements of four that make a row sure of itself, and the least share of sure rows that tells
-of the noise. A neighbour agrees in three by chance with less than one row in a hundred."""
-_LEAST = np.array([0.0, 2e-3, 2e-3, 2e-3, 2e-3])
-"""Least noise: rounding of float32 through logs and logits. Of position it goes by the extent."""
+_MIN_AGREEMENTS = ((3, 0.02), (2, 0.5))
+"""Agreements of four that make a row confident, and the minimum share of confident rows that the
+noise is estimated from. A neighbour agrees in three by chance with less than one row in a
+hundred."""
+_MIN_NOISE = np.array([0.0, 2e-3, 2e-3, 2e-3, 2e-3])
+"""Lower bound of noise: rounding of float32 through logs and logits. Of position it goes by the
+extent."""
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Noise:
-    """How far a row is from itself after the edit."""
+    """Residuals of the same row before and after the edit."""
 
-    usual: Floats
+    sigma: Floats
     """(5,) of position, colour, opacity, sizes and orientation."""
 
-    most: Floats
+    tolerance: Floats
     """(5,) beyond which they do not agree."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matches:
-    """Edited rows and the source rows they are."""
+    """Edited rows and their source rows."""
 
     rows: Indices
     """(m,) source row of each edited row, -1 for none."""
@@ -91,44 +93,44 @@ def match(edited: Rows, source: Rows, *, free: NDArray[np.bool_] | None = None) 
         rows=np.full(m, -1),
         copies=np.zeros(m, bool),
         ambiguous=np.zeros(m, bool),
-        noise=Noise(usual=_LEAST, most=_LEAST),
+        noise=Noise(sigma=_MIN_NOISE, tolerance=_MIN_NOISE),
     )
     if not m or not len(source):
         return nothing
-    floor = _LEAST.copy()
-    floor[0] = _ROUNDING * extent_of(source)
-    near = _Nearby.search(edited, source, np.arange(m), NEAREST)
-    noise = _noise(near, floor)
+    min_noise = _MIN_NOISE.copy()
+    min_noise[0] = _ROUNDING * extent_of(source)
+    candidates = _Candidates.search(edited, source, np.arange(m), NEAREST)
+    noise = _estimated_noise(candidates, min_noise)
     if noise is None:
         return nothing
-    costs = near.costs(noise)
-    order, costs = _sorted(near.indices, costs)
+    costs = candidates.costs(noise)
+    order, costs = _sorted(candidates.indices, costs)
     taken = np.zeros(len(source), bool) if free is None else ~free
-    rows = _paired(np.where(taken[order], np.inf, costs), order, len(source))
-    owned = taken.copy()
-    owned[rows[rows >= 0]] = True
-    left = np.flatnonzero(rows < 0)
-    if len(left) and not owned.all():
-        rows[left] = _among_the_rest(edited, source, left, ~owned, noise)
+    rows = _stable_matching(np.where(taken[order], np.inf, costs), order, len(source))
+    assigned = taken.copy()
+    assigned[rows[rows >= 0]] = True
+    unmatched = np.flatnonzero(rows < 0)
+    if len(unmatched) and not assigned.all():
+        rows[unmatched] = _match_remaining(edited, source, unmatched, ~assigned, noise)
     copies = (rows < 0) & np.isfinite(costs[:, 0])
     rows[copies] = order[copies, 0]
-    ambiguous = (rows >= 0) & (costs[:, 1:2] < costs[:, :1] + _CLOSE_COST).any(axis=1)
+    ambiguous = (rows >= 0) & (costs[:, 1:2] < costs[:, :1] + _AMBIGUITY_COST).any(axis=1)
     return Matches(rows=rows, copies=copies, ambiguous=ambiguous, noise=noise)
 
 
-def _among_the_rest(
-    edited: Rows, source: Rows, left: Indices, free: NDArray[np.bool_], noise: Noise
+def _match_remaining(
+    edited: Rows, source: Rows, unmatched: Indices, free: NDArray[np.bool_], noise: Noise
 ) -> Indices:
     """Rows that found nothing, looked for among more of the source rows that nobody has."""
     pool = np.flatnonzero(free)
-    near = _Nearby.search(edited, source[pool], left, FURTHER)
-    order, costs = _sorted(near.indices, near.costs(noise))
-    rows = _paired(costs, order, len(pool))
+    candidates = _Candidates.search(edited, source[pool], unmatched, FURTHER)
+    order, costs = _sorted(candidates.indices, candidates.costs(noise))
+    rows = _stable_matching(costs, order, len(pool))
     return np.where(rows < 0, -1, pool[rows])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Nearby:
+class _Candidates:
     """Some edited rows with their nearest source rows and how they differ."""
 
     indices: Indices
@@ -138,12 +140,12 @@ class _Nearby:
     """(m, k, 5) of position, colour, opacity, sizes and orientation."""
 
     @classmethod
-    def search(cls, edited: Rows, source: Rows, wanted: Indices, count: int) -> "_Nearby":
+    def search(cls, edited: Rows, source: Rows, wanted: Indices, count: int) -> "_Candidates":
         count = min(count, len(source))
         index = NeighbourIndex(torch.from_numpy(source.means))
         found = index.nearest(torch.from_numpy(edited.means[wanted]), count)
         indices = np.sort(found.indices.numpy(), axis=1)
-        residuals = np.empty((*indices.shape, len(_VALUES)), np.float32)
+        residuals = np.empty((*indices.shape, len(_DIMENSIONS)), np.float32)
         source_shapes, edited_shapes = shapes_of(source), shapes_of(edited[wanted])
         for part in _blocks(len(wanted), _BLOCK):
             theirs, ours = indices[part], edited[wanted[part]]
@@ -162,69 +164,71 @@ class _Nearby:
         return cls(indices=indices, residuals=residuals)
 
     def costs(self, noise: Noise) -> Floats:
-        """(m, k), infinite where a candidate is somebody else."""
+        """(m, k), infinite where a candidate is not the same Gaussian."""
         costs = np.empty(self.indices.shape)
         for part in _blocks(len(costs), _BLOCK):
             residuals = self.residuals[part]
-            agree = residuals <= noise.most
-            others = agree[..., 1:].sum(axis=2)
+            agree = residuals <= noise.tolerance
+            other_agreements = agree[..., 1:].sum(axis=2)
             # Formats that round by chunks are coarse where little is: there a row may lie far
             # from itself, if everything else says that it is the same.
-            near = residuals[..., 0] <= _FAR * noise.most[0]
+            near_in_position = residuals[..., 0] <= _MAX_POSITION_FACTOR * noise.tolerance[0]
             # Colour and opacity are those of the neighbours often enough.
-            formed = agree[..., 3] | agree[..., 4]
-            same = (agree[..., 0] & formed & (others >= 2)) | (near & (others == 4))
-            cost = (_VALUES * np.log1p((residuals / noise.usual) ** 2)).sum(axis=2)
+            shape_agrees = agree[..., 3] | agree[..., 4]
+            same = (agree[..., 0] & shape_agrees & (other_agreements >= 2)) | (
+                near_in_position & (other_agreements == 4)
+            )
+            cost = (_DIMENSIONS * np.log1p((residuals / noise.sigma) ** 2)).sum(axis=2)
             costs[part] = np.where(same, cost, np.inf)
         return costs
 
 
-def in_order(rows: Indices, wanted: NDArray[np.bool_], source: Rows) -> Indices:
+def keep_order(rows: Indices, exclusive: NDArray[np.bool_], source: Rows) -> Indices:
     """The same pairing with source rows that are equal in everything given out in their order.
 
     Args:
         rows: (m,) source row of each edited row, -1 for none.
-        wanted: (m,) edited rows that have their source row to themselves.
+        exclusive: (m,) edited rows that have their source row to themselves.
         source: The source rows.
     """
     columns = (source.means, source.covariances.reshape(-1, 9), source.colours)
     values = np.concatenate((*columns, source.opacities[:, None]), axis=1) + 0.0
-    whole = np.ascontiguousarray(values).view(
-        np.dtype((np.void, values.itemsize * values.shape[1]))
-    )
-    _, group, sizes = np.unique(whole[:, 0], return_inverse=True, return_counts=True)
-    several = wanted & (rows >= 0)
-    several[several] = sizes[group[rows[several]]] > 1
-    mine = np.flatnonzero(several)
-    if not len(mine):
+    keys = np.ascontiguousarray(values).view(np.dtype((np.void, values.itemsize * values.shape[1])))
+    _, group, sizes = np.unique(keys[:, 0], return_inverse=True, return_counts=True)
+    shares_values = exclusive & (rows >= 0)
+    shares_values[shares_values] = sizes[group[rows[shares_values]]] > 1
+    ambiguous = np.flatnonzero(shares_values)
+    if not len(ambiguous):
         return rows
     # Places of a group's source rows, ascending, and how many edited rows came before mine.
     members = np.argsort(group, kind="stable")
-    starts = np.concatenate(([0], np.cumsum(sizes)))[group[rows[mine]]]
+    starts = np.concatenate(([0], np.cumsum(sizes)))[group[rows[ambiguous]]]
     order = np.argsort(starts, kind="stable")
     first = np.concatenate(([True], np.diff(starts[order]) != 0))
     rank = np.arange(len(order)) - np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
     out = rows.copy()
-    out[mine[order]] = members[starts[order] + rank]
+    out[ambiguous[order]] = members[starts[order] + rank]
     return out
 
 
-def _noise(near: _Nearby, floor: Floats) -> Noise | None:
-    """How far rows are from themselves, as told by those that are sure; None if few are."""
-    for least, share in _SURE:
-        agree = near.residuals[..., 1:] <= _LOOSE[1:]
-        sure = agree.sum(axis=2) >= least
-        distance = np.where(sure, near.residuals[..., 0], np.inf)
+def _estimated_noise(candidates: _Candidates, min_noise: Floats) -> Noise | None:
+    """Noise of the residuals, estimated from confident rows; None if there are few."""
+    for min_agreements, min_share in _MIN_AGREEMENTS:
+        agree = candidates.residuals[..., 1:] <= _MAX_TOLERANCE[1:]
+        confident = agree.sum(axis=2) >= min_agreements
+        distance = np.where(confident, candidates.residuals[..., 0], np.inf)
         first = distance.argmin(axis=1)
         rows = np.flatnonzero(np.isfinite(distance.min(axis=1)))
-        if len(rows) < max(1.0, share * len(distance)):
+        if len(rows) < max(1.0, min_share * len(distance)):
             continue
-        found = near.residuals[rows, first[rows]].astype(np.float64)
-        # Where an attribute was changed on purpose, most are beyond what it can tell.
-        usual = np.clip(1.5 * np.median(found, axis=0), floor, np.maximum(_LOOSE / 2, floor))
-        most = np.clip(3 * np.quantile(found, 0.95, axis=0), 4 * floor, _LOOSE)
-        most[0] = max(2 * float(np.quantile(found[:, 0], 0.99)), 4 * floor[0])
-        return Noise(usual=usual, most=most)
+        found = candidates.residuals[rows, first[rows]].astype(np.float64)
+        # Where an attribute was changed on purpose, most residuals exceed its tolerance.
+        sigma = np.clip(
+            1.5 * np.median(found, axis=0), min_noise, np.maximum(_MAX_TOLERANCE / 2, min_noise)
+        )
+        tolerance = np.clip(3 * np.quantile(found, 0.95, axis=0), 4 * min_noise, _MAX_TOLERANCE)
+        tolerance[0] = max(2 * float(np.quantile(found[:, 0], 0.99)), 4 * min_noise[0])
+        return Noise(sigma=sigma, tolerance=tolerance)
     return None
 
 
@@ -234,27 +238,27 @@ def _sorted(indices: Indices, costs: Floats) -> tuple[Indices, Floats]:
     return np.take_along_axis(indices, order, 1), np.take_along_axis(costs, order, 1)
 
 
-def _paired(costs: Floats, candidates: Indices, count: int) -> Indices:
+def _stable_matching(costs: Floats, candidates: Indices, count: int) -> Indices:
     """A stable pairing of rows with candidates, each of which goes to one row at most."""
     order = np.argsort(costs, axis=1, kind="stable")  # taken ones became infinite
     candidates = np.take_along_axis(candidates, order, 1)
     costs = np.take_along_axis(costs, order, 1)
     m, k = costs.shape
-    turn = np.zeros(m, np.int64)
+    next_choice = np.zeros(m, np.int64)
     owner = np.full(count, -1)
-    asking = np.flatnonzero(np.isfinite(costs[:, 0]))
-    while len(asking):
-        wanted = candidates[asking, turn[asking]]
-        held = np.unique(owner[wanted])
-        rivals = np.concatenate((asking, held[held >= 0]))
-        places = candidates[rivals, turn[rivals]]
-        best = np.lexsort((rivals, costs[rivals, turn[rivals]], places))
-        first = best[np.concatenate(([True], np.diff(places[best]) != 0))]
-        owner[places[first]] = rivals[first]
-        losers = np.setdiff1d(rivals, rivals[first], assume_unique=True)
-        turn[losers] += 1
-        losers = losers[turn[losers] < k]
-        asking = losers[np.isfinite(costs[losers, turn[losers]])]
+    proposers = np.flatnonzero(np.isfinite(costs[:, 0]))
+    while len(proposers):
+        proposed = candidates[proposers, next_choice[proposers]]
+        current_owners = np.unique(owner[proposed])
+        rivals = np.concatenate((proposers, current_owners[current_owners >= 0]))
+        targets = candidates[rivals, next_choice[rivals]]
+        best = np.lexsort((rivals, costs[rivals, next_choice[rivals]], targets))
+        winners = best[np.concatenate(([True], np.diff(targets[best]) != 0))]
+        owner[targets[winners]] = rivals[winners]
+        rejected = np.setdiff1d(rivals, rivals[winners], assume_unique=True)
+        next_choice[rejected] += 1
+        rejected = rejected[next_choice[rejected] < k]
+        proposers = rejected[np.isfinite(costs[rejected, next_choice[rejected]])]
     rows = np.full(m, -1)
     has = np.flatnonzero(owner >= 0)
     rows[owner[has]] = has

@@ -3,8 +3,8 @@ r"""The similarity that an editor moved a scene, or a part of it, by.
 Opacity, mean colour and the ratios of the three scales do not change under a similarity. Edited
 rows are paired with the source rows that are nearest in these; the log of the ratio of their
 sizes is the log of the similarity's scale, which most right pairs share and wrong ones do not.
-Of the pairs that are left, three make a similarity (Umeyama 1991); the one that most pairs agree
-with is refined on them.
+Of the pairs that are left, three make a similarity (Umeyama 1991); the one with most inliers is
+refined on them (RANSAC).
 """
 
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from splatseg.neighbours import NeighbourIndex
 
 _SAMPLE = 6000
 _TRIPLES = 60_000
-_TRIED = 300
-_WINDOW = 0.12
+_MAX_FITS = 300
+_SCALE_WINDOW = 0.12
 """Width in which logs of scale count as one."""
 _SCALE_ERROR = 0.04
-_AGREES = 0.02
+_INLIER_SHARE = 0.02
 """Share of the source's extent within which a pair agrees with a similarity, at first."""
-_STEPS = np.array([0.01, 0.01, 0.01, 0.01, 0.06, 0.06])
+_QUANTISATION = np.array([0.01, 0.01, 0.01, 0.01, 0.06, 0.06])
 """What opacity, colour and log ratios of scales differ by after quantisation."""
-_LEAST_PAIRS = 6
-_PLENTY = 0.5
+_MIN_PAIRS = 6
+_CLEAR_SHARE = 0.5
 """Share of the pairs whose agreement leaves no question whether the scene was mirrored."""
 
 
@@ -39,7 +39,7 @@ class Hypothesis:
     edited_from_source: Similarity
     mirrored: bool
     pairs: int
-    """How many of the pairs looked at."""
+    """Number of inliers."""
 
 
 def find_move(edited: Rows, source: Rows, rng: np.random.Generator) -> Hypothesis | None:
@@ -49,30 +49,32 @@ def find_move(edited: Rows, source: Rows, rng: np.random.Generator) -> Hypothesi
     """
     if min(len(edited), len(source)) < 3:
         return None
-    ours, theirs = _pairs(edited, source, rng)
-    if len(ours) < 3:
+    edited_index, source_index = _pairs(edited, source, rng)
+    if len(edited_index) < 3:
         return None
-    target = edited.means[ours]
-    scale = float(np.exp((edited.logs[ours] - source.logs[theirs]).mean(axis=1)).mean())
-    tolerance = _AGREES * scale * extent_of(source)
+    target = edited.means[edited_index]
+    scale = float(
+        np.exp((edited.logs[edited_index] - source.logs[source_index]).mean(axis=1)).mean()
+    )
+    tolerance = _INLIER_SHARE * scale * extent_of(source)
     best: Hypothesis | None = None
     for mirrored in (False, True):
-        origin = source.means[theirs] * (np.array([-1.0, 1.0, 1.0]) if mirrored else 1.0)
+        origin = source.means[source_index] * (np.array([-1.0, 1.0, 1.0]) if mirrored else 1.0)
         found = _consensus(origin, target, scale, tolerance, rng)
         if found is None:
             continue
         move, pairs = found
         if best is None or pairs > 1.5 * best.pairs:
             best = Hypothesis(edited_from_source=move, mirrored=mirrored, pairs=pairs)
-        if pairs >= _PLENTY * len(ours):
+        if pairs >= _CLEAR_SHARE * len(edited_index):
             break
     return best
 
 
 def fit_similarity(origin: Floats, target: Floats) -> Similarity | None:
     """The least-squares similarity target_from_origin (Umeyama 1991); None of one point."""
-    centre, to = origin.mean(axis=0), target.mean(axis=0)
-    a, b = origin - centre, target - to
+    origin_centre, target_centre = origin.mean(axis=0), target.mean(axis=0)
+    a, b = origin - origin_centre, target - target_centre
     u, values, vt = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
     rotation = (u * sign) @ vt
@@ -82,7 +84,7 @@ def fit_similarity(origin: Floats, target: Floats) -> Similarity | None:
         return None
     return Similarity(
         rotation=torch.from_numpy(rotation),
-        translation=torch.from_numpy(to - scale * rotation @ centre),
+        translation=torch.from_numpy(target_centre - scale * rotation @ origin_centre),
         scale=scale,
     )
 
@@ -97,15 +99,15 @@ def _pairs(edited: Rows, source: Rows, rng: np.random.Generator) -> tuple[Indice
     found = nearest.indices[:, 0].numpy()
     logs = (edited.logs[rows] - source.logs[found]).mean(axis=1)
     order = np.sort(logs)
-    count = np.searchsorted(order, order + _WINDOW, side="right") - np.arange(len(order))
+    count = np.searchsorted(order, order + _SCALE_WINDOW, side="right") - np.arange(len(order))
     start = order[int(count.argmax())]
-    keep = (logs >= start) & (logs <= start + _WINDOW)
+    keep = (logs >= start) & (logs <= start + _SCALE_WINDOW)
     return rows[keep], found[keep]
 
 
 def _descriptors(rows: Rows) -> Floats:
     ratios = np.diff(rows.logs, axis=1)
-    return np.concatenate((rows.opacities[:, None], rows.colours, ratios), axis=1) / _STEPS
+    return np.concatenate((rows.opacities[:, None], rows.colours, ratios), axis=1) / _QUANTISATION
 
 
 def _consensus(
@@ -113,22 +115,22 @@ def _consensus(
 ) -> tuple[Similarity, int] | None:
     """The similarity of three pairs with which most pairs agree, refined on those."""
     triples = rng.integers(0, len(origin), (_TRIPLES, 3))
-    a = _sides(origin, triples) * scale
-    b = _sides(target, triples)
-    longest = a.max(axis=1)
-    error = np.abs(a - b).max(axis=1)
-    wide = (a.min(axis=1) > 0) & (longest > tolerance)
-    good = triples[wide & (error <= np.maximum(_SCALE_ERROR * longest, tolerance / 4))]
+    origin_sides = _side_lengths(origin, triples) * scale
+    target_sides = _side_lengths(target, triples)
+    longest = origin_sides.max(axis=1)
+    error = np.abs(origin_sides - target_sides).max(axis=1)
+    well_spread = (origin_sides.min(axis=1) > 0) & (longest > tolerance)
+    good = triples[well_spread & (error <= np.maximum(_SCALE_ERROR * longest, tolerance / 4))]
     best: Similarity | None = None
-    most = 0
-    for triple in good[:_TRIED]:
+    max_inliers = 0
+    for triple in good[:_MAX_FITS]:
         move = fit_similarity(origin[triple], target[triple])
         if move is None:
             continue
-        agree = int((_distances(move, origin, target) <= tolerance).sum())
-        if agree > most:
-            best, most = move, agree
-    if best is None or most < min(_LEAST_PAIRS, len(origin)):
+        inliers = int((_residuals(move, origin, target) <= tolerance).sum())
+        if inliers > max_inliers:
+            best, max_inliers = move, inliers
+    if best is None or max_inliers < min(_MIN_PAIRS, len(origin)):
         return None
     return _refined(best, origin, target, tolerance)
 
@@ -136,25 +138,25 @@ def _consensus(
 def _refined(
     move: Similarity, origin: Floats, target: Floats, tolerance: float
 ) -> tuple[Similarity, int] | None:
-    agree = _distances(move, origin, target) <= tolerance
+    inliers = _residuals(move, origin, target) <= tolerance
     for _ in range(8):
-        if agree.sum() < 3:
+        if inliers.sum() < 3:
             return None
-        better = fit_similarity(origin[agree], target[agree])
+        better = fit_similarity(origin[inliers], target[inliers])
         if better is None:
             return None
         move = better
-        distances = _distances(move, origin, target)
-        tolerance = min(tolerance, max(4 * float(np.median(distances[agree])), 1e-9))
-        agree = distances <= tolerance
-    return move, int(agree.sum())
+        distances = _residuals(move, origin, target)
+        tolerance = min(tolerance, max(4 * float(np.median(distances[inliers])), 1e-9))
+        inliers = distances <= tolerance
+    return move, int(inliers.sum())
 
 
-def _sides(points: Floats, triples: NDArray[np.int64]) -> Floats:
+def _side_lengths(points: Floats, triples: NDArray[np.int64]) -> Floats:
     corners = points[triples]
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
 
 
-def _distances(move: Similarity, origin: Floats, target: Floats) -> Floats:
+def _residuals(move: Similarity, origin: Floats, target: Floats) -> Floats:
     moved = move.scale * origin @ move.rotation.numpy().T + move.translation.numpy()
     return np.linalg.norm(moved - target, axis=1)

@@ -1,4 +1,4 @@
-"""What Gaussians are told apart by when rows of one scene are looked for in another."""
+"""Attributes of Gaussians by which rows of one scene are matched with another's."""
 
 from dataclasses import dataclass, replace
 
@@ -88,7 +88,7 @@ def shapes_of(rows: Rows) -> NDArray[np.float32]:
 
 
 def extent_of(rows: Rows) -> float:
-    """Half the width of the middle 98 %, of the widest axis; at least a tiny number."""
+    """Half the width of the central 98 %, of the widest axis; at least a tiny number."""
     if not len(rows):
         return 1.0
     low, high = np.quantile(rows.means, (0.01, 0.99), axis=0)

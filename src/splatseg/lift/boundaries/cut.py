@@ -3,7 +3,7 @@ r"""Cuts: Gaussians that reach over a boundary are split, so that each side can 
 A boundary is that of masks in the photographs (`cut_masks` for some ids, `cut_labels` for a
 whole layer) or a box in the world (`cut_box`). A Gaussian straddles it if its lesser side has
 at least `CutOptions.min_share`: of the evidence that masks give, or of the Gaussian's mass
-beyond a plane. It is split in the direction that separates the two sides best (`_sides`,
+beyond a plane. It is split in the direction that separates the two sides best (`sides`,
 `split`), its parts are held against the same boundary, and those that still straddle are split
 again, for a few rounds.
 """
@@ -31,9 +31,7 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.boundaries.geometry import (
-    axes_of,
-    directions_of_normals,
-    seen_along,
+    line_extent,
     unit_or_main,
 )
 from splatseg.lift.boundaries.mixture import MIXTURES
@@ -55,18 +53,18 @@ class CutOptions:
     """How often what still straddles is split again; 0 splits nothing."""
 
     min_share: float = 0.1
-    """Least share, in [0, 0.5], of the lesser side for a Gaussian to straddle the cut."""
+    """Minimum share, in [0, 0.5], of the lesser side for a Gaussian to straddle the cut."""
 
     min_pixels: float = 0.5
-    """Least standard deviation, pixels, that a Gaussian must have across the cut in some view;
+    """Minimum standard deviation, pixels, that a Gaussian must have across the cut in some view;
     smaller ones are not split. 0 splits all."""
 
     min_weight: float = 0.5
-    """Least evidence that a Gaussian must have to be split at a mask, in pixels that show it
+    """Minimum evidence that a Gaussian must have to be split at a mask, in pixels that show it
     fully, summed over views."""
 
     border_weight: float = 0.1
-    """What a pixel at the border of a mask counts, in [0, 1]: it shows both sides."""
+    """Weight of a pixel at the border of a mask, in [0, 1]: it shows both sides."""
 
     keep_share: float = 0.5
     """Share of its evidence, in [0, 1], that must lie inside for a Gaussian to count as inside.
@@ -97,8 +95,8 @@ class Cut:
     share: Float[Tensor, "n"]
     """How much of each lies inside, in [0, 1]; 0 where nothing is known of it."""
 
-    known: Float[Tensor, "n"]
-    """How much that rests on: evidence in fully visible pixels, or 1 for a box."""
+    evidence: Float[Tensor, "n"]
+    """What the share rests on: evidence in fully visible pixels, or 1 for a box."""
 
     inside: Selection
     """Those that count as inside."""
@@ -108,7 +106,7 @@ class Cut:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _TwoSides:
+class _InsideOutsideMaps:
     """Label maps in which some ids are INSIDE and all others OUTSIDE."""
 
     evidence: LabelSource
@@ -119,10 +117,12 @@ class _TwoSides:
         return self.evidence.view_names
 
     def label_map(self, name: str) -> LabelMap:
-        paper = self.evidence.label_map(name)
-        inside = torch.isin(paper.ids, torch.tensor(self.ids, dtype=paper.ids.dtype))
+        label_map = self.evidence.label_map(name)
+        inside = torch.isin(label_map.ids, torch.tensor(self.ids, dtype=label_map.ids.dtype))
         sides = torch.where(inside, INSIDE, OUTSIDE)
-        return replace(paper, ids=torch.where(paper.ids == UNLABELLED, UNLABELLED, sides).int())
+        return replace(
+            label_map, ids=torch.where(label_map.ids == UNLABELLED, UNLABELLED, sides).int()
+        )
 
 
 def cut_masks(
@@ -141,11 +141,11 @@ def cut_masks(
     Args:
         gaussians: The Gaussians of the scene.
         views: Those that vote, best all that the layer was lifted from.
-        evidence: Label maps of them; pixels at -1 say nothing.
+        evidence: Label maps of them; pixels at -1 do not count.
         ids: The ids that are inside.
         options: Which are split, and how.
         render_options: Switches of the blending model.
-        backend: Who renders.
+        backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
     Returns:
@@ -159,30 +159,23 @@ def cut_masks(
     _check_views(views, evidence)
     if not ids:
         raise InputError("ids: expected at least one, got none.")
-    maps = _TwoSides(evidence=evidence, ids=tuple(int(i) for i in ids))
-
-    def look(now: Gaussians, step: Callable[[], None]) -> Sides:
-        ones = torch.ones(len(now), dtype=torch.int32)
-        return sides_of(
-            now,
-            views,
-            maps,
-            ones * INSIDE,
-            ones * OUTSIDE,
-            border_weight=options.border_weight,
-            options=render_options or options_for(now, backend),
-            backend=backend,
-            step=step,
-        )
-
-    edited, sides, count = _in_rounds(gaussians, views, look, options, progress)
+    label_maps = _InsideOutsideMaps(evidence=evidence, ids=tuple(int(i) for i in ids))
+    scan = _Scan(
+        views,
+        label_maps,
+        options,
+        render_options=render_options,
+        backend=backend,
+        progress=progress,
+    )
+    edited, sides, count = _split_in_rounds(gaussians, scan)
     if not bool((sides.inside > 0).any()):
         shown = ", ".join(map(str, ids))
         raise InputError(f"ids: none of {len(views)} views shows a Gaussian with id {shown}.")
     return Cut(
         edited=edited,
         share=sides.share,
-        known=sides.inside + sides.outside,
+        evidence=sides.inside + sides.outside,
         inside=Selection(mask=sides.share > options.keep_share),
         split=count,
     )
@@ -211,7 +204,7 @@ def cut_labels(
         evidence: Label maps of them, the ones that the layer was lifted from.
         options: Which are split, and how.
         render_options: Switches of the blending model.
-        backend: Who renders.
+        backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
     Returns:
@@ -228,46 +221,30 @@ def cut_labels(
     candidates, shares = labels.candidates, labels.shares
     if candidates is None or shares is None or candidates.shape[1] < 2:
         raise InputError("labels: expected a layer with two candidates a Gaussian or more.")
+    scan = _Scan(
+        views, evidence, options, render_options=render_options, backend=backend, progress=progress
+    )
     rows = torch.arange(len(gaussians))
-    edited, now = Edited.unchanged(gaussians), labels
-    total = (options.rounds + 1) * len(views)
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
-    for turn in range(options.rounds + 1):
+    edited, current = Edited.unchanged(gaussians), labels
+    for round_index in range(options.rounds + 1):
         first, second = candidates[rows, 0], candidates[rows, 1]
-        sides = sides_of(
-            edited.gaussians,
-            views,
-            evidence,
-            first,
-            second,
-            border_weight=options.border_weight,
-            options=render_options or options_for(gaussians, backend),
-            backend=backend,
-            step=step,
-        )
-        now = _relabelled(now, sides, first, second, edited)
-        if turn == options.rounds:
+        sides = scan.sides(edited.gaussians, first, second)
+        current = _relabelled(current, sides, first, second, edited)
+        if round_index == options.rounds:
             break
-        straddling = _straddling(edited.gaussians, sides, views, options)
+        straddling = scan.straddling(edited.gaussians, sides)
         if not straddling.count:
             break
-        later = _split(edited.gaussians, straddling, sides, views, options)
-        edited, now = edited.then(later), apply_rows(now, later)
+        further = scan.split(edited.gaussians, straddling, sides)
+        edited, current = edited.then(further), apply_rows(current, further)
         rows = edited.rows
-    return edited, now
+    return edited, current
 
 
 def _relabelled(
     labels: Labels, sides: Sides, first: Tensor, second: Tensor, edited: Edited
 ) -> Labels:
-    """The layer with what the pixels say of parts: of rows whose fraction is below 1."""
+    """The layer with the labels of parts, the rows whose fraction is below 1, from their pixels."""
     if edited.fractions is None or labels.candidates is None or labels.shares is None:
         return labels
     seen = sides.inside + sides.outside + sides.other
@@ -294,164 +271,94 @@ def _relabelled(
     )
 
 
-def cut_box(
-    gaussians: Gaussians,
-    low: Sequence[float],
-    high: Sequence[float],
-    *,
-    among: Selection | None = None,
-    options: CutOptions | None = None,
-    cameras: Sequence[Camera] = (),
-) -> Cut:
-    r"""Split what straddles a face of a box whose sides are along the world's axes.
-
-    A Gaussian's mass beyond a plane at a distance of t of its standard deviations along the
-    plane's normal is :math:`\Phi(-|t|)`; the face where its lesser side is largest is the one
-    it is split at, as long as it reaches that face itself.
-
-    Args:
-        gaussians: The Gaussians of the scene.
-        low: Least x, y and z inside, scene units.
-        high: Largest x, y and z inside.
-        among: Only these are split; None is all.
-        options: Which are split, and how.
-        cameras: Those that the picture matters to and that sizes in pixels are of; without
-            any, size does not count.
-
-    Returns:
-        The cut. A Gaussian is inside where its centre is.
-
-    Raises:
-        RangeError: If the box is empty or not finite.
-        ShapeError: If `among` is of other Gaussians.
-    """
-    options = options or CutOptions()
-    if among is not None and len(among) != len(gaussians):
-        raise ShapeError(f"among: expected {len(gaussians)} rows, got {len(among)}.")
-    lower, upper = box_corners(low, high)
-    edited = Edited.unchanged(gaussians)
-    first = torch.zeros(len(gaussians), dtype=torch.bool)
-    for turn in range(options.rounds):
-        now = edited.gaussians
-        mass, normals = _nearest_face(now, lower, upper)
-        directions = directions_of_normals(now, normals)
-        large = seen_along(now, directions, cameras).pixels >= options.min_pixels
-        mask = (mass >= max(options.min_share, 1e-6)) & large & (now.scales.amax(dim=1) > 0)
-        straddling = Selection(mask=mask if among is None else mask & among.mask[edited.rows])
-        if turn == 0:
-            first = straddling.mask
-        if not straddling.count:
-            break
-        later = split_along(
-            now, straddling, directions[straddling.mask], parts=options.parts, cameras=cameras
-        )
-        edited = edited.then(later)
-    centres = edited.gaussians.means.double()
-    inside = ((centres >= lower) & (centres <= upper)).all(dim=1)
-    return Cut(
-        edited=edited,
-        share=inside.float(),
-        known=torch.ones(len(edited)),
-        inside=Selection(mask=inside),
-        split=int(first.sum()),
-    )
-
-
-def box_corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Corners of a box as float64, after a check that there is something between them."""
-    lower = torch.tensor([float(v) for v in low], dtype=torch.float64)
-    upper = torch.tensor([float(v) for v in high], dtype=torch.float64)
-    if lower.shape != (3,) or upper.shape != (3,):
-        raise ShapeError(f"box: expected two points, got {len(lower)} and {len(upper)} numbers.")
-    if not bool(torch.isfinite(lower).all() and torch.isfinite(upper).all()):
-        raise RangeError(f"box: expected finite numbers, got {lower.tolist()}, {upper.tolist()}.")
-    if not bool((lower < upper).all()):
-        raise RangeError(
-            "box: expected a first corner below the second along every axis, got "
-            f"{lower.tolist()} and {upper.tolist()}."
-        )
-    return lower, upper
-
-
-def _nearest_face(gaussians: Gaussians, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Mass of the lesser side at the face that cuts most, and the normal of that face."""
-    means = gaussians.means.double()
-    deviations = axes_of(gaussians).pow(2).sum(dim=2).sqrt().clamp_min(1e-30)
-    below, above = (means - low) / deviations, (high - means) / deviations
-    # How much of the mass lies between the two faces of each axis.
-    within = torch.special.ndtr(below) + torch.special.ndtr(above) - 1
-    best = torch.zeros(len(gaussians), dtype=torch.float64)
-    axis_of = torch.zeros(len(gaussians), dtype=torch.int64)
-    for axis in range(3):
-        others = [other for other in range(3) if other != axis]
-        reach = within[:, others].prod(dim=1).clamp_min(0)
-        for t in (below[:, axis], above[:, axis]):
-            # The face is only as large as the box: what passes beside it is not cut.
-            mass = torch.special.ndtr(-t.abs()) * reach
-            better = mass > best
-            best = torch.where(better, mass, best)
-            axis_of = torch.where(better, axis, axis_of)
-    return best, torch.nn.functional.one_hot(axis_of, 3).double()
-
-
-def _in_rounds(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    look: Callable[[Gaussians, Callable[[], None]], Sides],
-    options: CutOptions,
-    progress: Callable[[int, int], None] | None,
-) -> tuple[Edited, Sides, int]:
-    """Look, split, look again; ends with a look."""
-    edited, count, done = Edited.unchanged(gaussians), 0, 0
-    total = (options.rounds + 1) * len(views)
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
-    for turn in range(options.rounds):
-        sides = look(edited.gaussians, step)
-        straddling = _straddling(edited.gaussians, sides, views, options)
-        if turn == 0:
+def _split_in_rounds(gaussians: Gaussians, scan: "_Scan") -> tuple[Edited, Sides, int]:
+    """Measure, split, measure again; ends with a measurement of what came out."""
+    edited, count = Edited.unchanged(gaussians), 0
+    for round_index in range(scan.options.rounds):
+        sides = scan.inside_outside(edited.gaussians)
+        straddling = scan.straddling(edited.gaussians, sides)
+        if round_index == 0:
             count = straddling.count
         if not straddling.count:
             return edited, sides, count
-        edited = edited.then(_split(edited.gaussians, straddling, sides, views, options))
-    return edited, look(edited.gaussians, step), count
+        edited = edited.then(scan.split(edited.gaussians, straddling, sides))
+    return edited, scan.inside_outside(edited.gaussians), count
 
 
-def _straddling(
-    gaussians: Gaussians, sides: Sides, views: Sequence[View], options: CutOptions
-) -> Selection:
-    lesser = torch.minimum(sides.share, 1 - sides.share)
-    mask = lesser >= max(options.min_share, 1e-6)
-    mask &= sides.inside + sides.outside >= options.min_weight
-    mask &= gaussians.scales.amax(dim=1) > 0
-    rows = torch.nonzero(mask).squeeze(1)
-    if options.min_pixels > 0 and len(rows):
-        chosen = gaussians[rows]
-        directions = unit_or_main(chosen, sides.direction[rows])
-        size = seen_along(chosen, directions, [view.camera for view in views]).pixels
-        mask[rows] = size >= options.min_pixels
-    return Selection(mask=mask)
+class _Scan:
+    """Goes through the views to measure sides, and splits what straddles them.
 
+    Progress counts the views of all rounds.
+    """
 
-def _split(
-    gaussians: Gaussians,
-    straddling: Selection,
-    sides: Sides,
-    views: Sequence[View],
-    options: CutOptions,
-) -> Edited:
-    return split_along(
-        gaussians,
-        straddling,
-        sides.direction[straddling.mask],
-        parts=options.parts,
-        cameras=[view.camera for view in views],
-    )
+    def __init__(
+        self,
+        views: Sequence[View],
+        evidence: LabelSource,
+        options: CutOptions,
+        *,
+        render_options: RenderOptions | None,
+        backend: str,
+        progress: Callable[[int, int], None] | None,
+    ) -> None:
+        self.options = options
+        self._views = views
+        self._evidence = evidence
+        self._render_options = render_options
+        self._backend = backend
+        self._progress = progress
+        self._done = 0
+
+    def sides(self, gaussians: Gaussians, first: Tensor, second: Tensor) -> Sides:
+        """How much of each Gaussian the views show with its first and its second id."""
+        return sides_of(
+            gaussians,
+            self._views,
+            self._evidence,
+            first,
+            second,
+            border_weight=self.options.border_weight,
+            options=self._render_options or options_for(gaussians, self._backend),
+            backend=self._backend,
+            step=self._step,
+        )
+
+    def inside_outside(self, gaussians: Gaussians) -> Sides:
+        """The same for label maps of INSIDE and OUTSIDE."""
+        ones = torch.ones(len(gaussians), dtype=torch.int32)
+        return self.sides(gaussians, ones * INSIDE, ones * OUTSIDE)
+
+    def straddling(self, gaussians: Gaussians, sides: Sides) -> Selection:
+        """Gaussians with enough evidence on both sides that are large enough to be split."""
+        lesser = torch.minimum(sides.share, 1 - sides.share)
+        mask = lesser >= max(self.options.min_share, 1e-6)
+        mask &= sides.inside + sides.outside >= self.options.min_weight
+        mask &= gaussians.scales.amax(dim=1) > 0
+        rows = torch.nonzero(mask).squeeze(1)
+        if self.options.min_pixels > 0 and len(rows):
+            chosen = gaussians[rows]
+            directions = unit_or_main(chosen, sides.direction[rows])
+            size = line_extent(chosen, directions, self._cameras()).pixels
+            mask[rows] = size >= self.options.min_pixels
+        return Selection(mask=mask)
+
+    def split(self, gaussians: Gaussians, straddling: Selection, sides: Sides) -> Edited:
+        """Split along the directions that separate the sides."""
+        return split_along(
+            gaussians,
+            straddling,
+            sides.direction[straddling.mask],
+            parts=self.options.parts,
+            cameras=self._cameras(),
+        )
+
+    def _cameras(self) -> list[Camera]:
+        return [view.camera for view in self._views]
+
+    def _step(self) -> None:
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, (self.options.rounds + 1) * len(self._views))
 
 
 def _check_views(views: Sequence[View], evidence: LabelSource) -> None:

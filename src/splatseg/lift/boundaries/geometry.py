@@ -15,11 +15,11 @@ from torch import Tensor
 from splatseg.core import Camera, Gaussians
 from splatseg.core.rigid import rotation_from_quaternion
 
-_THINNEST = 1e-4
-"""Least scale, as a part of the largest, that a division is made with. A Gaussian of no
+_MIN_SCALE_RATIO = 1e-4
+"""Minimum scale, as a part of the largest, that a division is made with. A Gaussian of no
 thickness is taken for one that is very thin."""
 
-_SPHERE = 64
+_SPHERE_DIRECTIONS = 64
 _NEAR = 0.01
 
 
@@ -57,31 +57,31 @@ def unit_or_main(gaussians: Gaussians, vectors: Float[Tensor, "n 3"]) -> Float[T
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen:
+class LineExtent:
     """How cameras see a line through each Gaussian."""
 
     across: Float[Tensor, "n"]
-    """Root of the mean of rho squared, see `_mixture`: 1 across the views, 0 along them."""
+    """Root of the mean of rho squared, see `mixture`: 1 across the views, 0 along them."""
 
     pixels: Float[Tensor, "n"]
     """Largest standard deviation along the line in any image, pixels; infinite where there
-    are no cameras, 0 where none has the centre in its picture."""
+    are no cameras, 0 where none has the centre in its image."""
 
 
-def seen_along(
+def line_extent(
     gaussians: Gaussians, directions: Float[Tensor, "n 3"], cameras: Sequence[Camera] = ()
-) -> Seen:
+) -> LineExtent:
     r"""How much of the lines `directions` the cameras show.
 
     Seen along a ray d, whitened :math:`d_w = L^{-1} d`, the projected Gaussian is that of z
     along :math:`d_w`, so that :math:`\rho^2 = 1 - (e \cdot d_w)^2 / |d_w|^2`. Cameras that have
-    the centre in their picture count by the Gaussian's area in it, :math:`|d_w| |L| / z^2`.
+    the centre in their image count by the Gaussian's area in it, :math:`|d_w| |L| / z^2`.
     Without any, directions all over the sphere do.
 
     Args:
         gaussians: The Gaussians.
         directions: Unit vectors e, each in its Gaussian's frame.
-        cameras: Any cameras; distortion is not looked at.
+        cameras: Any cameras; distortion is ignored.
     """
     e = directions.double()
     axes = axes_of(gaussians)
@@ -108,22 +108,24 @@ def seen_along(
         pixels = torch.maximum(pixels, torch.where(inside, size / z.clamp_min(_NEAR), 0.0))
     unseen = total <= 0
     if bool(unseen.any()):
-        for ray in _sphere():
+        for ray in _sphere_directions():
             weight, rho2 = _area_and_share(inverse, ray.expand_as(means), e)
             weight = torch.where(unseen, weight, 0.0)
             total += weight
             squares += weight * rho2
     if not cameras:
         pixels = torch.full_like(pixels, torch.inf)
-    return Seen(across=torch.sqrt((squares / total.clamp_min(1e-300)).clamp(0, 1)), pixels=pixels)
+    return LineExtent(
+        across=torch.sqrt((squares / total.clamp_min(1e-300)).clamp(0, 1)), pixels=pixels
+    )
 
 
 def _inside(camera: Camera, points: Tensor) -> Tensor:
-    """Which points in the camera's frame lie in its picture, distortion left aside."""
+    """Which points in the camera's frame lie in its image, distortion left aside."""
     z = points[:, 2]
-    safe = z.clamp_min(_NEAR)
-    u = camera.fx * points[:, 0] / safe + camera.cx
-    v = camera.fy * points[:, 1] / safe + camera.cy
+    positive_z = z.clamp_min(_NEAR)
+    u = camera.fx * points[:, 0] / positive_z + camera.cx
+    v = camera.fy * points[:, 1] / positive_z + camera.cy
     return (z > _NEAR) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
 
 
@@ -131,24 +133,24 @@ def _inverse_axes(gaussians: Gaussians) -> Tensor:
     """L^-1 times |L|: the adjugate, up to Gaussians that are thinner than can be divided by."""
     scales = gaussians.scales.double()
     largest = scales.amax(dim=1, keepdim=True)
-    scales = torch.maximum(scales, _THINNEST * largest).clamp_min(1e-30)
+    scales = torch.maximum(scales, _MIN_SCALE_RATIO * largest).clamp_min(1e-30)
     rotations = rotation_from_quaternion(gaussians.rotations.double())
     volume = scales.prod(dim=1, keepdim=True)
     return (volume / scales).unsqueeze(2) * rotations.transpose(1, 2)
 
 
 def _area_and_share(inverse: Tensor, rays: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
-    """|d_w| |L|, which is the area of the picture, and rho squared."""
+    """|d_w| |L|, which is the area of the projection, and rho squared."""
     whitened = torch.einsum("nij,nj->ni", inverse, rays)
     area = torch.linalg.vector_norm(whitened, dim=1)
     along = (whitened * e).sum(dim=1) / area.clamp_min(1e-300)
     return area, (1 - along**2).clamp(0, 1)
 
 
-def _sphere() -> Tensor:
+def _sphere_directions() -> Tensor:
     """Directions spread over the half sphere (the other half sees the same)."""
-    i = torch.arange(_SPHERE, dtype=torch.float64) + 0.5
-    z = i / _SPHERE
+    i = torch.arange(_SPHERE_DIRECTIONS, dtype=torch.float64) + 0.5
+    z = i / _SPHERE_DIRECTIONS
     angle = torch.pi * (1 + 5**0.5) * i
     ring = torch.sqrt(1 - z * z)
     return torch.stack((ring * torch.cos(angle), ring * torch.sin(angle), z), dim=-1)

@@ -1,12 +1,12 @@
 r"""A normal distribution as a few narrower ones, and the opacities that look like one.
 
-**Places, widths and weights.** The standard normal density is replaced by N of the same standard
-deviation r < 1 at places :math:`m_c` with weights :math:`w_c`, symmetric about 0, such that its
+**Offsets, widths and weights.** The standard normal density is replaced by N of the same standard
+deviation r < 1 at offsets :math:`m_c` with weights :math:`w_c`, symmetric about 0, such that its
 moments up to the third stay what they are:
 
 .. math:: \sum_c w_c = 1, \qquad \sum_c w_c m_c = 0, \qquad r^2 + \sum_c w_c m_c^2 = 1
 
-What freedom is left for a given r (the weights and the ratios of the places) makes the squared
+What freedom is left for a given r (the weights and the ratios of the offsets) makes the squared
 difference of the two densities smallest; a test finds the constants below again.
 
 **Opacities.** Along the direction of the split a Gaussian's alpha is :math:`o\, e^{-u^2 / 2}`
@@ -20,7 +20,7 @@ opacities :math:`o_c` (symmetric like the weights) are those that make
           - o\, e^{-u^2 / 2} \Bigr)^2 du
 
 smallest. For a faint Gaussian seen across that is about :math:`o\, w_c / r_\rho`, the plain
-statement that a part of the mass has a part of the light; parts of an opaque one cover each
+statement that a part of the mass has a part of the weight; parts of an opaque one cover each
 other and need more, and those of one seen end-on lie over each other and need less. The
 opacities depend on o and :math:`\rho` only and are found by Gauss-Newton steps on a grid of u,
 with a slight pull towards that statement where it is all the same.
@@ -36,12 +36,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_REACH = 4.0
+_GRID_END = 4.0
 """Standard deviations at which the integral ends."""
 
-_NODES = 81
-_STEPS = 24
-_PULL = 1e-3
+_GRID_NODES = 81
+_GAUSS_NEWTON_STEPS = 24
+_REGULARISATION = 1e-3
 """Pull towards o w / r_rho, as a part of the normal matrix' trace: where parts lie over each
 other (rho near 0) any opacities with the same sum look alike, and those are taken."""
 
@@ -53,7 +53,7 @@ _ROWS = 16384
 class Mixture:
     """A standard normal distribution in narrower parts."""
 
-    places: tuple[float, ...]
+    offsets: tuple[float, ...]
     """Means of the parts, standard deviations of the whole, ascending."""
 
     weights: tuple[float, ...]
@@ -62,15 +62,15 @@ class Mixture:
     @property
     def width(self) -> float:
         """Standard deviation of each part; makes the second moment exactly 1."""
-        spread = sum(w * m * m for w, m in zip(self.weights, self.places, strict=True))
+        spread = sum(w * m * m for w, m in zip(self.weights, self.offsets, strict=True))
         return (1.0 - spread) ** 0.5
 
 
-def _symmetric(places: tuple[float, ...], weights: tuple[float, ...]) -> Mixture:
-    """From the part of the constants at and right of 0 (a place of 0 stands first)."""
-    skip = 1 if places[0] == 0 else 0
+def _symmetric(offsets: tuple[float, ...], weights: tuple[float, ...]) -> Mixture:
+    """From the part of the constants at and right of 0 (an offset of 0 stands first)."""
+    skip = 1 if offsets[0] == 0 else 0
     return Mixture(
-        places=(*(-m for m in reversed(places[skip:])), *places),
+        offsets=(*(-m for m in reversed(offsets[skip:])), *offsets),
         weights=(*reversed(weights[skip:]), *weights),
     )
 
@@ -81,7 +81,7 @@ MIXTURES: dict[int, Mixture] = {
     3: _symmetric((0.0, 1.12773), (0.57728, 0.21136)),
 }
 """By number of parts. Two parts differ by 4.5 % of the density's root mean square and three, that
-are narrower, by 2.1 %: a part in the middle is what an opaque Gaussian needs. More parts are had
+are narrower, by 2.1 %: a part at the centre is what an opaque Gaussian needs. More parts are had
 by splitting again."""
 
 
@@ -101,48 +101,48 @@ def opacities_of_parts(
         alpha_max: Largest alpha of the blending model.
 
     Returns:
-        :math:`o_c` of each part, in [0, 1], in the order of the places.
+        :math:`o_c` of each part, in [0, 1], in the order of the offsets.
     """
-    pairs = zip(opacities.double().split(_ROWS), across.double().split(_ROWS), strict=True)
-    blocks = [_solved(o, rho, mixture, alpha_max) for o, rho in pairs]
+    batches = zip(opacities.double().split(_ROWS), across.double().split(_ROWS), strict=True)
+    blocks = [_solved(o, rho, mixture, alpha_max) for o, rho in batches]
     if not blocks:
-        return opacities.new_zeros(0, len(mixture.places))
+        return opacities.new_zeros(0, len(mixture.offsets))
     return torch.cat(blocks).to(opacities)
 
 
 def _solved(o: Tensor, rho: Tensor, mixture: Mixture, alpha_max: float) -> Tensor:
     weights = torch.tensor(mixture.weights, dtype=o.dtype)
-    places = torch.tensor(mixture.places, dtype=o.dtype)
-    u = torch.linspace(-_REACH, _REACH, _NODES, dtype=o.dtype)
+    offsets = torch.tensor(mixture.offsets, dtype=o.dtype)
+    u = torch.linspace(-_GRID_END, _GRID_END, _GRID_NODES, dtype=o.dtype)
     width = torch.sqrt(1 - rho**2 * (1 - mixture.width**2))
     # Axes: Gaussian, node, part.
-    distance = (u[None, :, None] - rho[:, None, None] * places) / width[:, None, None]
-    bells = torch.exp(-0.5 * distance**2)
+    distance = (u[None, :, None] - rho[:, None, None] * offsets) / width[:, None, None]
+    densities = torch.exp(-0.5 * distance**2)
     wanted = (o[:, None] * torch.exp(-0.5 * u**2)).clamp_max(alpha_max)
-    pairs = _mirror_pairs(len(places)).to(o)
+    mirrored = _mirror_pairs(len(offsets)).to(o)
     # One unknown a mirrored pair: its opacity.
-    start = ((o / width)[:, None] * weights) @ pairs.T / pairs.sum(dim=1)
-    unknown = start
-    eye = torch.eye(len(pairs), dtype=o.dtype)
-    for _ in range(_STEPS):
-        alpha = (unknown @ pairs)[:, None, :] * bells
+    start = ((o / width)[:, None] * weights) @ mirrored.T / mirrored.sum(dim=1)
+    solution = start
+    eye = torch.eye(len(mirrored), dtype=o.dtype)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        alpha = (solution @ mirrored)[:, None, :] * densities
         free = alpha < alpha_max
         alpha = alpha.clamp_max(alpha_max)
-        passed = torch.prod(1 - alpha, dim=-1, keepdim=True)
-        slopes = (passed / (1 - alpha) * torch.where(free, bells, 0.0)) @ pairs.T
-        residual = (1 - passed).squeeze(-1) - wanted
-        gradient = torch.einsum("nuk,nu->nk", slopes, residual)
-        normal = torch.einsum("nuk,nul->nkl", slopes, slopes)
+        transmittance = torch.prod(1 - alpha, dim=-1, keepdim=True)
+        jacobian = (transmittance / (1 - alpha) * torch.where(free, densities, 0.0)) @ mirrored.T
+        residual = (1 - transmittance).squeeze(-1) - wanted
+        gradient = torch.einsum("nuk,nu->nk", jacobian, residual)
+        normal = torch.einsum("nuk,nul->nkl", jacobian, jacobian)
         trace = normal.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None] + 1e-12
-        gradient += _PULL * trace.squeeze(2) * (unknown - start)
-        step = torch.linalg.solve(normal + _PULL * trace * eye, gradient)
-        unknown = (unknown - step).clamp(0, 1)
-    return unknown @ pairs
+        gradient += _REGULARISATION * trace.squeeze(2) * (solution - start)
+        step = torch.linalg.solve(normal + _REGULARISATION * trace * eye, gradient)
+        solution = (solution - step).clamp(0, 1)
+    return solution @ mirrored
 
 
 def _mirror_pairs(parts: int) -> Tensor:
     """Which parts (columns) share one opacity (rows): those at m and -m."""
-    pairs = torch.zeros((parts + 1) // 2, parts)
+    mirrored = torch.zeros((parts + 1) // 2, parts)
     for part in range(parts):
-        pairs[min(part, parts - 1 - part), part] = 1
-    return pairs
+        mirrored[min(part, parts - 1 - part), part] = 1
+    return mirrored

@@ -1,9 +1,9 @@
-r"""Gaussians that take sides: labels sharpen the geometry.
+r"""Sharpening: positions, shapes and opacities refined by photographs and label maps.
 
 A fit on photographs alone does not care whether a Gaussian reaches from one thing over another
 of the same colour, or whether a thing lets a little of what is behind it through. Labels do. So
-Gaussians go on learning from the photographs and, beside them, from the label maps: of the light
-of a pixel as much as possible shall come from Gaussians of the pixel's id,
+Gaussians go on learning from the photographs and, beside them, from the label maps: of the weight
+of a pixel as much as possible shall be that of Gaussians of the pixel's id,
 
 .. math:: L = L_{\mathrm{photo}} + \lambda \, \frac{1}{|P|} \sum_{p \in P}
           \Bigl(1 - \sum_{i:\, l_i = y(p)} w_{pi}\Bigr)
@@ -13,8 +13,8 @@ Gaussian by this loss for one mask, splits those that both sides pull at, and fi
 Here the labels are decided in closed form (`uplift`), all of them at once, and the loss is one
 of positions, shapes and opacities: what two sides pull at moves, shrinks or becomes opaque.
 
-With more than a few ids the sum is not drawn for each of them. Every step gives each id a random
-code c of +1 and -1 in K channels and draws the codes of the Gaussians' labels; as
+With more than a few ids the sum is not rendered for each of them. Every step gives each id a random
+code c of +1 and -1 in K channels and renders the codes of the Gaussians' labels; as
 :math:`E[c_a \cdot c_b] = K [a = b]`,
 
 .. math:: \sum_{i:\, l_i = y} w_{pi} =
@@ -22,7 +22,7 @@ code c of +1 and -1 in K channels and draws the codes of the Gaussians' labels; 
 
 so that K channels have the right gradient on average, whatever the number of ids.
 
-Pixels whose id the layer does not show anywhere near say nothing: a model that errs alike in many
+Pixels whose id the layer does not show anywhere near do not count: a model that errs alike in many
 views would bend the geometry to its errors.
 
 References:
@@ -62,16 +62,16 @@ class SharpenOptions:
     """Steps, each from one photograph and its label map; 0 leaves the Gaussians as they are."""
 
     label_weight: float = 0.1
-    """Lambda: weight of the label maps beside the photographs. 1 is cleanest, and costs most of
-    the picture."""
+    """Lambda: weight of the label maps beside the photographs. 1 is cleanest, and costs most
+    image quality."""
 
     decide_every: int = 200
-    """Steps after which labels are decided anew."""
+    """Steps after which labels are decided again."""
 
     trust_pixels: int = 2
     """Pixels of the label maps count if the layer, as it was, shows their id at most so many
-    pixels away along each axis: they move a boundary, and what contradicts all other views says
-    nothing. -1 lets all count."""
+    pixels away along each axis: they move a boundary, and what contradicts all other views does not
+    count. -1 lets all count."""
 
     codes: int = 4
     """K: channels of the random codes. More is less noise for more time."""
@@ -96,7 +96,7 @@ class SharpenOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sharpened:
-    """Gaussians that took sides, row by row those of before."""
+    """Refined Gaussians, row by row those of before."""
 
     gaussians: Gaussians
 
@@ -104,7 +104,7 @@ class Sharpened:
     """Their labels, soft, decided from the same label maps."""
 
     agreement: tuple[float, float]
-    """Before and after: share of the light of labelled pixels, in [0, 1], that comes from
+    """Before and after: share of the weight of labelled pixels, in [0, 1], that is that of
     Gaussians of the pixel's id."""
 
     exposures: Mapping[str, Exposure] = field(default_factory=dict[str, Exposure])
@@ -132,19 +132,19 @@ def sharpen(
 
     Args:
         gaussians: The Gaussians of the scene.
-        views: Views with photographs and label maps. Only these are looked at.
+        views: Views with photographs and label maps. Only these are used.
         evidence: Their label maps, with ids that mean the same in all views (`MatchedMaps` for
-            segments); pixels at -1 say nothing.
+            segments); pixels at -1 do not count.
         options: How long, and how much labels count.
         uplift_options: How Gaussians get labels; candidates are at least 8 where confusion
             is corrected.
         confusion: How the evidence errs, see `correct_confusion`; None takes the majority.
         fit_options: How the photographs are compared (see `refinement_options`), and rates. Its
             seed is not used, and the poses of the views stay as they are: the label maps are
-            drawn with them.
+            rendered with them.
         exposures: Where exposures begin, for ``fit_options.exposure``, by name of the view.
         seed: Order of views and codes.
-        backend: Who renders.
+        backend: Name of the rendering backend.
         progress: Called with the steps done and all there are.
 
     Raises:
@@ -153,61 +153,104 @@ def sharpen(
         ShapeError: If a label map does not have its photograph's proportions.
     """
     options = options or SharpenOptions()
+    update = _LabelUpdate(
+        views=_photographed(views, evidence),
+        label_maps=_CachedLabelMaps(evidence),
+        votes=_with_candidates(uplift_options or UpliftOptions(), confusion),
+        confusion=confusion,
+        backend=backend,
+    )
+    fit = replace(fit_options or FitOptions(), seed=seed, refine_poses=False)
+    return _refined(gaussians, update, options, fit, exposures=exposures, progress=progress)
+
+
+def _photographed(views: Sequence[View], evidence: LabelSource) -> list[View]:
+    """The views in the order of their names, if all have a label map and a photograph."""
     ordered = voting_views(views, evidence, "a label map")
     for view in ordered:
         if view.image is None:
             raise InputError(f"views: expected a photograph of each, {view.name} has none.")
-    papers = _Papers(evidence)
-    wanted = uplift_options or UpliftOptions()
-    many = max(wanted.candidates, 2 if confusion is None else _CANDIDATES)
-    wanted = replace(wanted, candidates=many, slots=max(wanted.slots, many))
+    return ordered
 
-    def decided(now: Gaussians) -> tuple[Labels, float]:
-        votes = uplift(now, ordered, papers, options=wanted, backend=backend)
-        labels = votes
-        if confusion is not None:
-            labels = correct_confusion(
-                votes, options=confusion, view_correlation=votes.metadata["view_correlation"]
-            )
-        return labels, _agreement(votes, labels)
 
-    labels, before = decided(gaussians)
+def _refined(
+    gaussians: Gaussians,
+    update: "_LabelUpdate",
+    options: SharpenOptions,
+    fit: FitOptions,
+    *,
+    exposures: Mapping[str, Exposure] | None,
+    progress: Callable[[int, int], None] | None,
+) -> Sharpened:
+    """Fit with the loss of the label maps; labels are decided again every few steps."""
+    labels, before = update.labels(gaussians)
     after = before
-    trusted = papers
-    if options.trust_pixels >= 0:
-        drawn = replace(labels, candidates=None, shares=None)
-        by_name = {view.name: view for view in ordered}
-        trusted = _Papers(
-            _Trusted(papers, gaussians, by_name, drawn, options.trust_pixels, backend)
-        )
-    base = fit_options or FitOptions()
-    run = Refinement(
+    trusted = update.trusted(gaussians, labels, options.trust_pixels)
+    refinement = Refinement(
         gaussians,
-        ordered,
+        update.views,
         steps=options.sharpen_steps,
         start=options.rates_from,
-        options=replace(base, seed=seed, refine_poses=False),
+        options=fit,
         exposures=exposures,
-        backend=backend,
+        backend=update.backend,
     )
     for done in range(options.sharpen_steps):
-        term = _LabelTerm(trusted, labels.ids.cpu(), options, run.generator, backend)
-        run.step(term)
+        generator = refinement.generator
+        loss = _LabelLoss(trusted, labels.ids.cpu(), options, generator, update.backend)
+        refinement.step(loss)
         last = done + 1 == options.sharpen_steps
         if last or (done + 1) % options.decide_every == 0:
-            gaussians = run.gaussians()
-            labels, after = decided(gaussians)
+            gaussians = refinement.gaussians()
+            labels, after = update.labels(gaussians)
         if progress is not None:
             progress(done + 1, options.sharpen_steps)
-    metadata = dict(labels.metadata) | {
-        "sharpened": {"options": asdict(options), "seed": seed, "agreement": [before, after]}
-    }
+    record = {"options": asdict(options), "seed": fit.seed, "agreement": [before, after]}
+    metadata = dict(labels.metadata) | {"sharpened": record}
     return Sharpened(
         gaussians=gaussians,
         labels=replace(labels, metadata=metadata),
         agreement=(before, after),
-        exposures=run.exposures,
+        exposures=refinement.exposures,
     )
+
+
+def _with_candidates(options: UpliftOptions, confusion: ConfusionOptions | None) -> UpliftOptions:
+    """The same votes for a soft layer, with the candidates that relabelling needs."""
+    candidates = max(options.candidates, 2 if confusion is None else _CANDIDATES)
+    return replace(options, candidates=candidates, slots=max(options.slots, candidates))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _LabelUpdate:
+    """Decides labels from the votes of views, whenever Gaussians changed."""
+
+    views: Sequence[View]
+    label_maps: "_CachedLabelMaps"
+    votes: UpliftOptions
+    confusion: ConfusionOptions | None
+    backend: str
+
+    def labels(self, gaussians: Gaussians) -> tuple[Labels, float]:
+        """Labels by the votes of all views, and how many of the votes agree with them."""
+        votes = uplift(
+            gaussians, self.views, self.label_maps, options=self.votes, backend=self.backend
+        )
+        labels = votes
+        if self.confusion is not None:
+            correlation = votes.metadata["view_correlation"]
+            labels = correct_confusion(votes, options=self.confusion, view_correlation=correlation)
+        return labels, _agreement(votes, labels)
+
+    def trusted(self, gaussians: Gaussians, labels: Labels, pixels: int) -> "_CachedLabelMaps":
+        """The label maps without what contradicts the layer; all of them where pixels is -1."""
+        if pixels < 0:
+            return self.label_maps
+        hard = replace(labels, candidates=None, shares=None)
+        by_name = {view.name: view for view in self.views}
+        return _CachedLabelMaps(
+            _TrustedLabelMaps(self.label_maps, gaussians, by_name, hard, pixels, self.backend)
+        )
 
 
 def _agreement(votes: Labels, labels: Labels) -> float:
@@ -221,8 +264,8 @@ def _agreement(votes: Labels, labels: Labels) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Papers:
-    """Label maps, compressed once they were made: some take a drawing each time."""
+class _CachedLabelMaps:
+    """Label maps, compressed once they were made: some are rendered each time."""
 
     source: LabelSource
     kept: dict[str, tuple[tuple[int, ...], bytes, bytes | None]] = field(default_factory=dict)
@@ -235,21 +278,22 @@ class _Papers:
 
     def label_map(self, name: str) -> LabelMap:
         if name not in self.kept:
-            paper = self.source.label_map(name)
-            self.ids.update(torch.unique(paper.ids).tolist())
-            shape = (paper.height, paper.width)
-            sure = None if paper.confidence is None else _packed(paper.confidence.float())
-            self.kept[name] = (shape, _packed(paper.ids), sure)
-        shape, ids, sure = self.kept[name]
-        confidence = None if sure is None else _unpacked(sure, np.float32, shape)
-        return LabelMap(ids=_unpacked(ids, np.int32, shape), confidence=confidence)
+            view_map = self.source.label_map(name)
+            self.ids.update(torch.unique(view_map.ids).tolist())
+            shape = (view_map.height, view_map.width)
+            confidence = view_map.confidence
+            packed = None if confidence is None else _compressed(confidence.float())
+            self.kept[name] = (shape, _compressed(view_map.ids), packed)
+        shape, ids, packed = self.kept[name]
+        confidence = None if packed is None else _decompressed(packed, np.float32, shape)
+        return LabelMap(ids=_decompressed(ids, np.int32, shape), confidence=confidence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Trusted:
+class _TrustedLabelMaps:
     """Label maps without the pixels that contradict what a layer shows around them."""
 
-    papers: _Papers
+    label_maps: _CachedLabelMaps
     gaussians: Gaussians
     views: Mapping[str, View]
     labels: Labels
@@ -258,23 +302,25 @@ class _Trusted:
 
     @property
     def view_names(self) -> Sequence[str]:
-        return self.papers.view_names
+        return self.label_maps.view_names
 
     def label_map(self, name: str) -> LabelMap:
-        paper = self.papers.label_map(name)
-        camera = camera_of_map(self.views[name], paper.height, paper.width)
-        drawn = label_map(self.gaussians, camera, self.labels, backend=self.backend).ids
-        near = shown_near(paper.ids, drawn, self.pixels)
-        return LabelMap(ids=torch.where(near, paper.ids, UNLABELLED), confidence=paper.confidence)
+        view_map = self.label_maps.label_map(name)
+        camera = camera_of_map(self.views[name], view_map.height, view_map.width)
+        rendered = label_map(self.gaussians, camera, self.labels, backend=self.backend).ids
+        shown = shown_near(view_map.ids, rendered, self.pixels)
+        return LabelMap(
+            ids=torch.where(shown, view_map.ids, UNLABELLED), confidence=view_map.confidence
+        )
 
 
 def shown_near(
-    ids: Int32[Tensor, "height width"], drawn: Int32[Tensor, "height width"], pixels: int
+    ids: Int32[Tensor, "height width"], rendered: Int32[Tensor, "height width"], pixels: int
 ) -> Bool[Tensor, "height width"]:
-    """Where `drawn` has the pixel's own id at most so many pixels away along each axis."""
+    """Where `rendered` has the pixel's own id at most so many pixels away along each axis."""
     height, width = ids.shape
     # No pixel has the id -2.
-    around = torch.nn.functional.pad(drawn, (pixels,) * 4, value=-2)
+    around = torch.nn.functional.pad(rendered, (pixels,) * 4, value=-2)
     found = torch.zeros(ids.shape, dtype=torch.bool)
     for down in range(2 * pixels + 1):
         for across in range(2 * pixels + 1):
@@ -282,46 +328,44 @@ def shown_near(
     return found
 
 
-def _packed(values: Tensor) -> bytes:
+def _compressed(values: Tensor) -> bytes:
     return zlib.compress(values.cpu().contiguous().numpy().tobytes(), 1)
 
 
-def _unpacked(packed: bytes, kind: type[np.generic], shape: tuple[int, ...]) -> Tensor:
-    return torch.from_numpy(np.frombuffer(zlib.decompress(packed), kind).reshape(shape).copy())
+def _decompressed(compressed: bytes, kind: type[np.generic], shape: tuple[int, ...]) -> Tensor:
+    return torch.from_numpy(np.frombuffer(zlib.decompress(compressed), kind).reshape(shape).copy())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _LabelTerm:
+class _LabelLoss:
     """The second term of the loss, for one step."""
 
-    papers: _Papers
+    label_maps: _CachedLabelMaps
     labels: Int32[Tensor, "n"]
     options: SharpenOptions
     generator: torch.Generator
     backend: str
 
     def __call__(self, view: View, gaussians: Gaussians, rows: Int64[Tensor, "m"]) -> Tensor:
-        paper = self.papers.label_map(view.name)
+        view_map = self.label_maps.label_map(view.name)
         own = self.labels[rows.cpu()]
-        known = self.papers.ids | {UNLABELLED, *torch.unique(own).tolist()}
-        names = torch.tensor(sorted(known), dtype=torch.int32)
-        codes = 2.0 * torch.randint(
-            0, 2, (len(names), self.options.codes), generator=self.generator
-        )
+        known = self.label_maps.ids | {UNLABELLED, *torch.unique(own).tolist()}
+        ids = torch.tensor(sorted(known), dtype=torch.int32)
+        codes = 2.0 * torch.randint(0, 2, (len(ids), self.options.codes), generator=self.generator)
         codes -= 1
         # What has no label agrees with nothing.
-        codes[names == UNLABELLED] = 0
-        signal = codes[torch.searchsorted(names, own)].to(gaussians.means)
-        drawn = render(
+        codes[ids == UNLABELLED] = 0
+        signal = codes[torch.searchsorted(ids, own)].to(gaussians.means)
+        rendered = render(
             gaussians,
-            camera_of_map(view, paper.height, paper.width),
+            camera_of_map(view, view_map.height, view_map.width),
             signal,
             backend=self.backend,
         ).image
-        say = (paper.ids != UNLABELLED).float()
-        if paper.confidence is not None:
-            say = say * paper.confidence
-        wanted = codes[torch.searchsorted(names, paper.ids)] * say.unsqueeze(-1)
-        same = (drawn * wanted.to(drawn)).sum() / self.options.codes
-        worth = float(say.sum())
-        return self.options.label_weight * (1 - same / max(worth, 1.0))
+        weight = (view_map.ids != UNLABELLED).float()
+        if view_map.confidence is not None:
+            weight = weight * view_map.confidence
+        wanted = codes[torch.searchsorted(ids, view_map.ids)] * weight.unsqueeze(-1)
+        agreement = (rendered * wanted.to(rendered)).sum() / self.options.codes
+        total_weight = float(weight.sum())
+        return self.options.label_weight * (1 - agreement / max(total_weight, 1.0))

@@ -1,7 +1,7 @@
 r"""Splitting Gaussians: one becomes several narrower ones that together look like it.
 
 With :math:`x = \mu + L z`, :math:`L = R\,\mathrm{diag}(s)`, and a unit direction e in z, the
-parts of a mixture (`_mixture`, places m, weights w, width r) are
+parts of a mixture (`mixture`, offsets m, weights w, width r) are
 
 .. math:: \mu_c = \mu + m_c L e, \qquad
           \Sigma_c = L \bigl( I - (1 - r^2)\, e e^\top \bigr) L^\top
@@ -29,13 +29,13 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.boundaries.geometry import (
     axes_of,
     directions_of_normals,
+    line_extent,
     main_directions,
-    seen_along,
     unit_or_main,
 )
 from splatseg.lift.boundaries.mixture import MIXTURES, opacities_of_parts
 
-_SAME = 1e-9
+_AXIS_TOLERANCE = 1e-9
 """Deviation from an axis, below which a direction is that axis."""
 
 
@@ -58,7 +58,7 @@ def split(
         normals: For each selected one, in the order of rows, the normal of the cut in the
             world, of any length. None splits along the longest axis.
         parts: 2 or 3. Three are narrower and look more like the whole.
-        cameras: Those that the picture matters to; without any, all directions do alike.
+        cameras: Cameras that rendered images matter for; without any, all directions do alike.
 
     Returns:
         The Gaussians that stay, in order, and behind them the parts, those of one Gaussian
@@ -101,18 +101,18 @@ def split_along(
     check_shape("directions", directions, (len(rows), 3))
     sized = gaussians.scales[rows].amax(dim=1) > 0
     rows, directions = rows[sized], directions[sized]
-    whole = gaussians[rows]
-    e = unit_or_main(whole, directions.double())
+    chosen = gaussians[rows]
+    e = unit_or_main(chosen, directions.double())
     mixture = MIXTURES[parts]
     weights = torch.tensor(mixture.weights, dtype=torch.float64)
-    places = torch.tensor(mixture.places, dtype=torch.float64)
-    ends = torch.einsum("nij,nj->ni", axes_of(whole), e)
-    means = whole.means.double().unsqueeze(1) + places[None, :, None] * ends.unsqueeze(1)
-    rotations, scales = narrowed(whole, e, mixture.width)
-    across = seen_along(whole, e, cameras).across
-    opacities = opacities_of_parts(whole.opacities, across, mixture)
+    offsets = torch.tensor(mixture.offsets, dtype=torch.float64)
+    principal = torch.einsum("nij,nj->ni", axes_of(chosen), e)
+    means = chosen.means.double().unsqueeze(1) + offsets[None, :, None] * principal.unsqueeze(1)
+    rotations, scales = narrowed(chosen, e, mixture.width)
+    across = line_extent(chosen, e, cameras).across
+    opacities = opacities_of_parts(chosen.opacities, across, mixture)
     of_part = torch.arange(len(rows)).repeat_interleave(parts)
-    pieces = whole[of_part].replace(
+    parts_of_chosen = chosen[of_part].replace(
         means=means.reshape(-1, 3).to(gaussians.means),
         rotations=rotations[of_part].to(gaussians.rotations),
         scales=scales[of_part].to(gaussians.scales),
@@ -120,11 +120,11 @@ def split_along(
     )
     kept = torch.ones(len(gaussians), dtype=torch.bool)
     kept[rows] = False
-    stay = torch.nonzero(kept).squeeze(1)
+    unsplit = torch.nonzero(kept).squeeze(1)
     return Edited(
-        gaussians=Gaussians.concatenate([gaussians[stay], pieces]),
-        rows=torch.cat((stay, rows[of_part])),
-        fractions=torch.cat((torch.ones(len(stay)), weights.float().repeat(len(rows)))),
+        gaussians=Gaussians.concatenate([gaussians[unsplit], parts_of_chosen]),
+        rows=torch.cat((unsplit, rows[of_part])),
+        fractions=torch.cat((torch.ones(len(unsplit)), weights.float().repeat(len(rows)))),
     )
 
 
@@ -138,7 +138,7 @@ def narrowed(
     """
     e = directions.double()
     rotations, scales = gaussians.rotations.double(), gaussians.scales.double()
-    along = (e.abs().amax(dim=1) - 1).abs() < _SAME
+    along = (e.abs().amax(dim=1) - 1).abs() < _AXIS_TOLERANCE
     axis = torch.nn.functional.one_hot(e.abs().argmax(dim=1), 3).double()
     scales_along = scales * (1 - (1 - width) * axis)
     if bool(along.all()):

@@ -11,14 +11,15 @@ them.
 with the known ones held at their own shares. The value that arrives for an id is the probability
 that a random walk over the graph first meets evidence for that id.
 
-With ``smoothing`` known Gaussians listen too, the more the weaker their own evidence e is:
+With ``smoothing`` known Gaussians are averaged with their neighbours too, the more the weaker
+their own evidence e is:
 
 .. math:: x_i \leftarrow \frac{e_i\, y_i + s \sum_j P_{ij} x_j}{e_i + s}
 
 References:
     Zhu and Ghahramani, Learning from Labeled and Unlabeled Data with Label Propagation (2002),
     section 2.2: known nodes are held.
-    Zhou et al., Learning with Local and Global Consistency (2004), eq. 4: they listen.
+    Zhou et al., Learning with Local and Global Consistency (2004), eq. 4: known nodes change too.
     Marrie et al., LUDVIG (2024), section 3.3: diffusion on a graph of Gaussians.
 """
 
@@ -34,14 +35,20 @@ from torch import Tensor
 from splatseg._check import check_choice, check_finite, check_range
 from splatseg.core import UNLABELLED, Features, Gaussians, Labels
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.completion.graph import NodeAttributes, diffuse, neighbour_graph, ranked, walk
+from splatseg.lift.completion.graph import (
+    NodeAttributes,
+    diffuse,
+    neighbour_graph,
+    ranked,
+    transition_matrix,
+)
 
 CompletedLayer = Literal["as_given", "hard"]
 
-_LEAST = 1e-3
+_MIN_CONFIDENCE = 1e-3
 """Share of a label whose confidence is 0: it still counts where nothing else is known."""
 
-_CARRIED = 8
+_MAX_SHARES = 8
 """Shares of a Gaussian that go on from step to step, unless more are to be kept."""
 
 
@@ -50,17 +57,17 @@ class CompletionOptions:
     """How neighbours' labels spread."""
 
     neighbours: int = 12
-    """Nearest Gaussians that each one listens to."""
+    """Nearest Gaussians of each one in the neighbour graph."""
 
     spread_steps: int = 50
-    """How many neighbours far labels spread at most."""
+    """Upper bound of the steps over the graph that labels spread."""
 
     own_evidence: float = 0.0
-    """Evidence, in pixels' worth of blending weight, that a Gaussian must exceed to speak for
-    itself; with less it is labelled by its neighbours. Layers without evidence ignore it."""
+    """Evidence, in fully visible pixels, that a Gaussian must exceed to keep
+    its own label; with less it is labelled by its neighbours. Layers without evidence ignore it."""
 
     min_inferred: float = 0.0
-    """Least confidence in [0, 1] that an inferred label needs; below it there is none."""
+    """Minimum confidence in [0, 1] that an inferred label needs; below it there is none."""
 
     colour_width: float = 0.1
     """Standard deviation of colours in [0, 1] that count as alike."""
@@ -69,11 +76,11 @@ class CompletionOptions:
     """Width of the feature affinity, in squared median distances of features along edges."""
 
     smoothing: float = 0.0
-    """How much the neighbours of a Gaussian count together beside its own evidence, in pixels'
-    worth of blending weight; 50 is a good start. 0 leaves labels with evidence as they are."""
+    """How much the neighbours of a Gaussian count together beside its own evidence, in fully
+    visible pixels; 50 is a good start. 0 leaves labels with evidence as they are."""
 
     smoothing_steps: int = 5
-    """How many neighbours far known labels are smoothed."""
+    """Steps over the graph that known labels are smoothed."""
 
     completed_layer: CompletedLayer = "as_given"
     """as_given: a soft layer stays soft. hard: shares are smoothed and spread, and only the
@@ -117,14 +124,14 @@ def complete(
     Returns:
         The layer with `inferred` set where an id comes from neighbours: where there was none, or
         where smoothing chose another one. Their confidence is the share that arrived. Gaussians
-        that no evidence reaches in `spread_steps` keep the id -1. The metadata says how many
+        that no evidence reaches in `spread_steps` keep the id -1. The metadata holds how many
         there were of each.
 
     Raises:
         ShapeError: If the numbers of Gaussians, labels and features differ.
         RangeError: If a value is NaN or infinite.
-        InputError: If smoothing is asked for and the layer does not say how much evidence each
-            Gaussian has.
+        InputError: If smoothing is asked for and the layer does not hold the evidence of each
+            Gaussian.
 
     Example:
         >>> row = torch.arange(4.0).unsqueeze(1) * torch.tensor([[1.0, 0.0, 0.0]])
@@ -139,10 +146,25 @@ def complete(
     options = options or CompletionOptions()
     _check(gaussians, labels, options, features)
     known = _known(labels, options)
-    names, table = _shares(labels, known)
+    column_ids, shares = _shares(labels, known)
     kept = 1 if labels.candidates is None else labels.candidates.shape[1]
-    carried = max(_CARRIED, kept)
-    step = walk(
+    shares = _spread(gaussians, labels, shares, known, options=options, features=features)
+    return _completed(labels, options, known, _strongest_ids(shares, column_ids, kept))
+
+
+def _spread(
+    gaussians: Gaussians,
+    labels: Labels,
+    shares: Any,
+    known: NDArray[np.bool_],
+    *,
+    options: CompletionOptions,
+    features: Features | None,
+) -> Any:
+    """Shares after smoothing and label propagation over the neighbour graph, sparse (n, ids)."""
+    kept = 1 if labels.candidates is None else labels.candidates.shape[1]
+    max_shares = max(_MAX_SHARES, kept)
+    transition = transition_matrix(
         neighbour_graph(
             _attributes(gaussians, features),
             neighbours=options.neighbours,
@@ -151,18 +173,24 @@ def complete(
         )
     )
     if options.smoothing > 0 and labels.evidence is not None:
-        own = np.where(known, labels.evidence.cpu().float().numpy(), 0.0).astype(np.float32)
-        table = diffuse(
-            step,
-            table,
-            own,
-            strength=options.smoothing,
+        own_weight = np.where(known, labels.evidence.cpu().float().numpy(), 0.0).astype(np.float32)
+        shares = diffuse(
+            transition,
+            shares,
+            own_weight,
+            neighbour_weight=options.smoothing,
             steps=options.smoothing_steps,
-            kept=carried,
+            max_shares=max_shares,
         )
-    held = np.where(known, np.inf, 0.0).astype(np.float32)
-    table = diffuse(step, table, held, strength=1.0, steps=options.spread_steps, kept=carried)
-    return _completed(labels, options, known, _table(table, names, kept))
+    own_weight = np.where(known, np.inf, 0.0).astype(np.float32)
+    return diffuse(
+        transition,
+        shares,
+        own_weight,
+        neighbour_weight=1.0,
+        steps=options.spread_steps,
+        max_shares=max_shares,
+    )
 
 
 def _check(
@@ -180,8 +208,8 @@ def _check(
         check_finite("labels.evidence", labels.evidence)
     elif options.smoothing > 0:
         raise InputError(
-            "smoothing: expected a layer that says how much evidence each Gaussian has, "
-            "got one without; make it anew, or set smoothing to 0."
+            "smoothing: expected a layer with the evidence of each Gaussian, got one without; "
+            "make the layer again, or set smoothing to 0."
         )
     if features is not None:
         if len(features) != len(gaussians):
@@ -215,33 +243,33 @@ def _shares(labels: Labels, known: NDArray[np.bool_]) -> tuple[NDArray[np.int64]
 
     if labels.candidates is None or labels.shares is None:
         ids = labels.ids.cpu().long().numpy()[:, None]
-        values = labels.confidence.cpu().float().clamp_min(_LEAST).numpy()[:, None]
+        values = labels.confidence.cpu().float().clamp_min(_MIN_CONFIDENCE).numpy()[:, None]
     else:
         ids = labels.candidates.cpu().long().numpy()
         values = labels.shares.cpu().float().clamp_min(0).numpy()
-    real = (ids != UNLABELLED) & (values > 0) & known[:, None]
-    names, columns = np.unique(ids[real], return_inverse=True)
-    rows = np.nonzero(real)[0]
+    positive = (ids != UNLABELLED) & (values > 0) & known[:, None]
+    column_ids, columns = np.unique(ids[positive], return_inverse=True)
+    rows = np.nonzero(positive)[0]
     # Nothing known is one column of nothing.
-    names = names if len(names) else np.array([UNLABELLED])
-    table = scipy.sparse.csr_matrix(
-        (values[real].astype(np.float32), (rows, columns)), shape=(len(labels), len(names))
+    column_ids = column_ids if len(column_ids) else np.array([UNLABELLED])
+    shares = scipy.sparse.csr_matrix(
+        (values[positive].astype(np.float32), (rows, columns)), shape=(len(labels), len(column_ids))
     )
-    return names, table
+    return column_ids, shares
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Table:
+class _StrongestIds:
     """The strongest ids of each Gaussian, -1 where there are fewer, and their shares."""
 
     ids: Tensor
     shares: Tensor
 
 
-def _table(table: Any, names: NDArray[np.int64], kept: int) -> _Table:
-    columns, shares = ranked(table, kept)
-    ids = np.where(columns >= 0, names[np.maximum(columns, 0)], UNLABELLED)
-    return _Table(
+def _strongest_ids(shares: Any, column_ids: NDArray[np.int64], kept: int) -> _StrongestIds:
+    columns, shares = ranked(shares, kept)
+    ids = np.where(columns >= 0, column_ids[np.maximum(columns, 0)], UNLABELLED)
+    return _StrongestIds(
         ids=torch.from_numpy(ids.astype(np.int32)),
         # Sums in float32 may leave a lone id's share a hair above 1.
         shares=torch.from_numpy(shares).clamp(0, 1),
@@ -249,26 +277,26 @@ def _table(table: Any, names: NDArray[np.int64], kept: int) -> _Table:
 
 
 def _completed(
-    labels: Labels, options: CompletionOptions, known: NDArray[np.bool_], table: _Table
+    labels: Labels, options: CompletionOptions, known: NDArray[np.bool_], strongest: _StrongestIds
 ) -> Labels:
-    own = torch.from_numpy(known)
+    known_rows = torch.from_numpy(known)
     before = labels.ids.cpu()
     smoothed = options.smoothing > 0
-    reached = (table.ids[:, 0] != UNLABELLED) & (table.shares[:, 0] >= options.min_inferred)
+    reached = (strongest.ids[:, 0] != UNLABELLED) & (strongest.shares[:, 0] >= options.min_inferred)
     # What keeps its label keeps its row untouched, unless it was smoothed.
-    kept = own & ~reached if smoothed else own
+    kept = known_rows & ~reached if smoothed else known_rows
     changed = ~kept & reached
-    ids = torch.where(kept, before, torch.where(changed, table.ids[:, 0], UNLABELLED))
+    ids = torch.where(kept, before, torch.where(changed, strongest.ids[:, 0], UNLABELLED))
     confidence = torch.where(kept, labels.confidence.cpu().float(), 0.0)
-    confidence = torch.where(changed, table.shares[:, 0], confidence)
+    confidence = torch.where(changed, strongest.shares[:, 0], confidence)
     candidates, shares = None, None
     if labels.candidates is not None and labels.shares is not None:
-        rows, there = kept.unsqueeze(1), changed.unsqueeze(1)
-        candidates = torch.where(there, table.ids, UNLABELLED)
-        candidates = torch.where(rows, labels.candidates.cpu(), candidates).to(torch.int32)
-        shares = torch.where(there, table.shares, 0.0)
-        shares = torch.where(rows, labels.shares.cpu().float(), shares)
-    inferred = changed & (~own | (ids != before))
+        kept_rows, changed_rows = kept.unsqueeze(1), changed.unsqueeze(1)
+        candidates = torch.where(changed_rows, strongest.ids, UNLABELLED)
+        candidates = torch.where(kept_rows, labels.candidates.cpu(), candidates).to(torch.int32)
+        shares = torch.where(changed_rows, strongest.shares, 0.0)
+        shares = torch.where(kept_rows, labels.shares.cpu().float(), shares)
+    inferred = changed & (~known_rows | (ids != before))
     hard = options.completed_layer == "hard"
     result = replace(
         labels,
@@ -278,22 +306,22 @@ def _completed(
         shares=None if hard else shares,
         inferred=inferred,
     )
-    return _described(
+    return _with_record(
         result,
         options,
-        inferred=int((inferred & ~own).sum()),
-        corrected=int((inferred & own).sum()),
+        inferred=int((inferred & ~known_rows).sum()),
+        corrected=int((inferred & known_rows).sum()),
         unreached=int((ids == UNLABELLED).sum()),
     )
 
 
-def _described(
+def _with_record(
     labels: Labels, options: CompletionOptions, *, inferred: int, corrected: int, unreached: int
 ) -> Labels:
-    facts = {
+    record = {
         "options": asdict(options),
         "inferred": inferred,
         "corrected": corrected,
         "unreached": unreached,
     }
-    return replace(labels, metadata=dict(labels.metadata) | {"completion": facts})
+    return replace(labels, metadata=dict(labels.metadata) | {"completion": record})

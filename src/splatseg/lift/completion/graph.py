@@ -31,7 +31,7 @@ from splatseg.neighbours import NeighbourIndex
 _ROWS = 65536
 """Nodes handled at a time."""
 
-_FAINT = 1e-6
+_MIN_SHARE = 1e-6
 """Shares below this are dropped."""
 
 
@@ -65,23 +65,23 @@ def neighbour_graph(
     neighbours = min(neighbours, count - 1)
     if neighbours < 1:
         return scipy.sparse.csr_matrix((count, count), dtype=np.float32)
-    near, distance = _nearest(nodes.positions, neighbours)
-    # Where neighbours share a place all of them are as near as can be.
-    width = np.maximum(distance[:, -1].astype(np.float64), 1e-30)
-    unlike = np.empty((count, neighbours), dtype=np.float32)
+    nearest, distance = _nearest(nodes.positions, neighbours)
+    # Where neighbours share a position all of them are as near as can be.
+    local_width = np.maximum(distance[:, -1].astype(np.float64), 1e-30)
+    exponent = np.empty((count, neighbours), dtype=np.float32)
     for rows in _blocks(count):
-        scale = width[rows, None] * width[near[rows]]
-        unlike[rows] = distance[rows] ** 2 / (2 * scale)
+        scale = local_width[rows, None] * local_width[nearest[rows]]
+        exponent[rows] = distance[rows] ** 2 / (2 * scale)
         if nodes.colours is not None:
-            apart = _squared(nodes.colours, rows, near[rows])
-            unlike[rows] += apart / (2 * colour_width**2)
+            squared = _squared(nodes.colours, rows, nearest[rows])
+            exponent[rows] += squared / (2 * colour_width**2)
     if nodes.features is not None:
-        unlike += _feature_distances(nodes.features, near) / feature_width
+        exponent += _feature_distances(nodes.features, nearest) / feature_width
     # Beyond this float32 would leave a node with unlike neighbours without any.
-    strength = np.exp(-np.minimum(unlike, 60.0))
+    edge_weights = np.exp(-np.minimum(exponent, 60.0))
     starts = np.arange(count + 1, dtype=np.int64) * neighbours
     graph = scipy.sparse.csr_matrix(
-        (strength.reshape(-1), near.reshape(-1), starts), shape=(count, count)
+        (edge_weights.reshape(-1), nearest.reshape(-1), starts), shape=(count, count)
     )
     graph = graph.maximum(graph.T).tocsr()
     graph.sort_indices()
@@ -94,28 +94,28 @@ def _nearest(
     """Each node's nearest others (n, k) and how far they are, near ones first."""
     count = len(positions)
     index = NeighbourIndex(torch.from_numpy(positions))
-    near = np.empty((count, neighbours), dtype=np.int32)
+    nearest = np.empty((count, neighbours), dtype=np.int32)
     distance = np.empty((count, neighbours), dtype=np.float32)
     for rows in _blocks(count):
         found = index.nearest_others(neighbours, rows=torch.arange(rows.start, rows.stop))
-        near[rows] = found.indices.numpy()
+        nearest[rows] = found.indices.numpy()
         distance[rows] = found.distances.numpy()
-    return near, distance
+    return nearest, distance
 
 
 def _squared(
-    values: NDArray[np.float32], rows: slice, near: NDArray[np.int32]
+    values: NDArray[np.float32], rows: slice, nearest: NDArray[np.int32]
 ) -> NDArray[np.float32]:
     """Squared distances of a block of nodes to their neighbours, a channel at a time."""
-    total = np.zeros(near.shape, dtype=np.float32)
+    total = np.zeros(nearest.shape, dtype=np.float32)
     for channel in range(values.shape[1]):
         column = values[:, channel]
-        total += (column[rows, None] - column[near]) ** 2
+        total += (column[rows, None] - column[nearest]) ** 2
     return total
 
 
 def _feature_distances(
-    features: NDArray[np.float32], near: NDArray[np.int32]
+    features: NDArray[np.float32], nearest: NDArray[np.int32]
 ) -> NDArray[np.float32]:
     """Squared distances of unit features along edges, over their squared median.
 
@@ -124,15 +124,17 @@ def _feature_distances(
     length = np.linalg.norm(features, axis=1)
     known = length > 0
     unit = (features / np.where(known, length, 1)[:, None]).astype(np.float32)
-    apart = np.concatenate([_squared(unit, rows, near[rows]) for rows in _blocks(len(near))])
-    both = known[:, None] & known[near]
-    median = float(np.median(apart[both])) if both.any() else 0.0
+    squared = np.concatenate(
+        [_squared(unit, rows, nearest[rows]) for rows in _blocks(len(nearest))]
+    )
+    both = known[:, None] & known[nearest]
+    median = float(np.median(squared[both])) if both.any() else 0.0
     if not median > 0:
-        return np.zeros_like(apart)
-    return np.where(both, apart / median, np.float32(1.0))
+        return np.zeros_like(squared)
+    return np.where(both, squared / median, np.float32(1.0))
 
 
-def walk(graph: Any) -> Any:
+def transition_matrix(graph: Any) -> Any:
     r"""Rows that add up to 1: :math:`P = D^{-1} W`, a step of a random walk.
 
     Power iterations of P are those of the symmetric :math:`D^{-1/2} W D^{-1/2}` in other
@@ -146,87 +148,93 @@ def walk(graph: Any) -> Any:
 
 
 def diffuse(
-    step: Any,
+    transition: Any,
     shares: Any,
-    own: NDArray[np.float32],
+    own_weight: NDArray[np.float32],
     *,
-    strength: float,
+    neighbour_weight: float,
     steps: int,
-    kept: int,
+    max_shares: int,
 ) -> Any:
-    r"""Shares after some steps of giving neighbours a say.
+    r"""Shares after some steps of diffusion (label propagation).
 
     .. math:: x_i \leftarrow \frac{o_i\, y_i + s \sum_j P_{ij} x_j}{o_i + s}
 
     for nodes with finite o; a node with infinite o keeps its shares. The fixed point balances
-    what a node has seen itself against what its neighbours say.
+    a node's own evidence against the shares of its neighbours.
 
     Args:
-        step: P, sparse (n, n), rows that add up to at most 1.
+        transition: P, sparse (n, n), rows that add up to at most 1.
         shares: y, sparse (n, ids), rows that add up to at most 1.
-        own: o, (n,): how much a node's own shares count; 0 for a node that knows nothing.
-        strength: s, how much neighbours count, positive.
+        own_weight: o, (n,): how much a node's own shares count; 0 for a node without evidence.
+        neighbour_weight: s, how much neighbours count, positive.
         steps: How often.
-        kept: Largest shares of a node that are carried on, at least 1.
+        max_shares: Largest shares of a node that are carried on, at least 1.
 
     Returns:
         x, sparse (n, ids).
     """
     import scipy.sparse
 
-    bound = np.isinf(own)
-    free, fixed = np.flatnonzero(~bound), np.flatnonzero(bound)
-    if not len(free):
+    clamped = np.isinf(own_weight)
+    free_rows, clamped_rows = np.flatnonzero(~clamped), np.flatnonzero(clamped)
+    if not len(free_rows):
         return shares
-    held = own[free].astype(np.float64)
-    inward = scipy.sparse.diags((strength / (held + strength)).astype(np.float32)) @ step[free]
-    # What free nodes hear of themselves and of those that are bound never changes.
-    source = scipy.sparse.diags((held / (held + strength)).astype(np.float32)) @ shares[free]
-    source = (source + inward[:, fixed] @ shares[fixed]).tocsr()
-    inward = inward[:, free].tocsr()
-    now = shares[free]
+    free_weight = own_weight[free_rows].astype(np.float64)
+    free_transition = (
+        scipy.sparse.diags((neighbour_weight / (free_weight + neighbour_weight)).astype(np.float32))
+        @ transition[free_rows]
+    )
+    # The part of free nodes' own shares and of clamped neighbours never changes.
+    source = (
+        scipy.sparse.diags((free_weight / (free_weight + neighbour_weight)).astype(np.float32))
+        @ shares[free_rows]
+    )
+    source = (source + free_transition[:, clamped_rows] @ shares[clamped_rows]).tocsr()
+    free_transition = free_transition[:, free_rows].tocsr()
+    current = shares[free_rows]
     for _ in range(steps):
-        now = scipy.sparse.vstack(
+        current = scipy.sparse.vstack(
             [
-                _strongest((source[rows] + inward[rows] @ now).tocsr(), kept)
-                for rows in _blocks(len(free))
+                _strongest((source[rows] + free_transition[rows] @ current).tocsr(), max_shares)
+                for rows in _blocks(len(free_rows))
             ],
             format="csr",
         )
-    order = np.argsort(np.concatenate((free, fixed)), kind="stable")
-    together: Any = scipy.sparse.vstack([now, shares[fixed]], format="csr")
-    return together[order]
+    order = np.argsort(np.concatenate((free_rows, clamped_rows)), kind="stable")
+    merged: Any = scipy.sparse.vstack([current, shares[clamped_rows]], format="csr")
+    return merged[order]
 
 
-def _strongest(table: Any, kept: int) -> Any:
+def _strongest(table: Any, max_shares: int) -> Any:
     """Each row's largest entries; of equals the one with the smaller id."""
     import scipy.sparse
 
-    table.data[table.data < _FAINT] = 0
+    table.data[table.data < _MIN_SHARE] = 0
     table.eliminate_zeros()
     table.sort_indices()
     sizes = np.diff(table.indptr)
-    if not len(sizes) or sizes.max() <= kept:
+    if not len(sizes) or sizes.max() <= max_shares:
         return table
     row = np.repeat(np.arange(len(sizes)), sizes)
     order = np.lexsort((table.indices, -table.data, row))
     rank = np.arange(len(order)) - np.repeat(table.indptr[:-1], sizes)
-    chosen = np.sort(order[rank < kept])
-    starts = np.concatenate(([0], np.cumsum(np.minimum(sizes, kept))))
+    chosen = np.sort(order[rank < max_shares])
+    starts = np.concatenate(([0], np.cumsum(np.minimum(sizes, max_shares))))
     return scipy.sparse.csr_matrix(
         (table.data[chosen], table.indices[chosen], starts), shape=table.shape
     )
 
 
-def ranked(table: Any, kept: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def ranked(table: Any, max_shares: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Columns (n, kept), largest first, -1 where there are fewer, and their values."""
-    table = _strongest(table.tocsr().copy(), kept)
+    table = _strongest(table.tocsr().copy(), max_shares)
     sizes = np.diff(table.indptr)
     row = np.repeat(np.arange(len(sizes)), sizes)
     order = np.lexsort((table.indices, -table.data, row))
     rank = np.arange(len(order)) - np.repeat(table.indptr[:-1], sizes)
-    columns = np.full((len(sizes), kept), -1, dtype=np.int64)
-    values = np.zeros((len(sizes), kept), dtype=np.float32)
+    columns = np.full((len(sizes), max_shares), -1, dtype=np.int64)
+    values = np.zeros((len(sizes), max_shares), dtype=np.float32)
     columns[row, rank] = table.indices[order]
     values[row, rank] = table.data[order]
     return columns, values

@@ -1,1 +1,1 @@
-"""Label mass: what views say of each Gaussian, and what is decided from it."""
+"""Label mass: blending weight of each Gaussian per id, summed over views, and labels from it."""

@@ -1,4 +1,4 @@
-"""Evidence of views, read once each, and carried onto the Gaussians by the adjoint."""
+"""The adjoint of rendering: evidence of views, read once each, summed onto Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -40,47 +40,52 @@ def voting_views(views: Sequence[View], evidence: ViewNames, what: str) -> list[
     return ordered
 
 
-def pixel_votes(paper: LabelMap) -> tuple[Int64[Tensor, "ids"], Tensor, Float[Tensor, "ids"]]:
-    """Ids of a map ascending without -1, each pixel's place among them (or -1), and their votes.
+def pixel_votes(label_map: LabelMap) -> tuple[Int64[Tensor, "ids"], Tensor, Float[Tensor, "ids"]]:
+    """Ids of a map ascending without -1, each pixel's index among them (or -1), and their votes.
 
     A pixel counts 1, or its confidence.
     """
-    ids, place = torch.unique(paper.ids.cpu().long(), return_inverse=True)
-    confidence = paper.confidence
+    ids, index = torch.unique(label_map.ids.cpu().long(), return_inverse=True)
+    confidence = label_map.confidence
     weights = None if confidence is None else confidence.cpu().double().reshape(-1)
-    votes = torch.bincount(place.reshape(-1), weights=weights, minlength=len(ids)).double()
+    votes = torch.bincount(index.reshape(-1), weights=weights, minlength=len(ids)).double()
     if len(ids) and int(ids[0]) == UNLABELLED:
-        return ids[1:], place - 1, votes[1:]
-    return ids, place, votes
+        return ids[1:], index - 1, votes[1:]
+    return ids, index, votes
 
 
-def near_an_edge(paper: LabelMap, width: int) -> Bool[Tensor, "height width"]:
+def near_an_edge(label_map: LabelMap, width: int) -> Bool[Tensor, "height width"]:
     """Pixels with another id, or none beside an id, at most `width` pixels away along each axis."""
-    _, place, _ = pixel_votes(paper)
+    _, index, _ = pixel_votes(label_map)
     window = 2 * width + 1
-    image = place.double()[None, None]
-    highest = torch.nn.functional.max_pool2d(image, window, stride=1, padding=width)
-    lowest = -torch.nn.functional.max_pool2d(-image, window, stride=1, padding=width)
-    return (highest != lowest)[0, 0]
+    image = index.double()[None, None]
+    largest = torch.nn.functional.max_pool2d(image, window, stride=1, padding=width)
+    smallest = -torch.nn.functional.max_pool2d(-image, window, stride=1, padding=width)
+    return (largest != smallest)[0, 0]
 
 
 @dataclass(kw_only=True)
-class Light:
-    """How much voting light there was for each id, and how much of it Gaussians caught."""
+class LabelMass:
+    """Mass of each id: of all its pixels, and the part of it that lies on Gaussians."""
 
-    cast: dict[int, float] = field(default_factory=dict[int, float])
-    caught: dict[int, float] = field(default_factory=dict[int, float])
+    total: dict[int, float] = field(default_factory=dict[int, float])
+    """Pixels of each id, or their confidences, summed over views."""
 
-    def add(self, ids: Sequence[int], cast: Tensor, caught: Tensor) -> None:
+    on_gaussians: dict[int, float] = field(default_factory=dict[int, float])
+    """Blending weight of all Gaussians on these pixels; the rest passes all Gaussians."""
+
+    def add(self, ids: Sequence[int], total: Tensor, on_gaussians: Tensor) -> None:
         """Add one view's."""
-        for id, given, taken in zip(ids, cast.tolist(), caught.tolist(), strict=True):
-            self.cast[id] = self.cast.get(id, 0.0) + given
-            self.caught[id] = self.caught.get(id, 0.0) + taken
+        for id, more_total, more_on_gaussians in zip(
+            ids, total.tolist(), on_gaussians.tolist(), strict=True
+        ):
+            self.total[id] = self.total.get(id, 0.0) + more_total
+            self.on_gaussians[id] = self.on_gaussians.get(id, 0.0) + more_on_gaussians
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Engine:
-    """The adjoint of rendering label maps."""
+class RenderAdjoint:
+    """The adjoint of rendering: images of views summed onto Gaussians by blending weight."""
 
     gaussians: Gaussians
     options: RenderOptions
@@ -90,46 +95,56 @@ class Engine:
     by_view: ViewVotes | None = None
     """Where a sample of the votes is kept view by view."""
 
-    def cast(self, table: VoteTable, light: Light, camera: Camera, paper: LabelMap) -> Tensor:
+    def add_view(
+        self, table: VoteTable, label_mass: LabelMass, camera: Camera, label_map: LabelMap
+    ) -> Tensor:
         """Add a view's votes; returns how much of each Gaussian the view shows, (n,).
 
         One pass over the view, whatever the number of ids.
         """
-        ids, place, votes = pixel_votes(paper)
-        place = place.reshape(-1)
-        labelled = place >= 0
+        ids, index, votes = pixel_votes(label_map)
+        index = index.reshape(-1)
+        labelled = index >= 0
         values = torch.ones(int(labelled.sum()))
-        if paper.confidence is not None:
-            values = paper.confidence.cpu().float().reshape(-1)[labelled]
+        if label_map.confidence is not None:
+            values = label_map.confidence.cpu().float().reshape(-1)[labelled]
         image = SparseImage(
             indptr=torch.cat((torch.zeros(1, dtype=torch.int64), labelled.cumsum(0))),
-            channels=place[labelled].to(torch.int32),
+            channels=index[labelled].to(torch.int32),
             values=values,
             count=len(ids),
         )
         with torch.no_grad(), self.prepared(camera) as view:
-            found = view.back_project_sparse(image)
-        say = self._say(found.weights)
-        sums = found.sums if say is None else found.sums * say[found.gaussians]
-        table.add_sparse(ids[found.channels], found.gaussians, sums)
+            projected = view.back_project_sparse(image)
+        view_weight = self._view_weight(projected.weights)
+        sums = (
+            projected.sums
+            if view_weight is None
+            else projected.sums * view_weight[projected.gaussians]
+        )
+        table.add_sparse(ids[projected.channels], projected.gaussians, sums)
         if self.by_view is not None:
-            self.by_view.add_sparse(ids[found.channels], found.gaussians, found.sums)
-        caught = torch.bincount(found.channels, weights=found.sums.double(), minlength=len(ids))
-        light.add(ids.tolist(), votes, caught)
-        return found.weights if say is None else found.weights * say
+            self.by_view.add_sparse(ids[projected.channels], projected.gaussians, projected.sums)
+        on_gaussians = torch.bincount(
+            projected.channels, weights=projected.sums.double(), minlength=len(ids)
+        )
+        label_mass.add(ids.tolist(), votes, on_gaussians)
+        return projected.weights if view_weight is None else projected.weights * view_weight
 
     def prepared(self, camera: Camera) -> PreparedView:
         """A view, to be used more than once."""
         return prepare(self.gaussians, camera, options=self.options, backend=self.backend)
 
-    def collect(self, view: PreparedView, image: Float[Tensor, "h w c"]) -> tuple[Tensor, Tensor]:
+    def back_project(
+        self, view: PreparedView, image: Float[Tensor, "h w c"]
+    ) -> tuple[Tensor, Tensor]:
         """Sums (n, c) and weights (n,) of an image, on the CPU, by the nearest warp."""
         with torch.no_grad():
-            found = view.back_project(image.to(self.gaussians.means), warp="nearest")
-        return found.sums.float().cpu(), found.weights.float().cpu()
+            projected = view.back_project(image.to(self.gaussians.means), warp="nearest")
+        return projected.sums.float().cpu(), projected.weights.float().cpu()
 
-    def _say(self, visible: Float[Tensor, "n"]) -> Float[Tensor, "n"] | None:
-        """What a unit of this view's light on each Gaussian counts; None is 1 everywhere."""
+    def _view_weight(self, visible: Float[Tensor, "n"]) -> Float[Tensor, "n"] | None:
+        """Factor of this view's weight on each Gaussian; None is 1 everywhere."""
         if not self.equal_views:
             return None
         return torch.where(visible > 0, visible, 1.0) ** -self.equal_views

@@ -1,4 +1,4 @@
-"""Where the centres of Gaussians fall in a view, and what the view has to say there."""
+"""Pixels of the centres of Gaussians in a view, occlusion, and label maps at these pixels."""
 
 from dataclasses import dataclass, replace
 
@@ -43,48 +43,52 @@ def centres_in(means: Float[Tensor, "n 3"], camera: Camera, *, near: float) -> C
     polynomial leads back into the image, is left out.
     """
     points = means.detach().cpu().double()
-    at, depth = camera.project(points)
-    size = at.new_tensor([camera.width, camera.height])
-    inside = (depth > near) & ((at >= 0) & (at < size)).all(dim=-1)
+    projected, depth = camera.project(points)
+    size = projected.new_tensor([camera.width, camera.height])
+    inside = (depth > near) & ((projected >= 0) & (projected < size)).all(dim=-1)
     rows = torch.nonzero(inside).squeeze(1)
     if not camera.is_pinhole:
-        straight = replace(camera, model="pinhole", distortion=()).project(points[rows])[0]
-        back = camera.undistort_pixels(at[rows])
-        rows = rows[torch.linalg.vector_norm(back - straight, dim=-1) < _FOLD_TOLERANCE]
-    return Centres(gaussians=rows, pixels=at[rows].floor().long(), depth=depth[rows])
+        pinhole_pixels = replace(camera, model="pinhole", distortion=()).project(points[rows])[0]
+        undistorted = camera.undistort_pixels(projected[rows])
+        rows = rows[
+            torch.linalg.vector_norm(undistorted - pinhole_pixels, dim=-1) < _FOLD_TOLERANCE
+        ]
+    return Centres(gaussians=rows, pixels=projected[rows].floor().long(), depth=depth[rows])
 
 
-def in_front(
+def unoccluded(
     centres: Centres, gaussians: Gaussians, view: PreparedView, *, tolerance: float
 ) -> Tensor:
-    """Which centres are not behind what the view shows, bool (m,).
+    """Which centres are not behind the surface that the view shows, bool (m,).
 
-    What a pixel shows is where half of its light is spent (`Rendered.median_depth`); a pixel
-    whose light mostly passes hides nothing.
+    A pixel's surface is at its median depth (`Rendered.median_depth`), where transmittance falls
+    to one half; a pixel without one occludes nothing.
     """
     with torch.no_grad():
         signal = gaussians.means.new_zeros(len(gaussians), 1)
-        drawn = view.render(signal, warp="nearest")
-    surface = drawn.median_depth.cpu().double()[centres.pixels[:, 1], centres.pixels[:, 0]]
+        rendered = view.render(signal, warp="nearest")
+    surface = rendered.median_depth.cpu().double()[centres.pixels[:, 1], centres.pixels[:, 0]]
     return (surface <= 0) | (centres.depth <= surface * (1 + tolerance))
 
 
-def own_weights(centres: Centres, gaussians: Gaussians, view: PreparedView) -> Float[Tensor, "m"]:
+def centre_weights(
+    centres: Centres, gaussians: Gaussians, view: PreparedView
+) -> Float[Tensor, "m"]:
     """Blending weight of each Gaussian at the pixel of its centre, float32."""
     width = view.camera.width
     flat = centres.pixels[:, 1] * width + centres.pixels[:, 0]
-    wanted = torch.unique(flat)
-    home = torch.full((len(gaussians),), -1, dtype=torch.int64)
-    home[centres.gaussians] = flat
-    found = torch.zeros(len(gaussians))
-    for part in torch.split(wanted, _PIXELS):
-        asked = torch.stack((part % width, part // width), dim=-1)
-        rows = view.weights(asked)
+    centre_pixels = torch.unique(flat)
+    centre_pixel = torch.full((len(gaussians),), -1, dtype=torch.int64)
+    centre_pixel[centres.gaussians] = flat
+    centre_weight = torch.zeros(len(gaussians))
+    for part in torch.split(centre_pixels, _PIXELS):
+        requested = torch.stack((part % width, part // width), dim=-1)
+        rows = view.weights(requested)
         ids = rows.ids.cpu().long()
         pixel = torch.repeat_interleave(part, torch.diff(rows.indptr.cpu()))
-        own = home[ids] == pixel
-        found[ids[own]] = rows.weights.cpu().float()[own]
-    return found[centres.gaussians]
+        own = centre_pixel[ids] == pixel
+        centre_weight[ids[own]] = rows.weights.cpu().float()[own]
+    return centre_weight[centres.gaussians]
 
 
 def majority_map(ids: Int[Tensor, "height width"], radius: int) -> Int[Tensor, "height width"]:
@@ -97,8 +101,8 @@ def majority_map(ids: Int[Tensor, "height width"], radius: int) -> Int[Tensor, "
     best = torch.full(ids.shape, -1.0)
     winner = torch.full_like(ids, UNLABELLED)
     for id in torch.unique(ids).tolist():
-        here = (ids == id).double().cumsum(0).cumsum(1)
-        count = _square_sums(here, radius)
+        cumulative = (ids == id).double().cumsum(0).cumsum(1)
+        count = _square_sums(cumulative, radius)
         better = count > best
         best = torch.where(better, count, best.to(count))
         winner[better] = id

@@ -1,7 +1,7 @@
 r"""From the votes on a Gaussian to its label.
 
-With :math:`v_c` the votes for id c, V their sum (and, where light on unlabelled pixels counts
-against every id, that light too) and :math:`\gamma` the slackness:
+With :math:`v_c` the votes for id c, V their sum (and, where mass on unlabelled pixels counts
+against every id, that mass too) and :math:`\gamma` the slackness:
 
 - share: the id with most votes.
 - flashsplat: c against everything else is a binary problem, whose two-vector is L2-normalised;
@@ -69,25 +69,25 @@ def decide(
         slackness: :math:`\gamma`; plain shares have none.
         min_weight: Votes that a Gaussian must exceed to get anything.
         min_share: Least share of V that the label needs.
-        against: Light that speaks against every id, (n,).
+        against: Mass that counts against every id, (n,).
     """
     seen = ranking.total > min_weight
     total = ranking.total if against is None else ranking.total + against.clamp_min(0)
     shares = ranking.votes / torch.where(total > 0, total, 1.0).unsqueeze(1)
     # Sums in float32 may leave a lone id's share a hair above 1.
     shares = torch.where(seen.unsqueeze(1), shares, 0.0).clamp_max(1.0)
-    taken = (ranking.ids != UNLABELLED) & seen.unsqueeze(1)
+    accepted = (ranking.ids != UNLABELLED) & seen.unsqueeze(1)
     if rule != "share":
-        rest = 1 - shares
-        length = 1.0 if rule == "flashsplat_multi" else torch.hypot(shares, rest)
-        taken &= shares / length > rest / length + slackness
-    candidates = torch.where(taken, ranking.ids, UNLABELLED)
-    shares = torch.where(taken, shares, 0.0)
+        others = 1 - shares
+        norm = 1.0 if rule == "flashsplat_multi" else torch.hypot(shares, others)
+        accepted &= shares / norm > others / norm + slackness
+    candidates = torch.where(accepted, ranking.ids, UNLABELLED)
+    shares = torch.where(accepted, shares, 0.0)
     # Both rules grow with the share, so what is taken stands before what is not.
-    sure = taken[:, 0] & (shares[:, 0] >= min_share)
+    has_label = accepted[:, 0] & (shares[:, 0] >= min_share)
     return Decision(
-        ids=torch.where(sure, candidates[:, 0], UNLABELLED),
-        confidence=torch.where(sure, shares[:, 0], 0.0),
+        ids=torch.where(has_label, candidates[:, 0], UNLABELLED),
+        confidence=torch.where(has_label, shares[:, 0], 0.0),
         candidates=candidates,
         shares=shares,
     )

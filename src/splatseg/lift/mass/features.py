@@ -29,7 +29,7 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.adjoint import Engine, voting_views
+from splatseg.lift.mass.adjoint import RenderAdjoint, voting_views
 from splatseg.render import RenderOptions, options_for
 
 FeatureNorm = Literal["none", "unit", "standard"]
@@ -105,27 +105,12 @@ def uplift_features(
     """
     options = options or FeatureUpliftOptions()
     ordered = voting_views(views, evidence, "features")
-    engine = Engine(
+    adjoint = RenderAdjoint(
         gaussians=gaussians,
         options=render_options or options_for(gaussians, backend),
         backend=backend,
     )
-    weights = torch.zeros(len(gaussians))
-    values: Tensor | None = None
-    for done, view in enumerate(ordered):
-        grid = _checked(view, evidence.features(view.name))
-        if values is None:
-            values = torch.zeros(len(gaussians), grid.channels)
-        if grid.channels != values.shape[1]:
-            raise ShapeError(
-                f"evidence: expected {values.shape[1]} channels of view {view.name}, as of view "
-                f"{ordered[0].name}, got {grid.channels}."
-            )
-        weights += _collect(engine, view, grid, options, values)
-        if progress is not None:
-            progress(done + 1, len(ordered))
-    if values is None:
-        raise InputError("views: expected at least one view with features, got none.")
+    values, weights = _weighted_sums(adjoint, ordered, evidence, options, progress)
     seen = weights > options.min_weight
     values /= torch.where(seen, weights, 1.0).unsqueeze(1)
     values[~seen] = 0
@@ -140,8 +125,40 @@ def uplift_features(
     )
 
 
-def _collect(
-    engine: Engine, view: View, grid: FeatureMap, options: FeatureUpliftOptions, values: Tensor
+def _weighted_sums(
+    adjoint: RenderAdjoint,
+    ordered: Sequence[View],
+    evidence: FeatureSource,
+    options: FeatureUpliftOptions,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Tensor, Tensor]:
+    """Features (n, channels) summed with blending weights over all views, and the weights (n,)."""
+    count = len(adjoint.gaussians)
+    weights = torch.zeros(count)
+    values: Tensor | None = None
+    for done, view in enumerate(ordered):
+        grid = _checked(view, evidence.features(view.name))
+        if values is None:
+            values = torch.zeros(count, grid.channels)
+        if grid.channels != values.shape[1]:
+            raise ShapeError(
+                f"evidence: expected {values.shape[1]} channels of view {view.name}, as of view "
+                f"{ordered[0].name}, got {grid.channels}."
+            )
+        weights += _add_view(adjoint, view, grid, options, values)
+        if progress is not None:
+            progress(done + 1, len(ordered))
+    if values is None:
+        raise InputError("views: expected at least one view with features, got none.")
+    return values, weights
+
+
+def _add_view(
+    adjoint: RenderAdjoint,
+    view: View,
+    grid: FeatureMap,
+    options: FeatureUpliftOptions,
+    values: Tensor,
 ) -> Tensor:
     """Add a view's weighted features to `values`, some channels at a time; gives its weights."""
     covered, camera = _camera_of_grid(view, grid)
@@ -154,7 +171,7 @@ def _collect(
             )
     features = _normalised(grid.features.float().cpu(), options.norm)
     weights = torch.zeros(len(values))
-    with engine.prepared(camera) as prepared:
+    with adjoint.prepared(camera) as prepared:
         for start in range(0, grid.channels, options.channels):
             part = slice(start, start + options.channels)
             image = read_grid(
@@ -163,7 +180,7 @@ def _collect(
                 size=(camera.height, camera.width),
                 resampling=options.resampling,
             )
-            sums, weights = engine.collect(prepared, image)
+            sums, weights = adjoint.back_project(prepared, image)
             values[:, part] += sums
     return weights
 
@@ -191,11 +208,11 @@ def read_grid(
         resampling: ``bilinear`` between centres, or the ``nearest`` centre.
     """
     rows, columns = features.shape[:2]
-    tall = _taps(rows, cells[0], size[0], resampling)
-    wide = _taps(columns, cells[1], size[1], resampling)
+    row_taps = _taps(rows, cells[0], size[0], resampling)
+    column_taps = _taps(columns, cells[1], size[1], resampling)
     # First along the columns of the small grid, then down: the large image is written once.
-    across = _blend(features, wide, dim=1)
-    return _blend(across, tall, dim=0)
+    resampled = _blend(features, column_taps, dim=1)
+    return _blend(resampled, row_taps, dim=0)
 
 
 _Taps = tuple[Tensor, Tensor, Tensor]
@@ -203,24 +220,24 @@ _Taps = tuple[Tensor, Tensor, Tensor]
 
 def _taps(count: int, cells: float, pixels: int, resampling: Resampling) -> _Taps:
     """The two cells each pixel reads along an axis, and the second one's weight."""
-    at = (torch.arange(pixels, dtype=torch.float64) + 0.5) * (cells / pixels) - 0.5
-    at = at.clamp(0, count - 1)
+    position = (torch.arange(pixels, dtype=torch.float64) + 0.5) * (cells / pixels) - 0.5
+    position = position.clamp(0, count - 1)
     if resampling == "nearest":
         # A pixel on the border of two cells belongs to the later one, as pixels begin cells.
-        nearest = (at + 0.5).floor().long().clamp_max(count - 1)
+        nearest = (position + 0.5).floor().long().clamp_max(count - 1)
         return nearest, nearest, torch.zeros(pixels)
-    first = at.floor().long()
-    return first, (first + 1).clamp_max(count - 1), (at - first).float()
+    first = position.floor().long()
+    return first, (first + 1).clamp_max(count - 1), (position - first).float()
 
 
 def _blend(image: Tensor, taps: _Taps, *, dim: int) -> Tensor:
-    first, second, share = taps
-    if not bool(share.any()):
+    first, second, second_weight = taps
+    if not bool(second_weight.any()):
         return image.index_select(dim, first)
     shape = [1, 1, 1]
     shape[dim] = -1
     return torch.lerp(
-        image.index_select(dim, first), image.index_select(dim, second), share.view(shape)
+        image.index_select(dim, first), image.index_select(dim, second), second_weight.view(shape)
     )
 
 
@@ -228,8 +245,8 @@ def _camera_of_grid(view: View, grid: FeatureMap) -> tuple[tuple[int, int], Came
     """Rows and columns of pixels that the grid counts its cells in, and their camera."""
     rows, columns = view.camera.height, view.camera.width
     # Whole cells over a photograph that they do not divide: a part of a cell more or less.
-    near = abs(grid.height - rows) < grid.stride and abs(grid.width - columns) < grid.stride
-    if near:
+    covers = abs(grid.height - rows) < grid.stride and abs(grid.width - columns) < grid.stride
+    if covers:
         return (rows, columns), view.camera
     return (grid.height, grid.width), camera_of_map(view, grid.height, grid.width)
 
@@ -263,8 +280,8 @@ def _normalised(features: Tensor, norm: FeatureNorm) -> Tensor:
         cells = features.flatten(0, 1)
         deviation = cells.std(dim=0, correction=0)
         # What rounding leaves of a constant channel is no deviation.
-        least = 1e-6 * cells.abs().amax(dim=0)
-        flat = deviation <= least
-        scale = torch.where(flat, 0.0, 1 / torch.where(flat, 1.0, deviation))
+        threshold = 1e-6 * cells.abs().amax(dim=0)
+        constant = deviation <= threshold
+        scale = torch.where(constant, 0.0, 1 / torch.where(constant, 1.0, deviation))
         return (features - cells.mean(dim=0)) * scale
     return features

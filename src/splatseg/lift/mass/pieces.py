@@ -19,7 +19,7 @@ from splatseg.core import UNLABELLED, LabelMap, MaskSet
 class Pieces:
     """A partition of the pixels, and which segments each piece lies in."""
 
-    names: NDArray[np.int64]
+    segment_ids: NDArray[np.int64]
     """(segments,): id of a label map, or index of a mask in its set."""
 
     piece: NDArray[np.int32]
@@ -40,7 +40,7 @@ def pieces_of(segments: LabelMap | MaskSet) -> Pieces:
         pixels = [_pixels_of(segments, i) for i in range(len(segments))]
         piece = refined(pixels, segments.height * segments.width)
         count = int(piece.max(initial=-1)) + 1
-        # Any one pixel of a piece tells which segments all of it lies in.
+        # Any one pixel of a piece shows which segments all of it lies in.
         first = np.zeros(count, np.int64)
         first[piece[::-1]] = np.arange(len(piece))[::-1]
         is_first = np.zeros(len(piece), bool)
@@ -48,21 +48,21 @@ def pieces_of(segments: LabelMap | MaskSet) -> Pieces:
         within = [piece[part[is_first[part]]] for part in pixels]
         indptr = np.cumsum([0, *map(len, within)])
         columns = np.concatenate([np.zeros(0, np.int32), *within])
-        lies_in: Any = scipy.sparse.csr_matrix(
+        membership: Any = scipy.sparse.csr_matrix(
             (np.ones(len(columns), np.float32), columns, indptr), shape=(len(pixels), count)
         )
-        names = np.arange(len(segments), dtype=np.int64)
-        return Pieces(names=names, piece=piece, weight=None, segments=lies_in)
+        mask_index = np.arange(len(segments), dtype=np.int64)
+        return Pieces(segment_ids=mask_index, piece=piece, weight=None, segments=membership)
     ids = segments.ids.cpu().reshape(-1).numpy()
-    found, piece = np.unique(ids, return_inverse=True)
+    ids_found, piece = np.unique(ids, return_inverse=True)
     confidence = segments.confidence
-    all_of: Any = scipy.sparse.identity(len(found), "f4", format="csr")
-    known = np.flatnonzero(found != UNLABELLED)
+    identity: Any = scipy.sparse.identity(len(ids_found), "f4", format="csr")
+    known = np.flatnonzero(ids_found != UNLABELLED)
     return Pieces(
-        names=found[known].astype(np.int64),
+        segment_ids=ids_found[known].astype(np.int64),
         piece=piece.reshape(-1).astype(np.int32),
         weight=None if confidence is None else confidence.cpu().float().reshape(-1).numpy(),
-        segments=all_of[known],
+        segments=identity[known],
     )
 
 
@@ -89,19 +89,19 @@ def refined(sets: Sequence[NDArray[np.int64]], count: int) -> NDArray[np.int32]:
         part[items] = number_of[before]
         used += len(parts)
         if used > len(number_of) // 2:
-            part, used = _compact(part, used)
+            part, used = _renumbered(part, used)
             if used > len(number_of) // 4:
                 number_of = np.zeros(4 * used, np.int32)
                 hit = np.zeros(4 * used, bool)
-    return _compact(part, used)[0]
+    return _renumbered(part, used)[0]
 
 
-def _compact(part: NDArray[np.int32], used: int) -> tuple[NDArray[np.int32], int]:
+def _renumbered(part: NDArray[np.int32], used: int) -> tuple[NDArray[np.int32], int]:
     """Parts numbered without gaps in the order of their numbers, and how many there are."""
-    there = np.zeros(used, bool)
-    there[part] = True
-    rank = np.cumsum(there, dtype=np.int32) - 1
-    return rank[part], int(there.sum())
+    used_numbers = np.zeros(used, bool)
+    used_numbers[part] = True
+    rank = np.cumsum(used_numbers, dtype=np.int32) - 1
+    return rank[part], int(used_numbers.sum())
 
 
 def _pixels_of(segments: MaskSet, index: int) -> NDArray[np.int64]:

@@ -39,7 +39,7 @@ class ViewMasses:
     """The nonzero masses of one view, sorted by segment and then by Gaussian."""
 
     segment: Int64[Tensor, "m"]
-    """Id of a label map, or place of a mask in its set."""
+    """Id of a label map, or index of a mask in its set."""
 
     gaussian: Int64[Tensor, "m"]
     """Row of a Gaussian."""
@@ -88,14 +88,16 @@ def view_masses(
     pieces = pieces_of(segments)
     options = options or options_for(gaussians, backend)
     sums, visible = _sums(pieces, gaussians, camera, options=options, backend=backend)
-    bands = scipy.sparse.hstack([pieces.segments] * len(sums), format="csr", dtype=np.float32)
-    of_pieces: Any = scipy.sparse.vstack(sums, format="csr")
-    found = sparse_product(bands, entries_of(of_pieces), len(gaussians))
+    band_segments = scipy.sparse.hstack(
+        [pieces.segments] * len(sums), format="csr", dtype=np.float32
+    )
+    piece_masses: Any = scipy.sparse.vstack(sums, format="csr")
+    found = sparse_product(band_segments, entries_of(piece_masses), len(gaussians))
     if visible is None:
-        everything = np.bincount(of_pieces.indices, of_pieces.data, minlength=len(gaussians))
-        visible = torch.from_numpy(everything.astype(np.float32))
+        total = np.bincount(piece_masses.indices, piece_masses.data, minlength=len(gaussians))
+        visible = torch.from_numpy(total.astype(np.float32))
     return ViewMasses(
-        segment=torch.from_numpy(np.repeat(pieces.names, np.diff(found.indptr))),
+        segment=torch.from_numpy(np.repeat(pieces.segment_ids, np.diff(found.indptr))),
         gaussian=torch.from_numpy(found.indices.astype(np.int64)),
         weight=torch.from_numpy(found.data.astype(np.float32)),
         visible=visible,
@@ -110,19 +112,19 @@ def _sums(
     options: RenderOptions,
     backend: str,
 ) -> tuple[list[Any], Tensor | None]:
-    """Sparse (pieces, Gaussians) of each band, and what all pixels see where pieces do not tell."""
+    """Sparse (pieces, Gaussians) of each band, and the visibility where pieces lack it."""
     pinhole = undistorted_camera(camera)
     bands = list(_bands(pinhole.height * pinhole.width))
     if len(bands) == 1 and camera.is_pinhole and pieces.weight is None:
         return [_image_sums(pieces, gaussians, camera, options=options, backend=backend)], None
-    seen_at = None if camera.is_pinhole else _pinhole_pixels(camera)
+    pinhole_pixel = None if camera.is_pinhole else _pinhole_pixels(camera)
     sums: list[Any] = []
     visible = torch.zeros(len(gaussians))
     for band in bands:
         rows = _rows(gaussians, pinhole, band, options=options, backend=backend)
-        sums.append(_piece_sums(_band_pieces(pieces, band, seen_at), rows))
+        sums.append(_piece_sums(_band_pieces(pieces, band, pinhole_pixel), rows))
         if pieces.weight is not None:
-            visible += _visible(rows, band, seen_at)
+            visible += _visible(rows, band, pinhole_pixel)
     return sums, None if pieces.weight is None else visible
 
 
@@ -148,16 +150,16 @@ def _image_sums(
     )
 
 
-def _band_pieces(pieces: Pieces, band: slice, seen_at: NDArray[np.int64] | None) -> Any:
+def _band_pieces(pieces: Pieces, band: slice, pinhole_pixel: NDArray[np.int64] | None) -> Any:
     """Sparse (pieces, pixels of the band): what each pixel of W counts for each piece."""
     import scipy.sparse
 
-    if seen_at is None:
+    if pinhole_pixel is None:
         piece, column = pieces.piece[band], np.arange(band.stop - band.start)
         weight = None if pieces.weight is None else pieces.weight[band]
     else:
-        within = (seen_at >= band.start) & (seen_at < band.stop)
-        piece, column = pieces.piece[within], seen_at[within] - band.start
+        within = (pinhole_pixel >= band.start) & (pinhole_pixel < band.stop)
+        piece, column = pieces.piece[within], pinhole_pixel[within] - band.start
         weight = None if pieces.weight is None else pieces.weight[within]
     values = np.ones(len(piece), np.float32) if weight is None else weight
     shape = (pieces.segments.shape[1], band.stop - band.start)
@@ -173,14 +175,16 @@ def _piece_sums(pixels: Any, rows: SparseWeights) -> Any:
 
 
 def _visible(
-    rows: SparseWeights, band: slice, seen_at: NDArray[np.int64] | None
+    rows: SparseWeights, band: slice, pinhole_pixel: NDArray[np.int64] | None
 ) -> Float[Tensor, "n"]:
     """Weights summed over all pixels of the photograph that fall into the band."""
     count = band.stop - band.start
-    if seen_at is None:
+    if pinhole_pixel is None:
         pixels = torch.ones(count, 1)
     else:
-        within = seen_at[(seen_at >= band.start) & (seen_at < band.stop)] - band.start
+        within = (
+            pinhole_pixel[(pinhole_pixel >= band.start) & (pinhole_pixel < band.stop)] - band.start
+        )
         pixels = torch.from_numpy(np.bincount(within, minlength=count)).float().unsqueeze(1)
     return rows.adjoint(pixels.to(rows.weights.device))[:, 0].cpu()
 

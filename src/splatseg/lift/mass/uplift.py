@@ -7,8 +7,8 @@ A pixel votes for its id on every Gaussian that it shows, with the weight it sho
 
 which is :math:`W^\top` of the one-hot label map, normalised by how much of the Gaussian the
 voting pixels saw. The strongest id is the Gaussian's label and its share the confidence; other
-rules are in `lift.mass.decision`. Light that passes every Gaussian votes alike for the label of
-what none covers, such as the sky:
+rules are in `lift.mass.decision`. The transmittance behind all Gaussians votes alike for the label
+of what none covers, such as the sky:
 
 .. math:: b_c = \sum_{views} \sum_p \Bigl(1 - \sum_i w_{pi}\Bigr) [\mathrm{id}(p) = c]
               = \sum_{views} \sum_p [\mathrm{id}(p) = c] - \sum_i v_{ic}
@@ -38,7 +38,7 @@ from splatseg.core import (
     camera_of_map,
 )
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.mass.adjoint import Engine, Light, near_an_edge, voting_views
+from splatseg.lift.mass.adjoint import LabelMass, RenderAdjoint, near_an_edge, voting_views
 from splatseg.lift.mass.decision import LabelRule, decide
 from splatseg.lift.mass.view_votes import ViewVotes
 from splatseg.lift.mass.vote_table import Ranking, VoteTable
@@ -51,14 +51,14 @@ class UpliftOptions:
 
     candidates: int = 1
     """Ids kept for each Gaussian. 1 makes a hard layer; with more the layer keeps their shares
-    and is drawn softly."""
+    and is rendered softly."""
 
     min_weight: float = 0.0
     """Blending weight, summed over voting pixels, that a Gaussian must exceed to be labelled.
     One fully visible pixel counts 1."""
 
     min_share: float = 0.0
-    """Least share of the votes, in [0, 1], that the winner needs; below it there is no label."""
+    """Minimum share of the votes, in [0, 1], that the winner needs; below it there is no label."""
 
     label_rule: LabelRule = "share"
     """Who wins. share: the id with most votes. flashsplat: an id with more votes than all
@@ -66,16 +66,16 @@ class UpliftOptions:
     same after L1 normalisation; with a negative slackness several ids may win."""
 
     slackness: float = 0.0
-    """FlashSplat's gamma, in [-1, 1], added to what speaks against an id: above 0 labels are
+    """FlashSplat's gamma, in [-1, 1], added to the votes against an id: above 0 labels are
     cut tight around what was seen, below 0 generously."""
 
     count_void: bool = False
-    """Light on unlabelled pixels counts against every id: for masks of single objects, whose
+    """Mass on unlabelled pixels counts against every id: for masks of single objects, whose
     outside has no label."""
 
     equal_views: float = 0.0
     """How far views are made equal, in [0, 1]: a view's votes on a Gaussian are divided by how
-    much the view shows of it, to this power. At 0 every pixel has the same say, at 1 every view,
+    much the view shows of it, to this power. At 0 every pixel has the same weight, at 1 every view,
     however far away."""
 
     edge_pixels: int = 0
@@ -85,11 +85,11 @@ class UpliftOptions:
     """Weight of a pixel near an edge, in [0, 1]."""
 
     min_background: float = 1e-3
-    """Least share of the light of all voting pixels, in [0, 1], that must pass the Gaussians
+    """Minimum share of the weight of all voting pixels, in [0, 1], that must pass the Gaussians
     for there to be a background label. A closed room has none."""
 
     min_background_share: float = 0.5
-    """Least share of that light, in [0, 1], that the background label needs."""
+    """Minimum share of that weight, in [0, 1], that the background label needs."""
 
     memory: int = 1 << 30
     """Bytes of an exact table of votes, 4 for each id and Gaussian. With more ids than fit,
@@ -97,7 +97,7 @@ class UpliftOptions:
 
     slots: int = 32
     """Ids remembered of each Gaussian then, 8 bytes each; more than 1. Exact for Gaussians that
-    no more ids spoke for; of others an id with more than 1 / (slots + 1) of the votes is never
+    have votes for no more ids; of others an id with more than 1 / (slots + 1) of the votes is never
     lost."""
 
     def __post_init__(self) -> None:
@@ -155,8 +155,8 @@ def uplift(
     Returns:
         The layer, with the votes of each Gaussian as its evidence. Gaussians that no voting
         pixel saw have the id -1 and confidence 0. The metadata holds the method, its options,
-        the views, what the background rests on, and the largest share of the votes by which
-        a count may be too small (0 where the table was exact).
+        the views, what the background rests on, and the largest error bound of a count, as a share
+        of the Gaussian's votes (0 where the table was exact).
 
     Raises:
         InputError: If there are no views, if one has no label map, or no pixel has a label.
@@ -164,42 +164,96 @@ def uplift(
     """
     options = options or UpliftOptions()
     ordered = voting_views(views, evidence, "a label map")
+    votes = _collected(
+        gaussians,
+        ordered,
+        evidence,
+        options=options,
+        render_options=render_options or options_for(gaussians, backend),
+        backend=backend,
+        progress=progress,
+    )
+    return _labels(votes, ordered, options, _names(classes, votes.label_mass))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Votes:
+    """Votes of all views."""
+
+    table: VoteTable
+    label_mass: LabelMass
+    visibility: Tensor
+    """(n,): how much of each Gaussian the views show."""
+
+    squared_visibility: Tensor
+    """(n,): the squares of what each view shows, summed."""
+
+    by_view: ViewVotes | None
+    """Only of soft layers."""
+
+
+def _collected(
+    gaussians: Gaussians,
+    ordered: Sequence[View],
+    evidence: LabelSource,
+    *,
+    options: UpliftOptions,
+    render_options: RenderOptions,
+    backend: str,
+    progress: Callable[[int, int], None] | None,
+) -> _Votes:
+    """Go through the views once and add up their votes."""
     by_view = ViewVotes(gaussians.means) if options.candidates > 1 else None
-    engine = Engine(
+    adjoint = RenderAdjoint(
         gaussians=gaussians,
-        options=render_options or options_for(gaussians, backend),
+        options=render_options,
         backend=backend,
         equal_views=options.equal_views,
         by_view=by_view,
     )
     table = VoteTable(len(gaussians), memory=options.memory, slots=options.slots)
-    light = Light()
-    visible, squares = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+    label_mass = LabelMass()
+    visibility, squared_visibility = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
     for done, view in enumerate(ordered):
-        paper = evidence.label_map(view.name)
-        camera = camera_of_map(view, paper.height, paper.width)
-        shown = engine.cast(table, light, camera, _without_edges(paper, options))
-        visible += shown
-        squares += shown**2
+        label_map = evidence.label_map(view.name)
+        camera = camera_of_map(view, label_map.height, label_map.width)
+        weighted = _without_edges(label_map, options)
+        view_visibility = adjoint.add_view(table, label_mass, camera, weighted)
+        visibility += view_visibility
+        squared_visibility += view_visibility**2
         if by_view is not None:
             by_view.end_view(view.camera)
         if progress is not None:
             progress(done + 1, len(ordered))
-    if not light.cast:
+    if not label_mass.total:
         raise InputError(
             f"evidence: expected a labelled pixel in {len(ordered)} views, found none."
         )
-    ranking = table.rank(options.candidates)
+    return _Votes(
+        table=table,
+        label_mass=label_mass,
+        visibility=visibility,
+        squared_visibility=squared_visibility,
+        by_view=by_view,
+    )
+
+
+def _labels(
+    votes: _Votes, ordered: Sequence[View], options: UpliftOptions, names: dict[str, Any]
+) -> Labels:
+    """The layer that the votes decide."""
+    ranking = votes.table.rank(options.candidates)
     decision = decide(
         ranking,
         rule=options.label_rule,
         slackness=options.slackness,
         min_weight=options.min_weight,
         min_share=options.min_share,
-        against=visible - ranking.total if options.count_void else None,
+        against=votes.visibility - ranking.total if options.count_void else None,
     )
-    background, facts = _background(light, options)
+    background, record = _background(votes.label_mass, options)
     soft = options.candidates > 1
+    squares = votes.squared_visibility
     return Labels(
         ids=decision.ids,
         confidence=decision.confidence,
@@ -208,16 +262,16 @@ def uplift(
         shares=decision.shares if soft else None,
         evidence=ranking.total,
         # Kish's effective sample size: a view that shows hardly anything counts hardly anything.
-        effective_views=torch.where(squares > 0, visible**2 / squares, 0.0),
+        effective_views=torch.where(squares > 0, votes.visibility**2 / squares, 0.0),
         metadata={
             "method": "uplift",
             "options": asdict(options),
             "views": [view.name for view in ordered],
-            "names": _names(classes, light),
-            "background_votes": facts,
-            "largest_doubt": _largest_share(ranking.doubt, ranking.total),
+            "names": names,
+            "background_votes": record,
+            "largest_error_bound": _largest_share(ranking.error_bound, ranking.total),
         }
-        | _correlation(by_view, ranking),
+        | _correlation(votes.by_view, ranking),
     )
 
 
@@ -229,36 +283,39 @@ def _correlation(by_view: ViewVotes | None, ranking: Ranking) -> dict[str, float
     return {"view_correlation": by_view.correlation(ranking.ids, shares)}
 
 
-def _without_edges(paper: LabelMap, options: UpliftOptions) -> LabelMap:
-    """The same ids, in which pixels near an edge have less say."""
+def _without_edges(label_map: LabelMap, options: UpliftOptions) -> LabelMap:
+    """The same ids, in which pixels near an edge have less weight."""
     if not options.edge_pixels or options.edge_vote == 1:
-        return paper
-    say = torch.where(near_an_edge(paper, options.edge_pixels), options.edge_vote, 1.0)
-    if paper.confidence is not None:
-        say = say * paper.confidence.cpu().float()
-    return LabelMap(ids=paper.ids, confidence=say)
+        return label_map
+    weight = torch.where(near_an_edge(label_map, options.edge_pixels), options.edge_vote, 1.0)
+    if label_map.confidence is not None:
+        weight = weight * label_map.confidence.cpu().float()
+    return LabelMap(ids=label_map.ids, confidence=weight)
 
 
-def _background(light: Light, options: UpliftOptions) -> tuple[int, dict[str, float]]:
+def _background(label_mass: LabelMass, options: UpliftOptions) -> tuple[int, dict[str, float]]:
     """The label of what no Gaussian covers, or -1, and what that rests on."""
-    voting = sum(light.cast[id] for id in sorted(light.cast))
+    total_mass = sum(label_mass.total[id] for id in sorted(label_mass.total))
     # Rounding may leave a hair less than nothing.
-    passing = {id: max(0.0, light.cast[id] - light.caught[id]) for id in sorted(light.cast)}
-    passed = sum(passing.values())
-    # `max` takes the first of equals, the smallest id.
-    strongest = max(passing, key=lambda id: passing[id])
-    facts = {
-        "light": passed / voting if voting > 0 else 0.0,
-        "share": passing[strongest] / passed if passed > 0 else 0.0,
+    uncovered = {
+        id: max(0.0, label_mass.total[id] - label_mass.on_gaussians[id])
+        for id in sorted(label_mass.total)
     }
-    enough = passed > 0 and facts["light"] >= options.min_background
-    sure = facts["share"] >= options.min_background_share
-    return (strongest if enough and sure else UNLABELLED), facts
+    total_uncovered = sum(uncovered.values())
+    # `max` takes the first of equals, the smallest id.
+    strongest = max(uncovered, key=lambda id: uncovered[id])
+    record = {
+        "light": total_uncovered / total_mass if total_mass > 0 else 0.0,
+        "share": uncovered[strongest] / total_uncovered if total_uncovered > 0 else 0.0,
+    }
+    enough = total_uncovered > 0 and record["light"] >= options.min_background
+    clear = record["share"] >= options.min_background_share
+    return (strongest if enough and clear else UNLABELLED), record
 
 
-def _names(classes: ClassTable | None, light: Light) -> dict[str, Any]:
+def _names(classes: ClassTable | None, label_mass: LabelMass) -> dict[str, Any]:
     known = () if classes is None else classes.rows
-    return {str(row.id): row.name for row in known if row.id in light.cast}
+    return {str(row.id): row.name for row in known if row.id in label_mass.total}
 
 
 def _largest_share(part: Tensor, whole: Tensor) -> float:

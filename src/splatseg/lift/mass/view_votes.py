@@ -1,9 +1,9 @@
-r"""Whether views err independently of each other: what each says of a sample of Gaussians.
+r"""Whether views err independently of each other: the votes of each on a sample of Gaussians.
 
 A vote over many views removes errors that are independent from view to view, and a model of
-such errors can tell what is usually missed (`confusion`). A network that calls a desk a
+such errors can infer what is usually missed (`confusion`). A network that calls a desk a
 nightstand from one side does so in all neighbouring views, and there both fail. So each view is
-held out in turn: is what it says of a Gaussian told better by its nearest view than by any other?
+held out in turn: is its vote on a Gaussian predicted better by its nearest view than by any other?
 
 .. math:: \rho = \frac{\sum_i (a_i - e_i)}{\sum_i (1 - e_i)}
 
@@ -27,10 +27,10 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Camera
 
 _SAMPLE = 32768
-"""Gaussians that are listened to, in even steps through their order."""
+"""Gaussians that are sampled, in even steps through their order."""
 
 _CONTESTED = 2048
-"""Contested ones among them that are looked at, in even steps too."""
+"""Contested ones among them that are compared, in even steps too."""
 
 _CONTESTED_SHARE = 0.2
 """Least share of the second strongest id of a Gaussian on which views disagree."""
@@ -39,7 +39,7 @@ _MIN_VIEWS = 3
 """Views that must give a Gaussian one of its two ids."""
 
 _MIN_GAUSSIANS = 30
-"""Contested Gaussians below which nothing can be said."""
+"""Contested Gaussians below which there is no estimate."""
 
 
 class ViewVotes:
@@ -68,9 +68,9 @@ class ViewVotes:
         """Take in votes of the view at hand, one column an id."""
         index = self._index[rows]
         known = torch.nonzero(index >= 0).squeeze(1)
-        place, name = torch.nonzero(sums[known] > 0, as_tuple=True)
-        names = torch.tensor(list(ids), dtype=torch.int64)
-        self._parts.append((index[known][place], names[name], sums[known][place, name]))
+        row, column = torch.nonzero(sums[known] > 0, as_tuple=True)
+        column_ids = torch.tensor(list(ids), dtype=torch.int64)
+        self._parts.append((index[known][row], column_ids[column], sums[known][row, column]))
 
     def add_sparse(
         self, ids: Int64[Tensor, "m"], gaussians: Int64[Tensor, "m"], weights: Float[Tensor, "m"]
@@ -103,52 +103,54 @@ class ViewVotes:
             candidates: The strongest ids of each Gaussian, two or more.
             shares: Their shares of the votes.
         """
-        pairs = candidates[self._rows, :2].cpu().numpy()
+        top_two = candidates[self._rows, :2].cpu().numpy()
         contested = (shares[self._rows, 1].cpu().numpy() >= _CONTESTED_SHARE) & (
-            pairs[:, 1] != UNLABELLED
+            top_two[:, 1] != UNLABELLED
         )
         chosen = np.flatnonzero(contested)
         if len(chosen) > _CONTESTED:
             chosen = chosen[np.linspace(0, len(chosen) - 1, _CONTESTED).astype(np.int64)]
-        said = self._said(chosen)
+        votes = self._votes_of(chosen)
         centres = np.array(self._centres).reshape(-1, 3)
-        excess = room = 0.0
-        counted = 0
-        for row, here in zip(said, chosen.tolist(), strict=True):
-            views = np.flatnonzero((row == pairs[here, 0]) | (row == pairs[here, 1]))
-            second = row[views] == pairs[here, 1]
-            if len(views) < _MIN_VIEWS or second.all() or not second.any():
+        excess = max_excess = 0.0
+        used = 0
+        for view_ids, sample_row in zip(votes, chosen.tolist(), strict=True):
+            views = np.flatnonzero(
+                (view_ids == top_two[sample_row, 0]) | (view_ids == top_two[sample_row, 1])
+            )
+            votes_second = view_ids[views] == top_two[sample_row, 1]
+            if len(views) < _MIN_VIEWS or votes_second.all() or not votes_second.any():
                 continue
-            expected = _agreement_by_chance(second)
-            nearest = _nearest(centres[views] - self._means[here])
-            excess += float((second == second[nearest]).mean()) - expected
-            room += 1 - expected
-            counted += 1
-        return excess / room if counted >= _MIN_GAUSSIANS else None
+            expected = _agreement_by_chance(votes_second)
+            nearest = _nearest(centres[views] - self._means[sample_row])
+            excess += float((votes_second == votes_second[nearest]).mean()) - expected
+            max_excess += 1 - expected
+            used += 1
+        return excess / max_excess if used >= _MIN_GAUSSIANS else None
 
-    def _said(self, chosen: NDArray[np.int64]) -> NDArray[np.int32]:
-        """What each view says of the chosen, (chosen, views), -1 where it says nothing."""
-        place = np.full(len(self._rows), -1)
-        place[chosen] = np.arange(len(chosen))
-        said = np.full((len(chosen), len(self._views)), UNLABELLED, np.int32)
+    def _votes_of(self, chosen: NDArray[np.int64]) -> NDArray[np.int32]:
+        """The id each view votes for, (chosen, views), -1 where it has no vote."""
+        row_of = np.full(len(self._rows), -1)
+        row_of[chosen] = np.arange(len(chosen))
+        votes = np.full((len(chosen), len(self._views)), UNLABELLED, np.int32)
         for view, (index, ids) in enumerate(self._views):
-            at = place[index]
-            said[at[at >= 0], view] = ids[at >= 0]
-        return said
+            rows = row_of[index]
+            votes[rows[rows >= 0], view] = ids[rows >= 0]
+        return votes
 
 
-def _agreement_by_chance(second: NDArray[np.bool_]) -> float:
-    """Share of all pairs of views that say the same."""
-    count, some = len(second), int(second.sum())
-    rest = count - some
-    return (some * (some - 1) + rest * (rest - 1)) / (count * (count - 1))
+def _agreement_by_chance(votes_second: NDArray[np.bool_]) -> float:
+    """Share of all pairs of views that vote for the same id."""
+    count, seconds = len(votes_second), int(votes_second.sum())
+    firsts = count - seconds
+    return (seconds * (seconds - 1) + firsts * (firsts - 1)) / (count * (count - 1))
 
 
 def _nearest(offsets: NDArray[np.float64]) -> NDArray[np.int64]:
     """The view most like each, by the direction and the logarithm of the distance seen from."""
     distance = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     directions = offsets / distance[:, None]
-    apart = -directions @ directions.T
-    apart += 2 * np.abs(np.log(distance[:, None] / distance[None, :]))
-    np.fill_diagonal(apart, np.inf)
-    return apart.argmin(axis=1)
+    difference = -directions @ directions.T
+    difference += 2 * np.abs(np.log(distance[:, None] / distance[None, :]))
+    np.fill_diagonal(difference, np.inf)
+    return difference.argmin(axis=1)

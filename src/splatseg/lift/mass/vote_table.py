@@ -13,7 +13,7 @@ in :math:`[s, s + E]` (s is 0 where it has no slot), and, since each c is taken 
 .. math:: E \le \frac{\sum_c v_c - \sum_j s_j}{K + 1} \le \frac{\sum_c v_c}{K + 1}
 
 whatever the order: an id with more than that share of the votes is never lost. A Gaussian that
-only K ids or fewer spoke for has E = 0, and its votes are exact.
+has votes for K ids or fewer has E = 0, and its votes are exact.
 
 References:
     Misra and Gries, Finding repeated elements, Science of Computer Programming 2 (1982).
@@ -44,12 +44,12 @@ class Ranking:
     """Strongest first, equals by id; -1 where there are fewer."""
 
     votes: Float[Tensor, "n k"]
-    """Votes of each, 0 where there are fewer; at most `doubt` too small."""
+    """Votes of each, 0 where there are fewer; at most `error_bound` too small."""
 
     total: Float[Tensor, "n"]
     """Votes for all ids together, those without a slot included."""
 
-    doubt: Float[Tensor, "n"]
+    error_bound: Float[Tensor, "n"]
     """E of the module's docstring, 0 where the votes are exact."""
 
 
@@ -83,32 +83,32 @@ class VoteTable:
         rows: Int64[Tensor, "m"] | None = None,
     ) -> None:
         """Take in the votes of a view, one column an id; of all Gaussians or of `rows` alone."""
-        self._make_room(ids)
+        self._reserve_columns(ids)
         if rows is None:
             rows = torch.arange(len(sums))
         if self._summary is None:
             for id, column in zip(ids, sums.T.contiguous(), strict=True):
                 self._columns[id].index_add_(0, rows, column)
             return
-        place, name = torch.nonzero(sums > 0, as_tuple=True)
-        names = torch.tensor(list(ids), dtype=torch.int64)
-        self._summary.add(names[name], rows[place], sums[place, name])
+        row, column = torch.nonzero(sums > 0, as_tuple=True)
+        column_ids = torch.tensor(list(ids), dtype=torch.int64)
+        self._summary.add(column_ids[column], rows[row], sums[row, column])
 
     def add_sparse(
         self, ids: Int64[Tensor, "m"], gaussians: Int64[Tensor, "m"], weights: Float[Tensor, "m"]
     ) -> None:
         """Take in the votes of a view as triples; of one id and Gaussian there may be several."""
-        names, place = torch.unique(ids, return_inverse=True)
-        self._make_room(names.tolist())
+        unique_ids, column = torch.unique(ids, return_inverse=True)
+        self._reserve_columns(unique_ids.tolist())
         if self._summary is not None:
             self._summary.add(ids, gaussians, weights)
             return
-        order = torch.argsort(place, stable=True)
-        ends = torch.bincount(place, minlength=len(names)).cumsum(0).tolist()
+        order = torch.argsort(column, stable=True)
+        ends = torch.bincount(column, minlength=len(unique_ids)).cumsum(0).tolist()
         start = 0
-        for id, end in zip(names.tolist(), ends, strict=True):
-            mine = order[start:end]
-            self._columns[id].index_add_(0, gaussians[mine], weights[mine])
+        for id, end in zip(unique_ids.tolist(), ends, strict=True):
+            entries = order[start:end]
+            self._columns[id].index_add_(0, gaussians[entries], weights[entries])
             start = end
 
     def rank(self, k: int) -> Ranking:
@@ -118,16 +118,16 @@ class VoteTable:
         ids = torch.full((self._count, k), UNLABELLED, dtype=torch.int32)
         votes = torch.zeros(self._count, k)
         total = torch.zeros(self._count)
-        for rows, names, block in self._blocks():
-            value, place = block.sort(dim=1, descending=True, stable=True)
+        for rows, column_ids, block in self._blocks():
+            value, order = block.sort(dim=1, descending=True, stable=True)
             kept = min(k, block.shape[1])
             best = value[:, :kept]
             votes[rows, :kept] = best
-            ids[rows, :kept] = torch.where(best > 0, names[place[:, :kept]], UNLABELLED).int()
+            ids[rows, :kept] = torch.where(best > 0, column_ids[order[:, :kept]], UNLABELLED).int()
             total[rows] = block.sum(dim=1)
-        return Ranking(ids=ids, votes=votes, total=total, doubt=torch.zeros(self._count))
+        return Ranking(ids=ids, votes=votes, total=total, error_bound=torch.zeros(self._count))
 
-    def _make_room(self, ids: Sequence[int]) -> None:
+    def _reserve_columns(self, ids: Sequence[int]) -> None:
         if self._summary is not None:
             return
         new = [id for id in ids if id not in self._columns]
@@ -138,8 +138,8 @@ class VoteTable:
                 self._columns[id] = torch.zeros(self._count)
             return
         summary = SlotTable(self._count, self._slots)
-        for rows, names, block in self._blocks():
-            summary.fill(rows, names, block)
+        for rows, column_ids, block in self._blocks():
+            summary.fill(rows, column_ids, block)
         self._summary = summary
         self._columns.clear()
 
@@ -148,10 +148,10 @@ class VoteTable:
         if not self._columns:
             return
         ids = sorted(self._columns)
-        names = torch.tensor(ids, dtype=torch.int64)
+        column_ids = torch.tensor(ids, dtype=torch.int64)
         for start in range(0, self._count, _ROWS):
             rows = slice(start, start + _ROWS)
-            yield rows, names, torch.stack([self._columns[id][rows] for id in ids], dim=1)
+            yield rows, column_ids, torch.stack([self._columns[id][rows] for id in ids], dim=1)
 
 
 class SlotTable:
@@ -161,26 +161,28 @@ class SlotTable:
         self._ids = torch.full((count, slots), UNLABELLED, dtype=torch.int32)
         self._votes = torch.zeros(count, slots)
         self._total = torch.zeros(count)
-        self._doubt = torch.zeros(count)
+        self._error_bound = torch.zeros(count)
 
     @property
     def nbytes(self) -> int:
         """Memory it holds."""
-        return sum(t.nbytes for t in (self._ids, self._votes, self._total, self._doubt))
+        return sum(t.nbytes for t in (self._ids, self._votes, self._total, self._error_bound))
 
     def fill(
-        self, rows: slice, names: Int64[Tensor, "ids"], votes: Float[Tensor, "rows ids"]
+        self, rows: slice, column_ids: Int64[Tensor, "ids"], votes: Float[Tensor, "rows ids"]
     ) -> None:
         """Start with exact votes: all ids are dealt with at once, as a merge of summaries."""
         slots = self._ids.shape[1]
         self._total[rows] = votes.sum(dim=1)
-        value, place = votes.sort(dim=1, descending=True, stable=True)
+        value, order = votes.sort(dim=1, descending=True, stable=True)
         kept = min(slots, value.shape[1])
-        taken = value[:, slots] if value.shape[1] > slots else torch.zeros(len(value))
-        rest = (value[:, :kept] - taken.unsqueeze(1)).clamp_min(0)
-        self._doubt[rows] = taken
+        decrement = value[:, slots] if value.shape[1] > slots else torch.zeros(len(value))
+        rest = (value[:, :kept] - decrement.unsqueeze(1)).clamp_min(0)
+        self._error_bound[rows] = decrement
         self._votes[rows, :kept] = rest
-        self._ids[rows, :kept] = torch.where(rest > 0, names[place[:, :kept]], UNLABELLED).int()
+        self._ids[rows, :kept] = torch.where(
+            rest > 0, column_ids[order[:, :kept]], UNLABELLED
+        ).int()
 
     def add(
         self, ids: Int64[Tensor, "m"], gaussians: Int64[Tensor, "m"], weights: Float[Tensor, "m"]
@@ -190,7 +192,7 @@ class SlotTable:
         They go in waves of at most one id a Gaussian, and a wave is a handful of tensor
         operations.
         """
-        gaussian, name, weight = _merged(gaussians, ids, weights)
+        gaussian, id, weight = _merged(gaussians, ids, weights)
         self._total.index_add_(0, gaussian, weight)
         first = torch.ones(len(gaussian), dtype=torch.bool)
         first[1:] = gaussian[1:] != gaussian[:-1]
@@ -199,7 +201,7 @@ class SlotTable:
         order = torch.argsort(wave, stable=True)
         sizes = torch.bincount(wave).tolist() if len(wave) else []
         for part in torch.split(order, sizes):
-            self._add_wave(gaussian[part], name[part].int(), weight[part])
+            self._add_wave(gaussian[part], id[part].int(), weight[part])
 
     def rank(self, k: int) -> Ranking:
         """The k strongest ids of each Gaussian."""
@@ -209,41 +211,43 @@ class SlotTable:
         kept = min(k, slots)
         for start in range(0, count, _ROWS):
             rows = slice(start, start + _ROWS)
-            names = self._ids[rows].long()
-            names, by_name = torch.where(names == UNLABELLED, _NO_ID, names).sort(dim=1)
-            value, place = (
-                self._votes[rows].gather(1, by_name).sort(dim=1, descending=True, stable=True)
+            slots_ids = self._ids[rows].long()
+            slots_ids, by_id = torch.where(slots_ids == UNLABELLED, _NO_ID, slots_ids).sort(dim=1)
+            value, order = (
+                self._votes[rows].gather(1, by_id).sort(dim=1, descending=True, stable=True)
             )
-            names = names.gather(1, place)[:, :kept]
-            ids[rows, :kept] = torch.where(names == _NO_ID, UNLABELLED, names).int()
+            slots_ids = slots_ids.gather(1, order)[:, :kept]
+            ids[rows, :kept] = torch.where(slots_ids == _NO_ID, UNLABELLED, slots_ids).int()
             votes[rows, :kept] = value[:, :kept]
-        return Ranking(ids=ids, votes=votes, total=self._total, doubt=self._doubt)
+        return Ranking(ids=ids, votes=votes, total=self._total, error_bound=self._error_bound)
 
-    def _add_wave(self, rows: Tensor, names: Tensor, weights: Tensor) -> None:
-        known, held = self._ids[rows], self._votes[rows]
-        hit = known == names.unsqueeze(1)
-        has_slot = hit.any(dim=1)
-        weakest, slot = held.min(dim=1)
-        taken = torch.where(has_slot, 0.0, torch.minimum(weakest, weights))
-        held = torch.where(hit, held + weights.unsqueeze(1), held - taken.unsqueeze(1))
-        known = torch.where(held > 0, known, UNLABELLED)
+    def _add_wave(self, rows: Tensor, ids: Tensor, weights: Tensor) -> None:
+        slot_ids, slot_votes = self._ids[rows], self._votes[rows]
+        matches = slot_ids == ids.unsqueeze(1)
+        has_slot = matches.any(dim=1)
+        weakest, slot = slot_votes.min(dim=1)
+        decrement = torch.where(has_slot, 0.0, torch.minimum(weakest, weights))
+        slot_votes = torch.where(
+            matches, slot_votes + weights.unsqueeze(1), slot_votes - decrement.unsqueeze(1)
+        )
+        slot_ids = torch.where(slot_votes > 0, slot_ids, UNLABELLED)
         enters = ~has_slot & (weights > weakest)
-        here = torch.nonzero(enters).squeeze(1)
-        known[here, slot[here]] = names[here]
-        held[here, slot[here]] = (weights - weakest)[here]
-        self._ids[rows], self._votes[rows] = known, held
-        self._doubt[rows] += taken
+        entering = torch.nonzero(enters).squeeze(1)
+        slot_ids[entering, slot[entering]] = ids[entering]
+        slot_votes[entering, slot[entering]] = (weights - weakest)[entering]
+        self._ids[rows], self._votes[rows] = slot_ids, slot_votes
+        self._error_bound[rows] += decrement
 
 
 def _merged(gaussians: Tensor, ids: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Triples with one weight a pair, by Gaussian, within it by weight downwards, then by id."""
     order = torch.from_numpy(np.lexsort((ids.numpy(), gaussians.numpy())))
     gaussians, ids, weights = gaussians[order], ids[order], weights[order]
-    new = torch.ones(len(ids), dtype=torch.bool)
-    new[1:] = (gaussians[1:] != gaussians[:-1]) | (ids[1:] != ids[:-1])
-    summed = torch.zeros(int(new.sum())).index_add_(0, new.cumsum(0) - 1, weights.float())
-    gaussians, ids = gaussians[new], ids[new]
-    keep = summed > 0
-    gaussians, ids, summed = gaussians[keep], ids[keep], summed[keep]
-    order = torch.from_numpy(np.lexsort((ids.numpy(), -summed.numpy(), gaussians.numpy())))
-    return gaussians[order], ids[order], summed[order]
+    is_first = torch.ones(len(ids), dtype=torch.bool)
+    is_first[1:] = (gaussians[1:] != gaussians[:-1]) | (ids[1:] != ids[:-1])
+    mass = torch.zeros(int(is_first.sum())).index_add_(0, is_first.cumsum(0) - 1, weights.float())
+    gaussians, ids = gaussians[is_first], ids[is_first]
+    keep = mass > 0
+    gaussians, ids, mass = gaussians[keep], ids[keep], mass[keep]
+    order = torch.from_numpy(np.lexsort((ids.numpy(), -mass.numpy(), gaussians.numpy())))
+    return gaussians[order], ids[order], mass[order]
