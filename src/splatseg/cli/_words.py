@@ -6,6 +6,7 @@ from dataclasses import fields, is_dataclass
 
 from splatseg.errors import InputError
 
+_QUOTED = re.compile(r"`(\w+)`")
 _NAMED = re.compile(r"^(\w+(?:, \w+)*): ")
 
 
@@ -47,16 +48,27 @@ def field_names(command: object) -> set[str]:
 
 
 def with_flags(message: str, fields: Collection[str]) -> str:
-    """A message that begins with names of options, with the flags of a command instead.
+    """A message with the flags of a command for names of options, at its start or in backticks.
 
     Example:
         >>> with_flags("min_confidence: expected 0 to 1, got 2.", {"min_confidence"})
         '--min-confidence: expected 0 to 1, got 2.'
+        >>> with_flags("x: is there; `overwrite` replaces it.", {"overwrite"})
+        'x: is there; --overwrite replaces it.'
     """
+
+    def flag(match: re.Match[str]) -> str:
+        return _flag(match[1]) if match[1] in fields else match[0]
+
+    message = _QUOTED.sub(flag, message)
     found = _NAMED.match(message)
     if found is None:
         return message
     names = found[1].split(", ")
     if not all(name in fields for name in names):
         return message
-    return ", ".join("--" + name.replace("_", "-") for name in names) + message[found.end(1) :]
+    return ", ".join(map(_flag, names)) + message[found.end(1) :]
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

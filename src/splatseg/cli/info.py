@@ -11,18 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._output import where_it_stopped
-from splatseg.core import (
-    TREE_LEVELS,
-    Capture,
-    Features,
-    Gaussians,
-    InstanceTree,
-    Labels,
-    Layer,
-    Scene,
-    View,
-)
+from splatseg.core import Capture, Features, Gaussians, Labels, Layer, Scene, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import CheckpointSummary, checkpoint_summary
 from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_capture
@@ -38,6 +27,7 @@ from splatseg.io.scene import (
     scene_layer_names,
 )
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
+from splatseg.tasks.stopped_fit import where_it_stopped
 
 _LAYOUTS = ("auto", *FORMATS)
 _CAPTURE_FILES = (
@@ -232,10 +222,6 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
 def _layer_kind(layer: Layer) -> str:
     if isinstance(layer, Labels):
         return f"labels of {len(layer.present)} ids"
-    if isinstance(layer, InstanceTree):
-        levels = Counter(node.level for node in layer.nodes)
-        counts = ", ".join(f"{levels[level]} {level}s" for level in TREE_LEVELS)
-        return f"tree of {len(layer.nodes)} nodes ({counts})"
     if isinstance(layer, Features):
         return f"features of {layer.values.shape[1]} channels"
     return f"selection of {layer.count}"
