@@ -205,8 +205,8 @@ def test_files_and_report_of_one_command(masks, splatseg) -> None:
 
 def test_missing_views_are_told(small, splatseg) -> None:
     command = ("segment", small.scene, "--method", "uplift")
-    assert "note:" not in splatseg(*command)[1]
-    assert "note:" not in splatseg(*command, "--views", "all")[1], "held-out views need none"
+    assert "note:" not in splatseg(*command)[2]
+    assert "note:" not in splatseg(*command, "--views", "all")[2], "held-out views need none"
     (small.capture / "labels_semantic" / "train_1.png").unlink()
     status, out, _ = splatseg(*command)
     assert status == 0

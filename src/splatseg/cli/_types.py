@@ -12,9 +12,7 @@ def _named(metavar: str | None, help: str, *aliases: str) -> Any:
     return tyro.conf.arg(metavar=metavar, help=help, aliases=aliases or None)
 
 
-SceneFolder: TypeAlias = Annotated[
-    Path, tyro.conf.Positional, _named("SCENE", "The scene folder.")
-]
+SceneFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, _named("SCENE", "The scene folder.")]
 
 Output: TypeAlias = Annotated[Path, _named("PATH", "Where to write.", "-o")]
 
@@ -62,7 +60,6 @@ Format: TypeAlias = Annotated[
 
 Overwrite: TypeAlias = Annotated[
     bool,
-    tyro.conf.FlagCreatePairsOff,
     _named(None, "Replace what an earlier run left under the same name."),
 ]
 
@@ -83,12 +80,10 @@ Frames: TypeAlias = Annotated[int, _named("N", "Views of --split path.")]
 
 Json: TypeAlias = Annotated[
     bool,
-    tyro.conf.FlagCreatePairsOff,
     _named(None, "Print one JSON object of what was made or found, and nothing else, to stdout."),
 ]
 
 Quiet: TypeAlias = Annotated[
     bool,
-    tyro.conf.FlagCreatePairsOff,
     _named(None, "Show no progress and no notes; results and errors are still printed."),
 ]

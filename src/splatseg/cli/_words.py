@@ -3,6 +3,7 @@
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import fields, is_dataclass
+from typing import Any, cast, get_type_hints
 
 from splatseg.errors import InputError
 
@@ -56,11 +57,7 @@ def with_flags(message: str, fields: Collection[str]) -> str:
         >>> with_flags("x: is there; `overwrite` replaces it.", {"overwrite"})
         'x: is there; --overwrite replaces it.'
     """
-
-    def flag(match: re.Match[str]) -> str:
-        return _flag(match[1]) if match[1] in fields else match[0]
-
-    message = _QUOTED.sub(flag, message)
+    message = names_as_flags(message, fields)
     found = _NAMED.match(message)
     if found is None:
         return message
@@ -68,6 +65,31 @@ def with_flags(message: str, fields: Collection[str]) -> str:
     if not all(name in fields for name in names):
         return message
     return ", ".join(map(_flag, names)) + message[found.end(1) :]
+
+
+def names_as_flags(text: str, names: Collection[str]) -> str:
+    """A text with flags for names of options in backticks.
+
+    Example:
+        >>> names_as_flags("as `min_share` says; `x` stays", {"min_share"})
+        'as --min-share says; `x` stays'
+    """
+
+    def flag(match: re.Match[str]) -> str:
+        return _flag(match[1]) if match[1] in names else match[0]
+
+    return _QUOTED.sub(flag, text)
+
+
+def option_names(command: type[Any]) -> set[str]:
+    """Names of all fields of a command's class, those of nested dataclasses included."""
+    names: set[str] = set()
+    hints = get_type_hints(command)
+    for field in fields(command):
+        names.add(field.name)
+        if is_dataclass(kind := hints[field.name]):
+            names |= option_names(cast("type[Any]", kind))
+    return names
 
 
 def _flag(name: str) -> str:

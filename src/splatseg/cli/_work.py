@@ -110,5 +110,3 @@ class ConsoleObserver(Observer):
 
 def _nothing(now: object) -> None:
     """Where nobody wants to know."""
-
-

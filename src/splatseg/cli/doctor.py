@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from splatseg.cli._types import Format, Json
 from splatseg.errors import InputError
 from splatseg.pose.doctor import (
     Diagnosis,
@@ -24,6 +25,14 @@ class Command:
 
     Exit status: 0 when nothing is wrong, or when what is wrong was corrected with --fix;
     2 when faults are left.
+
+    For example:
+
+    splatseg doctor capture
+
+    splatseg doctor capture --fix corrected
+
+    splatseg doctor capture --format colmap --max-views 60 --json
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
@@ -33,26 +42,24 @@ class Command:
     """Folder to write the corrected capture to, as a transforms.json that refers to the same
     photographs. Nothing of DATA is changed; without faults nothing is written."""
 
-    json: bool = False
-    """Print one JSON object with all figures."""
+    json: Json = False
 
-    views: int = 30
+    max_views: int = 30
     """Most photographs to look at; more take longer and decide more finely."""
 
-    format: str = "auto"
-    """How DATA is read: auto, nerfstudio, colmap, blender, llff or idr."""
+    format: Format = "auto"
 
 
 def run(command: Command) -> None:
     """Examine a capture."""
-    if command.views < 2:
-        raise InputError(f"--views: expected at least 2, got {command.views}.")
+    if command.max_views < 2:
+        raise InputError(f"max_views: expected at least 2, got {command.max_views}.")
     if command.fix is not None:
         _check_output(command.fix)
     read = read_for_doctor(command.data, format=command.format)
     diagnosis = diagnose(
         read.capture,
-        options=DoctorOptions(views=command.views),
+        options=DoctorOptions(views=command.max_views),
         found=read.faults,
         declared=read.declared,
     )

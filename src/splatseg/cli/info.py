@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from splatseg.cli._types import Format, Json
 from splatseg.core import Capture, Features, Gaussians, Labels, Layer, Scene, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import CheckpointSummary, checkpoint_summary
@@ -42,17 +43,22 @@ _SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".gltf", ".glb")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """Say in one line what is there: a capture, a scene, a splat file or evidence."""
+    """Say in one line what is there: a capture, a scene, a splat file or evidence.
+
+    For example:
+
+    splatseg info room
+
+    splatseg info capture --format colmap --verbose
+
+    splatseg info room.ply --json
+    """
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """Folder of a capture, of a scene, of evidence or of bare photographs, or a splat file."""
 
-    format: str = "auto"
-    """Which description of a capture to read, where it has several: nerfstudio, blender,
-    colmap, llff or idr. auto takes the first of these that is there."""
-
-    json: bool = False
-    """Print one JSON object."""
+    format: Format = "auto"
+    json: Json = False
 
     verbose: bool = False
     """Print all details, one a line, under the line."""

@@ -108,8 +108,7 @@ def measured_change(
     if all(view.image is not None and view.image.is_file() for view in spaced):
         for name, gaussians in zip(("photographs_before", "photographs_after"), pairs, strict=True):
             scores = [
-                psnr(*picture_and_photograph(gaussians, view, backend=backend))
-                for view in spaced
+                psnr(*picture_and_photograph(gaussians, view, backend=backend)) for view in spaced
             ]
             found[name] = math.fsum(scores) / len(scores)
     return {name: round(value, 3) for name, value in found.items()} | {"views": len(spaced)}
@@ -117,5 +116,3 @@ def measured_change(
 
 def _image(gaussians: Gaussians, view: View, backend: str) -> Tensor:
     return render(gaussians, view.camera, backend=backend).image.clamp(0, 1)
-
-

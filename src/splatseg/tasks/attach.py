@@ -189,9 +189,7 @@ def _layers_to_file(work: _Work, output: Path) -> AttachedLayers:
     if instances is not None and options.instances is not None:
         columns |= label_columns(instances, "instance")
         table |= label_tables(found.carry(instances), "instance", options.instances, scene.classes)
-    return _write(
-        work, output, _like(scene.gaussians, edited), found, columns=columns, table=table
-    )
+    return _write(work, output, _like(scene.gaussians, edited), found, columns=columns, table=table)
 
 
 def _write(

@@ -103,9 +103,7 @@ def make_demo(
     capture = folder / "capture"
     _photograph(capture, options, observer)
     steps.append(("generate", time.monotonic() - started))
-    job = _MainJob(
-        folder=folder, options=options, backend=backend, observer=observer, steps=steps
-    )
+    job = _MainJob(folder=folder, options=options, backend=backend, observer=observer, steps=steps)
     job.run()
     begin = time.monotonic()
     figures = DemoFigures(
@@ -136,9 +134,7 @@ def _photograph(capture: Path, options: DemoOptions, observer: Observer) -> None
         height=options.width * 3 // 4,
     )
     with observer.stage("photograph") as step:
-        write_capture(
-            scene, capture, views=views, points=_POINTS, seed=options.seed, progress=step
-        )
+        write_capture(scene, capture, views=views, points=_POINTS, seed=options.seed, progress=step)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,9 +211,7 @@ class _MainJob:
         self.observer.info(_fitted(made))
 
     def _segment(self, scene: Scene, method: str, options: SegmentOptions) -> Segmentation:
-        made = segment(
-            scene, method, options=options, backend=self.backend, observer=self.observer
-        )
+        made = segment(scene, method, options=options, backend=self.backend, observer=self.observer)
         save_scene_layer(self.folder / "scene", made.name, made.layer)
         return made
 
@@ -294,9 +288,7 @@ def _prepare(folder: Path, observer: Observer) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _record(
-    figures: DemoFigures, steps: list[tuple[str, float]], total: float
-) -> dict[str, Any]:
+def _record(figures: DemoFigures, steps: list[tuple[str, float]], total: float) -> dict[str, Any]:
     return {
         "made_by": _MADE_BY,
         "finished": True,

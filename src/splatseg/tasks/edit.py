@@ -200,9 +200,7 @@ def edit_scene(
     else:
         work = _Work(
             options=options,
-            cut=Cut(
-                by=options.cut, evidence=options.evidence, options=cut_options or CutOptions()
-            ),
+            cut=Cut(by=options.cut, evidence=options.evidence, options=cut_options or CutOptions()),
             backend=backend,
             observer=observer,
         )

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from splatseg.core import Capture, Gaussians, Scene
 from splatseg.errors import InputError
-from splatseg.importing import Alignment, SceneKind, VirtualViews, align, place_cameras
+from splatseg.importing import Alignment, VirtualViews, align, place_cameras
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import save_scene
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
@@ -121,7 +121,19 @@ def import_scene(
             observer.info(_aligned(alignment))
         scene = _with_photographs(gaussians, capture, alignment, provenance)
     else:
-        scene, placed = _with_cameras(file, gaussians, options, backend, observer, provenance)
+        up = _up(file, options.up)
+        with observer.stage("placing cameras") as step:
+            placed = place_cameras(
+                gaussians,
+                up=up,
+                count=options.max_views,
+                width=options.width,
+                height=options.height,
+                kind=None if options.kind == "auto" else options.kind,
+                backend=backend,
+                progress=step,
+            )
+        scene = _with_cameras(gaussians, up, placed, provenance)
         observer.info(_placed(placed))
     return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=placed)
 
@@ -156,30 +168,14 @@ def _with_photographs(
 
 
 def _with_cameras(
-    file: Path,
     gaussians: Gaussians,
-    options: ImportOptions,
-    backend: BackendName,
-    observer: Observer,
+    up: tuple[float, float, float],
+    placed: VirtualViews,
     provenance: dict[str, Any],
-) -> tuple[Scene, VirtualViews]:
-    up = _up(file, options.up)
-    kind: SceneKind | None = None if options.kind == "auto" else options.kind
-    with observer.stage("placing cameras") as step:
-        placed = place_cameras(
-            gaussians,
-            up=up,
-            count=options.max_views,
-            width=options.width,
-            height=options.height,
-            kind=kind,
-            backend=backend,
-            progress=step,
-        )
+) -> Scene:
     facts = {"kind": placed.kind, "coverage": round(placed.coverage, 4), "up": list(up)}
     provenance = provenance | {"virtual_views": facts}
-    scene = Scene(gaussians=gaussians, views=placed.views, up=up, provenance=provenance)
-    return scene, placed
+    return Scene(gaussians=gaussians, views=placed.views, up=up, provenance=provenance)
 
 
 def _up(file: Path, name: UpAxis) -> tuple[float, float, float]:

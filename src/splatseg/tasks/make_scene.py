@@ -67,9 +67,7 @@ class MakeSceneOptions:
         if not (math.isfinite(every) and every > 0):
             raise InputError(f"checkpoint_every: expected a positive number, got {every}.")
         if self.checkpoint_steps is not None and self.checkpoint_steps < 1:
-            raise InputError(
-                f"checkpoint_steps: expected at least 1, got {self.checkpoint_steps}."
-            )
+            raise InputError(f"checkpoint_steps: expected at least 1, got {self.checkpoint_steps}.")
         if self.frames < 1:
             raise InputError(f"frames: expected at least 1, got {self.frames}.")
 

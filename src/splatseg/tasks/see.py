@@ -84,9 +84,7 @@ def see(
     found = _model(model, options, regions)
     cache = None
     if options.cache is not None:
-        cache = ModelCache(
-            folder=options.cache, precision=options.precision, report=observer.note
-        )
+        cache = ModelCache(folder=options.cache, precision=options.precision, report=observer.note)
     if found.note:
         observer.note(f"{found.name}: {found.note}")
     folder = scene.root / EVIDENCE_FOLDER / evidence

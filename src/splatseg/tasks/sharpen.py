@@ -162,6 +162,9 @@ def merged(layer: Labels, found: Sharpened) -> Labels:
     evidence = new.evidence
     if evidence is not None and layer.evidence is not None:
         evidence = torch.where(decided, evidence, layer.evidence)
+    views = new.effective_views
+    if views is not None and layer.effective_views is not None:
+        views = torch.where(decided, views, layer.effective_views)
     return replace(
         layer,
         ids=torch.where(decided, new.ids, layer.ids),
@@ -169,6 +172,7 @@ def merged(layer: Labels, found: Sharpened) -> Labels:
         candidates=None,
         shares=None,
         evidence=evidence,
+        effective_views=views,
         inferred=inferred if bool(inferred.any()) else None,
         metadata=dict(layer.metadata) | {"sharpened": new.metadata["sharpened"]},
     )
