@@ -15,6 +15,7 @@ from splatseg.core import InstanceTree, Labels, Layer
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.splats import read_splats
+from splatseg.tasks import demo as demo_task
 
 SMALL = ["--steps", "40", "--train-views", "6", "--width", "64", "--max-gaussians", "3000"]
 

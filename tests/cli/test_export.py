@@ -63,7 +63,9 @@ def test_objects(labelled, splatseg, tmp_path) -> None:
     assert [row["class"] for row in content["objects"]] == ["right wall"] * 2
     # Another format and fewer objects: the folder is replaced as a whole.
     again = ("--what", "objects", "--instances", "pieces", "--only", "far piece", "-o", out)
-    assert splatseg("export", labelled.scene, *again, "--splat-format", "spz", "--unlabelled")[0] == 0
+    assert (
+        splatseg("export", labelled.scene, *again, "--splat-format", "spz", "--unlabelled")[0] == 0
+    )
     assert sorted(p.name for p in out.iterdir()) == [
         "300_far-piece.spz", "objects.json", "unlabelled.spz",
     ]  # fmt: skip

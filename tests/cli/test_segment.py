@@ -208,9 +208,9 @@ def test_missing_views_are_told(small, splatseg) -> None:
     assert "note:" not in splatseg(*command)[2]
     assert "note:" not in splatseg(*command, "--views", "all")[2], "held-out views need none"
     (small.capture / "labels_semantic" / "train_1.png").unlink()
-    status, out, _ = splatseg(*command)
+    status, _, err = splatseg(*command)
     assert status == 0
-    assert "note: 1 of 3 views have no such evidence, the first is train_1" in out
+    assert "note: 1 of 3 views have no such evidence, the first is train_1" in err
 
 
 def test_mistakes_cost_one_sentence_and_nothing_else(masks, splatseg, tmp_path) -> None:

@@ -286,8 +286,8 @@ def test_an_interruption_leaves_nothing(labelled, splatseg, tmp_path, monkeypatc
 
 
 def test_what_no_pixel_shows_keeps_its_label(labelled) -> None:
-    from splatseg.tasks.sharpen import merged
     from splatseg.lift import Sharpened
+    from splatseg.tasks.sharpen import merged
 
     old = Labels(
         ids=torch.tensor([2, 7, 7], dtype=torch.int32),

@@ -2,7 +2,7 @@ r"""Cuts: Gaussians that reach over a boundary are split, so that each side can 
 
 A boundary is that of masks in the photographs (`cut_masks` for some ids, `cut_labels` for a
 whole layer) or a box in the world (`cut_box`). A Gaussian straddles it if its lesser side has
-at least `CutOptions.min_share`: of the evidence that masks give, or of the Gaussian's mass
+at least `CutOptions.min_side`: of the evidence that masks give, or of the Gaussian's mass
 beyond a plane. It is split in the direction that separates the two sides best (`_sides`,
 `split`), its parts are held against the same boundary, and those that still straddle are split
 again, for a few rounds.
@@ -54,7 +54,7 @@ class CutOptions:
     rounds: int = 2
     """How often what still straddles is split again; 0 splits nothing."""
 
-    min_share: float = 0.1
+    min_side: float = 0.1
     """Least share, in [0, 0.5], of the lesser side for a Gaussian to straddle the cut."""
 
     min_pixels: float = 0.5
@@ -78,7 +78,7 @@ class CutOptions:
             raise RangeError(f"parts: expected one of {known}, got {self.parts}.")
         if self.rounds < 0:
             raise RangeError(f"rounds: expected 0 or more, got {self.rounds}.")
-        check_range("min_share", self.min_share, 0.0, 0.5)
+        check_range("min_side", self.min_side, 0.0, 0.5)
         check_range("border_weight", self.border_weight, 0.0, 1.0)
         check_range("keep_share", self.keep_share, 0.0, 1.0)
         for name in ("min_pixels", "min_weight"):
@@ -336,7 +336,7 @@ def cut_box(
         mass, normals = _nearest_face(now, lower, upper)
         directions = directions_of_normals(now, normals)
         large = seen_along(now, directions, cameras).pixels >= options.min_pixels
-        mask = (mass >= max(options.min_share, 1e-6)) & large & (now.scales.amax(dim=1) > 0)
+        mask = (mass >= max(options.min_side, 1e-6)) & large & (now.scales.amax(dim=1) > 0)
         straddling = Selection(mask=mask if among is None else mask & among.mask[edited.rows])
         if turn == 0:
             first = straddling.mask
@@ -426,7 +426,7 @@ def _straddling(
     gaussians: Gaussians, sides: Sides, views: Sequence[View], options: CutOptions
 ) -> Selection:
     lesser = torch.minimum(sides.share, 1 - sides.share)
-    mask = lesser >= max(options.min_share, 1e-6)
+    mask = lesser >= max(options.min_side, 1e-6)
     mask &= sides.inside + sides.outside >= options.min_weight
     mask &= gaussians.scales.amax(dim=1) > 0
     rows = torch.nonzero(mask).squeeze(1)
