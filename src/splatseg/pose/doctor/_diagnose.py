@@ -55,7 +55,7 @@ _POINT_VIEWS, _POINT_LONGEST = 20, 320
 class DoctorOptions:
     """How thoroughly to look."""
 
-    views: int = 30
+    max_views: int = 30
     """Most photographs to look at."""
 
     longest: int = 800
@@ -96,7 +96,7 @@ def diagnose(
     views = [view for view in capture.views if view.image is not None]
     if matches is None:
         matches = match_views(
-            views, most_views=options.views, longest=options.longest, seed=options.seed
+            views, most_views=options.max_views, longest=options.longest, seed=options.seed
         )
     examination = _examine(capture, views, matches, seed=options.seed)
     faults = [*found, *examination.faults]
@@ -151,7 +151,7 @@ def find_points(
     options = options or DoctorOptions()
     views = [view for view in capture.views if view.image is not None]
     matches = match_views(
-        views, most_views=options.views, longest=options.longest, seed=options.seed
+        views, most_views=options.max_views, longest=options.longest, seed=options.seed
     )
     if len(matches) < _MATCHES:
         return None
