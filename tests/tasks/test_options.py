@@ -167,8 +167,17 @@ def test_attaching_takes_the_layers_that_are_named(made, tmp_path) -> None:
     assert scene_layer_names(imported) == ("classes",)
     with pytest.raises(InputError, match="`overwrite` replaces them"):
         attach_layers(made, imported)
-    half = gaussians.replace(means=gaussians.means + 50 * torch.rand_like(gaussians.means))
-    write_splats(half, tmp_path / "other.ply")
+    noise = torch.Generator().manual_seed(1)
+    count = len(gaussians)
+    write_splats(
+        gaussians.replace(
+            means=torch.rand(count, 3, generator=noise) * 90,
+            scales=torch.rand(count, 3, generator=noise) + 0.01,
+            opacities=torch.rand(count, generator=noise),
+            sh=torch.randn(gaussians.sh.shape, generator=noise),
+        ),
+        tmp_path / "other.ply",
+    )
     strict = AttachLayersOptions(min_found=0.9)
     with pytest.raises(InputError, match="fewer than `min_found` 0.9"):
         attach_layers(made, tmp_path / "other.ply", tmp_path / "x", options=strict)

@@ -62,9 +62,7 @@ def capture_of(
 def _without_poses(data: Path, format: str, poses: Poses) -> bool:
     if poses == "sfm":
         if format != "auto":
-            raise InputError(
-                f"format: expected none with poses that are found (sfm), got {format!r}."
-            )
+            raise InputError(f"format: expected none with `poses` sfm, got {format!r}.")
         return True
     if poses == "given" or format != "auto":
         return False
