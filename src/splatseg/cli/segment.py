@@ -183,16 +183,15 @@ def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
         "layer": result.name,
         "file": path,
         "kind": type(result.layer).__name__.lower(),
-        "gaussians": len(result.layer),
         "views": len(result.views),
         "stage_seconds": {name: round(value, 3) for name, value in result.timings.items()},
     }
-    if isinstance(result.layer, Labels):
-        ids = result.layer.ids
-        facts["labelled"] = int((ids != UNLABELLED).sum())
-        facts["ids"] = len(result.layer.present)
-        inferred = result.layer.inferred
-        facts["inferred"] = 0 if inferred is None else int(inferred.sum())
+    if not isinstance(result.layer, Features):
+        labels = result.labels
+        facts["gaussians"] = len(labels)
+        facts["labelled"] = int((labels.ids != UNLABELLED).sum())
+        facts["ids"] = len(labels.present)
+        facts["inferred"] = 0 if labels.inferred is None else int(labels.inferred.sum())
     return facts
 
 

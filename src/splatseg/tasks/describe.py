@@ -7,7 +7,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Capture, Features, Gaussians, Labels, Layer, Scene, View
+from splatseg.core import (
+    TREE_LEVELS,
+    Capture,
+    Features,
+    Gaussians,
+    InstanceTree,
+    Labels,
+    Layer,
+    Scene,
+    View,
+)
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import CheckpointSummary, checkpoint_summary
 from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_capture
@@ -189,6 +199,10 @@ def _layer_kind(layer: Layer) -> str:
         return f"labels of {len(layer.present)} ids"
     if isinstance(layer, Features):
         return f"features of {layer.values.shape[1]} channels"
+    if isinstance(layer, InstanceTree):
+        levels = Counter(node.level for node in layer.nodes)
+        counts = ", ".join(f"{levels[level]} {level}s" for level in TREE_LEVELS)
+        return f"tree of {len(layer.nodes)} nodes ({counts})"
     return f"selection of {layer.count}"
 
 
