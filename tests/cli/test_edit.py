@@ -82,7 +82,7 @@ def test_a_thing_is_removed_at_its_masks_and_comes_back(room, tmp_path, capsys) 
     words = ["edit", str(room), "-o", str(out), "--remove", "--layer", "objects"]
     assert main([*words, "--names", "thing", "--min-weight", "0"]) == 0
     said = capsys.readouterr().out
-    assert "Gaussians split at the boundary (masks): pictures before and after are" in said
+    assert "Gaussians split at the boundary (masks): renders before and after are" in said
     (edit,) = history(out)
     assert edit["kind"] == "remove"
     assert edit["where"] == {"layer": "objects", "ids": [3]}
