@@ -282,7 +282,7 @@ def main() -> None:
         "--thin", type=int, default=1, help="measure in every n-th view only; cuts use all"
     )
     parser.add_argument("--keep-share", type=float, default=CutOptions().keep_share)
-    parser.add_argument("--min-share", type=float, default=CutOptions().min_share)
+    parser.add_argument("--min-side", type=float, default=CutOptions().min_side)
     args = parser.parse_args()
     started = time.perf_counter()
     document = load_document(args.scene, data=args.data)
@@ -294,7 +294,7 @@ def main() -> None:
     things = dict(list(things_of(args.data, labels).items())[:: args.every])
     if args.ids:
         things = {thing: name for thing, name in things.items() if thing in args.ids}
-    cut = CutOptions(keep_share=args.keep_share, min_share=args.min_share)
+    cut = CutOptions(keep_share=args.keep_share, min_side=args.min_side)
     if args.split == "each":
         removed = one_by_one(document, things, truth, cut, args.thin)
     else:

@@ -280,7 +280,7 @@ def scored(bench: Bench, edited: Edited) -> tuple[float, float, float, float, fl
     """Shares of right labels, right rows, strangers without label, survivors; seconds."""
     out = bench.folder / "attached.ply"
     command = [sys.executable, "-m", "splatseg", "attach", str(bench.root), str(edited.path)]
-    options = ["--layer", bench.layer, "--instances", _ROW, "-o", str(out), "--least-share", "0"]
+    options = ["--layer", bench.layer, "--instances", _ROW, "-o", str(out), "--min-found", "0"]
     begun = time.perf_counter()
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     seconds = time.perf_counter() - begun

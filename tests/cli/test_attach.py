@@ -89,7 +89,7 @@ def test_a_new_scene(labelled, kept, edited, splatseg, tmp_path) -> None:
     status, _, err = splatseg("attach", labelled.scene, edited, "-o", new)
     assert status == 2
     assert "new folder" in err
-    some = ("--layer", "high, fifths", "-o", tmp_path / "some")
+    some = ("--layers", "high, fifths", "-o", tmp_path / "some")
     assert splatseg("attach", labelled.scene, edited, *some)[0] == 0
     assert scene_layer_names(tmp_path / "some") == ("fifths", "high")
 
@@ -149,9 +149,9 @@ def test_a_ply_with_columns(labelled, kept, edited, splatseg, tmp_path) -> None:
 
 def test_an_imported_scene(labelled, kept, edited, splatseg, tmp_path) -> None:
     scene = tmp_path / "imported"
-    command = ("import", edited, "-o", scene, "--views", 2, "--width", 64, "--height", 48)
+    command = ("import", edited, "-o", scene, "--max-views", 2, "--width", 64, "--height", 48)
     assert splatseg(*command)[0] == 0
-    status, _out, err = splatseg("attach", labelled.scene, scene, "--layer", "fifths")
+    status, _out, err = splatseg("attach", labelled.scene, scene, "--layers", "fifths")
     assert (status, err) == (0, "")
     assert scene_layer_names(scene) == ("fifths",)
     got = load_scene_layer(scene, "fifths")
@@ -194,7 +194,7 @@ def test_mistakes_get_one_sentence(labelled, edited, splatseg, tmp_path) -> None
     out = ("-o", tmp_path / "new")
     ply = ("-o", tmp_path / "new.ply")
     cases = [
-        ((scene, edited), "-o: needed"),
+        ((scene, edited), "--output: needed"),
         ((scene, tmp_path / "no.ply", *out), "no.ply"),
         ((scene, tmp_path / "bytes.ply", *out), "bytes.ply"),
         ((scene, tmp_path / "none.ply", *out), "file of none"),
@@ -205,14 +205,14 @@ def test_mistakes_get_one_sentence(labelled, edited, splatseg, tmp_path) -> None
         ((scene, edited, *ply), "fifths, high, vectors"),
         ((scene, edited, *ply, "--layer", "vectors"), "labels"),
         ((scene, edited, *ply, "--instances", "high"), "labels"),
-        ((scene, edited, *out, "--layer", "eighths"), "fifths, high, vectors"),
+        ((scene, edited, *out, "--layers", "eighths"), "fifths, high, vectors"),
         ((scene, edited, *out, "--instances", "fifths"), "--instances"),
         ((scene, edited, "-o", tmp_path / "x.spz"), "x.spz: expected a scene folder or a .ply"),
         ((scene, edited, "-o", tmp_path / "x.compressed.ply"), "expected a scene folder or a .ply"),
         ((scene, edited, "-o", tmp_path / "no" / "x"), "folder to write in"),
         ((scene, edited, "-o", labelled.capture), "new folder"),
         ((scene, edited, "-o", edited, "--layer", "fifths"), "is what is read"),
-        ((scene, edited, *out, "--least-share", 2), "--least-share"),
+        ((scene, edited, *out, "--min-found", 2), "--min-found"),
         ((scene, edited, *out, "--moves", -1), "moves"),
     ]  # fmt: skip
     before = sorted(p for p in tmp_path.rglob("*"))

@@ -10,13 +10,14 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.cli import demo, main
+from splatseg.cli import main
 from splatseg.core import InstanceTree, Labels, Layer
 from splatseg.io.captures import read_capture
 from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.splats import read_splats
+from splatseg.tasks import demo as demo_task
 
-SMALL = ["--steps", "40", "--views", "6", "--width", "64", "--max-gaussians", "3000"]
+SMALL = ["--steps", "40", "--train-views", "6", "--width", "64", "--max-gaussians", "3000"]
 
 
 def rows_of(layer: Layer) -> torch.Tensor:
@@ -137,7 +138,7 @@ def test_after_ctrl_c_a_second_run_works(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(demo, "export", stop)
+        patch.setattr(demo_task, "export", stop)
         assert main(["demo", "-o", str(earlier), *SMALL]) == 1
     assert "interrupted" in capsys.readouterr().err
     assert json.loads((earlier / "demo.json").read_text())["finished"] is False
@@ -174,7 +175,7 @@ def test_somebody_elses_folder_is_refused_and_left_alone(
     [
         (["-o", "a/b"], "a/b: expected a place"),
         (["-o", "file"], "file: expected a folder"),
-        (["--views", "2"], "--views: expected at least 4"),
+        (["--train-views", "2"], "--train-views: expected at least 4"),
         (["--width", "8"], "--width: expected at least 32"),
     ],
 )

@@ -44,12 +44,12 @@ def each_pose(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Content],
 
 def test_a_healthy_copy(broken, splatseg, tmp_path) -> None:
     folder = broken()
-    words = ("doctor", folder, "--views", 12, "--fix", tmp_path / "out")
+    words = ("doctor", folder, "--max-views", 12, "--fix", tmp_path / "out")
     status, out, err = splatseg(*words)
     assert (status, err) == (0, "")
     assert "no fault found" in out
     assert not (tmp_path / "out").exists(), "nothing is written where nothing is wrong"
-    status, out, _ = splatseg("doctor", folder, "--views", 12, "--json")
+    status, out, _ = splatseg("doctor", folder, "--max-views", 12, "--json")
     facts = json.loads(out)
     assert status == 0
     assert (facts["healthy"], facts["faults"], facts["written"]) == (True, [], None)
@@ -59,7 +59,7 @@ def test_a_healthy_copy(broken, splatseg, tmp_path) -> None:
 def test_a_fault_without_fix_is_status_2(broken, splatseg) -> None:
     folder = broken(each_pose(np.linalg.inv))
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    status, out, err = splatseg("doctor", folder, "--views", 12)
+    status, out, err = splatseg("doctor", folder, "--max-views", 12)
     assert status == 2
     assert "world-to-camera matrices where camera-to-world ones are expected" in out
     assert err.strip() == (
@@ -77,7 +77,7 @@ def test_fix_writes_a_capture_that_is_healthy(broken, generated_room, splatseg, 
             content[key] /= 2
 
     folder = broken(change)
-    status, out, err = splatseg("doctor", folder, "--views", 12, "--fix", tmp_path / "out")
+    status, out, err = splatseg("doctor", folder, "--max-views", 12, "--fix", tmp_path / "out")
     assert (status, err) == (0, "")
     assert "2 faults found" in out
     fixed, true = read_capture(tmp_path / "out"), read_capture(generated_room)
@@ -90,7 +90,7 @@ def test_fix_writes_a_capture_that_is_healthy(broken, generated_room, splatseg, 
         np.testing.assert_allclose(camera.cam_from_world, expected.cam_from_world, atol=1e-9)
         assert (camera.fx, camera.cx, camera.cy) == (expected.fx, expected.cx, expected.cy)
         assert view.image.samefile(true.view(view.name).image)
-    status, out, _ = splatseg("doctor", tmp_path / "out", "--views", 12, "--json")
+    status, out, _ = splatseg("doctor", tmp_path / "out", "--max-views", 12, "--json")
     assert status == 0
     assert json.loads(out)["healthy"]
 
@@ -99,7 +99,7 @@ def test_sizes_that_contradict_the_photographs(broken, generated_room, splatseg,
     """Width and height exchanged, intrinsics right: `read_capture` refuses it."""
     folder = broken(lambda content: content.update(w=240, h=320))
     status, out, err = splatseg(
-        "doctor", folder, "--views", 12, "--fix", tmp_path / "out", "--json"
+        "doctor", folder, "--max-views", 12, "--fix", tmp_path / "out", "--json"
     )
     assert status == 0, err
     facts = json.loads(out)
@@ -122,7 +122,7 @@ def test_the_applied_transform_is_named(broken, splatseg) -> None:
 
     folder = broken(change)
     (folder / "metadata.json").write_text(json.dumps({"up_axis": "+y"}))
-    status, out, err = splatseg("doctor", folder, "--views", 12)
+    status, out, err = splatseg("doctor", folder, "--max-views", 12)
     assert status == 2, err
     assert "transforms.json's applied_transform, which was not applied to them" in out
 
@@ -130,7 +130,7 @@ def test_the_applied_transform_is_named(broken, splatseg) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--views", "1"], "--views: expected at least 2, got 1"),
+        (["--max-views", "1"], "--max-views: expected at least 2, got 1"),
         (["--fix", "full"], "full: expected a new or empty folder to write to"),
         (["--fix", "no/out"], "no/out: expected a place in a folder that is there"),
     ],

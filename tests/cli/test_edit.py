@@ -82,7 +82,7 @@ def test_a_thing_is_removed_at_its_masks_and_comes_back(room, tmp_path, capsys) 
     words = ["edit", str(room), "-o", str(out), "--remove", "--layer", "objects"]
     assert main([*words, "--names", "thing", "--min-weight", "0"]) == 0
     said = capsys.readouterr().out
-    assert "Gaussians split at the boundary (masks): pictures before and after are" in said
+    assert "Gaussians split at the boundary (masks): renders before and after are" in said
     (edit,) = history(out)
     assert edit["kind"] == "remove"
     assert edit["where"] == {"layer": "objects", "ids": [3]}
@@ -133,7 +133,7 @@ def test_a_thing_is_removed_at_its_masks_and_comes_back(room, tmp_path, capsys) 
 
 def test_a_copy_is_moved_and_a_thing_coloured(room, tmp_path) -> None:
     out = tmp_path / "out"
-    thing = ["--layer", "objects", "--ids", "3", "--split", "off"]
+    thing = ["--layer", "objects", "--ids", "3", "--cut", "off"]
     assert (
         main(
             [
@@ -200,7 +200,7 @@ def test_colours_are_scaled_and_shifted(room, tmp_path) -> None:
     before = load_scene(room).gaussians.colours
     out = tmp_path / "tinted"
     words = ["--colour-scale", "0.5", "1", "1", "--colour-shift", "0.125", "0", "-0.25"]
-    assert main(["edit", str(room), "-o", str(out), *words, "--split", "off"]) == 0
+    assert main(["edit", str(room), "-o", str(out), *words, "--cut", "off"]) == 0
     expected = before * torch.tensor([0.5, 1, 1]) + torch.tensor([0.125, 0, -0.25])
     found = load_scene(out).gaussians.colours
     inside = ((expected > 0) & (expected < 1)).all(dim=1)
@@ -253,7 +253,7 @@ def test_scenes_are_joined(room, tmp_path) -> None:
                 "objects",
                 "--ids",
                 "3",
-                "--split",
+                "--cut",
                 "masks",
                 "--evidence",
                 "no",

@@ -63,7 +63,9 @@ def test_objects(labelled, splatseg, tmp_path) -> None:
     assert [row["class"] for row in content["objects"]] == ["right wall"] * 2
     # Another format and fewer objects: the folder is replaced as a whole.
     again = ("--what", "objects", "--instances", "pieces", "--only", "far piece", "-o", out)
-    assert splatseg("export", labelled.scene, *again, "--format", "spz", "--unlabelled")[0] == 0
+    assert (
+        splatseg("export", labelled.scene, *again, "--splat-format", "spz", "--unlabelled")[0] == 0
+    )
     assert sorted(p.name for p in out.iterdir()) == [
         "300_far-piece.spz", "objects.json", "unlabelled.spz",
     ]  # fmt: skip
@@ -226,7 +228,7 @@ def test_mistakes_get_one_sentence(labelled, splatseg, tmp_path) -> None:
         (("--what", "objects", "--layer", "empty", *out), "no Gaussian has an id"),
         (("--what", "table", "--layer", "walls", "-o", tmp_path / "t.xls"), ".csv or .json"),
         (("--what", "points", "--layer", "walls", "-o", tmp_path / "t.xyz"), ".las"),
-        (("--what", "points", "--format", "ply", "-o", tmp_path / "t.ply"), "--format"),
+        (("--what", "points", "--splat-format", "ply", "-o", tmp_path / "t.ply"), "--splat-format"),
         (("--what", "table", "--unlabelled", *out), "--unlabelled"),
         (("--what", "coco", "--layer", "walls", "--split", "none", *out), "test, train"),
         (("--what", "statue", *out), "objects"),

@@ -9,7 +9,7 @@ from splatseg.core import Labels, Similarity
 from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.io.splats import read_splats, write_splats
 
-SMALL = ("--views", 13, "--width", 64, "--height", 48)
+SMALL = ("--max-views", 13, "--width", 64, "--height", 48)
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_bad_input_is_one_sentence(small, splat_file, splatseg, tmp_path) -> Non
         ((splat_file, "-o", layered), "got a scene with layers (mine)"),
         ((splat_file, *out, "--data", tmp_path / "empty"), "expected a capture"),
         ((splat_file, *out, "--as-is"), "--as-is: goes with --data"),
-        ((splat_file, *out, "--views", 0), "--views: expected at least 1"),
+        ((splat_file, *out, "--max-views", 0), "--max-views: expected at least 1"),
     ]:
         status, _, err = splatseg("import", *words)
         assert status == 2, words

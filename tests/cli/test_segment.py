@@ -205,12 +205,12 @@ def test_files_and_report_of_one_command(masks, splatseg) -> None:
 
 def test_missing_views_are_told(small, splatseg) -> None:
     command = ("segment", small.scene, "--method", "uplift")
-    assert "note:" not in splatseg(*command)[1]
-    assert "note:" not in splatseg(*command, "--views", "all")[1], "held-out views need none"
+    assert "note:" not in splatseg(*command)[2]
+    assert "note:" not in splatseg(*command, "--views", "all")[2], "held-out views need none"
     (small.capture / "labels_semantic" / "train_1.png").unlink()
-    status, out, _ = splatseg(*command)
+    status, _, err = splatseg(*command)
     assert status == 0
-    assert "note: 1 of 3 views have no such evidence, the first is train_1" in out
+    assert "note: 1 of 3 views have no such evidence, the first is train_1" in err
 
 
 def test_mistakes_cost_one_sentence_and_nothing_else(masks, splatseg, tmp_path) -> None:

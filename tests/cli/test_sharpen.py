@@ -136,7 +136,7 @@ def test_evidence_of_the_scene_itself_comes_along(labelled, splatseg, tmp_path) 
 
 
 def test_views_are_those_of_the_layer(labelled) -> None:
-    from splatseg.cli.sharpen import _views
+    from splatseg.tasks.sharpen import views_to_learn_from as _views
 
     scene = load_scene(labelled.scene, data=labelled.capture)
     every = open_evidence(labelled.capture / "semantic")
@@ -162,7 +162,7 @@ def test_label_maps_of_something_else_are_refused(labelled, splatseg, tmp_path) 
 
 
 def test_the_fit_goes_on_as_it_was(labelled) -> None:
-    from splatseg.cli.sharpen import _fit_options
+    from splatseg.tasks.sharpen import fit_options_of as _fit_options
 
     scene = load_scene(labelled.scene, data=labelled.capture)
     unknown = _fit_options(scene, scene.views)
@@ -273,7 +273,7 @@ def test_a_layer_of_unknown_origin_needs_evidence(labelled, splatseg, tmp_path) 
 
 
 def test_an_interruption_leaves_nothing(labelled, splatseg, tmp_path, monkeypatch) -> None:
-    import splatseg.cli.sharpen as command
+    from splatseg.tasks import sharpen as command
 
     def stopped(*arguments, **options):
         raise KeyboardInterrupt
@@ -286,8 +286,8 @@ def test_an_interruption_leaves_nothing(labelled, splatseg, tmp_path, monkeypatc
 
 
 def test_what_no_pixel_shows_keeps_its_label(labelled) -> None:
-    from splatseg.cli.sharpen import merged
     from splatseg.lift import Sharpened
+    from splatseg.tasks.sharpen import merged
 
     old = Labels(
         ids=torch.tensor([2, 7, 7], dtype=torch.int32),

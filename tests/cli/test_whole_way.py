@@ -115,7 +115,7 @@ def test_objects_leave_in_files_and_come_back(room, run, classes, tmp_path) -> N
     run("export", room, "--what", "objects", "--layer", classes, "-o", tmp_path / "objects")
     (file,) = (tmp_path / "objects").rglob("*floor*.ply")
     assert len(read_splats(file)) == int(floor.sum())
-    run("import", file, "-o", tmp_path / "floor", "--views", 13, "--width", 64, "--height", 48)
+    run("import", file, "-o", tmp_path / "floor", "--max-views", 13, "--width", 64, "--height", 48)
     assert len(load_scene(tmp_path / "floor").gaussians) == int(floor.sum())
 
     kept = torch.randperm(len(layer), generator=torch.Generator().manual_seed(3))[: len(layer) // 2]
@@ -125,7 +125,7 @@ def test_objects_leave_in_files_and_come_back(room, run, classes, tmp_path) -> N
     assert isinstance(again, Labels)
     assert torch.equal(again.ids, layer.ids[kept])
 
-    words = ("--remove", "--layer", classes, "--names", "floor", "--split", "off")
+    words = ("--remove", "--layer", classes, "--names", "floor", "--cut", "off")
     run("edit", room, "-o", tmp_path / "bare", *words)
     left = load_scene_layer(tmp_path / "bare", classes)
     assert isinstance(left, Labels)

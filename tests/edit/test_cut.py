@@ -165,7 +165,7 @@ def left_of(cut, views) -> float:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"min_share": 0.5}, {"min_pixels": 20.0}, {"min_weight": 1e4}],
+    [{"min_side": 0.5}, {"min_pixels": 20.0}, {"min_weight": 1e4}],
 )
 def test_each_limit_keeps_a_gaussian_whole(changes) -> None:
     row = gaussians_at([[0.12, 0, 0]], [0.4, 0.2, 0.2])
@@ -276,7 +276,7 @@ def test_hostile_cuts_are_refused(some) -> None:
     for changes, message in (
         ({"parts": 4}, "parts: expected one of 2, 3, got 4"),
         ({"rounds": -1}, "rounds: expected 0 or more"),
-        ({"min_share": 0.6}, "min_share: expected a value in"),
+        ({"min_side": 0.6}, "min_side: expected a value in"),
         ({"min_pixels": math.inf}, "min_pixels: expected 0 or more"),
         ({"keep_share": -0.1}, "keep_share: expected a value in"),
     ):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from splatseg.cli._fit_report import score_and_report
 from splatseg.core import Capture, Scene
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitResult, fit
 from splatseg.io.scene import save_scene
+from splatseg.tasks._fit_report import score_and_report
 
 OPTIONS = FitOptions(minutes=None, steps=120, max_gaussians=70, seed=3, background="black")
 
@@ -51,10 +51,13 @@ class Page(HTMLParser):
 
 def test_a_finished_fit(fitted) -> None:
     root, capture, result = fitted
-    message = score_and_report(root, capture, result, options=OPTIONS, backend="cpu", scoring=True)
+    found, where = score_and_report(
+        root, capture, result, options=OPTIONS, backend="cpu", scoring=True
+    )
     scores = evaluate_photographs(result.gaussians, capture.test_views, backend="cpu")
-    assert f"PSNR {scores.psnr:.2f} dB on 3 held-out views, SSIM {scores.ssim:.3f}\n" in message
-    assert str(root / "reports" / "fit.html") in message
+    assert found is not None
+    assert (found.psnr, found.ssim) == (scores.psnr, scores.ssim)
+    assert where == root / "reports" / "fit.html"
 
     record = json.loads((root / "reports" / "fit.json").read_text())
     assert record["steps"] == 120
@@ -101,10 +104,10 @@ def test_a_finished_fit(fitted) -> None:
 def test_an_interrupted_fit_is_not_scored(fitted) -> None:
     root, capture, result = fitted
     stopped = replace(result, interrupted=True)
-    message = score_and_report(
+    found, _ = score_and_report(
         root, capture, stopped, options=OPTIONS, backend="cpu", scoring=False
     )
-    assert message == f"report: {root / 'reports' / 'fit.html'}\n"
+    assert found is None
     record = json.loads((root / "reports" / "fit.json").read_text())
     assert record["interrupted"] is True
     assert record["held_out"] is None
@@ -116,13 +119,13 @@ def test_an_interrupted_fit_is_not_scored(fitted) -> None:
 
 def test_one_held_out_view_and_none(fitted) -> None:
     root, capture, result = fitted
-    for count, images, expected in ((1, 3, "PSNR"), (0, 0, "no held-out views to score\n")):
+    for count, images in ((1, 3), (0, 0)):
         views = (*capture.train_views, *capture.test_views[:count])
         fewer = replace(capture, views=views)
-        message = score_and_report(
+        found, _ = score_and_report(
             root, fewer, replace(result, views=views), options=OPTIONS, backend="cpu", scoring=True
         )
-        assert message.startswith(expected)
+        assert (found is not None) == (count > 0)
         page = Page((root / "reports" / "fit.html").read_text())
         assert page.tags.count("img") == images
 

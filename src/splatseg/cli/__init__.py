@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from splatseg.cli._pages import kept_page
-from splatseg.cli._words import field_names, with_flags
+from splatseg.cli._words import field_names, option_names, with_flags
 from splatseg.errors import InputError, SplatsegError
 
 EXIT_DONE = 0
@@ -198,15 +198,19 @@ def _run(module: CommandModule, name: str, words: list[str]) -> int:
 
     # A command whose flags depend on its words makes its type from them.
     command_for = getattr(module, "command_for", None)
+    kind = module.Command if command_for is None else command_for(words)
     try:
         command = parse(
-            module.Command if command_for is None else command_for(words),
+            kind,
             words,
             prog=f"splatseg {name}",
             config=getattr(module, "CONFIG", None) or default_config(),
         )
     except SystemExit as leaving:  # after --help (0) or a usage error (2)
         return leaving.code if isinstance(leaving.code, int) else EXIT_USAGE
+    except InputError as error:  # options check themselves
+        error.args = (with_flags(str(error), option_names(kind)),)
+        raise
     try:
         module.run(command)
     except InputError as error:

@@ -8,13 +8,16 @@ which both are as a person wants to read them, and its answer is copied back.
 import dataclasses
 import inspect
 import types
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Union, cast, get_args, get_origin, get_type_hints
 
 import docstring_parser
 import tyro
 
+from splatseg.cli._words import names_as_flags, option_names
+
+_LISTS: dict[Any, type[str] | type[int]] = {tuple[str, ...]: str, tuple[int, ...]: int}
 _PLACEHOLDERS: dict[Any, str] = {str: "NAME", int: "N", float: "X", Path: "PATH"}
 
 
@@ -26,7 +29,7 @@ def parse(
     Raises:
         SystemExit: After the help (status 0), or after words that cannot be used (2).
     """
-    shown = _readable(command)
+    shown = _readable(command, option_names(command))
     return _original(tyro.cli(shown, prog=prog, args=list(words), config=config), command)
 
 
@@ -41,8 +44,13 @@ def flowing(text: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
-def _readable(command: type[Any]) -> type[Any]:
-    """A subclass with annotated fields; nested dataclasses likewise."""
+def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
+    """A subclass with annotated fields; nested dataclasses likewise.
+
+    Args:
+        command: The class.
+        names: All options of the command, which texts name in backticks.
+    """
     hints = get_type_hints(command, include_extras=True)
     texts = _texts(command)
     made: list[tuple[str, Any, Any]] = []
@@ -51,7 +59,7 @@ def _readable(command: type[Any]) -> type[Any]:
         default = field.default
         factory = field.default_factory
         if dataclasses.is_dataclass(kind):
-            inner = _readable(cast("type[Any]", kind))
+            inner = _readable(cast("type[Any]", kind), names)
             value = factory() if factory is not dataclasses.MISSING else default
             if value is not dataclasses.MISSING:
                 default = _copied(value, inner)
@@ -63,11 +71,16 @@ def _readable(command: type[Any]) -> type[Any]:
         if metavar is None and not dataclasses.is_dataclass(kind):
             metavar = _placeholder(kind)
         argument = tyro.conf.arg(
-            help=help,
+            name=next((note.name for note in configured if note.name is not None), None),
+            help=None if help is None else names_as_flags(help, names),
             metavar=metavar,
             aliases=next((note.aliases for note in configured if note.aliases), None),
         )
         others = [note for note in notes if not _is_argument(note)]
+        if kind is bool and field.default is False:
+            others.append(tyro.conf.FlagCreatePairsOff)  # --no-x would say what is so anyway
+        if kind in _LISTS:
+            others.append(_list_of(_LISTS[kind]))
         annotated: Any = Annotated[kind, argument]
         for note in others:
             annotated = Annotated[annotated, note]
@@ -112,6 +125,28 @@ def _copied(value: Any, kind: type[Any]) -> Any:
     return kind(**values)
 
 
+def _list_of(kind: type[str] | type[int]) -> Any:
+    """How a list is read: its items by comma, by space, or both."""
+
+    def read(words: list[str]) -> tuple[Any, ...]:
+        items = (item.strip() for word in words for item in word.split(","))
+        return tuple(kind(item) for item in items if item)
+
+    def written(values: tuple[Any, ...]) -> list[str]:
+        return [str(value) for value in values]
+
+    def fits(values: object) -> bool:
+        return isinstance(values, tuple)
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NAME ..",
+        instance_from_str=read,
+        is_instance=fits,
+        str_from_instance=written,
+    )
+
+
 def _texts(command: type[Any]) -> dict[str, str]:
     """The string below each field, flowing; a subclass's before its base's."""
     found: dict[str, str] = {}
@@ -147,4 +182,6 @@ def _placeholder(kind: Any) -> str | None:
     if get_origin(kind) is tuple and Ellipsis not in get_args(kind):
         parts = [_placeholder(part) for part in get_args(kind)]
         return None if None in parts else " ".join(part for part in parts if part is not None)
+    if kind in _LISTS:
+        return f"{_PLACEHOLDERS[_LISTS[kind]]} .."
     return _PLACEHOLDERS.get(kind)

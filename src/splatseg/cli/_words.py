@@ -3,9 +3,11 @@
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import fields, is_dataclass
+from typing import Any, cast, get_type_hints
 
 from splatseg.errors import InputError
 
+_QUOTED = re.compile(r"`(\w+)`")
 _NAMED = re.compile(r"^(\w+(?:, \w+)*): ")
 
 
@@ -47,16 +49,48 @@ def field_names(command: object) -> set[str]:
 
 
 def with_flags(message: str, fields: Collection[str]) -> str:
-    """A message that begins with names of options, with the flags of a command instead.
+    """A message with the flags of a command for names of options, at its start or in backticks.
 
     Example:
         >>> with_flags("min_confidence: expected 0 to 1, got 2.", {"min_confidence"})
         '--min-confidence: expected 0 to 1, got 2.'
+        >>> with_flags("x: is there; `overwrite` replaces it.", {"overwrite"})
+        'x: is there; --overwrite replaces it.'
     """
+    message = names_as_flags(message, fields)
     found = _NAMED.match(message)
     if found is None:
         return message
     names = found[1].split(", ")
     if not all(name in fields for name in names):
         return message
-    return ", ".join("--" + name.replace("_", "-") for name in names) + message[found.end(1) :]
+    return ", ".join(map(_flag, names)) + message[found.end(1) :]
+
+
+def names_as_flags(text: str, names: Collection[str]) -> str:
+    """A text with flags for names of options in backticks.
+
+    Example:
+        >>> names_as_flags("as `min_share` says; `x` stays", {"min_share"})
+        'as --min-share says; `x` stays'
+    """
+
+    def flag(match: re.Match[str]) -> str:
+        return _flag(match[1]) if match[1] in names else match[0]
+
+    return _QUOTED.sub(flag, text)
+
+
+def option_names(command: type[Any]) -> set[str]:
+    """Names of all fields of a command's class, those of nested dataclasses included."""
+    names: set[str] = set()
+    hints = get_type_hints(command)
+    for field in fields(command):
+        names.add(field.name)
+        if is_dataclass(kind := hints[field.name]):
+            names |= option_names(cast("type[Any]", kind))
+    return names
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

@@ -1,25 +1,21 @@
-"""What commands that go through views share: which views, which layer, and who is told."""
+"""What commands share: who is told of the work, and how its result is printed."""
 
+import json
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from typing_extensions import override
 
+from splatseg.cli._fit_progress import fit_progress, pose_progress
 from splatseg.cli._progress import progress
 from splatseg.core import Scene
-from splatseg.errors import InputError
+from splatseg.fit import FitProgress
 from splatseg.io.scene import load_scene
+from splatseg.pose import PoseProgress
 from splatseg.tasks import Observer
-
-
-def check_new_scene(out: Path) -> None:
-    """Refuse before the work a place that a new scene could not be written to after it."""
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise InputError(f"{out}: expected a new folder, got one that is there.")
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"{out}: expected a place in a folder that is there, got none.")
 
 
 def open_scene(root: Path, data: Path | None) -> Scene:
@@ -35,17 +31,82 @@ def typed(words: Sequence[str]) -> str:
     return " ".join(["splatseg", *words[1:]])
 
 
+def print_result(facts: Mapping[str, Any], lines: Sequence[str], *, json: bool) -> None:
+    """Print what was made: one JSON object, or lines for people.
+
+    Args:
+        facts: What was made, in values that JSON holds; paths become their text.
+        lines: The same in sentences.
+        json: Which of the two.
+    """
+    sys.stdout.write(_json_line(facts) if json else "".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()
+
+
+def _json_line(facts: Mapping[str, Any]) -> str:
+    return json.dumps(facts, allow_nan=False, default=_path_text) + "\n"
+
+
+def _path_text(value: object) -> str:
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"expected a value that JSON holds, got {type(value).__name__}.")
+
+
 class ConsoleObserver(Observer):
-    """Shows progress on stderr and writes notes to stdout."""
+    """Shows progress and notes on stderr, and what was found on stdout.
+
+    Args:
+        quiet: Show nothing.
+        json: Stdout is for one JSON object: what was found goes to stderr too.
+    """
+
+    def __init__(self, *, quiet: bool = False, json: bool = False) -> None:
+        self._quiet = quiet
+        self._json = json
 
     @override
     @contextmanager
     def stage(self, stage: str) -> Generator[Callable[[int, int], None]]:
         """A bar or lines for the stage."""
-        with progress(stage) as step:
+        with progress(stage, quiet=self._quiet) as step:
+            yield step
+
+    @override
+    @contextmanager
+    def fit_stage(self) -> Generator[Callable[[FitProgress], None]]:
+        """With loss and PSNR."""
+        if self._quiet:
+            yield _nothing
+            return
+        with fit_progress() as step:
+            yield step
+
+    @override
+    @contextmanager
+    def pose_stage(self) -> Generator[Callable[[PoseProgress], None]]:
+        """With the names of its parts."""
+        if self._quiet:
+            yield _nothing
+            return
+        with pose_progress() as step:
             yield step
 
     @override
     def note(self, message: str) -> None:
+        """A line of its own on stderr."""
+        if not self._quiet:
+            sys.stderr.write(f"note: {message}\n")
+            sys.stderr.flush()
+
+    @override
+    def info(self, message: str) -> None:
         """A line of its own."""
-        sys.stdout.write(f"note: {message}\n")
+        if not self._quiet:
+            stream = sys.stderr if self._json else sys.stdout
+            stream.write(f"{message}\n")
+            stream.flush()
+
+
+def _nothing(now: object) -> None:
+    """Where nobody wants to know."""

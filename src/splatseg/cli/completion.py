@@ -21,6 +21,14 @@ class Command:
 
     bash: source <(splatseg completion bash), in ~/.bashrc. zsh: the same, in ~/.zshrc, behind
     compinit. fish: splatseg completion fish | source, in config.fish.
+
+    For example:
+
+    splatseg completion bash > ~/.splatseg.bash
+
+    splatseg completion zsh > ~/.splatseg.zsh
+
+    splatseg completion fish > ~/.config/fish/completions/splatseg.fish
     """
 
     shell: Annotated[Shell, tyro.conf.Positional]

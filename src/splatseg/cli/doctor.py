@@ -1,21 +1,16 @@
 """``splatseg doctor``: what is wrong with a capture's cameras and points, and a corrected copy."""
 
-import json
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from splatseg.cli._types import Format, Json
+from splatseg.cli._work import print_result
 from splatseg.errors import InputError
-from splatseg.pose.doctor import (
-    Diagnosis,
-    DoctorOptions,
-    diagnose,
-    read_for_doctor,
-    write_corrected,
-)
+from splatseg.pose.doctor import Diagnosis, DoctorOptions
+from splatseg.tasks import examine_capture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,6 +19,14 @@ class Command:
 
     Exit status: 0 when nothing is wrong, or when what is wrong was corrected with --fix;
     2 when faults are left.
+
+    For example:
+
+    splatseg doctor capture
+
+    splatseg doctor capture --fix corrected
+
+    splatseg doctor capture --format colmap --max-views 60 --json
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
@@ -33,41 +36,29 @@ class Command:
     """Folder to write the corrected capture to, as a transforms.json that refers to the same
     photographs. Nothing of DATA is changed; without faults nothing is written."""
 
-    json: bool = False
-    """Print one JSON object with all figures."""
+    json: Json = False
 
-    views: int = 30
+    max_views: int = 30
     """Most photographs to look at; more take longer and decide more finely."""
 
-    format: str = "auto"
-    """How DATA is read: auto, nerfstudio, colmap, blender, llff or idr."""
+    format: Format = "auto"
 
 
 def run(command: Command) -> None:
     """Examine a capture."""
-    if command.views < 2:
-        raise InputError(f"--views: expected at least 2, got {command.views}.")
-    if command.fix is not None:
-        _check_output(command.fix)
-    read = read_for_doctor(command.data, format=command.format)
-    diagnosis = diagnose(
-        read.capture,
-        options=DoctorOptions(views=command.views),
-        found=read.faults,
-        declared=read.declared,
+    found = examine_capture(
+        command.data,
+        fix=command.fix,
+        options=DoctorOptions(max_views=command.max_views),
+        format=command.format,
     )
-    written = command.fix is not None and diagnosis.corrected is not None
-    if written and command.fix is not None:
-        write_corrected(diagnosis, command.fix)
-    if command.json:
-        content = facts(diagnosis) | {"written": str(command.fix) if written else None}
-        sys.stdout.write(json.dumps(content, allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(report(diagnosis, str(command.data)))
-        if written:
-            sys.stdout.write(f"{command.fix}: the corrected capture\n")
-    sys.stdout.flush()
-    if not diagnosis.healthy and not written:
+    diagnosis = found.diagnosis
+    content = facts(diagnosis) | {"written": found.written}
+    lines = report(diagnosis, str(command.data))
+    if found.written is not None:
+        lines.append(f"{found.written}: the corrected capture")
+    print_result(content, lines, json=command.json)
+    if not diagnosis.healthy and found.written is None:
         raise InputError(_sentence(diagnosis, command))
 
 
@@ -85,7 +76,7 @@ def facts(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def report(diagnosis: Diagnosis, name: str) -> str:
+def report(diagnosis: Diagnosis, name: str) -> list[str]:
     """A diagnosis for people, a line for each thing."""
     lines = [f"{name}: {_verdict(diagnosis)}"]
     for fault in diagnosis.faults:
@@ -95,7 +86,7 @@ def report(diagnosis: Diagnosis, name: str) -> str:
     lines += [f"  doubt: {doubt}" for doubt in diagnosis.doubts]
     lines += [f"  not checked: {sentence}" for sentence in diagnosis.unchecked]
     lines.append(f"  {_evidence(diagnosis.figures)}")
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
@@ -123,11 +114,3 @@ def _sentence(diagnosis: Diagnosis, command: Command) -> str:
     if diagnosis.corrected is None:
         return f"{command.data}: {names}; no correction that was tried helps."
     return f"{command.data}: {names}; --fix OUT writes a corrected capture."
-
-
-def _check_output(folder: Path) -> None:
-    """Refuse before the work what could not be written after it."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: expected a new or empty folder to write to.")
-    if not folder.resolve().parent.is_dir():
-        raise InputError(f"{folder}: expected a place in a folder that is there, got none.")

@@ -1,21 +1,18 @@
 """``splatseg evaluate``: a layer against truth, and renders against photographs."""
 
-import json
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._work import ConsoleObserver, open_scene
+from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Split
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Scene
 from splatseg.evaluate.solid import PointRule
 from splatseg.io.json_files import write_json
-from splatseg.render import BackendName
 from splatseg.tasks import EvaluationOptions, evaluate
 from splatseg.tasks.evaluate import Metric
 
@@ -29,19 +26,26 @@ _PER_CLASS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """Score a layer against the truth, and the pictures against the photographs.
+    """Score a layer against the truth, and renders against the photographs.
 
     mIoU, fwIoU and accuracy are pooled over all views and equal to those of the usual scorers;
     the per-image mIoU is the mean over views. Predictions are drawn in the truth's own pixels.
     Instances are matched one to one over the whole scene; panoptic quality takes a segment as
     all its pixels in all views.
+
+    For example:
+
+    splatseg evaluate room --layer semantic --truth capture/semantic
+
+    splatseg evaluate room --layer objects --truth capture/instance --metric instances --json
+
+    splatseg evaluate room --split train --photographs
     """
 
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """The scene folder."""
+    scene: SceneFolder
 
     layer: str | None = None
-    """Name of the layer to score. None scores the pictures only."""
+    """Name of the layer to score. None scores renders only."""
 
     truth: Path | None = None
     """Folder of the true id maps, one PNG a view; 0 is void. Of classes, or of instances with
@@ -76,8 +80,7 @@ class Command:
     void: int | None = None
     """A further id of the truth's files that means void, such as 255."""
 
-    split: str = "test"
-    """Which views: test, train, another split of the scene, or all."""
+    split: Split = "test"
 
     metric: Metric = "semantic"
     """What to score: semantic, classes; instances, objects whatever their ids; panoptic, both
@@ -87,24 +90,20 @@ class Command:
     """With binary: the id to score. None takes every labelled pixel."""
 
     photographs: bool = False
-    """Insist on scoring the pictures (PSNR, SSIM). Without it they are scored where the
+    """Insist on scoring renders (PSNR, SSIM). Without it they are scored where the
     photographs are at hand."""
 
     lpips: tuple[Path, ...] = ()
     """Also score LPIPS with your weights: AlexNet's or VGG-16's, and the heads', as .safetensors
     or .npz with the names of torchvision and of the lpips package."""
 
-    json: bool = False
-    """Print one JSON object instead of a table."""
-
     json_file: Path | None = None
     """Also write that object to this file."""
 
-    backend: BackendName = "auto"
-    """Who renders. auto: cuda for scenes on a GPU, cpu otherwise."""
-
-    data: Path | None = None
-    """Folder of the capture, where it was moved."""
+    backend: Backend = "auto"
+    data: Data = None
+    json: Json = False
+    quiet: Quiet = False
 
 
 def run(command: Command) -> None:
@@ -115,13 +114,13 @@ def run(command: Command) -> None:
         scene,
         options=EvaluationOptions(**asked),
         backend=command.backend,
-        observer=ConsoleObserver(),
+        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
     figures["scene"] = str(command.scene)
     if command.json_file is not None:
         write_json(command.json_file, figures)
     if command.json:
-        sys.stdout.write(json.dumps(figures) + "\n")
+        print_result(figures, [], json=True)
     else:
         _print_tables(figures, scene)
 

@@ -1,17 +1,17 @@
 """``splatseg export``: a scene and its labels as files of other programs."""
 
-import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder, SplitOrPath
 from splatseg.cli._words import listed
-from splatseg.cli._work import ConsoleObserver, open_scene
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.io.export import BoxMethod
 from splatseg.io.splats import WritableFormat
-from splatseg.render import BackendName
 from splatseg.tasks import ExportOptions, export
 from splatseg.tasks.export import What
 
@@ -28,10 +28,17 @@ class Command:
     class, colour and confidence, .csv or .json.
 
     What an earlier export wrote is replaced as a whole; other files are left alone.
+
+    For example:
+
+    splatseg export room -o labelled.ply --layer semantic --instances objects
+
+    splatseg export room -o objects --what objects --layer objects --only chair,table
+
+    splatseg export room -o room.las --what points --layer semantic --min-opacity 0.3
     """
 
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """The scene folder."""
+    scene: SceneFolder
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
     """File to write: .ply, .compressed.ply, .splat, .spz for splats. Folder for objects and
@@ -47,7 +54,7 @@ class Command:
     """Layer of labels for instance_id and instance_confidence. With it, its ids are the objects
     and the ids of --layer their classes; without, the ids of --layer are the objects."""
 
-    format: WritableFormat | None = None
+    splat_format: WritableFormat | None = None
     """Format of splats: ply, compressed.ply, splat, spz, spz3 (SPZ version 3). Default: what
     OUT ends in, ply for objects."""
 
@@ -67,27 +74,25 @@ class Command:
     """How boxes are turned. upright: about the scene's up axis, with the least ground area.
     pca: along the principal axes. auto: upright where the scene has an up axis."""
 
-    split: str = "test"
-    """With coco: which views: test, train, another split, all, or path: a smooth path near the
-    training cameras."""
-
-    frames: int = 360
-    """Views of --split path."""
-
-    backend: BackendName = "auto"
-    """Who renders. auto: cuda for scenes on a GPU, cpu otherwise."""
+    split: SplitOrPath = "test"
+    frames: Frames = 360
+    backend: Backend = "auto"
+    data: Data = None
+    json: Json = False
+    quiet: Quiet = False
 
 
 def run(command: Command) -> None:
     """Export a scene."""
+    started = time.monotonic()
     done = export(
-        open_scene(command.scene, None),
+        open_scene(command.scene, command.data),
         command.output,
         command.what,
         options=ExportOptions(
             layer=command.layer,
             instances=command.instances,
-            format=command.format,
+            splat_format=command.splat_format,
             only=listed("--only", command.only) if command.only else (),
             min_confidence=command.min_confidence,
             min_opacity=command.min_opacity,
@@ -97,8 +102,16 @@ def run(command: Command) -> None:
             frames=command.frames,
         ),
         backend=command.backend,
-        observer=ConsoleObserver(),
+        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
-    sys.stdout.write(f"{done.summary} in {done.output}\n")
+    facts = {
+        "output": done.output,
+        "what": command.what,
+        "summary": done.summary,
+        "table": done.table,
+        "seconds": round(time.monotonic() - started, 3),
+    }
+    lines = [f"{done.summary} in {done.output}"]
     if done.table is not None:
-        sys.stdout.write(f"what the ids mean in {done.table}\n")
+        lines.append(f"what the ids mean in {done.table}")
+    print_result(facts, lines, json=command.json)

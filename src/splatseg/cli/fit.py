@@ -1,43 +1,19 @@
 """``splatseg fit``: photographs with cameras become a scene of Gaussians."""
 
 import sys
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from importlib import metadata
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from splatseg.cli._fit_report import score_and_report
-from splatseg.cli._output import check_output
-from splatseg.cli._photographs import Poses, capture_of
-from splatseg.cli._progress import lines_on_stderr
-from splatseg.core import Capture, Scene
-from splatseg.fit import (
-    EXPOSURES,
-    Checkpoints,
-    FitOptions,
-    FitProgress,
-    FitResult,
-    Preset,
-    Strategy,
-    deferred_interrupts,
-    discard_checkpoint,
-    exposures_record,
-    fit,
-    random_point_count,
-    reduction_note,
-)
-from splatseg.io.scene import CHECKPOINT_FILE, save_scene
-from splatseg.render import BackendName
+from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Overwrite, Quiet, Seed
+from splatseg.cli._work import ConsoleObserver, print_result, typed
+from splatseg.fit import FitOptions, Preset, Strategy
+from splatseg.tasks import MadeScene, MakeSceneOptions, make_scene
 
-# Weight of the newest view in the figures of the progress line; views differ much.
-_SMOOTHING = 0.02
 _DEFAULT = FitOptions()
+_SCENE = MakeSceneOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,15 +21,22 @@ class Command:
     """Fit Gaussians to the training photographs of a capture, and write a scene folder.
 
     Ctrl-C ends it early and writes what there is; --resume goes on from there, and from the
-    last checkpoint of a fit that was killed.
+    last checkpoint of a fit that was killed. --overwrite begins again instead.
+
+    For example:
+
+    splatseg fit photographs -o room
+
+    splatseg fit capture -o room --preset quick --steps 3000 --seed 1
+
+    splatseg fit walk.mp4 -o room --frames 200 --json
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data, a folder of bare
     photographs, or a video."""
 
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SCENE")]
-    """The scene folder to write. A scene that is there is replaced unless it has layers."""
+    output: MadeSceneFolder
 
     minutes: float | None = None
     """Length of the optimisation; the whole command ends within a minute more. None is the
@@ -90,10 +73,9 @@ class Command:
     """Go on with the fit that was stopped in SCENE, with the same data and options; minutes or
     steps may be others. The result is that of a fit that was never stopped."""
 
-    overwrite: bool = False
-    """Begin again where a fit was stopped in SCENE."""
+    overwrite: Overwrite = False
 
-    checkpoint_every: float = 60.0
+    checkpoint_every: float = _SCENE.checkpoint_every
     """Seconds between two checkpoints, from which --resume goes on."""
 
     checkpoint_steps: int | None = None
@@ -122,97 +104,45 @@ class Command:
     refine_poses: bool = _DEFAULT.refine_poses
     """Correct the poses of training views while fitting."""
 
-    seed: int = 0
-    """Seed of everything that is drawn at random."""
+    seed: Seed = 0
+    backend: Backend = "auto"
+    format: Format = "auto"
 
-    backend: BackendName = "auto"
-    """Who renders. auto and cpu: the C++ kernels."""
-
-    format: str = "auto"
-    """How DATA is read: auto, nerfstudio, colmap, blender, llff or idr."""
-
-    poses: Poses = "auto"
+    poses: Literal["auto", "given", "sfm"] = _SCENE.poses
     """Where cameras come from. given: DATA. sfm: they are found from the photographs alone, by
     structure from motion, and kept in SCENE/capture. auto: sfm where DATA has none."""
 
-    frames: int = 120
+    frames: int = _SCENE.frames
     """Frames to take from DATA where it is a video."""
+
+    json: Json = False
+    quiet: Quiet = False
 
 
 def run(command: Command) -> None:
     """Fit a scene and write it."""
-    options = _options(command)
-    place = check_output(command.output, resume=command.resume, overwrite=command.overwrite)
-    checkpoints = _checkpoints(command)
-    capture = capture_of(
+    made = make_scene(
         command.data,
-        scene=command.output,
-        format=command.format,
-        poses=command.poses,
-        frames=command.frames,
-        seed=command.seed,
+        command.output,
+        options=MakeSceneOptions(
+            format=command.format,
+            poses=command.poses,
+            frames=command.frames,
+            resume=command.resume,
+            overwrite=command.overwrite,
+            checkpoint_every=command.checkpoint_every,
+            checkpoint_steps=command.checkpoint_steps,
+            keep_checkpoint=command.keep_checkpoint,
+            preset=command.preset,
+        ),
+        fit_options=_options(command),
+        backend=command.backend,
+        command=typed(sys.argv),
+        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
-    for note in (*capture.notes, reduction_note(capture.train_views, longest=options.longest)):
-        if note is not None:
-            sys.stdout.write(f"{note}\n")
-    sys.stdout.write(_beginning(capture, options))
-    sys.stdout.flush()
-
-    if place is not None:
-        sys.stdout.write(f"{place}\n")
-        sys.stdout.flush()
-    with deferred_interrupts() as interrupts:
-        with _shown_progress() as show:
-            result = fit(
-                capture,
-                options=options,
-                backend=command.backend,
-                progress=show,
-                checkpoints=checkpoints,
-            )
-        _save(command, options, capture, result)
-    sys.stdout.write(_summary(result, command.output))
-    sys.stdout.writelines(f"{note}\n" for note in result.notes)
-    sys.stdout.flush()
-    stopped = interrupts.requested or result.interrupted
-    sys.stdout.write(
-        score_and_report(
-            command.output,
-            capture,
-            result,
-            options=options,
-            backend=command.backend,
-            scoring=not stopped,
-        )
-    )
-    if stopped:
+    print_result(_facts(made), _lines(made), json=command.json)
+    if made.interrupted:
         raise KeyboardInterrupt
-
-
-def _save(command: Command, options: FitOptions, capture: Capture, result: FitResult) -> None:
-    """Write the scene; then a finished fit needs its checkpoint no more."""
-    scene = Scene(
-        gaussians=result.gaussians,
-        views=result.views,
-        classes=capture.classes,
-        up=capture.up,
-        metres_per_unit=capture.metres_per_unit,
-        source=capture.path,
-        provenance=_provenance(command, options, result),
-    )
-    save_scene(scene, command.output)
-    if not (result.interrupted or command.keep_checkpoint):
-        discard_checkpoint(command.output / CHECKPOINT_FILE)
-
-
-def _checkpoints(command: Command) -> Checkpoints:
-    return Checkpoints(
-        path=command.output / CHECKPOINT_FILE,
-        seconds=command.checkpoint_every,
-        steps=command.checkpoint_steps,
-        resume=command.resume,
-        at_end=command.keep_checkpoint,
-    )
 
 
 def _options(command: Command) -> FitOptions:
@@ -235,95 +165,39 @@ def _options(command: Command) -> FitOptions:
     return options
 
 
-def _beginning(capture: Capture, options: FitOptions) -> str:
-    train, test = len(capture.train_views), len(capture.test_views)
-    points = 0 if capture.points is None else len(capture.points)
-    drawn = ""
-    if (number := random_point_count(capture, options)) > 0:
-        where = "at" if points == 0 or options.start == "random" else "at these and up to"
-        drawn = f"; starting {where} {number} places where photographs agree"
-    return (
-        f"{capture.path} ({capture.format}): {train} training views, {test} held out, "
-        f"{points} start points{drawn}\n"
-    )
-
-
-class _Smoothed:
-    """Loss and PSNR of single views, smoothed over many of them."""
-
-    def __init__(self) -> None:
-        self._values: tuple[float, float] | None = None
-
-    def text(self, now: FitProgress) -> str:
-        """What a line of progress says of a step."""
-        loss, psnr = self._values or (now.loss, now.psnr)
-        loss += _SMOOTHING * (now.loss - loss)
-        psnr += _SMOOTHING * (now.psnr - psnr)
-        self._values = loss, psnr
-        speed = now.step / max(now.seconds, 1e-9)
-        return (
-            f"step {now.step}, loss {loss:.4f}, PSNR {psnr:.2f}, {now.count} Gaussians, "
-            f"{speed:.1f} it/s"
-        )
-
-
-@contextmanager
-def _shown_progress() -> Generator[Callable[[FitProgress], None]]:
-    """On stderr: share done, smoothed loss and PSNR, count, speed, estimate."""
-    smoothed = _Smoothed()
-    lines = lines_on_stderr("fit")
-    if lines is not None:
-
-        def write(now: FitProgress) -> None:
-            text = smoothed.text(now)
-            lines.show(now.progress, 1.0, text=text, seconds_left=now.seconds_left)
-
-        yield write
-        return
-    columns = (
-        TextColumn("fit"),
-        BarColumn(bar_width=24),
-        TextColumn("{task.percentage:>3.0f}%"),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=1.0, left="")
-        shown = 0.0
-
-        def show(now: FitProgress) -> None:
-            nonlocal shown
-            text = smoothed.text(now)
-            if now.seconds - shown < 0.25:
-                return
-            shown = now.seconds
-            left = f"{now.seconds_left / 60:.1f} min left"
-            bar.update(task, completed=now.progress, description=text, left=left)
-
-        yield show
-
-
-def _provenance(command: Command, options: FitOptions, result: FitResult) -> dict[str, Any]:
+def _facts(made: MadeScene) -> dict[str, Any]:
+    scores, result = made.scores, made.result
     return {
-        "command": "fit",
+        "scene": made.folder,
+        "gaussians": len(result.gaussians),
         "steps": result.steps,
         "seconds": round(result.seconds, 3),
-        "interrupted": result.interrupted,
-        "seed": options.seed,
-        "preset": command.preset,
-        "backend": command.backend,
-        "options": asdict(options),
-        **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),
-        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+        "interrupted": made.interrupted,
+        "train_views": len(made.capture.train_views),
+        "test_views": len(made.capture.test_views),
+        "scored_views": 0 if scores is None else len(scores.views),
+        "psnr": None if scores is None else scores.psnr,
+        "ssim": None if scores is None else scores.ssim,
+        "report": made.report,
+        "notes": list(result.notes),
     }
 
 
-def _summary(result: FitResult, root: Path) -> str:
+def _lines(made: MadeScene) -> list[str]:
+    result = made.result
     rate = result.steps / max(result.seconds, 1e-9)
     ended = "stopped after" if result.interrupted else "in"
     onwards = "; the same command with --resume goes on" if result.interrupted else ""
-    return (
-        f"{root}: {len(result.gaussians)} Gaussians {ended} {result.steps} steps, "
-        f"{result.seconds:.1f} s ({rate:.1f} steps/s){onwards}\n"
-    )
+    lines = [
+        f"{made.folder}: {len(result.gaussians)} Gaussians {ended} {result.steps} steps, "
+        f"{result.seconds:.1f} s ({rate:.1f} steps/s){onwards}",
+        *result.notes,
+    ]
+    if not made.held_out:
+        lines.append("no held-out views to score")
+    elif made.scores is not None:
+        scored = f"{made.held_out} held-out views"
+        if len(made.scores.views) < made.held_out:
+            scored = f"{len(made.scores.views)} of {made.held_out} held-out views"
+        lines.append(f"PSNR {made.scores.psnr:.2f} dB on {scored}, SSIM {made.scores.ssim:.3f}")
+    return [*lines, f"report: {made.report}"]

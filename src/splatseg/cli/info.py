@@ -1,68 +1,34 @@
 """``splatseg info``: what a capture, a scene, a splat file or a folder of evidence holds."""
 
-import json
-import sys
-import warnings
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._output import where_it_stopped
-from splatseg.core import (
-    TREE_LEVELS,
-    Capture,
-    Features,
-    Gaussians,
-    InstanceTree,
-    Labels,
-    Layer,
-    Scene,
-    View,
-)
-from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.fit import CheckpointSummary, checkpoint_summary
-from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_capture
-from splatseg.io.evidence import Evidence, evidence_names, open_evidence
-from splatseg.io.images import DEFAULT_LONGEST, image_size
-from splatseg.io.layers import load_layer
-from splatseg.io.scene import (
-    CHECKPOINT_FILE,
-    is_scene,
-    is_unfinished,
-    load_scene,
-    load_scene_layer,
-    scene_layer_names,
-)
-from splatseg.io.splats import SplatWarning, read_splats, splat_format
-
-_LAYOUTS = ("auto", *FORMATS)
-_CAPTURE_FILES = (
-    "transforms.json",
-    "transforms_train.json",
-    "poses_bounds.npy",
-    "cameras_sphere.npz",
-    "cameras.npz",
-)
-_SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".gltf", ".glb")
+from splatseg.cli._types import Format, Json
+from splatseg.cli._work import print_result
+from splatseg.tasks import describe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """Say in one line what is there: a capture, a scene, a splat file or evidence."""
+    """Say in one line what is there: a capture, a scene, a splat file or evidence.
+
+    For example:
+
+    splatseg info room
+
+    splatseg info capture --format colmap --verbose
+
+    splatseg info room.ply --json
+    """
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """Folder of a capture, of a scene, of evidence or of bare photographs, or a splat file."""
 
-    format: str = "auto"
-    """Which description of a capture to read, where it has several: nerfstudio, blender,
-    colmap, llff or idr. auto takes the first of these that is there."""
-
-    json: bool = False
-    """Print one JSON object."""
+    format: Format = "auto"
+    json: Json = False
 
     verbose: bool = False
     """Print all details, one a line, under the line."""
@@ -70,238 +36,17 @@ class Command:
 
 def run(command: Command) -> None:
     """Tell what is there."""
-    if command.format not in _LAYOUTS:
-        raise InputError(
-            f"--format: expected one of {', '.join(_LAYOUTS)}, got {command.format!r}."
-        )
     facts = describe(command.path, format=command.format)
-    if command.json:
-        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
-        return
-    sys.stdout.write(summary(facts) + "\n")
+    lines = [summary(facts)]
     if command.verbose:
-        for key, value in facts.items():
-            sys.stdout.write(f"  {key}: {_shown(value)}\n")
-
-
-def describe(path: Path, *, format: str = "auto") -> dict[str, Any]:
-    """What is at a path, in values that JSON holds.
-
-    Raises:
-        MissingFileError: If there is nothing.
-        InputError: If it is nothing that splatseg reads, or broken.
-    """
-    if not path.exists():
-        raise MissingFileError(f"{path}: there is no such file or folder.")
-    if path.is_dir():
-        return _describe_folder(path, format)
-    if path.name in _CAPTURE_FILES:
-        return _capture_facts(read_capture(path, format=format))
-    if path.suffix == ".npz":
-        layer = load_layer(path)
-        return {"path": str(path), "kind": "layer", "holds": _layer_kind(layer), "rows": len(layer)}
-    return _splat_facts(path)
+        lines += [f"  {key}: {_shown(value)}" for key, value in facts.items()]
+    print_result(facts, lines, json=command.json)
 
 
 def summary(facts: dict[str, Any]) -> str:
     """The facts in one line."""
     notes = "".join(f"; note: {note}" for note in facts.get("notes", []))
     return f"{facts['path']}: {_SENTENCES[facts['kind']](facts)}{notes}"
-
-
-def _describe_folder(path: Path, format: str) -> dict[str, Any]:
-    if format == "auto" and is_scene(path):
-        return _scene_facts(load_scene(path))
-    if format == "auto" and is_unfinished(path):
-        return _unfinished_facts(path)
-    if format != "auto" or find_formats(path):
-        return _capture_facts(read_capture(path, format=format))
-    if (path / "meta.json").is_file():
-        return _splat_facts(path)
-    if inside := _captures_inside(path):
-        return {"path": str(path), "kind": "folder", "holds": inside}
-    files = [p for p in sorted(path.iterdir()) if p.suffix.lower() in _SPLAT_SUFFIXES]
-    if (path / "evidence.json").is_file():
-        return _evidence_facts(open_evidence(path, unfinished="allow"))
-    if not files and not bare_photographs(path):
-        return _evidence_or_nothing(path)
-    if files:
-        formats = Counter(splat_format(file) for file in files)
-        return {"path": str(path), "kind": "splat folder", "files": dict(sorted(formats.items()))}
-    if evidence := _as_label_maps(path):
-        return evidence
-    photographs = bare_photographs(path)
-    sizes = Counter(image_size(photograph) for photograph in photographs)
-    return {
-        "path": str(path),
-        "kind": "photographs",
-        "photographs": len(photographs),
-        "sizes": [f"{w}x{h}" for w, h in sizes],
-        "notes": [
-            f"larger than {DEFAULT_LONGEST} pixels; worked on at {DEFAULT_LONGEST}"
-            for size in list(sizes)[:1]
-            if max(size) > DEFAULT_LONGEST
-        ],
-    }
-
-
-def _unfinished_facts(path: Path) -> dict[str, Any]:
-    """Facts of a folder that a fit was to make a scene of."""
-    checkpoint = path / CHECKPOINT_FILE
-    facts: dict[str, Any] = {"path": str(path), "kind": "unfinished fit"}
-    summary = CheckpointSummary(steps=0, progress=0.0, seconds=0.0, gaussians=0)
-    if checkpoint.is_file():
-        summary = checkpoint_summary(checkpoint)
-    return facts | asdict(summary)
-
-
-def _captures_inside(path: Path) -> list[str]:
-    """Names of the captures and scenes directly inside a folder."""
-    folders = [p for p in sorted(path.iterdir()) if p.is_dir() and not p.name.startswith(".")]
-    return [p.name for p in folders if is_scene(p) or find_formats(p)]
-
-
-def _evidence_or_nothing(path: Path) -> dict[str, Any]:
-    try:
-        evidence = open_evidence(path, unfinished="allow")
-    except InputError as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise InputError(
-            f"{path}: expected a capture, photographs, a scene, evidence or splats, got none."
-        ) from error
-    return _evidence_facts(evidence)
-
-
-def _as_label_maps(path: Path) -> dict[str, Any] | None:
-    """Facts of a folder of single-channel PNGs, None if they are photographs."""
-    if {p.suffix.lower() for p in bare_photographs(path)} != {".png"}:
-        return None
-    try:
-        return _evidence_facts(open_evidence(path, unfinished="allow"))
-    except FileFormatError:
-        # Three channels: photographs that were saved as PNG.
-        return None
-
-
-def _capture_facts(capture: Capture) -> dict[str, Any]:
-    folder = capture.path
-    others = [format for format in find_formats(folder) if format != capture.format]
-    facts: dict[str, Any] = {"path": str(folder), "kind": "capture", "format": capture.format}
-    facts |= _view_facts(capture.views)
-    facts |= {
-        "points": None if capture.points is None else len(capture.points),
-        "classes": None if capture.classes is None else len(capture.classes.rows),
-        "up": None if capture.up is None else list(capture.up),
-        "metres_per_unit": capture.metres_per_unit,
-        "masks": sum(view.mask is not None for view in capture.views),
-        "depth_maps": sum(view.depth is not None for view in capture.views),
-        "splats": None if capture.splats is None else str(capture.splats),
-        "evidence": list(evidence_names([folder])),
-        "other_formats": others,
-        "notes": list(capture.notes),
-    }
-    return facts
-
-
-def _scene_facts(scene: Scene) -> dict[str, Any]:
-    root = scene.root if scene.root is not None else Path()
-    places = [place for place in (root, scene.source) if place is not None]
-    lost = [v for v in scene.views if v.image is not None and not v.image.is_file()]
-    facts: dict[str, Any] = {"path": str(root), "kind": "scene"}
-    facts |= _gaussian_facts(scene.gaussians) | _view_facts(scene.views)
-    notes = [f"{len(lost)} photographs are not where they were (see --data)"] if lost else []
-    if (root / CHECKPOINT_FILE).is_file():
-        stopped = where_it_stopped(root / CHECKPOINT_FILE)
-        if stopped is not None:
-            notes.append(f"its fit {stopped}; fit --resume continues it")
-    facts |= {
-        "classes": None if scene.classes is None else len(scene.classes.rows),
-        "up": None if scene.up is None else list(scene.up),
-        "metres_per_unit": scene.metres_per_unit,
-        "source": None if scene.source is None else str(scene.source),
-        "layers": {
-            name: _layer_kind(load_scene_layer(root, name)) for name in scene_layer_names(root)
-        },
-        "evidence": list(evidence_names(places)),
-        "notes": notes,
-    }
-    return facts
-
-
-def _layer_kind(layer: Layer) -> str:
-    if isinstance(layer, Labels):
-        return f"labels of {len(layer.present)} ids"
-    if isinstance(layer, InstanceTree):
-        levels = Counter(node.level for node in layer.nodes)
-        counts = ", ".join(f"{levels[level]} {level}s" for level in TREE_LEVELS)
-        return f"tree of {len(layer.nodes)} nodes ({counts})"
-    if isinstance(layer, Features):
-        return f"features of {layer.values.shape[1]} channels"
-    return f"selection of {layer.count}"
-
-
-def _evidence_facts(evidence: Evidence) -> dict[str, Any]:
-    names = evidence.view_names
-    if not names:
-        raise InputError(f"{evidence.folder}: expected evidence of at least one view, got none.")
-    return {
-        "path": str(evidence.folder),
-        "kind": "evidence",
-        "evidence_kind": evidence.kind,
-        "views": len(names),
-        "first_view": names[0],
-        "in_first_view": _first_view(evidence, names[0]),
-        "classes": None if evidence.classes is None else len(evidence.classes.rows),
-    }
-
-
-def _first_view(evidence: Evidence, name: str) -> str:
-    if evidence.kind == "features":
-        features = evidence.features(name)
-        rows, columns, channels = features.features.shape
-        return f"{rows} x {columns} cells of {features.stride} pixels, {channels} channels"
-    masks = evidence.masks(name)
-    what = "masks" if evidence.kind == "masks" else "ids"
-    return f"{len(masks)} {what} on {masks.width}x{masks.height} pixels"
-
-
-def _splat_facts(path: Path) -> dict[str, Any]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", SplatWarning)
-        gaussians = read_splats(path)
-    facts: dict[str, Any] = {"path": str(path), "kind": "splats", "format": splat_format(path)}
-    notes = [str(warning.message) for warning in caught]
-    return facts | _gaussian_facts(gaussians) | {"notes": notes}
-
-
-def _gaussian_facts(gaussians: Gaussians) -> dict[str, Any]:
-    bounds = None
-    if len(gaussians):
-        low, high = gaussians.means.amin(dim=0), gaussians.means.amax(dim=0)
-        bounds = [low.tolist(), high.tolist()]
-    return {
-        "gaussians": len(gaussians),
-        "sh_degree": gaussians.sh_degree,
-        "bounds": bounds,
-        "extra_columns": sorted(gaussians.extra),
-    }
-
-
-def _view_facts(views: Sequence[View]) -> dict[str, Any]:
-    sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in views)
-    return {
-        "photographs": sum(view.image is not None for view in views),
-        "views": len(views),
-        "split": dict(sorted(Counter(view.split for view in views).items(), key=_split_order)),
-        "sizes": list(sizes),
-        "lenses": sorted({view.camera.model for view in views}),
-    }
-
-
-def _split_order(item: tuple[str, int]) -> tuple[int, str]:
-    order = ("train", "val", "test")
-    return (order.index(item[0]) if item[0] in order else len(order), item[0])
 
 
 def _capture_sentence(facts: dict[str, Any]) -> str:

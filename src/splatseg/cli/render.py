@@ -1,15 +1,15 @@
 """``splatseg render``: views of a scene, or a path through it, as PNG files and films."""
 
-import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder, SplitOrPath
 from splatseg.cli._words import listed
-from splatseg.cli._work import ConsoleObserver, open_scene
-from splatseg.render import BackendName
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.tasks import RenderingOptions, render_views
 
 
@@ -23,42 +23,46 @@ class Command:
 
     --split path draws a smooth path near the captured cameras, and writes its cameras to
     DIR/transforms.json. --video makes a film of each folder, DIR/<what>.mp4.
+
+    For example:
+
+    splatseg render room -o renders
+
+    splatseg render room -o renders --what rgb,depth,semantic --coloured
+
+    splatseg render room -o path --split path --frames 240 --video
     """
 
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """The scene folder."""
+    scene: SceneFolder
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder to write to. DIR/<what> of an earlier render is replaced as a whole."""
 
-    split: str = "test"
-    """Which views: test, train, another split of the scene, all, or path: a smooth path near the
-    training cameras."""
+    split: SplitOrPath = "test"
 
     what: tuple[str, ...] = ("rgb",)
     """What to draw: rgb, depth, alpha, and names of layers, by comma or by space."""
 
     coloured: bool = False
-    """Also write DIR/<layer>_coloured with pictures of label layers in the legend's colours."""
+    """Also write DIR/<layer>_coloured with images of label layers in the legend's colours."""
 
     video: bool = False
     """Also write DIR/<what>.mp4: depth and labels in colours. Needs splatseg[video]."""
 
-    frames: int = 360
-    """Views of --split path."""
+    frames: Frames = 360
 
     fps: float = 24.0
     """Frames a second of --video."""
 
-    backend: BackendName = "auto"
-    """Who renders. auto: cuda for scenes on a GPU, cpu otherwise."""
-
-    data: Path | None = None
-    """Folder of the capture, where it was moved. Only commands that read photographs need it."""
+    backend: Backend = "auto"
+    data: Data = None
+    json: Json = False
+    quiet: Quiet = False
 
 
 def run(command: Command) -> None:
     """Render a scene."""
+    started = time.monotonic()
     done = render_views(
         open_scene(command.scene, command.data),
         command.output,
@@ -71,6 +75,13 @@ def run(command: Command) -> None:
             fps=command.fps,
         ),
         backend=command.backend,
-        observer=ConsoleObserver(),
+        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
-    sys.stdout.write(f"{done.views} views of {', '.join(done.entries)} in {done.folder}\n")
+    facts = {
+        "folder": done.folder,
+        "views": done.views,
+        "entries": list(done.entries),
+        "seconds": round(time.monotonic() - started, 3),
+    }
+    line = f"{done.views} views of {', '.join(done.entries)} in {done.folder}"
+    print_result(facts, [line], json=command.json)

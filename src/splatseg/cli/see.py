@@ -1,20 +1,17 @@
 """``splatseg see``: a 2D model, or evidence recorded elsewhere -> evidence of a scene."""
 
-import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from splatseg.cli._progress import progress
-from splatseg.cli._work import open_scene
-from splatseg.core import Model, Scene, View
-from splatseg.errors import InputError
-from splatseg.io.scene import check_name
-from splatseg.models import ModelCache, SeenEvidence, find_model, record_evidence
-from splatseg.models.classical import Classical, RegionOptions
-from splatseg.models.recorded import AnyRecorded, recorded_model
+from splatseg.cli._types import Data, Json, Overwrite, Quiet, SceneFolder
+from splatseg.cli._words import listed
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result
+from splatseg.models import SeenEvidence
+from splatseg.models.classical import RegionOptions
+from splatseg.tasks import SeeOptions, see
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,11 +19,18 @@ class Command:
     """Look at a scene's photographs with a 2D model, and write down what it sees.
 
     The evidence goes to SCENE/evidence/NAME, a file a view. Work that was stopped goes on where
-    it was when the same command is given again.
+    it was when the same command is given again; --overwrite begins anew.
+
+    For example:
+
+    splatseg see room --model classical --evidence masks
+
+    splatseg see room --model sam-masks --evidence masks_sam --views all --allow-missing
+
+    splatseg see room --model label-maps --evidence labels --zero-is-class --void 255
     """
 
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """The scene folder."""
+    scene: SceneFolder
 
     model: Annotated[str, tyro.conf.arg(metavar="NAME_OR_FOLDER")]
     """The model: classical (a stand-in that needs no weights), one that an installed package
@@ -38,8 +42,8 @@ class Command:
     what: Literal["masks", "labels", "panoptic", "features", "text"] | None = None
     """What to ask the model for. None takes what it has, masks before the others."""
 
-    views: str = "train"
-    """Which views: train, all, or names with commas between them. It is recorded with the
+    views: tuple[str, ...] = ("train",)
+    """Which views: train, all, or names of views, by comma or by space. It is recorded with the
     evidence."""
 
     allow_missing: bool = False
@@ -58,11 +62,10 @@ class Command:
     precision: Literal["float16", "int8"] = "float16"
     """How features are kept in the cache."""
 
-    overwrite: bool = False
-    """Delete evidence of this name first."""
-
-    data: Path | None = None
-    """Folder of the capture, where it was moved."""
+    overwrite: Overwrite = False
+    data: Data = None
+    json: Json = False
+    quiet: Quiet = False
 
     regions: RegionOptions = field(default_factory=RegionOptions)
     """Settings of the masks of model classical."""
@@ -70,42 +73,34 @@ class Command:
 
 def run(command: Command) -> None:
     """See a scene."""
-    check_name("--evidence", command.evidence)
-    scene = open_scene(command.scene, command.data)
-    views = _views(scene, command.views)
-    model = _model(command)
-    cache = (
-        None
-        if command.cache is None
-        else ModelCache(folder=command.cache, precision=command.precision, report=_say)
+    asked = {field.name: getattr(command, field.name) for field in fields(SeeOptions)}
+    asked["views"] = listed("--views", command.views)
+    seen = see(
+        open_scene(command.scene, command.data),
+        command.model,
+        command.evidence,
+        options=SeeOptions(**asked),
+        regions=command.regions,
+        observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
-    if model.note:
-        _say(f"{model.name}: {model.note}")
-    folder = command.scene / "evidence" / command.evidence
-    folder.parent.mkdir(exist_ok=True)
-    with progress("see") as step:
-        seen = record_evidence(
-            model,
-            views,
-            folder,
-            what=command.what,
-            asked=command.views,
-            overwrite=command.overwrite,
-            missing="skip" if command.allow_missing else "refuse",
-            cache=cache,
-            progress=step,
-        )
-    for note in seen.notes:
-        _say(f"note: {note}")
-    if cache is not None:
-        _say(f"{cache.folder}: {cache.size()}")
-    sys.stdout.write(f"{summary(seen, model)}\n{folder}\n")
+    facts = {
+        "evidence": seen.folder,
+        "kind": seen.kind,
+        "model": seen.model,
+        "views": seen.views,
+        "views_kept": seen.kept,
+        "masks": seen.masks,
+        "seconds": round(seen.seconds, 3),
+        "bytes": seen.bytes,
+        "notes": list(seen.notes),
+    }
+    print_result(facts, [summary(seen), str(seen.folder)], json=command.json)
 
 
-def summary(seen: SeenEvidence, model: Model) -> str:
+def summary(seen: SeenEvidence) -> str:
     """One line on what was written."""
     new = seen.views - seen.kept
-    parts = [f"{seen.kind} of {seen.views} views by {model.name}"]
+    parts = [f"{seen.kind} of {seen.views} views by {seen.model}"]
     if seen.kept:
         parts.append(f"{seen.kept} of them were there")
     if new and seen.masks is not None:
@@ -114,35 +109,3 @@ def summary(seen: SeenEvidence, model: Model) -> str:
         parts.append(f"{seen.seconds / new:.2f} s an image")
     parts.append(f"{seen.bytes / 1e6:.1f} MB")
     return ", ".join(parts)
-
-
-def _views(scene: Scene, asked: str) -> tuple[View, ...]:
-    if asked not in ("train", "all"):
-        return tuple(scene.view(name.strip()) for name in asked.split(","))
-    views = scene.views if asked == "all" else scene.train_views
-    if not views:
-        raise InputError(f"--views: the scene has no view that {asked} allows.")
-    return views
-
-
-def _model(command: Command) -> Model:
-    model = find_model(command.model)
-    if not isinstance(model, Classical) and command.regions != RegionOptions():
-        raise InputError(
-            f"expected settings of regions with --model classical, got --model {command.model}."
-        )
-    if isinstance(model, AnyRecorded):
-        kind = "masks" if command.what == "masks" else None
-        return recorded_model(
-            command.model, kind=kind, zero_is_class=command.zero_is_class, void=command.void
-        )
-    if command.zero_is_class or command.void is not None:
-        raise InputError(
-            f"--zero-is-class, --void: expected with recorded label maps, got --model "
-            f"{command.model}."
-        )
-    return Classical(regions=command.regions) if isinstance(model, Classical) else model
-
-
-def _say(sentence: str) -> None:
-    print(sentence, file=sys.stderr)

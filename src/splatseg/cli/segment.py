@@ -10,15 +10,15 @@ from typing import Annotated, Any
 import torch
 import tyro
 
+from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder
 from splatseg.cli._words import option_value
-from splatseg.cli._work import ConsoleObserver, open_scene, typed
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import UNLABELLED, Features, Labels
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import save_scene_layer
 from splatseg.lift import CompletionOptions
 from splatseg.methods import Method, find_method, methods
-from splatseg.render import BackendName
 from splatseg.tasks import (
     Segmentation,
     SegmentOptions,
@@ -37,10 +37,17 @@ class Command:
     """Lift what was seen in photographs onto the Gaussians: evidence becomes a layer.
 
     The layer is written to SCENE/layers. An older layer of the same name is replaced.
+
+    For example:
+
+    splatseg segment room --method uplift --evidence labels_semantic --layer semantic
+
+    splatseg segment room --method associate --evidence masks --layer objects --export --report
+
+    splatseg segment room --method vote --evidence labels_tracked --views all --json
     """
 
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """The scene folder."""
+    scene: SceneFolder
 
     method: Annotated[str, tyro.conf.arg(metavar="METHOD")]
     """How. `splatseg segment --method METHOD --help` shows the options of one."""
@@ -58,11 +65,10 @@ class Command:
     truth: Path | None = None
     """Folder of true maps, shown and scored in the report."""
 
-    backend: BackendName = "auto"
-    """Who renders. auto: cuda for scenes on a GPU, cpu otherwise."""
-
-    data: Path | None = None
-    """Folder of the capture, where it was moved."""
+    backend: Backend = "auto"
+    data: Data = None
+    json: Json = False
+    quiet: Quiet = False
 
     completion: CompletionOptions = field(default_factory=CompletionOptions)
     """How neighbours' labels spread."""
@@ -115,7 +121,7 @@ def _with_summaries() -> type[Any]:
 def run(command: Command) -> None:
     """Segment a scene."""
     started = time.monotonic()
-    observer = ConsoleObserver()
+    observer = ConsoleObserver(quiet=command.quiet, json=command.json)
     scene = open_scene(command.scene, command.data)
     opened = time.monotonic() - started
     truth = None if command.truth is None else open_evidence(command.truth)
@@ -136,7 +142,8 @@ def run(command: Command) -> None:
     if command.export:
         check_layer_exports(scene, command.scene, result.name)
     path = save_scene_layer(command.scene, result.name, result.layer)
-    sys.stdout.write(_summary(result, time.monotonic() - started) + f"{path}\n")
+    lines = [_summary(result, time.monotonic() - started), str(path)]
+    made = _facts(result, path)
     timings = {"load": opened}
     if command.export:
         began = time.monotonic()
@@ -149,10 +156,11 @@ def run(command: Command) -> None:
             observer=observer,
         )
         timings["export"] = time.monotonic() - began
-        for file in files:
-            sys.stdout.write(f"{file.summary} in {file.output}\n")
+        lines += [f"{file.summary} in {file.output}" for file in files]
+        made["exports"] = [file.output for file in files]
         if maps is not None:
-            sys.stdout.write(f"{maps.views} views in {maps.folder}\n")
+            lines.append(f"{maps.views} views in {maps.folder}")
+            made["exports"].append(maps.folder)
     if command.report:
         where = report_layer(
             scene,
@@ -163,7 +171,28 @@ def run(command: Command) -> None:
             command=typed(sys.argv),
             backend=command.backend,
         )
-        sys.stdout.write(f"report: {where}\n")
+        lines.append(f"report: {where}")
+        made["report"] = where
+    made["seconds"] = round(time.monotonic() - started, 3)
+    print_result(made, lines, json=command.json)
+
+
+def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
+    """What was made, for programs."""
+    facts: dict[str, Any] = {
+        "layer": result.name,
+        "file": path,
+        "kind": type(result.layer).__name__.lower(),
+        "views": len(result.views),
+        "stage_seconds": {name: round(value, 3) for name, value in result.timings.items()},
+    }
+    if not isinstance(result.layer, Features):
+        labels = result.labels
+        facts["gaussians"] = len(labels)
+        facts["labelled"] = int((labels.ids != UNLABELLED).sum())
+        facts["ids"] = len(labels.present)
+        facts["inferred"] = 0 if labels.inferred is None else int(labels.inferred.sum())
+    return facts
 
 
 def _check_outputs(command: Command, method: Method) -> None:
@@ -181,7 +210,7 @@ def _summary(result: Segmentation, seconds: float) -> str:
         count, channels = result.layer.values.shape
         return (
             f"features of {channels} channels on {count} Gaussians, "
-            f"from {views} views in {seconds:.1f} s\n"
+            f"from {views} views in {seconds:.1f} s"
         )
     labels = result.labels
     labelled = int((labels.ids != UNLABELLED).sum())
@@ -191,7 +220,7 @@ def _summary(result: Segmentation, seconds: float) -> str:
     guessed = f", {inferred} of them inferred from neighbours" if inferred else ""
     return (
         f"{labelled} of {len(labels)} Gaussians labelled ({share:.1f} %){guessed}, {ids} ids, "
-        f"from {views} views in {seconds:.1f} s; background: {_background(labels)}\n"
+        f"from {views} views in {seconds:.1f} s; background: {_background(labels)}"
     )
 
 

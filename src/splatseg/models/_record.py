@@ -32,6 +32,9 @@ class SeenEvidence:
     """What was written."""
 
     folder: Path
+    model: str
+    """Name of the model."""
+
     kind: EvidenceKind
     views: int
     """Views with evidence, those that were there before included."""
@@ -114,6 +117,7 @@ def record_evidence(
     _write_header(folder, source, metadata | {"complete": True})
     return SeenEvidence(
         folder=folder,
+        model=model.name,
         kind=source.kind,
         views=len(wanted),
         kept=len(done),

@@ -20,7 +20,7 @@ class Poses:
     def __len__(self) -> int:
         return len(self.centres)
 
-    def __getitem__(self, index: Tensor) -> "_Poses":
+    def __getitem__(self, index: Tensor) -> "Poses":
         return Poses(centres=self.centres[index], quaternions=self.quaternions[index])
 
 

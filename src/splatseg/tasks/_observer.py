@@ -2,6 +2,11 @@
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from splatseg.fit import FitProgress
+    from splatseg.pose import PoseProgress
 
 
 class Observer:
@@ -16,13 +21,16 @@ class Observer:
         """A stage of the work begins, such as ``render``."""
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """So many of so many steps of a stage are done."""
+        """So many of so many steps of a stage are done; of 0 where the number is not known."""
 
     def finished(self, stage: str) -> None:
         """A stage has ended, by an exception too."""
 
     def note(self, message: str) -> None:
         """Something a person should know; a sentence without a full stop."""
+
+    def info(self, message: str) -> None:
+        """What was found or decided on the way; a line without a full stop."""
 
     @contextmanager
     def stage(self, stage: str) -> Generator[Callable[[int, int], None]]:
@@ -32,6 +40,18 @@ class Observer:
             yield lambda done, total: self.progress(stage, done, total)
         finally:
             self.finished(stage)
+
+    @contextmanager
+    def fit_stage(self) -> Generator["Callable[[FitProgress], None]"]:
+        """The stage ``fit``, for who wants the loss and the number of Gaussians as well."""
+        with self.stage("fit") as step:
+            yield lambda now: step(round(1000 * now.progress), 1000)
+
+    @contextmanager
+    def pose_stage(self) -> Generator["Callable[[PoseProgress], None]"]:
+        """The stage ``poses``, for who wants the names of its parts as well."""
+        with self.stage("poses") as step:
+            yield lambda now: step(now.done, now.total)
 
 
 SILENT = Observer()

@@ -51,7 +51,7 @@ class ExportOptions:
     """Layer of labels for instance_id and instance_confidence. With it, its ids are the objects
     and the ids of `layer` their classes; without, the ids of `layer` are the objects."""
 
-    format: WritableFormat | None = None
+    splat_format: WritableFormat | None = None
     """Format of splats: ply, compressed.ply, splat, spz, spz3 (SPZ version 3). Default: what
     the output ends in, ply for objects."""
 
@@ -191,7 +191,7 @@ def _check(scene: Scene, output: Path, what: What, options: ExportOptions) -> No
         if not 0 <= value <= 1:
             raise RangeError(f"{name}: expected 0 to 1, got {value}.")
     for name, given, kinds in (
-        ("format", options.format is not None, ("splat", "objects")),
+        ("splat_format", options.splat_format is not None, ("splat", "objects")),
         ("unlabelled", options.unlabelled, ("objects",)),
         ("min_opacity", options.min_opacity > 0, ("points",)),
     ):
@@ -367,7 +367,7 @@ def _splat(job: _Job) -> Exported:
         job.output,
         columns=columns,
         table=table,
-        format=job.options.format,
+        format=job.options.splat_format,
     )
     return Exported(output=job.output, summary=f"{count} Gaussians", table=beside)
 
@@ -378,7 +378,7 @@ def _folder_of_objects(job: _Job) -> Exported:
         job.objects,
         job.output,
         rows=_objects(job),
-        format=job.options.format or "ply",
+        format=job.options.splat_format or "ply",
         columns=_columns(job),
         about=job.about,
         unlabelled=job.options.unlabelled,

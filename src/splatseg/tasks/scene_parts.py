@@ -1,6 +1,6 @@
 """Parts of a scene by the names that people give them: views of a split, layers, evidence."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from splatseg.core import FlatLayer, Layer, Scene, View, flat_layer, layer_address
@@ -21,6 +21,27 @@ def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
         return views
     known = ", ".join(sorted({view.split for view in scene.views})) or "none: it has no views"
     raise InputError(f"split: expected all or a split of the scene ({known}), got {split!r}.")
+
+
+def views_asked(scene: Scene, asked: Sequence[str]) -> tuple[View, ...]:
+    """The views that are asked for: ``train``, ``all``, or views by their names.
+
+    Raises:
+        InputError: If there is none, or none of a name.
+    """
+    if not asked:
+        raise InputError("views: expected train, all or names of views, got none.")
+    if len(asked) > 1 or asked[0] not in ("train", "all"):
+        return tuple(scene.view(name) for name in asked)
+    views = scene.views if asked[0] == "all" else scene.train_views
+    if not views:
+        raise InputError(f"views: the scene has no view that {asked[0]} allows.")
+    return views
+
+
+def views_recorded(asked: Sequence[str]) -> str:
+    """What was asked for, as it is written beside what was made."""
+    return ",".join(asked)
 
 
 def layer_of(scene: Scene, address: str, layers: Mapping[str, Layer] | None = None) -> FlatLayer:

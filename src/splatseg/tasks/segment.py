@@ -2,7 +2,7 @@
 
 import importlib.metadata
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from splatseg.lift.segments.panoptic import merge_panoptic
 from splatseg.methods import Method, MethodInputs, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.scene_parts import layer_of
+from splatseg.tasks.scene_parts import layer_of, views_asked, views_recorded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +54,8 @@ class SegmentOptions:
     void: int | None = None
     """A further id of the evidence's files that means none, such as 255."""
 
-    views: str = "train"
-    """Which views may be used: train, all, or names with commas between them. What is asked for
+    views: tuple[str, ...] = ("train",)
+    """Which views may be used: train, all, or names by comma or by space. What is asked for
     is recorded in the layer."""
 
     published: bool = False
@@ -209,7 +209,7 @@ def _described(
     """The layer with a record of what it was made from."""
     metadata = dict(layer.metadata) | {
         "evidence": evidence_name,
-        "views_asked": options.views,
+        "views_asked": views_recorded(options.views),
         "seed": options.seed,
         "versions": {
             "splatseg": importlib.metadata.version("splatseg"),
@@ -263,17 +263,19 @@ def _evidence(scene: Scene, options: SegmentOptions) -> tuple[str, Evidence]:
     return name, open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
 
 
-def _views(scene: Scene, evidence: Evidence, asked: str, observer: Observer) -> tuple[View, ...]:
+def _views(
+    scene: Scene, evidence: Evidence, asked: Sequence[str], observer: Observer
+) -> tuple[View, ...]:
     """The views asked for that have evidence; named ones must have it."""
-    if asked not in ("train", "all"):
-        return tuple(scene.view(name.strip()) for name in asked.split(","))
-    allowed = scene.views if asked == "all" else scene.train_views
+    allowed = views_asked(scene, asked)
+    if asked[0] not in ("train", "all"):
+        return allowed
     known = set(evidence.view_names)
     views = tuple(view for view in allowed if view.name in known)
     if not views:
         raise InputError(
             f"evidence: expected some of at least one of the {len(allowed)} views that "
-            f"{asked} allows, got none."
+            f"{asked[0]} allows, got none."
         )
     lacking = [view for view in allowed if view.name not in known]
     # Evidence of the train views alone is as it should be, whatever is allowed.

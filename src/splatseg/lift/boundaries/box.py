@@ -84,7 +84,7 @@ def _straddling(
     directions = directions_of_normals(gaussians, normals)
     large = line_extent(gaussians, directions, cameras).pixels >= options.min_pixels
     sized = gaussians.scales.amax(dim=1) > 0
-    return (mass >= max(options.min_share, 1e-6)) & large & sized, directions
+    return (mass >= max(options.min_side, 1e-6)) & large & sized, directions
 
 
 def box_corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@ r"""Cuts: Gaussians that reach over a boundary are split, so that each side can 
 
 A boundary is that of masks in the photographs (`cut_masks` for some ids, `cut_labels` for a
 whole layer) or a box in the world (`cut_box`). A Gaussian straddles it if its lesser side has
-at least `CutOptions.min_share`: of the evidence that masks give, or of the Gaussian's mass
+at least `CutOptions.min_side`: of the evidence that masks give, or of the Gaussian's mass
 beyond a plane. It is split in the direction that separates the two sides best (`sides`,
 `split`), its parts are held against the same boundary, and those that still straddle are split
 again, for a few rounds.
@@ -52,7 +52,7 @@ class CutOptions:
     rounds: int = 2
     """How often what still straddles is split again; 0 splits nothing."""
 
-    min_share: float = 0.1
+    min_side: float = 0.1
     """Minimum share, in [0, 0.5], of the lesser side for a Gaussian to straddle the cut."""
 
     min_pixels: float = 0.5
@@ -76,7 +76,7 @@ class CutOptions:
             raise RangeError(f"parts: expected one of {known}, got {self.parts}.")
         if self.rounds < 0:
             raise RangeError(f"rounds: expected 0 or more, got {self.rounds}.")
-        check_range("min_share", self.min_share, 0.0, 0.5)
+        check_range("min_side", self.min_side, 0.0, 0.5)
         check_range("border_weight", self.border_weight, 0.0, 1.0)
         check_range("keep_share", self.keep_share, 0.0, 1.0)
         for name in ("min_pixels", "min_weight"):
@@ -331,7 +331,7 @@ class _Scan:
     def straddling(self, gaussians: Gaussians, sides: Sides) -> Selection:
         """Gaussians with enough evidence on both sides that are large enough to be split."""
         lesser = torch.minimum(sides.share, 1 - sides.share)
-        mask = lesser >= max(self.options.min_share, 1e-6)
+        mask = lesser >= max(self.options.min_side, 1e-6)
         mask &= sides.inside + sides.outside >= self.options.min_weight
         mask &= gaussians.scales.amax(dim=1) > 0
         rows = torch.nonzero(mask).squeeze(1)

@@ -17,7 +17,7 @@ from splatseg.pose.doctor._world import judge_points, judge_up
 class DoctorOptions:
     """How thoroughly to look."""
 
-    views: int = 30
+    max_views: int = 30
     """Most photographs to look at."""
 
     longest: int = 800
@@ -58,7 +58,7 @@ def diagnose(
     views = [view for view in capture.views if view.image is not None]
     if matches is None:
         matches = match_views(
-            views, max_views=options.views, longest=options.longest, seed=options.seed
+            views, max_views=options.max_views, longest=options.longest, seed=options.seed
         )
     examination = examine(capture, views, matches, seed=options.seed)
     faults = [*found, *examination.faults]
@@ -107,7 +107,7 @@ def find_points(
     options = options or DoctorOptions()
     views = [view for view in capture.views if view.image is not None]
     matches = match_views(
-        views, max_views=options.views, longest=options.longest, seed=options.seed
+        views, max_views=options.max_views, longest=options.longest, seed=options.seed
     )
     if len(matches) < MIN_MATCHES:
         return None

@@ -1,6 +1,5 @@
-"""The end of ``splatseg fit``: held-out views are scored and reports/fit.html is written."""
+"""The end of a fit: held-out views are scored and reports/fit.html is written."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,11 +29,15 @@ def score_and_report(
     options: FitOptions,
     backend: BackendName,
     scoring: bool,
-) -> str:
-    """Score the held-out views, write SCENE/reports/fit.html and fit.json; gives what to print.
+    command: str = "",
+) -> tuple[PhotographReport | None, Path]:
+    """Score the held-out views, write SCENE/reports/fit.html and fit.json.
 
     As many views are scored as the time for it allows; with `scoring` False none is, for who
     stopped a fit does not want to wait.
+
+    Returns:
+        The scores, None where no view was scored, and the report.
     """
     views = [view for view in capture.test_views if view.image is not None]
     scores = None
@@ -49,7 +52,7 @@ def score_and_report(
         scores=scores,
         held_out=len(views),
         file_bytes=(root / GAUSSIANS_FILE).stat().st_size,
-        command=_typed(sys.argv),
+        command=command,
         poses=_poses(root),
         facts={"backend": backend},
     )
@@ -62,7 +65,7 @@ def score_and_report(
         page = report_html(fit_report(data, pairs=pairs))
         path.write_text(page, encoding="utf-8", newline="\n")
     write_json(folder / "fit.json", fit_record(data))
-    return _told(scores, len(views)) + f"report: {folder / 'fit.html'}\n"
+    return scores, folder / "fit.html"
 
 
 def _pairs(
@@ -73,11 +76,11 @@ def _pairs(
     masks: MaskUse,
     backend: BackendName,
 ) -> Gallery:
-    """Photograph, picture and difference of the worst, the middle and the best view."""
+    """Photograph, picture and difference of the worst, the median and the best view."""
     ordered = sorted(scores.per_view, key=lambda score: score.psnr)
-    middle, last = len(ordered) // 2, len(ordered) - 1
+    median, last = len(ordered) // 2, len(ordered) - 1
     # Of few views some are two of the three; each is shown once.
-    ranks = {0: "worst", middle: "median", last: "best"} if last else {0: "the only one"}
+    ranks = {0: "worst", median: "median", last: "best"} if last else {0: "the only one"}
     names = {view.name: view for view in views}
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for rank, label in ranks.items():
@@ -108,22 +111,3 @@ def _pairs(
 def _poses(root: Path) -> dict[str, Any] | None:
     path = root / POSES_FOLDER / "poses.json"
     return read_json(path).get("report") if path.is_file() else None
-
-
-def _typed(words: Sequence[str]) -> str:
-    """The command line; nothing where the command was called from Python."""
-    name = Path(words[0]).name if words else ""
-    if name not in ("splatseg", "__main__.py"):
-        return ""
-    return " ".join(["splatseg", *words[1:]])
-
-
-def _told(scores: PhotographReport | None, count: int) -> str:
-    if not count:
-        return "no held-out views to score\n"
-    if scores is None:
-        return ""
-    scored = f"{count} held-out views"
-    if len(scores.views) < count:
-        scored = f"{len(scores.views)} of {count} held-out views"
-    return f"PSNR {scores.psnr:.2f} dB on {scored}, SSIM {scores.ssim:.3f}\n"

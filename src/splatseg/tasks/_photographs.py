@@ -1,28 +1,21 @@
-"""The capture that `splatseg fit` is given: with poses, or to be found for bare photographs."""
+"""The capture that a scene is made of: with poses, or to be found for bare photographs."""
 
-import sys
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-from splatseg.cli._progress import lines_on_stderr
 from splatseg.core import Capture
 from splatseg.errors import InputError
 from splatseg.io.captures import find_formats, read_capture
 from splatseg.io.scene import POSES_FOLDER
 from splatseg.pose import (
     PoseOptions,
-    PoseProgress,
     PoseReport,
     PoseResult,
     holds_photographs,
     is_video,
     recover_poses,
 )
+from splatseg.tasks._observer import Observer
 
 Poses = Literal["auto", "given", "sfm"]
 """Where cameras come from."""
@@ -32,8 +25,15 @@ _NAMED = 10
 
 
 def capture_of(
-    data: Path, *, scene: Path, format: str, poses: Poses, frames: int, seed: int
-) -> Capture:
+    data: Path,
+    *,
+    scene: Path,
+    format: str,
+    poses: Poses,
+    frames: int,
+    seed: int,
+    observer: Observer,
+) -> tuple[Capture, PoseReport | None]:
     """Read a capture, or find the poses of photographs or a video and say how that went.
 
     Args:
@@ -44,21 +44,25 @@ def capture_of(
         poses: Where cameras come from.
         frames: Frames taken from a video.
         seed: Of everything that is drawn at random.
+        observer: Is told of the progress and of what was found.
+
+    Returns:
+        The capture, and how its poses were found; None where they came with it.
     """
     if not _without_poses(data, format, poses):
-        return read_capture(data, format=format)
+        return read_capture(data, format=format), None
     options = PoseOptions(seed=seed, frames=frames)
-    with _shown_progress() as show:
-        result = recover_poses(data, folder=scene / POSES_FOLDER, options=options, progress=show)
-    sys.stdout.write(_told(data, scene / POSES_FOLDER, result))
-    sys.stdout.flush()
-    return result.capture
+    with observer.pose_stage() as step:
+        result = recover_poses(data, folder=scene / POSES_FOLDER, options=options, progress=step)
+    for line in _sentences(data, scene / POSES_FOLDER, result):
+        observer.info(line)
+    return result.capture, result.report
 
 
 def _without_poses(data: Path, format: str, poses: Poses) -> bool:
     if poses == "sfm":
         if format != "auto":
-            raise InputError(f"--format: expected none with --poses sfm, got {format!r}.")
+            raise InputError(f"format: expected none with `poses` sfm, got {format!r}.")
         return True
     if poses == "given" or format != "auto":
         return False
@@ -67,38 +71,7 @@ def _without_poses(data: Path, format: str, poses: Poses) -> bool:
     return data.is_dir() and not find_formats(data) and holds_photographs(data)
 
 
-@contextmanager
-def _shown_progress() -> Generator[Callable[[PoseProgress], None]]:
-    """On stderr: the stage and how much of it is done."""
-    lines = lines_on_stderr("poses")
-    if lines is not None:
-
-        def write(now: PoseProgress) -> None:
-            # Stages take differently long: there is no estimate of the whole.
-            lines.show(now.done, None, text=_stage(now))
-
-        yield write
-        return
-    columns = (
-        TextColumn("poses"),
-        BarColumn(bar_width=24),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None)
-
-        def show(now: PoseProgress) -> None:
-            bar.update(task, description=_stage(now), completed=now.done, total=now.total or None)
-
-        yield show
-
-
-def _stage(now: PoseProgress) -> str:
-    return f"{now.stage} {now.done}/{now.total}" if now.total else now.stage
-
-
-def _told(data: Path, folder: Path, result: PoseResult) -> str:
+def _sentences(data: Path, folder: Path, result: PoseResult) -> list[str]:
     """What was placed, how well, by whom, and what was left out and why."""
     report = result.report
     lines = [_placed(data, report)]
@@ -121,7 +94,7 @@ def _told(data: Path, folder: Path, result: PoseResult) -> str:
     more = len(report.left_out) - _NAMED
     if more > 0:
         lines.append(f"left out {more} more; {folder / 'poses.json'} names them")
-    return "".join(f"{line}\n" for line in lines)
+    return lines
 
 
 def _placed(data: Path, report: PoseReport) -> str:

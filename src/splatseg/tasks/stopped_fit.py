@@ -1,14 +1,15 @@
-"""The folder that `splatseg fit` writes to: what may be there, and what is kept there meanwhile."""
+"""Fits that were stopped: where, and whether they can go on."""
 
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
 from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
-from splatseg.io.scene import CHECKPOINT_FILE, is_scene, is_unfinished, scene_layer_names
+from splatseg.io.scene import CHECKPOINT_FILE, is_scene
+from splatseg.tasks.new_scene import check_replaceable_scene
 
 
-def check_output(root: Path, *, resume: bool, overwrite: bool) -> str | None:
-    """Refuse before the work what could not be written after it.
+def check_fit_output(root: Path, *, resume: bool, overwrite: bool) -> str | None:
+    """Refuse before a fit what could not be written after it.
 
     Args:
         root: The scene folder to be.
@@ -24,19 +25,7 @@ def check_output(root: Path, *, resume: bool, overwrite: bool) -> str | None:
     """
     if resume and overwrite:
         raise InputError("resume, overwrite: expected one of the two, got both.")
-    if root.exists() and not root.is_dir():
-        raise InputError(f"{root}: expected a folder to write to, got a file.")
-    if not root.resolve().parent.is_dir():
-        raise InputError(f"{root}: expected a place in a folder that is there, got none.")
-    if is_scene(root):
-        layers = scene_layer_names(root)
-        if layers:
-            raise InputError(
-                f"{root}: expected a new folder, got a scene with layers ({', '.join(layers)}), "
-                "which belong to its Gaussians; remove it or choose another name."
-            )
-    elif root.is_dir() and not is_unfinished(root) and any(root.iterdir()):
-        raise InputError(f"{root}: expected an empty folder or a new one, got one with files.")
+    check_replaceable_scene(root, unfinished=True)
     checkpoint = root / CHECKPOINT_FILE
     if resume:
         return _resumed(root, checkpoint)
@@ -45,7 +34,7 @@ def check_output(root: Path, *, resume: bool, overwrite: bool) -> str | None:
         if stopped is not None:
             raise InputError(
                 f"{root}: expected a new folder, got a fit that {stopped}; "
-                f"{'--resume continues it, ' if _resumable(checkpoint) else ''}--overwrite begins "
+                f"{'`resume` continues it, ' if _resumable(checkpoint) else ''}`overwrite` begins "
                 "again."
             )
     return None
@@ -59,7 +48,7 @@ def where_it_stopped(checkpoint: Path) -> str | None:
         return "was stopped by another splatseg and cannot be resumed"
     except FileFormatError:
         return "was stopped and has a damaged checkpoint"
-    return None if summary.progress >= 1 else f"was stopped at {_place(summary)}"
+    return None if summary.progress >= 1 else f"was stopped at {_where(summary)}"
 
 
 def _resumable(checkpoint: Path) -> bool:
@@ -72,16 +61,16 @@ def _resumable(checkpoint: Path) -> bool:
 
 def _resumed(root: Path, checkpoint: Path) -> str:
     if checkpoint.is_file():
-        return f"{root}: going on from {_place(checkpoint_summary(checkpoint))}"
+        return f"{root}: going on from {_where(checkpoint_summary(checkpoint))}"
     if is_scene(root):
         raise InputError(
             f"{root}: expected a fit that can be resumed, got a scene without a checkpoint; "
-            "--keep-checkpoint keeps that of a finished fit."
+            "`keep_checkpoint` keeps that of a finished fit."
         )
     return f"{root}: nothing to go on from, beginning"
 
 
-def _place(summary: CheckpointSummary) -> str:
+def _where(summary: CheckpointSummary) -> str:
     return (
         f"step {summary.steps} ({100 * summary.progress:.0f} %, {summary.seconds / 60:.1f} minutes)"
     )

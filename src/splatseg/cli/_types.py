@@ -1,0 +1,89 @@
+"""Flags that several commands share: one type, one help, one meaning each."""
+
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import tyro
+
+from splatseg.render import BackendName
+
+
+def _named(metavar: str | None, help: str, *aliases: str) -> Any:
+    return tyro.conf.arg(metavar=metavar, help=help, aliases=aliases or None)
+
+
+SceneFolder: TypeAlias = Annotated[Path, tyro.conf.Positional, _named("SCENE", "The scene folder.")]
+
+Output: TypeAlias = Annotated[Path, _named("PATH", "Where to write.", "-o")]
+
+NewScene: TypeAlias = Annotated[
+    Path, _named("NEW", "The scene folder to write. It must not be there yet.", "-o")
+]
+
+MadeSceneFolder: TypeAlias = Annotated[
+    Path,
+    _named(
+        "SCENE",
+        "The scene folder to write. A scene that is there is replaced unless it has layers.",
+        "-o",
+    ),
+]
+
+Data: TypeAlias = Annotated[
+    Path | None,
+    _named(
+        "CAPTURE",
+        "Folder of the capture, where it was moved. Only what reads photographs or evidence of "
+        "the capture needs it.",
+    ),
+]
+
+Backend: TypeAlias = Annotated[
+    BackendName,
+    _named(
+        None,
+        "Who renders: cpu, the C++ kernels; cuda; reference, slow and plain. auto: cuda for "
+        "Gaussians on a GPU, cpu otherwise.",
+    ),
+]
+
+Seed: TypeAlias = Annotated[int, _named("N", "Seed of everything that is drawn at random.")]
+
+Format: TypeAlias = Annotated[
+    str,
+    _named(
+        "NAME",
+        "How the capture is read: auto, nerfstudio, blender, colmap, llff or idr. auto takes the "
+        "first of these that is there.",
+    ),
+]
+
+Overwrite: TypeAlias = Annotated[
+    bool,
+    _named(None, "Replace what an earlier run left under the same name."),
+]
+
+Split: TypeAlias = Annotated[
+    str, _named("SPLIT", "Which views: test, train, another split of the scene, or all.")
+]
+
+SplitOrPath: TypeAlias = Annotated[
+    str,
+    _named(
+        "SPLIT",
+        "Which views: test, train, another split of the scene, all, or path: a smooth path near "
+        "the training cameras.",
+    ),
+]
+
+Frames: TypeAlias = Annotated[int, _named("N", "Views of --split path.")]
+
+Json: TypeAlias = Annotated[
+    bool,
+    _named(None, "Print one JSON object of what was made or found, and nothing else, to stdout."),
+]
+
+Quiet: TypeAlias = Annotated[
+    bool,
+    _named(None, "Show no progress and no notes; results and errors are still printed."),
+]

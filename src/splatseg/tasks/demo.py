@@ -1,0 +1,303 @@
+"""The main job on a generated room, of which the truth is known."""
+
+import shutil
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Scene
+from splatseg.errors import InputError, RangeError
+from splatseg.fit import FitOptions
+from splatseg.io.json_files import read_json, write_json
+from splatseg.io.scene import load_scene, save_scene_layer
+from splatseg.render import BackendName
+from splatseg.report.demo_report import DemoFigures, machine_score, write_report
+from splatseg.synthetic import cameras, room, write_capture
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate
+from splatseg.tasks.export import ExportOptions, export
+from splatseg.tasks.make_scene import MadeScene, make_scene
+from splatseg.tasks.new_scene import check_parent
+from splatseg.tasks.outputs import export_layer, report_layer
+from splatseg.tasks.render import RenderingOptions, render_views
+from splatseg.tasks.see import see
+from splatseg.tasks.segment import Segmentation, SegmentOptions, segment
+
+_RECORD = "demo.json"
+_MADE_BY = "splatseg demo"
+# Everything that the demo writes besides its record; a second run removes these and no more.
+_FOLDERS = ("capture", "scene", "render")
+_FILES = ("labelled.ply", "labelled.json", "contact_sheet.png", "report.html")
+_POINTS = 15_000
+_LAYER = "semantic"
+_EVIDENCE = "labels_semantic"
+_OBJECTS = "objects"
+_MASKS = "masks"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions:
+    """Which room, how many photographs of it, and how long it is fitted."""
+
+    minutes: float | None = None
+    """Length of the fit. None is 1.5, unless `steps` says how long."""
+
+    steps: int | None = None
+    """Length of the fit in steps instead: same seed, same result."""
+
+    max_gaussians: int = 60_000
+    """Most Gaussians of the scene."""
+
+    train_views: int = 48
+    """Photographs to learn from; a quarter as many are held out."""
+
+    width: int = 320
+    """Pixels a row of the photographs; they are three quarters as high."""
+
+    seed: int = 0
+    """Which room, and every other choice."""
+
+    def __post_init__(self) -> None:
+        if self.train_views < 4:
+            raise RangeError(f"train_views: expected at least 4, got {self.train_views}.")
+        if self.width < 32:
+            raise RangeError(f"width: expected at least 32 pixels, got {self.width}.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Demo:
+    """What a demo left in its folder, and what it measured."""
+
+    folder: Path
+    figures: DemoFigures
+    record: dict[str, Any]
+    """What its demo.json holds: scores, seconds by step, commands that do the same."""
+
+
+def make_demo(
+    folder: Path,
+    *,
+    options: DemoOptions | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> Demo:
+    """Generate a room with a network's label maps, and do with it all that the main job is.
+
+    Args:
+        folder: Where everything goes. One that an earlier demo made is replaced.
+        options: Which room.
+        backend: Who renders.
+        observer: Is told of each step by the command that does the same.
+
+    Raises:
+        InputError: If the folder holds anything but an earlier demo.
+    """
+    started = time.monotonic()
+    options = options or DemoOptions()
+    _prepare(folder, observer)
+    steps: list[tuple[str, float]] = []
+    observer.info("Generating a room with photographs, truth and machine labels")
+    capture = folder / "capture"
+    _photograph(capture, options, observer)
+    steps.append(("generate", time.monotonic() - started))
+    job = _MainJob(folder=folder, options=options, backend=backend, observer=observer, steps=steps)
+    job.run()
+    begin = time.monotonic()
+    figures = DemoFigures(
+        came=machine_score(capture, _EVIDENCE),
+        train=job.figures[_LAYER, "train"],
+        test=job.figures[_LAYER, "test"],
+        objects=job.figures[_OBJECTS, "test"],
+        steps=tuple(steps),
+        commands=tuple(job.lines),
+        started=started,
+    )
+    write_report(
+        folder, figures, seed=options.seed, layer=_LAYER, evidence=_EVIDENCE, objects=_OBJECTS
+    )
+    steps.append(("report", time.monotonic() - begin))
+    record = _record(figures, steps, time.monotonic() - started)
+    write_json(folder / _RECORD, record)
+    return Demo(folder=folder, figures=figures, record=record)
+
+
+def _photograph(capture: Path, options: DemoOptions, observer: Observer) -> None:
+    scene = room(seed=options.seed)
+    views = cameras(
+        room(seed=options.seed),
+        train=options.train_views,
+        test=max(1, options.train_views // 4),
+        width=options.width,
+        height=options.width * 3 // 4,
+    )
+    with observer.stage("photograph") as step:
+        write_capture(scene, capture, views=views, points=_POINTS, seed=options.seed, progress=step)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _MainJob:
+    """The steps of the main job; each tells the command that does the same from the shell."""
+
+    folder: Path
+    options: DemoOptions
+    backend: BackendName
+    observer: Observer
+    steps: list[tuple[str, float]]
+    """Names and seconds."""
+
+    lines: list[str] = field(default_factory=list[str])
+    """The commands."""
+
+    figures: dict[tuple[str, str], dict[str, Any]] = field(
+        default_factory=dict[tuple[str, str], dict[str, Any]]
+    )
+    """Scores by layer and split."""
+
+    def run(self) -> None:
+        """Do all steps."""
+        folder, backend, observer = self.folder, self.backend, self.observer
+        capture, root = folder / "capture", folder / "scene"
+        with self._step("fit", capture, "-o", root, *self._fit_words()):
+            self._fit(capture, root)
+        scene = load_scene(root)
+        with self._step(
+            "segment", root, "--method", "uplift", "--evidence", _EVIDENCE, "--layer", _LAYER
+        ):
+            self._segment(scene, "uplift", SegmentOptions(evidence=_EVIDENCE, layer=_LAYER))
+        with self._step("see", root, "--model", "classical", "--evidence", _MASKS):
+            see(scene, "classical", _MASKS, observer=observer)
+        with self._step(
+            *("segment", root, "--method", "associate", "--evidence", _MASKS),
+            *("--layer", _OBJECTS, "--export", "--report"),
+        ):
+            made = self._segment(
+                scene, "associate", SegmentOptions(evidence=_MASKS, layer=_OBJECTS)
+            )
+            export_layer(scene, root, _OBJECTS, made.layer, backend=backend, observer=observer)
+            report_layer(scene, root, made, command=self.lines[-1], backend=backend)
+        what = ("rgb", "depth", _LAYER, _OBJECTS)
+        with self._step("render", root, "--what", ",".join(what), "-o", folder / "render"):
+            render_views(
+                scene,
+                folder / "render",
+                options=RenderingOptions(what=what),
+                backend=backend,
+                observer=observer,
+            )
+        for split in ("train", "test"):
+            self._evaluate(scene, _LAYER, split, capture / "semantic", "semantic")
+        self._evaluate(scene, _OBJECTS, "test", capture / "instance", "instances")
+        labelled = folder / "labelled.ply"
+        with self._step("export", root, "--layer", _LAYER, "--instances", _OBJECTS, "-o", labelled):
+            export(scene, labelled, options=ExportOptions(layer=_LAYER, instances=_OBJECTS))
+
+    def _fit(self, capture: Path, root: Path) -> None:
+        options = replace(FitOptions.preset("default"), seed=self.options.seed)
+        options = options.with_length(minutes=self._minutes(), steps=self.options.steps)
+        options = replace(options, max_gaussians=self.options.max_gaussians)
+        made = make_scene(
+            capture,
+            root,
+            fit_options=options,
+            backend=self.backend,
+            command=self.lines[-1],
+            observer=self.observer,
+        )
+        if made.interrupted:
+            raise KeyboardInterrupt
+        self.observer.info(_fitted(made))
+
+    def _segment(self, scene: Scene, method: str, options: SegmentOptions) -> Segmentation:
+        made = segment(scene, method, options=options, backend=self.backend, observer=self.observer)
+        save_scene_layer(self.folder / "scene", made.name, made.layer)
+        return made
+
+    def _evaluate(self, scene: Scene, layer: str, split: str, truth: Path, metric: Metric) -> None:
+        with self._step(
+            *("evaluate", self.folder / "scene", "--layer", layer, "--truth", truth),
+            *("--split", split, "--metric", metric),
+        ):
+            found = evaluate(
+                scene,
+                options=EvaluationOptions(layer=layer, truth=truth, split=split, metric=metric),
+                backend=self.backend,
+                observer=self.observer,
+            )
+        self.figures[layer, split] = found
+        shown = {key: value for key, value in found.items() if isinstance(value, float)}
+        self.observer.info("  ".join(f"{key} {value:.3f}" for key, value in shown.items()))
+
+    @contextmanager
+    def _step(self, name: str, *words: object) -> Generator[None]:
+        """Tell a command, and time what does the same."""
+        chosen = [] if self.backend == "auto" or name == "see" else ["--backend", self.backend]
+        line = " ".join(["splatseg", name, *map(str, words), *chosen])
+        self.lines.append(line)
+        self.observer.info(f"\n$ {line}")
+        begin = time.monotonic()
+        yield
+        seconds = time.monotonic() - begin
+        if self.steps[-1][0] == name:
+            self.steps[-1] = (name, self.steps[-1][1] + seconds)
+        else:
+            self.steps.append((name, seconds))
+
+    def _minutes(self) -> float | None:
+        options = self.options
+        return 1.5 if options.minutes is None and options.steps is None else options.minutes
+
+    def _fit_words(self) -> list[object]:
+        options, minutes = self.options, self._minutes()
+        words: list[object] = [] if minutes is None else ["--minutes", minutes]
+        if options.steps is not None:
+            words += ["--steps", options.steps]
+        return [*words, "--max-gaussians", options.max_gaussians, "--seed", options.seed]
+
+
+def _fitted(made: MadeScene) -> str:
+    scores = "" if made.scores is None else f"; PSNR {made.scores.psnr:.2f} dB held out"
+    return f"{len(made.result.gaussians)} Gaussians in {made.result.steps} steps{scores}"
+
+
+def _prepare(folder: Path, observer: Observer) -> None:
+    """Leave an empty folder with the record of an unfinished demo in it.
+
+    The record comes first and goes last, so that whatever an interrupted run leaves is known
+    to be a demo's and may be replaced by the next.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder to write to, got a file.")
+    check_parent(folder)
+    record = folder / _RECORD
+    if folder.is_dir() and any(folder.iterdir()):
+        if not record.is_file() or read_json(record).get("made_by") != _MADE_BY:
+            raise InputError(
+                f"{folder}: expected a new or empty folder or one that an earlier demo made, got "
+                "one with other files; choose another."
+            )
+        observer.info(f"Replacing the earlier demo in {folder}")
+    folder.mkdir(exist_ok=True)
+    write_json(record, {"made_by": _MADE_BY, "finished": False})
+    for name in _FOLDERS:
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
+    for name in _FILES:
+        (folder / name).unlink(missing_ok=True)
+
+
+def _record(figures: DemoFigures, steps: list[tuple[str, float]], total: float) -> dict[str, Any]:
+    return {
+        "made_by": _MADE_BY,
+        "finished": True,
+        "psnr_test": figures.test["PSNR"],
+        "miou_labels_as_they_came_train": figures.came.miou,
+        "miou_lifted_train": figures.train["mIoU"],
+        "miou_lifted_test": figures.test["mIoU"],
+        "miou_objects_test": figures.objects["mIoU"],
+        "seconds": {name: round(seconds, 2) for name, seconds in steps},
+        "seconds_total": round(total, 2),
+        "commands": list(figures.commands),
+    }

@@ -1,0 +1,218 @@
+"""A splat file of any tool becomes a scene, with its photographs or with virtual cameras."""
+
+import warnings
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from splatseg.core import Capture, Gaussians, Scene
+from splatseg.errors import InputError
+from splatseg.importing import Alignment, VirtualViews, align, place_cameras
+from splatseg.io.captures import read_capture
+from splatseg.io.scene import save_scene
+from splatseg.io.splats import SplatWarning, read_splats, splat_format
+from splatseg.render import BackendName
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.new_scene import check_replaceable_scene
+
+UpAxis = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]
+"""An axis of the file's frame; auto is what its format usually has."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportOptions:
+    """How a file finds its photographs, or its virtual cameras."""
+
+    data: Path | None = None
+    """The capture that the splats were made from. None places virtual cameras."""
+
+    format: str = "auto"
+    """How the capture is read: auto, nerfstudio, colmap, blender, llff or idr."""
+
+    as_is: bool = False
+    """Take the file as it stands, without comparing it with the photographs."""
+
+    up: UpAxis = "auto"
+    """Which way is up, where there is no capture. auto: +y for glTF, -y for all else."""
+
+    max_views: int = 40
+    """Most virtual cameras to place. Every eighth is a test view."""
+
+    width: int = 800
+    """Width of the virtual views, pixels."""
+
+    height: int = 600
+    """Height of the virtual views, pixels."""
+
+    kind: Literal["auto", "object", "room"] = "auto"
+    """Whether virtual cameras stand around the scene or within it. auto: within, where the
+    scene surrounds them."""
+
+    def __post_init__(self) -> None:
+        if self.max_views < 1:
+            raise InputError(f"max_views: expected at least 1, got {self.max_views}.")
+        if min(self.width, self.height) < 16:
+            raise InputError(
+                f"width, height: expected at least 16 pixels, got {self.width} and {self.height}."
+            )
+        if self.as_is and self.data is None:
+            raise InputError("as_is: goes with `data`, which says what the file is compared with.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImportedScene:
+    """A scene folder made of a splat file."""
+
+    scene: Scene
+    alignment: Alignment | None
+    """How the file lay to the photographs; None where they were not compared."""
+
+    placed: VirtualViews | None
+    """Virtual cameras; None with a capture."""
+
+
+def import_scene(
+    file: Path,
+    folder: Path,
+    *,
+    options: ImportOptions | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> ImportedScene:
+    """Make a scene folder of a splat file.
+
+    With a capture, a few views are drawn and compared with the photographs; a file in another
+    frame (axes, nerfstudio's transforms, another scale) is moved. Without, cameras are placed
+    so that they cover what is visible.
+
+    Args:
+        file: PLY, compressed PLY, .splat, SPZ, SOG or glTF.
+        folder: The scene folder to write. A scene that is there is replaced unless it has
+            layers.
+        options: The capture, or how cameras are placed.
+        backend: Who renders.
+        observer: Is told of the progress and of what was found.
+
+    Raises:
+        InputError: If something is in the way, the file holds no Gaussians, or it fits the
+            photographs in no frame.
+        FileFormatError: If the file is broken.
+    """
+    options = options or ImportOptions()
+    check_replaceable_scene(folder)
+    gaussians = read_with_notes(file, observer)
+    if not len(gaussians):
+        raise InputError(f"{file}: expected Gaussians, got a file of none.")
+    provenance = {
+        "command": "import",
+        "file": file.name,
+        "format": splat_format(file),
+        "backend": backend,
+        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+    }
+    alignment, placed = None, None
+    if options.data is not None:
+        capture = read_capture(options.data, format=options.format)
+        for note in capture.notes:
+            observer.note(note)
+        if not options.as_is:
+            alignment = align(gaussians, capture, splats=file, backend=backend)
+            observer.info(_aligned(alignment))
+        scene = _with_photographs(gaussians, capture, alignment, provenance)
+    else:
+        up = _up(file, options.up)
+        with observer.stage("placing cameras") as step:
+            placed = place_cameras(
+                gaussians,
+                up=up,
+                count=options.max_views,
+                width=options.width,
+                height=options.height,
+                kind=None if options.kind == "auto" else options.kind,
+                backend=backend,
+                progress=step,
+            )
+        scene = _with_cameras(gaussians, up, placed, provenance)
+        observer.info(_placed(placed))
+    return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=placed)
+
+
+def read_with_notes(file: Path, observer: Observer) -> Gaussians:
+    """The Gaussians of a splat file; what is odd about it goes to the observer."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", SplatWarning)
+        gaussians = read_splats(file)
+    for warning in caught:
+        observer.note(str(warning.message))
+    return gaussians
+
+
+def _with_photographs(
+    gaussians: Gaussians,
+    capture: Capture,
+    found: Alignment | None,
+    provenance: dict[str, Any],
+) -> Scene:
+    if found is not None and found.moved:
+        gaussians = gaussians.transformed(found.capture_from_file)
+    return Scene(
+        gaussians=gaussians,
+        views=capture.views,
+        classes=capture.classes,
+        up=capture.up,
+        metres_per_unit=capture.metres_per_unit,
+        source=capture.path,
+        provenance=provenance | _alignment_facts(found, capture),
+    )
+
+
+def _with_cameras(
+    gaussians: Gaussians,
+    up: tuple[float, float, float],
+    placed: VirtualViews,
+    provenance: dict[str, Any],
+) -> Scene:
+    facts = {"kind": placed.kind, "coverage": round(placed.coverage, 4), "up": list(up)}
+    provenance = provenance | {"virtual_views": facts}
+    return Scene(gaussians=gaussians, views=placed.views, up=up, provenance=provenance)
+
+
+def _up(file: Path, name: UpAxis) -> tuple[float, float, float]:
+    if name == "auto":
+        name = "+y" if splat_format(file) == "gltf" else "-y"
+    sign = 1.0 if name[0] == "+" else -1.0
+    x, y, z = (sign if axis == name[1] else 0.0 for axis in "xyz")
+    return x, y, z
+
+
+def _aligned(found: Alignment) -> str:
+    quality = f"correlation {found.correlation:.2f}, {found.psnr:.1f} dB at a small size"
+    if not found.moved:
+        return f"the splats fit the photographs ({quality})"
+    return (
+        f"the splats were in another frame (correlation {found.correlation_as_is:.2f}) and were "
+        f"moved: {found.what} ({quality})"
+    )
+
+
+def _placed(placed: VirtualViews) -> str:
+    where = "around an object" if placed.kind == "object" else "within a room"
+    return (
+        f"{len(placed.views)} virtual cameras {where}; they show "
+        f"{100 * placed.coverage:.0f} % of what is visible"
+    )
+
+
+def _alignment_facts(found: Alignment | None, capture: Capture) -> dict[str, Any]:
+    if found is None:
+        return {"alignment": "taken as it is"}
+    return {
+        "alignment": {
+            "capture": capture.path.name,
+            "moved": found.what or None,
+            "capture_from_file": found.capture_from_file.matrix.tolist(),
+            "correlation": round(found.correlation, 4),
+            "correlation_as_is": round(found.correlation_as_is, 4),
+        }
+    }

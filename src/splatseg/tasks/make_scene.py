@@ -1,0 +1,237 @@
+"""Photographs become a scene: poses where they lack them, a fit, scores, a report."""
+
+import math
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Capture, Scene
+from splatseg.errors import InputError
+from splatseg.evaluate import PhotographReport
+from splatseg.fit import (
+    EXPOSURES,
+    Checkpoints,
+    FitOptions,
+    FitResult,
+    deferred_interrupts,
+    discard_checkpoint,
+    exposures_record,
+    fit,
+    random_point_count,
+    reduction_note,
+)
+from splatseg.io.scene import CHECKPOINT_FILE, save_scene
+from splatseg.pose import PoseReport
+from splatseg.render import BackendName
+from splatseg.tasks._fit_report import score_and_report
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._photographs import Poses, capture_of
+from splatseg.tasks.stopped_fit import check_fit_output
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MakeSceneOptions:
+    """What is around a fit: how photographs are read, and how it is kept and goes on."""
+
+    format: str = "auto"
+    """How the capture is read: auto, nerfstudio, colmap, blender, llff or idr."""
+
+    poses: Poses = "auto"
+    """Where cameras come from: given, the capture; sfm, from the photographs alone; auto, sfm
+    where the capture has none."""
+
+    frames: int = 120
+    """Frames to take from a video."""
+
+    resume: bool = False
+    """Go on with the fit that was stopped in the folder."""
+
+    overwrite: bool = False
+    """Begin again where a fit was stopped in the folder."""
+
+    checkpoint_every: float = 60.0
+    """Seconds between two checkpoints."""
+
+    checkpoint_steps: int | None = None
+    """Steps between two checkpoints, instead of seconds."""
+
+    keep_checkpoint: bool = False
+    """Keep the checkpoint of the finished fit, so that it can be made longer."""
+
+    preset: str = "default"
+    """Name of the preset that the fit's options came from; it is recorded."""
+
+    def __post_init__(self) -> None:
+        every = self.checkpoint_every
+        if not (math.isfinite(every) and every > 0):
+            raise InputError(f"checkpoint_every: expected a positive number, got {every}.")
+        if self.checkpoint_steps is not None and self.checkpoint_steps < 1:
+            raise InputError(f"checkpoint_steps: expected at least 1, got {self.checkpoint_steps}.")
+        if self.frames < 1:
+            raise InputError(f"frames: expected at least 1, got {self.frames}.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MadeScene:
+    """A scene folder, and how it was made."""
+
+    folder: Path
+    capture: Capture
+    """What it was made of; poses that were found included."""
+
+    result: FitResult
+    interrupted: bool
+    """Whether it was asked to stop; the folder holds what there was, and a checkpoint."""
+
+    scores: PhotographReport | None
+    """Renders of held-out views against photographs; None where none were scored."""
+
+    held_out: int
+    """Held-out views with photographs."""
+
+    report: Path
+    """The page on the fit."""
+
+    poses: PoseReport | None
+    """How poses were found; None where they came with the capture."""
+
+
+def make_scene(
+    data: Path,
+    folder: Path,
+    *,
+    options: MakeSceneOptions | None = None,
+    fit_options: FitOptions | None = None,
+    backend: BackendName = "auto",
+    command: str = "",
+    observer: Observer = SILENT,
+) -> MadeScene:
+    """Fit Gaussians to the training photographs of a capture, and write a scene folder.
+
+    A `KeyboardInterrupt` out of the observer, Ctrl-C or SIGTERM ends the fit early: the scene
+    holds what there is, and a call with `MakeSceneOptions.resume` goes on. Another exception
+    out of the observer goes through; the last checkpoint is what a call with resume goes on
+    from.
+
+    Args:
+        data: Folder of a capture or of bare photographs, or a video.
+        folder: The scene folder to write. A scene that is there is replaced unless it has
+            layers.
+        options: What is around the fit.
+        fit_options: The fit itself; its seed is that of everything that is drawn at random.
+        backend: Who renders.
+        command: The words that started it, for the report; may be empty.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If the folder holds what would be lost, or the capture cannot be used.
+        FileFormatError: If a file of the capture or a checkpoint is damaged.
+    """
+    options = options or MakeSceneOptions()
+    fit_options = fit_options or FitOptions()
+    resumed = check_fit_output(folder, resume=options.resume, overwrite=options.overwrite)
+    capture, poses = capture_of(
+        data,
+        scene=folder,
+        format=options.format,
+        poses=options.poses,
+        frames=options.frames,
+        seed=fit_options.seed,
+        observer=observer,
+    )
+    for note in (*capture.notes, reduction_note(capture.train_views, longest=fit_options.longest)):
+        if note is not None:
+            observer.note(note)
+    observer.info(_beginning(capture, fit_options))
+    if resumed is not None:
+        observer.info(resumed)
+    with deferred_interrupts() as interrupts:
+        with observer.fit_stage() as step:
+            result = fit(
+                capture,
+                options=fit_options,
+                backend=backend,
+                progress=step,
+                checkpoints=_checkpoints(folder, options),
+            )
+        provenance = _provenance(options, fit_options, backend, result)
+        _save(folder, capture, result, provenance, keep=options.keep_checkpoint)
+    stopped = interrupts.requested or result.interrupted
+    scores, report = score_and_report(
+        folder,
+        capture,
+        result,
+        options=fit_options,
+        backend=backend,
+        scoring=not stopped,
+        command=command,
+    )
+    return MadeScene(
+        folder=folder,
+        capture=capture,
+        result=result,
+        interrupted=stopped,
+        scores=scores,
+        held_out=sum(view.image is not None for view in capture.test_views),
+        report=report,
+        poses=poses,
+    )
+
+
+def _save(
+    folder: Path, capture: Capture, result: FitResult, provenance: dict[str, Any], *, keep: bool
+) -> None:
+    """Write the scene; then a finished fit needs its checkpoint no more."""
+    scene = Scene(
+        gaussians=result.gaussians,
+        views=result.views,
+        classes=capture.classes,
+        up=capture.up,
+        metres_per_unit=capture.metres_per_unit,
+        source=capture.path,
+        provenance=provenance,
+    )
+    save_scene(scene, folder)
+    if not (result.interrupted or keep):
+        discard_checkpoint(folder / CHECKPOINT_FILE)
+
+
+def _checkpoints(folder: Path, options: MakeSceneOptions) -> Checkpoints:
+    return Checkpoints(
+        path=folder / CHECKPOINT_FILE,
+        seconds=options.checkpoint_every,
+        steps=options.checkpoint_steps,
+        resume=options.resume,
+        at_end=options.keep_checkpoint,
+    )
+
+
+def _beginning(capture: Capture, options: FitOptions) -> str:
+    train, test = len(capture.train_views), len(capture.test_views)
+    points = 0 if capture.points is None else len(capture.points)
+    drawn = ""
+    if (number := random_point_count(capture, options)) > 0:
+        where = "at" if points == 0 or options.start == "random" else "at these and up to"
+        drawn = f"; starting {where} {number} places where photographs agree"
+    return (
+        f"{capture.path} ({capture.format}): {train} training views, {test} held out, "
+        f"{points} start points{drawn}"
+    )
+
+
+def _provenance(
+    options: MakeSceneOptions, fit_options: FitOptions, backend: str, result: FitResult
+) -> dict[str, Any]:
+    return {
+        "command": "fit",
+        "steps": result.steps,
+        "seconds": round(result.seconds, 3),
+        "interrupted": result.interrupted,
+        "seed": fit_options.seed,
+        "preset": options.preset,
+        "backend": backend,
+        "options": asdict(fit_options),
+        **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),
+        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+    }

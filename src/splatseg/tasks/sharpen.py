@@ -1,0 +1,299 @@
+"""A new scene whose Gaussians belong to one side each of a layer's boundaries."""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatseg.core import (
+    UNLABELLED,
+    Gaussians,
+    InstanceTree,
+    Labels,
+    LabelSource,
+    Layer,
+    Scene,
+    View,
+    layer_address,
+)
+from splatseg.edit import Document, layer_called, save_document
+from splatseg.edit.document import BASE, HISTORY
+from splatseg.errors import InputError
+from splatseg.evaluate import psnr, render_and_photograph
+from splatseg.fit import (
+    EXPOSURES,
+    FitOptions,
+    exposures_record,
+    recorded_exposures,
+    refinement_options,
+)
+from splatseg.io.evidence import Evidence, copy_evidence, find_evidence, open_evidence
+from splatseg.lift import (
+    ConfusionOptions,
+    EvidenceSegments,
+    MatchedMaps,
+    Sharpened,
+    SharpenOptions,
+    sharpen,
+)
+from splatseg.methods import keeps_ids
+from splatseg.render import BackendName
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.new_scene import check_new_folder
+from splatseg.tasks.scene_parts import mask_use, views_that_made
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharpenSceneOptions:
+    """What is sharpened by what, and how it is measured."""
+
+    layer: str
+    """The layer whose boundaries count: labels."""
+
+    evidence: str | None = None
+    """Name of the evidence that tells where boundaries are. None takes what the layer was made
+    from. Segments with ids of each view's own take those of the layer that they fit best."""
+
+    measure: int = 8
+    """Held-out views in which renders are compared with photographs before and after; 0 for
+    none."""
+
+    seed: int = 0
+    """Seed of the order of views and of random codes."""
+
+    def __post_init__(self) -> None:
+        if self.measure < 0:
+            raise InputError(f"measure: expected 0 or more, got {self.measure}.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SharpenedScene:
+    """A new scene folder, and what sharpening changed."""
+
+    folder: Path
+    document: Document
+    agreement: tuple[float, float]
+    """Share of the light of labelled pixels, in [0, 1], that comes from Gaussians of their
+    label, before and after."""
+
+    psnr: tuple[float, float] | None
+    """PSNR of renders against photographs before and after, dB; None where not measured."""
+
+    measured_views: int
+    """Views of the PSNR."""
+
+
+def sharpen_scene(
+    document: Document,
+    folder: Path,
+    *,
+    options: SharpenSceneOptions,
+    sharpen_options: SharpenOptions | None = None,
+    confusion: ConfusionOptions | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> SharpenedScene:
+    """Go on learning from photographs and evidence until Gaussians have one label each.
+
+    The new scene has as many Gaussians in the same order. The layer is decided anew; other
+    layers come along, and the evidence if it is the scene's own. It is written whole or not at
+    all.
+
+    Args:
+        document: The scene with its layers, read from its folder.
+        folder: The scene folder to write.
+        options: The layer, the evidence, and what is measured.
+        sharpen_options: How long, and how much labels count.
+        confusion: How the evidence errs; None decides labels by plain majority.
+        backend: Who renders.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If there is no such layer or evidence, or something is in the way.
+    """
+    check_new_folder(folder)
+    how = sharpen_options or SharpenOptions()
+    scene = document.scene
+    layer = _layer(document, options.layer)
+    evidence, source, views = _source(scene, layer, options, backend)
+    spaced = _spaced(scene, options.measure)
+    before = _psnr(scene, scene.gaussians, spaced, backend)
+    exposures = recorded_exposures(scene.provenance)
+    with observer.stage("sharpen") as step:
+        found = sharpen(
+            scene.gaussians,
+            views,
+            source,
+            options=how,
+            confusion=confusion,
+            fit_options=fit_options_of(scene, views),
+            exposures=exposures,
+            seed=options.seed,
+            backend=backend,
+            progress=step,
+        )
+    after = _psnr(scene, found.gaussians, spaced, backend)
+    provenance = _provenance(scene, options, how, found, psnr=[before, after])
+    if found.exposures:
+        provenance[EXPOSURES] = exposures_record({**exposures, **found.exposures})
+    layers = {**document.layers, **_sharpened(document, options.layer, merged(layer, found))}
+    new = replace(scene, gaussians=found.gaussians, provenance=provenance)
+    saved = save_document(Document(scene=new, layers=layers), folder)
+    # What lies in the scene's own folder would be out of reach from the new one.
+    if scene.root is not None and _lies_in(evidence.folder, scene.root / "evidence"):
+        copy_evidence(evidence.folder, folder)
+    return SharpenedScene(
+        folder=folder,
+        document=saved,
+        agreement=found.agreement,
+        psnr=None if before is None or after is None else (before, after),
+        measured_views=len(spaced),
+    )
+
+
+def merged(layer: Labels, found: Sharpened) -> Labels:
+    """The layer with what was decided anew; what no pixel shows keeps what it had."""
+    new = found.labels
+    decided = new.ids != UNLABELLED
+    inferred = torch.zeros(len(layer), dtype=torch.bool)
+    if layer.inferred is not None:
+        inferred = layer.inferred & ~decided
+    evidence = new.evidence
+    if evidence is not None and layer.evidence is not None:
+        evidence = torch.where(decided, evidence, layer.evidence)
+    views = new.effective_views
+    if views is not None and layer.effective_views is not None:
+        views = torch.where(decided, views, layer.effective_views)
+    return replace(
+        layer,
+        ids=torch.where(decided, new.ids, layer.ids),
+        confidence=torch.where(decided, new.confidence, layer.confidence),
+        candidates=None,
+        shares=None,
+        evidence=evidence,
+        effective_views=views,
+        inferred=inferred if bool(inferred.any()) else None,
+        metadata=dict(layer.metadata) | {"sharpened": new.metadata["sharpened"]},
+    )
+
+
+def views_to_learn_from(scene: Scene, layer: Labels, evidence: Evidence) -> tuple[View, ...]:
+    """The views that made the layer and have a photograph.
+
+    Raises:
+        InputError: If there is none.
+    """
+    views = views_that_made(scene, layer.metadata, evidence)
+    views = tuple(view for view in views if view.image is not None)
+    if not views:
+        raise InputError(
+            f"{evidence.folder}: expected evidence of a view with a photograph that may be used, "
+            "got none."
+        )
+    return views
+
+
+def fit_options_of(scene: Scene, views: tuple[View, ...]) -> FitOptions:
+    """How the scene's photographs are compared; without depth where no view has a depth map."""
+    options = refinement_options(scene.provenance)
+    if all(view.depth is None for view in views):
+        options = replace(options, depth="off")
+    return options
+
+
+def _provenance(
+    scene: Scene,
+    options: SharpenSceneOptions,
+    how: SharpenOptions,
+    found: Sharpened,
+    *,
+    psnr: list[float | None],
+) -> dict[str, Any]:
+    provenance = {
+        key: value for key, value in scene.provenance.items() if key not in (HISTORY, BASE)
+    }
+    provenance["sharpened"] = {
+        "scene": None if scene.root is None else scene.root.resolve().as_posix(),
+        "layer": options.layer,
+        "options": asdict(how),
+        "seed": options.seed,
+        "agreement": list(found.agreement),
+        "psnr": psnr,
+    }
+    return provenance
+
+
+def _lies_in(folder: Path, parent: Path) -> bool:
+    return folder.resolve().parent == parent.resolve()
+
+
+def _sharpened(document: Document, address: str, labels: Labels) -> dict[str, Layer]:
+    """The layer after sharpening, under its name; a tree keeps the levels above and below."""
+    name, level = layer_address(address)
+    whole = document.layers[name]
+    if isinstance(whole, InstanceTree):
+        return {name: whole.with_cut(labels, level or "object")}
+    return {name: labels}
+
+
+def _layer(document: Document, name: str) -> Labels:
+    layer = layer_called(document.layers, name)
+    if not isinstance(layer, Labels):
+        raise InputError(f"layer: expected labels, {name} is a selection or features.")
+    return layer
+
+
+def _source(
+    scene: Scene, layer: Labels, options: SharpenSceneOptions, backend: BackendName
+) -> tuple[Evidence, LabelSource, tuple[View, ...]]:
+    """The evidence, label maps of it with the layer's ids, and the views to learn from."""
+    name = options.evidence or layer.metadata.get("evidence")
+    if not isinstance(name, str):
+        raise InputError(
+            f"evidence: expected a name, as layer {options.layer} does not say what it was "
+            "made from; got none."
+        )
+    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+    own = name == layer.metadata.get("evidence")
+    zero = own and "source_ids" in layer.metadata
+    evidence = open_evidence(find_evidence(folders, name), zero_is_class=zero)
+    views = views_to_learn_from(scene, layer, evidence)
+    same = own and keeps_ids(layer.metadata.get("method"))
+    if same and evidence.kind in ("labels", "tracked"):
+        return evidence, evidence, views
+    if evidence.kind not in ("masks", "panoptic", "tracked"):
+        raise InputError(
+            f"evidence: expected the label maps that layer {options.layer} was made from, or "
+            f"segments of objects; {name} is {evidence.kind}."
+        )
+    matched = MatchedMaps(
+        gaussians=scene.gaussians,
+        views=views,
+        source=EvidenceSegments(evidence=evidence),
+        labels=layer,
+        backend=backend,
+    )
+    return evidence, matched, views
+
+
+def _spaced(scene: Scene, most: int) -> tuple[View, ...]:
+    """Some held-out views, or training views where there are none."""
+    pool = [view for view in scene.test_views or scene.train_views if view.image is not None]
+    pool = [view for view in pool if view.image is not None and view.image.is_file()]
+    if not pool or not most:
+        return ()
+    return tuple(pool[:: -(-len(pool) // most)])
+
+
+def _psnr(
+    scene: Scene, gaussians: Gaussians, views: tuple[View, ...], backend: str
+) -> float | None:
+    if not views:
+        return None
+    masks = mask_use(scene)
+    scores = [
+        psnr(*render_and_photograph(gaussians, view, masks=masks, backend=backend))
+        for view in views
+    ]
+    return sum(scores) / len(scores)
