@@ -215,7 +215,7 @@ def cues(bench: Bench) -> None:
         longest_side=options.longest_side,
     )
     agreement = table.agreement()
-    nested = nesting(agreement)
+    nested = nesting(agreement, table.level)
     group = cluster(nested.agreement, options.agreement, conflicts=nested.conflicts)
     found = segment_tree(
         table,

@@ -103,3 +103,67 @@ def test_one_contradiction_among_many_views_keeps_nothing_apart() -> None:
     together = cluster(found.agreement, 0.2, conflicts=found.conflicts)
     assert together[:6].tolist() == [0] * 6
     assert together[6] == 1
+
+
+LEVEL = np.array([0, 1] * 3)
+
+
+def test_masks_of_different_levels_of_one_view_are_never_one_instance() -> None:
+    # The whole twice in each view, once as a part and once as an object: shapes say nothing.
+    share = np.array([WHOLE] * 6, dtype=np.float64)
+    plain, said = nesting(agreement(share, VIEW)), nesting(agreement(share, VIEW), LEVEL)
+    assert cluster(plain.agreement, 0.2, conflicts=plain.conflicts).tolist() == [0] * 6
+    together = cluster(said.agreement, 0.2, conflicts=said.conflicts)
+    assert together.tolist() == [0, 1, 0, 1, 0, 1]
+    assert sorted(zip(*said.inside.nonzero(), strict=True)) == [(0, 1), (2, 3), (4, 5)]
+
+
+def test_levels_keep_apart_what_views_would_outvote() -> None:
+    # One view of six has a fragment besides, at another level, beside what is seen of the whole.
+    share = np.array([WHOLE] * 5 + [[1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], dtype=np.float64)
+    view = [0, 1, 2, 3, 4, 5, 5]
+    plain = nesting(agreement(share, view))
+    assert cluster(plain.agreement, 0.2, conflicts=plain.conflicts).tolist() == [0] * 7
+    said = nesting(agreement(share, view), np.array([1] * 6 + [0]))
+    assert cluster(said.agreement, 0.2, conflicts=said.conflicts).tolist() == [0] * 6 + [1]
+    assert said.inside.nnz == 0
+    assert said.share == 0
+
+
+def test_of_two_levels_the_finer_lies_inside_even_where_it_holds_more() -> None:
+    share = np.array([WHOLE, [1, 1, 1, 1, 0]], dtype=np.float64)
+    assert list(zip(*nesting(agreement(share, [0, 0])).inside.nonzero(), strict=True)) == []
+    finer = nesting(agreement(share, [0, 0]), np.array([0, 1]))
+    assert list(zip(*finer.inside.nonzero(), strict=True)) == [(0, 1)]
+    # What is mostly outside lies in nothing, whatever its level.
+    apart = np.array([[1, 1, 1, 1, 0], [0, 0, 0, 1, 1]], dtype=np.float64)
+    assert nesting(agreement(apart, [0, 0]), np.array([0, 1])).inside.nnz == 0
+
+
+def test_levels_all_alike_say_nothing() -> None:
+    one, other = nesting(agreement(SHARE, VIEW)), nesting(agreement(SHARE, VIEW), np.full(6, 2))
+    assert (one.inside != other.inside).nnz == 0
+    assert (one.conflicts != other.conflicts).nnz == 0
+    assert other.forbidden.nnz == 0
+
+
+def test_masks_of_different_views_may_have_different_levels() -> None:
+    share = np.array([WHOLE] * 3, dtype=np.float64)
+    found = nesting(agreement(share, [0, 1, 2]), np.array([0, 1, 2]))
+    assert found.conflicts.nnz == 0
+    assert cluster(found.agreement, 0.2, conflicts=found.conflicts).tolist() == [0, 0, 0]
+
+
+def test_containment_counts_from_seven_tenths_on_and_the_same_from_eight() -> None:
+    ten = np.ones(10)
+
+    def holds(count: int, start: int = 0) -> np.ndarray:
+        return np.array([start <= i < start + count for i in range(16)], dtype=np.float64)
+
+    for inside, count in ((7, 1), (6, 0)):
+        # Ten Gaussians of which `inside` lie in a set of twelve.
+        share = np.stack((holds(10), holds(12, 10 - inside)))
+        assert nesting(agreement(share, [0, 0])).inside.nnz == count
+    for smaller, count in ((8, 0), (7, 1)):
+        share = np.stack((np.append(ten, np.zeros(6)), holds(smaller)))
+        assert nesting(agreement(share, [0, 0])).inside.nnz == count

@@ -31,6 +31,7 @@ def table(rng) -> SegmentTable:
         size=np.bincount(segment, mass, minlength=SEGMENTS),
         category=np.full(SEGMENTS, -1),
         score=np.ones(SEGMENTS),
+        level=np.zeros(SEGMENTS, np.int64),
     )
 
 

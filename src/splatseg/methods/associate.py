@@ -13,7 +13,8 @@ by `lift.mass.confusion`: a model that misses a cup calls its pixels table, far 
 that sees a cup where there is only table, and the votes themselves tell how often.
 
 Where masks overlap, segments of one view that lie inside each other are of different levels and
-never one instance (`splatseg.lift.segments.nesting`). Groups of segments then become a tree
+never one instance (`splatseg.lift.segments.nesting`); nor are those to which a model itself gave
+different levels. Groups of segments then become a tree
 (`splatseg.lift.segments.tree`), whose levels say which nodes are objects
 (`splatseg.lift.segments.levels`); masks of objects and of their parts vote for the objects, and
 within each object for its parts. With ``overlapping="flat"`` there are no levels: groups of masks
@@ -204,7 +205,7 @@ def _tree(
     classes: ClassTable | None,
 ) -> InstanceTree:
     """Groups, objects and parts of segments that lie inside each other."""
-    nested = nesting(agreement)
+    nested = nesting(agreement, table.level)
     group = cluster(nested.agreement, options.agreement, conflicts=nested.conflicts)
     found = segment_tree(
         table,

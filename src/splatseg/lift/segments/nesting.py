@@ -6,12 +6,18 @@ With the soft share :math:`s_{ai}` of Gaussian i that segment a holds of what it
 
 is about 1 where a lies inside b, and near 0 where they are apart. Both sums stand in the
 agreement of all segments already, so that no pixel is read again.
+
+Where the model itself gives levels, they decide: two segments of one view with different levels
+are never one instance, even if they hold the same Gaussians, and of two such the finer is the one
+that lies inside. Between segments of one level, and where there are no levels, C decides alone.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatseg.lift.segments.clustering import Agreement
 
@@ -33,35 +39,51 @@ class Nesting:
     inside: Any
     """Sparse boolean (segments, segments): the row lies inside the column, in one view."""
 
+    forbidden: Any
+    """Sparse symmetric boolean (segments, segments): pairs of one view to which the model gave
+    different levels."""
+
     @property
     def conflicts(self) -> Any:
-        """Sparse symmetric (segments, segments): 1 where two segments are of different levels."""
+        """Sparse symmetric (segments, segments): above 0 where two are of different levels.
+
+        1 where their shapes say so, which other views may outvote; where the model says so, as
+        many as there are views, which none can.
+        """
         both = self.inside + self.inside.T
         both.data[:] = 1.0
-        return both.tocsr()
+        views = self.agreement.seen.shape[1]
+        return both.maximum(self.forbidden * float(views)).tocsr()
 
     @property
     def share(self) -> float:
         """Share of the segments that lie inside another or have another inside, in [0, 1]."""
-        return float(np.mean(np.diff(self.conflicts.indptr) > 0)) if self.inside.shape[0] else 0.0
+        both = (self.inside + self.inside.T).tocsr()
+        return float(np.mean(np.diff(both.indptr) > 0)) if both.shape[0] else 0.0
 
 
-def nesting(agreement: Agreement) -> Nesting:
+def nesting(agreement: Agreement, level: NDArray[np.int64] | None = None) -> Nesting:
     """Find what lies inside what within each view.
 
     Args:
         agreement: What all pairs of segments share, with what each shares with itself on the
             diagonal.
+        level: (segments,): granularity that the model gave to each segment, 0 the finest. None
+            and all alike say nothing.
     """
     import scipy.sparse
 
+    if level is None:
+        level = np.zeros(len(agreement.view), np.int64)
     pairs = agreement.shared.tocoo()
     own = np.asarray(agreement.shared.diagonal(), dtype=np.float64)
     same_view = (agreement.view[pairs.row] == agreement.view[pairs.col]) & (pairs.row != pairs.col)
     row, column, both = pairs.row[same_view], pairs.col[same_view], pairs.data[same_view]
     union = own[row] + own[column] - both
-    twice = both >= _SAME * union
-    inside = ~twice & (both >= MIN_CONTAINMENT * own[row]) & (own[row] < own[column])
+    step = level[column] - level[row]
+    twice = (both >= _SAME * union) & (step == 0)
+    finer = (step > 0) | ((step == 0) & (own[row] < own[column]))
+    inside = ~twice & (both >= MIN_CONTAINMENT * own[row]) & finer
     kept = np.ones(len(pairs.data), bool)
     kept[np.flatnonzero(same_view)[~twice]] = False
     shape = pairs.shape
@@ -75,4 +97,21 @@ def nesting(agreement: Agreement) -> Nesting:
         inside=scipy.sparse.csr_matrix(
             (np.ones(int(inside.sum())), (row[inside], column[inside])), shape=shape
         ),
+        forbidden=_different_levels(agreement.view, level),
     )
+
+
+def _different_levels(view: NDArray[np.int64], level: NDArray[np.int64]) -> Any:
+    """Sparse symmetric (segments, segments): 1 where two of one view differ in level."""
+    import scipy.sparse
+
+    order = np.argsort(view, kind="stable")
+    bounds = np.flatnonzero(np.diff(view[order], prepend=-1, append=-1))
+    pairs = [np.zeros((2, 0), np.int64)]
+    for start, stop in pairwise(bounds.tolist()):
+        own = order[start:stop]
+        row, column = np.nonzero(level[own][:, None] != level[own][None, :])
+        pairs.append(np.stack((own[row], own[column])))
+    row, column = np.concatenate(pairs, axis=1)
+    count = len(view)
+    return scipy.sparse.csr_matrix((np.ones(len(row)), (row, column)), shape=(count, count))

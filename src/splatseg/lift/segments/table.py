@@ -83,6 +83,9 @@ class SegmentTable:
     score: NDArray[np.float64]
     """(segments,): how sure the model was, in [0, 1]."""
 
+    level: NDArray[np.int64]
+    """(segments,): granularity that the model gave, 0 the finest; all 0 where it gives none."""
+
     def votes(self, group: NDArray[np.int64], weight: NDArray[np.float64]) -> Any:
         """Sparse (Gaussians, groups): mass by group; segments of group -1 have no vote."""
         import scipy.sparse
@@ -246,7 +249,7 @@ def segment_table(
             raise InputError(f"evidence: there are no segments of view {view.name!r}.")
     ordered = sorted(views, key=lambda view: view.name)
     entries = SegmentEntries(len(gaussians), most_views)
-    rows: list[tuple[int, int, int, float]] = []
+    rows: list[tuple[int, int, int, float, int]] = []
     for place, view in enumerate(ordered):
         segments = source.segments_of(view.name)
         names, scores = _in_order(segments)
@@ -261,7 +264,7 @@ def segment_table(
         camera = camera_of_map(view, segments.height, segments.width)
         found = view_masses(gaussians, camera, segments, options=render_options, backend=backend)
         rows += [
-            (place, name, categories.get(name, UNLABELLED), score)
+            (place, name, categories.get(name, UNLABELLED), score, _level_of(segments, name))
             for name, score in zip(names, scores, strict=True)
         ]
         _add(entries, found, names, worth, outside=isinstance(segments, MaskSet))
@@ -269,7 +272,9 @@ def segment_table(
             progress(place + 1, len(ordered))
     if not rows:
         raise InputError(f"evidence: expected a segment in {len(views)} views, found none.")
-    view_of, name_of, category, score = (np.array(column) for column in zip(*rows, strict=True))
+    view_of, name_of, category, score, level = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
     gaussian, segment, mass, seen = entries.result()
     starts = np.searchsorted(segment, np.arange(len(rows) + 1)).tolist()
     size = [float(mass[a:b].sum(dtype=np.float64)) for a, b in pairwise(starts)]
@@ -285,6 +290,7 @@ def segment_table(
         size=np.array(size),
         category=category.astype(np.int64),
         score=score.astype(np.float64),
+        level=level.astype(np.int64),
     )
 
 
@@ -341,10 +347,16 @@ def _in_order(segments: LabelMap | MaskSet) -> tuple[list[int], list[float]]:
     """Names of segments by their first pixel, of masks with the same one by area, and scores."""
     if isinstance(segments, MaskSet):
         starts = [
-            (_first_pixel(segments, i), mask.area, mask.counts.tobytes(), i)
+            (
+                _first_pixel(segments, i),
+                mask.area,
+                mask.counts.tobytes(),
+                int(segments.levels[i]),
+                i,
+            )
             for i, mask in enumerate(segments.masks)
         ]
-        order = [i for _, area, _, i in sorted(starts) if area > 0]
+        order = [i for _, area, _, _, i in sorted(starts) if area > 0]
         return order, [float(segments.scores[i]) for i in order]
     ids = segments.ids.reshape(-1).numpy()
     names, first = np.unique(ids, return_index=True)
@@ -355,6 +367,11 @@ def _in_order(segments: LabelMap | MaskSet) -> tuple[list[int], list[float]]:
         return [name for _, name in pairs], [1.0] * len(pairs)
     sure = segments.confidence.reshape(-1)
     return [name for _, name in pairs], [float(sure[at]) for at, _ in pairs]
+
+
+def _level_of(segments: LabelMap | MaskSet, name: int) -> int:
+    """The granularity of a mask; segments of label maps have none."""
+    return int(segments.levels[name]) if isinstance(segments, MaskSet) else 0
 
 
 def _first_pixel(segments: MaskSet, index: int) -> int:

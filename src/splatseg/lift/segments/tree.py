@@ -1,7 +1,8 @@
 """Groups of segments of all levels become a tree: what lies inside what.
 
 A node is a set of Gaussians, those that its segments hold most of (its core). It lies inside the
-smallest other node that covers most of it, unless the views say otherwise: where segments of both
+smallest other node that covers most of it, none that is of a finer level where the model gives
+levels, unless the views say otherwise: where segments of both
 are seen in one view, they must lie inside each other there as well (`lift.segments.nesting`).
 Groups that few of the views saw which could have seen them are no nodes: where a model cuts a
 thing along a shadow it does so in one view and not in the next.
@@ -39,7 +40,8 @@ class SegmentTree:
     """(segments,): the node of each segment, -1 for none."""
 
     parent: NDArray[np.int64]
-    """(nodes,): row of the parent, -1 for none. Parents have larger cores."""
+    """(nodes,): row of the parent, -1 for none. Parents have larger cores, or are coarser where
+    the model gives levels."""
 
     size: NDArray[np.float64]
     """(nodes,): square root of what is seen of each Gaussian, summed over the core."""
@@ -92,7 +94,7 @@ def segment_tree(
     support, views = _support(agreement, group, len(table.views))
     group = _renumbered(group, np.flatnonzero((support >= min_support) & (views >= min_views)))
     both = _overlaps(table, group)
-    same = _same_nodes(both)
+    same = _same_nodes(both, _forbidden(nested, group, len(both)))
     if same is not None:
         group = np.where(group >= 0, same[group], -1)
         both = _overlaps(table, group)
@@ -174,10 +176,23 @@ def _held_most(
     return entries.row[most], entries.col[most], entries.data[most]
 
 
-def _same_nodes(both: NDArray[np.float64]) -> NDArray[np.int64] | None:
+def _forbidden(nested: Nesting, group: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """(groups, groups): whether the model gave segments of both different levels in one view."""
+    pairs = nested.forbidden.tocoo()
+    one, other = group[pairs.row], group[pairs.col]
+    known = (one >= 0) & (other >= 0)
+    found = np.zeros((count, count), bool)
+    found[one[known], other[known]] = True
+    return found
+
+
+def _same_nodes(
+    both: NDArray[np.float64], forbidden: NDArray[np.bool_]
+) -> NDArray[np.int64] | None:
     """Where each group goes: to the earlier of two with the same core; None if none do."""
     size = both.diagonal()
     ratio = both / np.maximum(size[:, None] + size[None, :] - both, 1e-12)
+    ratio[forbidden] = 0
     np.fill_diagonal(ratio, 0)
     best = ratio.argmax(axis=1)
     row = np.arange(len(size))
@@ -209,10 +224,21 @@ def _parents(
     together = there @ there.T
     # A node seen beside another no more than once cannot be told from it by views.
     agrees = (together < 2) | (inside >= _MIN_NESTED * together)
-    larger = (size[None, :] > size[:, None]) | (
-        (size[None, :] == size[:, None]) & (np.arange(count)[None, :] < np.arange(count)[:, None])
-    )
+    # The model's level goes before size: a whole of which little is seen is still the whole.
+    rank = np.empty(count, np.int64)
+    level = _median_level(table, group, count)
+    rank[np.lexsort((-np.arange(count), size, level))] = np.arange(count)
+    larger = rank[None, :] > rank[:, None]
     fits = agrees & larger & (both >= overlap * size[:, None]) & (size > 0)[:, None]
-    smallest = np.where(fits, size[None, :], np.inf)
+    smallest = np.where(fits, rank[None, :], count)
     best = smallest.argmin(axis=1) if count else np.zeros(0, np.int64)
     return np.where(fits.any(axis=1), best, -1).astype(np.int64)
+
+
+def _median_level(table: SegmentTable, group: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """The level that the segments of each group have, of an even number the finer middle one."""
+    member = np.flatnonzero(group >= 0)
+    order = member[np.lexsort((table.level[member], group[member]))]
+    size = np.bincount(group[member], minlength=count)
+    first = np.cumsum(size) - size
+    return table.level[order[first + (size - 1) // 2]]
