@@ -1,14 +1,18 @@
 """Masks that are nested in every view become a tree of groups, objects and parts."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from splatseg.core import InstanceTree, Labels, MaskSet, Rle, View
+from splatseg.core import TREE_LEVELS, InstanceTree, Labels, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError
 from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
+from splatseg.render.cpu import set_threads, threads
 
 from .test_associate import BACKEND, GAUSSIANS, VIEWS, Segments, columns
 
@@ -162,3 +166,139 @@ def test_ids_count_objects_first_by_what_is_seen_of_them() -> None:
     assert evidence is not None
     mass = [float(evidence[tree.cut().ids == id].sum()) for id in (1, 2, 3)]
     assert np.all(np.diff(mass) <= 0)
+
+
+def with_levels(source: Segments, levels: Sequence[int]) -> Segments:
+    given = torch.tensor(levels, dtype=torch.int32)
+    return replace(source, of={name: replace(m, levels=given) for name, m in source.of.items()})
+
+
+def test_levels_that_a_model_gives_keep_masks_of_a_view_apart() -> None:
+    # The right square twice in every view: once as a part, once as an object.
+    twice = nested({view.name: ((4,), (0, 1), (4,)) for view in VIEWS})
+    plain = tree_of(twice)
+    assert {node.level for node in plain.nodes} == {"object"}
+    assert sets(plain.cut()) == {LEFT, RIGHT}
+    said = tree_of(with_levels(twice, (0, 1, 1)))
+    assert [node.level for node in said.nodes] == ["object", "object", "part"]
+    right = said.nodes[2].parent
+    assert set(said.cut("object").ids[8:12].tolist()) == {right}
+    assert set(said.cut("part").ids[8:12].tolist()) == {3}
+    # Whichever of the two comes first in the file.
+    turned = tree_of(with_levels(nested({v.name: ((4,), (0, 1), (4,)) for v in VIEWS}), (1, 1, 0)))
+    assert turned.nodes == said.nodes
+    assert torch.equal(turned.labels.ids, said.labels.ids)
+
+
+def test_levels_that_agree_with_shapes_change_no_node() -> None:
+    levels = [0] * 4 + [1, 1, 2, 1]
+    assert tree_of(with_levels(nested(), levels)).nodes == tree_of(nested()).nodes
+
+
+def bits(tree: InstanceTree) -> list[bytes]:
+    labels = tree.labels
+    assert labels.evidence is not None
+    columns = (labels.ids, labels.confidence, labels.evidence)
+    return [column.contiguous().numpy().tobytes() for column in columns]
+
+
+def test_same_bits_at_one_two_and_three_threads() -> None:
+    before = torch.get_num_threads(), threads()
+    found = []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            set_threads(count)
+            tree = associate(GAUSSIANS, VIEWS, ragged(7), backend="cpu")
+            assert isinstance(tree, InstanceTree)
+            found.append(tree)
+    finally:
+        torch.set_num_threads(before[0])
+        set_threads(before[1])
+    assert len(found[0].nodes) > 3
+    for other in found[1:]:
+        assert other.nodes == found[0].nodes
+        assert bits(other) == bits(found[0])
+        assert other.metadata == found[0].metadata
+
+
+def ragged(seed: int, views: Sequence[View] = VIEWS) -> Segments:
+    """Masks as models err: each view lacks some, and has unions of strips that nothing is."""
+    rng = np.random.default_rng(seed)
+    strips = {}
+    for view in views:
+        kept = [wanted for wanted in NESTED if rng.random() < 0.8] or [NESTED[0]]
+        first, count = int(rng.integers(0, 4)), int(rng.integers(1, 4))
+        strips[view.name] = [*kept, tuple(range(first, min(first + count, 5)))]
+    return nested(strips, views)
+
+
+def shuffled(source: Segments, rng: np.random.Generator) -> Segments:
+    """The masks of every view in another order, so that each has another name."""
+    found = {}
+    for name, masks_of in source.of.items():
+        order = rng.permutation(len(masks_of))
+        found[name] = replace(masks_of, masks=tuple(masks_of.masks[i] for i in order))
+    return replace(source, of=found)
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 10**6))
+def test_the_whole_tree_follows_neither_order_nor_names(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    source = ragged(seed)
+    one = tree_of(source)
+    other = tree_of(shuffled(source, rng), [VIEWS[i] for i in rng.permutation(len(VIEWS))])
+    assert one.nodes == other.nodes
+    assert bits(one) == bits(other)
+    assert one.metadata == other.metadata
+
+
+def test_names_of_views_are_in_the_metadata_alone() -> None:
+    source, names = ragged(3), {"v0": "z", "v1": "c", "v2": "m", "v3": "a"}
+    renamed = [replace(view, name=names[view.name]) for view in VIEWS]
+    other = tree_of(
+        replace(source, of={names[name]: found for name, found in source.of.items()}), renamed
+    )
+    one = tree_of(source)
+    assert one.metadata["views"] != other.metadata["views"]
+    for level in TREE_LEVELS:
+        assert sets(one.cut(level)) == sets(other.cut(level))
+    kinds = [
+        sorted((n.level, n.support, n.segments, n.views) for n in t.nodes) for t in (one, other)
+    ]
+    assert kinds[0] == kinds[1]
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10**6), min_support=st.sampled_from([0.0, 0.3, 0.6]))
+def test_whatever_masks_come_cuts_lie_inside_each_other(seed: int, min_support: float) -> None:
+    """Part inside object inside group as sets, children inside parents, siblings apart."""
+    tree = tree_of(ragged(seed), min_support=min_support)
+    cuts = {level: tree.cut(level).ids for level in TREE_LEVELS}
+    members = {
+        node.id: frozenset(
+            i
+            for i, id in enumerate(tree.labels.ids.tolist())
+            if id > 0 and node.id in tree.path(id)
+        )
+        for node in tree.nodes
+    }
+    assert all(members.values()), "a node without a Gaussian says nothing"
+    for node in tree.nodes:
+        if node.parent > 0:
+            assert members[node.id] <= members[node.parent]
+    for fine, coarse in (("part", "object"), ("object", "group")):
+        inside = cuts[fine] > 0 if fine == "object" else cuts["object"] > 0
+        for id in cuts[fine][inside].unique().tolist():
+            above = cuts[coarse][cuts[fine] == id].unique().tolist()
+            assert len(above) == 1
+            assert above[0] in tree.path(id)
+        # Nothing gets lost on the way up.
+        assert bool((cuts[coarse][inside] > 0).all())
+    for node in tree.nodes:
+        if node.level == "object":
+            assert (
+                frozenset((cuts["object"] == node.id).nonzero().squeeze(1).tolist())
+                == members[node.id]
+            )
