@@ -1,8 +1,10 @@
-"""Makes the golden scene folder of the current format version in tests/golden/scene-v1.
+"""Makes the golden files of the current format versions in tests/golden.
 
-Run from the project's root: ``python tests/golden/make_io.py``. A version's files are made
-once and then kept: later versions of splatseg must read them. The scene has one view of each
-lens, evidence of each kind that is written and a layer of each kind.
+Run from the project's root: ``python tests/golden/make_io.py``. It makes what is not there:
+scene-v1, a scene folder with one view of each lens, evidence of each kind that is written and a
+layer of each kind that version 1 of layers has; and layers-v2, a layer of the kind that came with
+version 2. A version's files are made once and then kept: later versions of splatseg must read
+them.
 """
 
 import json
@@ -18,17 +20,22 @@ from splatseg.core import (
     FeatureMap,
     Features,
     Gaussians,
+    InstanceTree,
     LabelMap,
     Labels,
     MaskSet,
     Scene,
     Selection,
+    TreeNode,
     View,
 )
 from splatseg.io.evidence import create_evidence, save_features, save_label_map, save_masks
+from splatseg.io.layers import VERSION as LAYER_VERSION
+from splatseg.io.layers import save_layer
 from splatseg.io.scene import CAMERAS_FILE, SCENE_FILE, VERSION, save_scene, save_scene_layer
 
 ROOT = Path(__file__).parent / f"scene-v{VERSION}"
+LAYERS = Path(__file__).parent / f"layers-v{LAYER_VERSION}"
 CLASSES = ClassTable(
     rows=(
         ClassInfo(id=1, name="wall", isthing=False, colour=(10, 20, 30)),
@@ -105,6 +112,29 @@ def golden_layers() -> dict[str, Labels | Features | Selection]:
     }
 
 
+def golden_tree() -> InstanceTree:
+    """A group of two objects, one of which has two parts, beside an object by itself."""
+    return InstanceTree(
+        nodes=(
+            TreeNode(id=1, parent=4, name="Stuhl 1", class_id=7, support=0.75, segments=9, views=3),
+            TreeNode(id=2, parent=4, name="object 2", support=0.5, segments=2, views=2),
+            TreeNode(id=3, name="object 3", segments=1, views=1),
+            TreeNode(id=4, level="group", name="group 4", support=0.25, segments=4, views=4),
+            TreeNode(id=5, parent=1, level="part", name="part 5", support=0.125),
+            TreeNode(id=9, parent=1, level="part", name="Fuß"),
+        ),
+        labels=Labels(
+            ids=torch.tensor([9, -1, 4, 5, 2, 3], dtype=torch.int32),
+            confidence=torch.tensor([0.5, 0.0, 1.0, 0.25, 0.75, 0.125]),
+            background=3,
+            evidence=torch.tensor([3.0, 0.0, 1.5, 2.0, 0.5, 8.0]),
+            effective_views=torch.tensor([1.0, 0.0, 2.5, 1.25, 1.0, 4.0]),
+            inferred=torch.tensor([False, False, True, False, True, False]),
+            metadata={"method": "associate", "views": ["left/1"]},
+        ),
+    )
+
+
 def golden_evidence() -> tuple[LabelMap, MaskSet, FeatureMap]:
     """A label map, masks and features of the view left/1."""
     ids = torch.full((6, 8), -1, dtype=torch.int32)
@@ -126,6 +156,14 @@ def golden_evidence() -> tuple[LabelMap, MaskSet, FeatureMap]:
 
 
 def main() -> None:
+    if not ROOT.exists():
+        make_scene()
+    if not LAYERS.exists():
+        LAYERS.mkdir()
+        save_layer(LAYERS / "tree.npz", golden_tree())
+
+
+def make_scene() -> None:
     save_scene(golden_scene(), ROOT)
     # The path of the machine that made it is nobody's business.
     path = ROOT / SCENE_FILE

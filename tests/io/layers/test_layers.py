@@ -1,8 +1,10 @@
 """Layers: round trips, bytes that stay the same, and files that are refused."""
 
+import importlib.util
 import io
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -72,6 +74,44 @@ def test_round_trip_and_same_bytes(tmp_path, name) -> None:
     same(LAYERS[name], read)
     save_layer(tmp_path / "b.npz", read)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def golden(project_root: Path):
+    """The script that made the golden files, as a module."""
+    path = project_root / "tests/golden/make_io.py"
+    spec = importlib.util.spec_from_file_location("make_io", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_tree_of_version_2_is_read(golden, project_root) -> None:
+    tree = load_layer(project_root / "tests/golden/layers-v2/tree.npz")
+    assert isinstance(tree, InstanceTree)
+    same(golden.golden_tree(), tree)
+    assert tree.cut("group").ids.tolist() == [4, -1, 4, 4, 4, 3]
+    assert tree.cut().ids.tolist() == [1, -1, -1, 1, 2, 3]
+    assert tree.cut("part").background == 3
+
+
+@pytest.mark.parametrize("name", ["semantic", "features", "chosen"])
+def test_layers_of_version_1_are_read_and_stay_of_version_1(
+    golden, project_root, tmp_path, name
+) -> None:
+    layer = load_layer(project_root / f"tests/golden/scene-v1/layers/{name}.npz")
+    same(golden.golden_layers()[name], layer)
+    save_layer(tmp_path / "again.npz", layer)
+    with np.load(tmp_path / "again.npz", allow_pickle=False) as archive:
+        assert json.loads(archive["header"].tobytes())["version"] == 1
+
+
+def test_layers_of_a_later_version_are_refused(tmp_path) -> None:
+    path = changed(tmp_path, lambda h, a: h.update(version=3), layer="tree")
+    with pytest.raises(FileFormatError, match="version 2 or less, got version 3"):
+        load_layer(path)
 
 
 def test_layers_without_levels_are_files_that_older_readers_know(tmp_path) -> None:
