@@ -167,3 +167,15 @@ def test_containment_counts_from_seven_tenths_on_and_the_same_from_eight() -> No
     for smaller, count in ((8, 0), (7, 1)):
         share = np.stack((np.append(ten, np.zeros(6)), holds(smaller)))
         assert nesting(agreement(share, [0, 0])).inside.nnz == count
+
+
+def test_one_pair_of_levels_among_many_views_keeps_two_groups_apart() -> None:
+    # Two sets that share four of six Gaussians, each in five views of its own and both in one.
+    one, other = [1, 1, 1, 1, 1, 0], [0, 1, 1, 1, 1, 1]
+    share = np.array([one, other] + [one] * 5 + [other] * 5, dtype=np.float64)
+    view = [0, 0, *range(1, 11)]
+    plain = nesting(agreement(share, view))
+    assert cluster(plain.agreement, 0.2, conflicts=plain.conflicts).tolist() == [0] * 12
+    said = nesting(agreement(share, view), np.array([0, 1] + [0] * 5 + [1] * 5))
+    together = cluster(said.agreement, 0.2, conflicts=said.conflicts)
+    assert together.tolist() == [0, 1] + [0] * 5 + [1] * 5
