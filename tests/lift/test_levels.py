@@ -40,6 +40,8 @@ def levels(*arguments) -> list[int]:
         ([-1, 0, 0, 1, 1], [OBJECT, PART, PART, PART, PART]),
         # A chain of one child each is an object with parts.
         ([-1, 0, 1, 2], [OBJECT, PART, PART, PART]),
+        # One thing by itself is no group, however many parts it has.
+        ([-1, 0, 1, 1, 1], [OBJECT, PART, PART, PART, PART]),
         # A room of two desks with two lamps each.
         (
             [-1, 0, 0, 1, 1, 1, 2, 2, 2, *(k for k in range(3, 9) for _ in range(2))],
