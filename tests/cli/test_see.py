@@ -252,7 +252,7 @@ def test_a_second_scene_of_the_same_photographs_uses_the_cache(small, splatseg, 
     assert status == 0
     told = [line for line in err.splitlines() if "computed again" in line]
     assert len(told) == 1
-    assert told[0].startswith(f"{entries[0]}: ")
+    assert told[0].startswith(f"note: {entries[0]}: ")
     for name in TRAIN:
         a, b = (small.scene / "evidence" / e / f"{name}.json" for e in "ab")
         assert a.read_bytes() == b.read_bytes()
@@ -507,7 +507,7 @@ def test_other_words_that_cannot_be_used(small, splatseg, recorded) -> None:
         see(splatseg, small, recorded, "--what", "labels")
     )
     sentence = refused(see(splatseg, small, recorded, "--least-area", "0.2"))
-    assert "settings of regions with --model classical" in sentence
+    assert "settings of regions with model classical" in sentence
     sentence = refused(splatseg("see", small.scene, *CLASSICAL, "--void", "3"))
     assert "--void" in sentence
     sentence = refused(splatseg("see", small.scene, "--model", "classical", "--evidence", "../up"))

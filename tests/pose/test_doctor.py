@@ -94,7 +94,7 @@ class Matched:
 
 
 def matched(capture: Capture) -> Matched:
-    matches = match_views(capture.views, max_views=OPTIONS.views, longest=OPTIONS.longest)
+    matches = match_views(capture.views, max_views=OPTIONS.max_views, longest=OPTIONS.longest)
     return Matched(capture, matches)
 
 
