@@ -193,13 +193,13 @@ def test_export_writes_the_level_that_is_asked_for(treed, run, tmp_path) -> None
 
 def test_edit_takes_a_part_and_the_tree_stays_in_step(treed, run, tmp_path) -> None:
     before = tree_in(treed.scene)
-    words = ("--remove", "--layer", "things@part", "--names", "upper", "--split", "off")
+    words = ("--remove", "--layer", "things@part", "--names", "upper", "--cut", "off")
     run("edit", treed.scene, "-o", tmp_path / "bare", *words)
     after = tree_in(tmp_path / "bare")
     assert after.nodes == before.nodes
     assert torch.equal(after.labels.ids, before.labels.ids[before.labels.ids != 5])
 
-    words = ("--extract", "--layer", "things", "--ids", 1, "--split", "off")
+    words = ("--extract", "--layer", "things", "--ids", 1, "--cut", "off")
     run("edit", treed.scene, "-o", tmp_path / "left", *words)
     left = tree_in(tmp_path / "left").labels.ids
     assert torch.equal(left, before.labels.ids[before.cut().ids == 1])
@@ -208,7 +208,7 @@ def test_edit_takes_a_part_and_the_tree_stays_in_step(treed, run, tmp_path) -> N
 
 def test_an_object_cut_at_its_border_keeps_its_parts(treed, run, tmp_path) -> None:
     """What is split along the border goes to both sides, with the deepest node that it had."""
-    words = ("--remove", "--layer", "things", "--ids", 1, "--split", "layer", *CPU)
+    words = ("--remove", "--layer", "things", "--ids", 1, "--cut", "layer", *CPU)
     before = tree_in(treed.scene)
     run("edit", treed.scene, "-o", tmp_path / "bare", *words)
     after = tree_in(tmp_path / "bare")
@@ -255,7 +255,7 @@ def test_levels_that_are_not_there_get_one_sentence(
         "render": ("--what", address, "-o", out, *CPU),
         "evaluate": ("--layer", address, "--truth", treed.capture / "semantic", *CPU),
         "export": ("--what", "objects", "--layer", address, "-o", out),
-        "edit": ("--remove", "--layer", address, "--ids", 5, "--split", "off", "-o", out),
+        "edit": ("--remove", "--layer", address, "--ids", 5, "--cut", "off", "-o", out),
     }[command]
     status, printed, err = splatseg(command, treed.scene, *words)
     assert status == 2
