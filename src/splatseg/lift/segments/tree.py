@@ -192,7 +192,8 @@ def _joined_cores(
     last = np.zeros(count, np.int64)
     last[same] = np.arange(len(same))
     rows = np.where(several, len(same) + index[:-1], last)
-    return scipy.sparse.vstack((cores, anew), format="csr")[rows]
+    found: Any = scipy.sparse.vstack((cores, anew), format="csr")
+    return found[rows]
 
 
 def _held_most(table: SegmentTable, group: NDArray[np.int64]) -> Any:

@@ -70,9 +70,10 @@ class _Ballot:
             mine = np.flatnonzero((of == of_gaussian[gaussian]) & (of >= 0))
             gaussians.append(gaussian[mine])
             values.append(table.mass[entries][mine] * self.weight[segment[mine]])
-        return np.bincount(
+        votes = np.bincount(
             np.concatenate(gaussians), np.concatenate(values), minlength=table.gaussians
         )
+        return votes.astype(np.float64, copy=False)
 
 
 def tree_votes(
