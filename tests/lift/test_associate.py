@@ -13,6 +13,7 @@ from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import ConfusionOptions
 from splatseg.lift.segments.ballots import majority
+from splatseg.lift.segments.pairs import join_pairs
 from splatseg.lift.segments.shared import shared_masses
 from splatseg.lift.segments.table import SegmentTable, segment_table
 from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
@@ -266,23 +267,28 @@ def test_a_sample_of_gaussians_keeps_the_sums(monkeypatch) -> None:
     assert groups(run(clean(NAMES)).ids) == THINGS
 
 
-@pytest.mark.parametrize("count", [3, 700])
-def test_unions_dense_and_sparse_are_the_same(rng, monkeypatch, count) -> None:
+@pytest.mark.parametrize("size", [1, 4, 1 << 20])
+def test_what_views_of_one_group_see_of_another(rng, monkeypatch, size) -> None:
+    """In pieces of any size, for pairs in any order."""
     import scipy.sparse
 
-    module = importlib.import_module("splatseg.lift.segments.clustering")
-    seen = scipy.sparse.random(count, 9, 0.4, random_state=1, format="csr")
-    members = scipy.sparse.csr_matrix(rng.integers(0, 3, (count, 9)).astype(float))
-    row = np.sort(rng.integers(0, count, 50))
-    column = rng.integers(0, count, 50)
-    monkeypatch.setattr(module, "_DENSE", 2.0 * 50)
-    one = module._unions(seen, members, row, column)
-    monkeypatch.setattr(module, "_DENSE", 0.0)
-    other = module._unions(seen, members, row, column)
-    a, b = seen.toarray(), members.toarray()
-    expected = (a[row] * b[column] + b[row] * a[column]).sum(axis=1)
-    np.testing.assert_allclose(one, expected)
-    np.testing.assert_allclose(other, expected)
+    module = importlib.import_module("splatseg.lift.segments.pairs")
+    seen = scipy.sparse.random(30, 9, 0.4, random_state=1, format="csr")
+    members = scipy.sparse.csr_matrix(rng.integers(0, 3, (30, 9)).astype(float))
+    one, other = rng.integers(0, 30, 50), rng.integers(0, 30, 50)
+    monkeypatch.setattr(module, "_CELLS", size)
+    monkeypatch.setattr(module, "_PAIRS", size)
+    found = module.seen_by(seen, members, one, other)
+    expected = (seen.toarray()[one] * members.toarray()[other]).sum(axis=1)
+    np.testing.assert_allclose(found, expected)
+
+
+def test_pairs_of_joined_groups_add_up() -> None:
+    """0 and 3 join, and 1 and 2: what they shared with each other is gone."""
+    row, column = np.array([0, 0, 1, 1, 2, 0]), np.array([1, 2, 2, 3, 3, 4])
+    value = np.array([1.0, 2, 4, 8, 16, 32])
+    found = join_pairs(row, column, value, np.array([0, 1, 1, 0, 4]))
+    assert [part.tolist() for part in found] == [[0, 0], [1, 4], [27, 32]]
 
 
 def test_votes_become_a_soft_layer() -> None:

@@ -1,5 +1,6 @@
 """Masks that are nested in every view become a tree of groups, objects and parts."""
 
+import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -11,10 +12,11 @@ from hypothesis import strategies as st
 
 from splatseg.core import TREE_LEVELS, InstanceTree, Labels, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError
+from splatseg.lift.segments.clustering import Agreement, cluster
 from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
 from splatseg.render.cpu import set_threads, threads
 
-from .test_associate import BACKEND, GAUSSIANS, VIEWS, Segments, columns
+from .test_associate import BACKEND, GAUSSIANS, VIEWS, Segments, columns, table_of
 
 # What the strips between these borders hold: the halves of the left square, those of the middle
 # one, and the right square.
@@ -302,3 +304,78 @@ def test_whatever_masks_come_cuts_lie_inside_each_other(seed: int, min_support: 
                 frozenset((cuts["object"] == node.id).nonzero().squeeze(1).tolist())
                 == members[node.id]
             )
+
+
+@pytest.mark.parametrize("same", [[0, 1, 1, 2, 0, 3, 4, 5], [0, 1, 2, 3, 4, 5, 6, 0]])
+def test_cores_of_joined_groups_are_those_found_from_nothing(monkeypatch, same) -> None:
+    """Groups that were not joined keep their cores, whichever row they move to."""
+    module = importlib.import_module("splatseg.lift.segments.tree")
+    table = table_of(nested())
+    seen = table.sights().power(2).tocsr()
+    group = np.arange(len(table.view)) % 8
+    joined = np.array(same)[group]
+    cores = module._cores(table, seen, group)
+    kept = module._joined_cores(table, seen, cores, joined, np.array(same))
+    monkeypatch.setattr(module, "_ROWS", 1)
+    anew = module._cores(table, seen, joined)
+    assert anew.nnz > 0
+    assert np.array_equal(kept.toarray(), anew.toarray())
+
+
+def _dense_cluster(agreement, threshold, conflicts):
+    """Every pair compared anew in every round."""
+    count = len(agreement.view)
+    seen = agreement.seen.toarray().astype(float)
+    shared = np.triu(agreement.shared.toarray().astype(float), 1)
+    shared += shared.T
+    member = np.zeros(seen.shape)
+    member[np.arange(count), agreement.view] = 1
+    groups = [[row] for row in range(count)]
+    while True:
+        m = np.array([member[g].sum(axis=0) for g in groups])
+        s = np.array([seen[g].sum(axis=0) for g in groups])
+        both = np.array([[shared[np.ix_(a, b)].sum() for b in groups] for a in groups])
+        against = np.array([[conflicts[np.ix_(a, b)].sum() for b in groups] for a in groups])
+        views = (m > 0).sum(axis=1)
+        ratio = both / np.maximum(s @ m.T + m @ s.T - both, 1e-12)
+        ratio[against > 0.2 * np.minimum(views[:, None], views)] = 0
+        np.fill_diagonal(ratio, 0)
+        best = ratio.argmax(axis=1)
+        enough = ratio.max(axis=1) >= threshold
+        pairs = [(a, int(b)) for a, b in enumerate(best) if a < b and enough[a] and best[b] == a]
+        if not pairs:
+            break
+        for a, b in pairs:
+            groups[a] = groups[a] + groups[b]
+        gone = {b for _, b in pairs}
+        groups = [g for row, g in enumerate(groups) if row not in gone]
+    found = np.empty(count, int)
+    for index, group in enumerate(groups):
+        found[group] = index
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rounds_that_keep_what_is_unchanged_are_rounds_from_nothing(seed) -> None:
+    import scipy.sparse
+
+    rng = np.random.default_rng(seed)
+    count, views = 60, 7
+    view = np.sort(rng.integers(0, views, count))
+    kind = rng.integers(0, 9, count)
+    shared = rng.random((count, count)) * np.where(kind[:, None] == kind, 1.0, 0.1)
+    shared = np.where(rng.random((count, count)) < 0.5, shared, 0)
+    shared = np.maximum(shared, shared.T)
+    conflicts = np.triu((view[:, None] == view) & (rng.random((count, count)) < 0.2), 1)
+    conflicts = (conflicts | conflicts.T).astype(float)
+    agreement = Agreement(
+        shared=scipy.sparse.csr_matrix(shared),
+        seen=scipy.sparse.csr_matrix(0.5 + rng.random((count, views))),
+        view=view,
+    )
+    found = cluster(agreement, 0.15, conflicts=scipy.sparse.csr_matrix(conflicts))
+    assert 1 < found.max() + 1 < count - 10
+    assert np.array_equal(found, _dense_cluster(agreement, 0.15, conflicts))
+    free = cluster(agreement, 0.15)
+    assert not np.array_equal(found, free)
+    assert np.array_equal(free, _dense_cluster(agreement, 0.15, 0 * conflicts))

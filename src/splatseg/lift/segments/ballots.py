@@ -31,7 +31,8 @@ def majority(votes: Any) -> Labels:
     count = votes.shape[0]
     votes.sort_indices()
     rows = np.repeat(np.arange(count), np.diff(votes.indptr))
-    order = np.lexsort((votes.indices, -votes.data, rows))
+    # The sort is stable, and indices ascend within a row: the smaller comes first among equals.
+    order = np.lexsort((-votes.data, rows))
     rows = rows[order]
     first = np.ones(len(rows), bool)
     first[1:] = rows[1:] != rows[:-1]

@@ -26,15 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatseg.lift.segments.pairs import join_pairs, seen_by
+
 _ROUNDS = 1000
-_PAIRS = 1 << 17
-"""Pairs of groups whose unions are computed at a time."""
-
-_DENSE = 0.002
-"""Share of all pairs above which the unions of all are computed, as products of dense blocks."""
-
-_BLOCK = 512
-"""Rows of such a block."""
 
 _MAX_CONFLICT = 0.2
 """Two groups stay apart if they contradict each other in more of the views of the smaller: that
@@ -67,86 +61,108 @@ def cluster(agreement: Agreement, threshold: float, *, conflicts: Any = None) ->
     import scipy.sparse
 
     count, views = agreement.seen.shape
-    group = np.arange(count)
-    shared: Any = scipy.sparse.csr_matrix(agreement.shared, dtype=np.float64)
+    every = np.arange(count)
     seen: Any = scipy.sparse.csr_matrix(agreement.seen, dtype=np.float64)
     members: Any = scipy.sparse.csr_matrix(
-        (np.ones(count), (group, agreement.view)), shape=(count, views)
+        (np.ones(count), (every, agreement.view)), shape=(count, views)
     )
-    apart: Any = None if conflicts is None else scipy.sparse.csr_matrix(conflicts, dtype=np.float64)
+    candidates = _Candidates(_upper(agreement.shared), seen, members, threshold)
+    if conflicts is not None:
+        candidates.conflicts = _upper(conflicts)
+    group = every
+    candidates.update(every, np.ones(count, bool))
     for _ in range(_ROUNDS):
-        target = _mutual_best(shared, seen, members, threshold, apart)
+        target = candidates.mutual_best()
         if target is None:
             break
-        names, compact = np.unique(target, return_inverse=True)
-        join: Any = scipy.sparse.csr_matrix(
-            (np.ones(len(target)), (compact, np.arange(len(target)))),
-            shape=(len(names), len(target)),
+        changed = target != every
+        changed[target[changed]] = True
+        join: Any = scipy.sparse.csr_matrix((np.ones(count), (target, every)), shape=(count, count))
+        candidates.seen, candidates.members = join @ candidates.seen, join @ candidates.members
+        candidates.update(target, changed)
+        group = target[group]
+    return np.unique(group, return_inverse=True)[1]
+
+
+def _upper(pairs: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """The pairs above the diagonal of a symmetric sparse matrix."""
+    entries = pairs.tocoo()
+    above = (entries.row < entries.col) & (entries.data > 0)
+    return entries.row[above], entries.col[above], entries.data[above]
+
+
+class _Candidates:
+    """Pairs of groups, and which of them may join; groups are named after their first segment."""
+
+    def __init__(
+        self,
+        pairs: tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
+        seen: Any,
+        members: Any,
+        threshold: float,
+    ) -> None:
+        self.row, self.column, self.shared = pairs
+        self.ratio = np.zeros(len(self.row))
+        """0 for pairs that do not join."""
+        self.seen, self.members = seen, members
+        self.conflicts: tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None = None
+        self._threshold = threshold
+
+    def update(self, target: NDArray[Any], changed: NDArray[np.bool_]) -> None:
+        """Join groups, and compare those that changed with all others anew."""
+        touched = changed[self.row] | changed[self.column]
+        row, column, shared = join_pairs(
+            self.row[touched], self.column[touched], self.shared[touched], target
         )
-        shared = (join @ shared @ join.T).tocsr()
-        seen, members = (join @ seen).tocsr(), (join @ members).tocsr()
-        if apart is not None:
-            apart = (join @ apart @ join.T).tocsr()
-        group = compact[group]
-    return group
+        if self.conflicts is not None:
+            self.conflicts = join_pairs(*self.conflicts, target)
+        ratio = self._ratios(row, column, shared)
+        kept = ~touched
+        self.row = np.concatenate((self.row[kept], row))
+        self.column = np.concatenate((self.column[kept], column))
+        self.shared = np.concatenate((self.shared[kept], shared))
+        self.ratio = np.concatenate((self.ratio[kept], ratio))
 
+    def _ratios(
+        self, row: NDArray[Any], column: NDArray[Any], shared: NDArray[Any]
+    ) -> NDArray[np.float64]:
+        union = seen_by(self.seen, self.members, row, column)
+        union += seen_by(self.seen, self.members, column, row) - shared
+        ratio = shared / np.maximum(union, 1e-12)
+        enough = np.flatnonzero(ratio >= self._threshold)
+        joins = enough[self._compatible(row[enough], column[enough])]
+        found = np.zeros(len(ratio))
+        found[joins] = ratio[joins]
+        return found
 
-def _mutual_best(
-    shared: Any, seen: Any, members: Any, threshold: float, conflicts: Any
-) -> NDArray[Any] | None:
-    """Where each group goes: to the earlier of two that are each other's best; None if none do."""
-    pairs = shared.tocoo()
-    apart = (pairs.row < pairs.col) & (pairs.data > 0)
-    row, column, both = pairs.row[apart], pairs.col[apart], pairs.data[apart]
-    order = np.argsort(row, kind="stable")
-    row, column, both = row[order], column[order], both[order]
-    ratio = both / np.maximum(_unions(seen, members, row, column) - both, 1e-12)
-    enough = ratio >= threshold
-    if conflicts is not None:
-        enough[enough] = _compatible(members, conflicts, row[enough], column[enough])
-    if not enough.any():
-        return None
-    row, column, ratio = row[enough], column[enough], ratio[enough]
-    one = np.concatenate((row, column))
-    other = np.concatenate((column, row))
-    value = np.concatenate((ratio, ratio))
-    order = np.lexsort((other, -value, one))
-    first = np.unique(one[order], return_index=True)
-    best = np.full(seen.shape[0], -1)
-    best[first[0]] = other[order][first[1]]
-    target = np.arange(seen.shape[0])
-    has = np.flatnonzero(best >= 0)
-    mutual = has[best[best[has]] == has]
-    target[mutual] = np.minimum(mutual, best[mutual])
-    return target
+    def _compatible(self, row: NDArray[Any], column: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether the segments of two groups contradict each other in few of the views."""
+        if self.conflicts is None or not len(self.conflicts[0]):
+            return np.ones(len(row), bool)
+        one, other, times = self.conflicts
+        count = self.seen.shape[0]
+        keys = one.astype(np.int64) * count + other  # ascending
+        wanted = row.astype(np.int64) * count + column
+        index = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        against = np.where(keys[index] == wanted, times[index], 0.0)
+        views = np.diff(self.members.indptr)
+        return against <= _MAX_CONFLICT * np.minimum(views[row], views[column])
 
-
-def _compatible(
-    members: Any, conflicts: Any, row: NDArray[Any], column: NDArray[Any]
-) -> NDArray[np.bool_]:
-    """Whether the segments of two groups contradict each other in few of the views, for pairs."""
-    views = np.asarray((members > 0).sum(axis=1)).ravel()
-    against = np.asarray(conflicts[row, column]).ravel()
-    return against <= _MAX_CONFLICT * np.minimum(views[row], views[column])
-
-
-def _unions(
-    seen: Any, members: Any, row: NDArray[Any], column: NDArray[Any]
-) -> NDArray[np.float64]:
-    """What views of either group see of the other, for pairs (row, column) with rows ascending."""
-    union = np.empty(len(row))
-    count = seen.shape[0]
-    if len(row) <= _DENSE * count**2:
-        for start in range(0, len(row), _PAIRS):
-            part = slice(start, start + _PAIRS)
-            r, c = row[part], column[part]
-            union[part] = np.asarray(seen[r].multiply(members[c]).sum(axis=1)).ravel()
-            union[part] += np.asarray(members[r].multiply(seen[c]).sum(axis=1)).ravel()
-        return union
-    whole_seen, whole_members = seen.toarray(), members.toarray()
-    for start in range(0, count, _BLOCK):
-        block = slice(start, start + _BLOCK)
-        first, last = np.searchsorted(row, [start, start + _BLOCK])
-        sums = whole_seen[block] @ whole_members.T + whole_members[block] @ whole_seen.T
-        union[first:last] = sums[row[first:last] - start, column[first:last]]
-    return union
+    def mutual_best(self) -> NDArray[Any] | None:
+        """Where each group goes: to the earlier of two that are each other's best, or None."""
+        enough = np.flatnonzero(self.ratio >= self._threshold)
+        if not len(enough):
+            return None
+        row, column, ratio = self.row[enough], self.column[enough], self.ratio[enough]
+        one = np.concatenate((row, column))
+        other = np.concatenate((column, row))
+        value = np.concatenate((ratio, ratio))
+        order = np.lexsort((other, -value, one))
+        first = np.unique(one[order], return_index=True)
+        best = np.full(self.seen.shape[0], -1)
+        best[first[0]] = other[order][first[1]]
+        target = np.arange(self.seen.shape[0])
+        has = np.flatnonzero(best >= 0)
+        mutual = has[best[best[has]] == has]
+        target[mutual] = np.minimum(mutual, best[mutual])
+        return target

@@ -88,6 +88,10 @@ class SegmentTable:
 
     def votes(self, group: NDArray[np.int64], weight: NDArray[np.float64]) -> Any:
         """Sparse (Gaussians, groups): mass by group; segments of group -1 have no vote."""
+        return self.masses(group, weight).T.tocsr()
+
+    def masses(self, group: NDArray[np.int64], weight: NDArray[np.float64]) -> Any:
+        """Sparse (groups, Gaussians): what `votes` says, by group."""
         import scipy.sparse
 
         there = np.flatnonzero(group >= 0)
@@ -96,7 +100,7 @@ class SegmentTable:
             shape=(int(group.max(initial=-1)) + 1, len(group)),
         )
         rows = self._starts(), self.gaussian, self.mass
-        return sparse_product(join, rows, self.gaussians).T.tocsr()
+        return sparse_product(join, rows, self.gaussians)
 
     def sights(self) -> Any:
         """Sparse (Gaussians, views): the square root of what each view sees of each Gaussian."""
@@ -128,7 +132,7 @@ class SegmentTable:
         share next to nothing are left out.
         """
         held = np.zeros(self.gaussians, np.int64)
-        for entries in self._slices():
+        for entries in self.slices():
             holds, _ = self._shares(entries)
             held += np.bincount(self.gaussian[entries][holds], minlength=self.gaussians)
         worth = self._sample(held)
@@ -158,7 +162,7 @@ class SegmentTable:
         counts = np.zeros(len(self.view), np.int64)
         root_worth = np.sqrt(worth, dtype=np.float32)
         end = 0
-        for entries in self._slices():
+        for entries in self.slices():
             holds, share = self._shares(entries)
             gaussian = self.gaussian[entries]
             chosen = np.flatnonzero(holds & (worth[gaussian] > 0))
@@ -178,14 +182,16 @@ class SegmentTable:
         share: NDArray[np.float32] = np.divide(self.mass[entries], least, dtype=np.float32)
         return (seen > _LEAST_WEIGHT) & (share > _LEAST_SHARE), share
 
-    def _slices(self) -> Iterator[slice]:
+    def slices(self) -> Iterator[slice]:
         """All entries, a few at a time."""
         for start in range(0, len(self.gaussian), _ENTRIES):
             yield slice(start, start + _ENTRIES)
 
     def _starts(self) -> NDArray[np.int64]:
         """Where the entries of each segment begin, and where those of the last one end."""
-        return np.searchsorted(self.segment, np.arange(len(self.view) + 1)).astype(np.int64)
+        # Of the entries' own type: of another one numpy would convert all entries first.
+        segments = np.arange(len(self.view) + 1, dtype=self.segment.dtype)
+        return np.searchsorted(self.segment, segments).astype(np.int64)
 
     def _sample(self, entries: NDArray[np.int64]) -> NDArray[np.float64]:
         """What each Gaussian counts, 0 for those left out, so that the pairs are affordable.
@@ -200,7 +206,7 @@ class SegmentTable:
         if pairs.sum() <= _PAIRS:
             return worth
         size = np.zeros(self.gaussians)
-        for part in self._slices():
+        for part in self.slices():
             size += np.bincount(self.gaussian[part], self.seen[part], minlength=self.gaussians)
         low, high = 0.0, float(1 / max(size[size > 0].min(), 1e-9))
         for _ in range(60):

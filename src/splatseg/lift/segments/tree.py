@@ -9,6 +9,7 @@ thing along a shadow it does so in one view and not in the next.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,9 @@ _MIN_HELD = 0.5
 
 _MIN_VISIBILITY = 0.3
 """A view could have seen a node if it sees this share of what the best view sees of it."""
+
+_ROWS = 1 << 16
+"""Gaussians of a group whose views are looked up at a time."""
 
 _SAME = 0.75
 """Intersection over union of two cores from which on they are one node: an object all but one
@@ -93,11 +97,15 @@ def segment_tree(
     """
     support, views = _support(agreement, group, len(table.views))
     group = _renumbered(group, np.flatnonzero((support >= min_support) & (views >= min_views)))
-    both = _overlaps(table, group)
+    by_view = table.sights().power(2)
+    weight = np.sqrt(np.asarray(by_view.sum(axis=1)).ravel())
+    seen = by_view.tocsr()
+    cores = _cores(table, seen, group)
+    both = _overlaps(cores, weight)
     same = _same_nodes(both, _forbidden(nested, group, len(both)))
     if same is not None:
         group = np.where(group >= 0, same[group], -1)
-        both = _overlaps(table, group)
+        both = _overlaps(_joined_cores(table, seen, cores, group, same), weight)
     support, views = _support(agreement, group, len(table.views))
     return SegmentTree(
         node=group,
@@ -133,47 +141,84 @@ def _support(
     return (could & did).sum(axis=1) / np.maximum(could.sum(axis=1), 1), did.sum(axis=1)
 
 
-def _overlaps(table: SegmentTable, group: NDArray[np.int64]) -> NDArray[np.float64]:
+def _overlaps(cores: Any, weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """(groups, groups): what the cores share; their sizes on the diagonal."""
     import scipy.sparse
 
-    count = int(group.max(initial=-1)) + 1
-    row, column, mass = _held_most(table, group)
-    seen = table.sights().power(2).tocsc()
-    member = group >= 0
-    had = np.zeros((len(table.views), count), bool)
-    had[table.view[member], group[member]] = True
-    held = np.zeros(len(mass))
-    for view in range(len(table.views)):
-        sight = seen[:, [view]].toarray().ravel()
-        held += np.where(had[view][column], sight[row], 0.0)
-    core = mass >= _MIN_HELD * held
-    weight = np.sqrt(np.asarray(seen.sum(axis=1)).ravel())
-    cores: Any = scipy.sparse.csr_matrix(
-        (np.ones(int(core.sum())), (column[core], row[core])), shape=(count, seen.shape[0])
-    )
     return (cores @ scipy.sparse.diags(weight) @ cores.T).toarray()
 
 
-def _held_most(
-    table: SegmentTable, group: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Gaussian, group and mass where a group holds most of what its own segments touch.
+def _cores(table: SegmentTable, seen: Any, group: NDArray[np.int64]) -> Any:
+    """Sparse (groups, Gaussians): 1 for the Gaussians that a group holds most of.
+
+    Args:
+        table: The segments.
+        seen: Sparse rows (Gaussians, views): what each view sees of each Gaussian.
+        group: The group of each segment, -1 for none.
+    """
+    import scipy.sparse
+
+    held = _held_most(table, group)
+    member = group >= 0
+    had = np.zeros((held.shape[0], len(table.views)))
+    had[group[member], table.view[member]] = 1
+    core = np.zeros(len(held.data), bool)
+    for row, (start, stop) in enumerate(pairwise(held.indptr.tolist())):
+        for first in range(start, stop, _ROWS):
+            part = slice(first, min(first + _ROWS, stop))
+            core[part] = held.data[part] >= _MIN_HELD * (seen[held.indices[part]] @ had[row])
+    ends = np.append(0, np.cumsum(core))[held.indptr]
+    return scipy.sparse.csr_matrix(
+        (np.ones(int(ends[-1])), held.indices[core], ends), shape=held.shape
+    )
+
+
+def _joined_cores(
+    table: SegmentTable, seen: Any, cores: Any, group: NDArray[np.int64], same: NDArray[np.int64]
+) -> Any:
+    """The cores after groups were joined: only those of groups of several are found anew.
+
+    Args:
+        table: The segments.
+        seen: Sparse rows (Gaussians, views): what each view sees of each Gaussian.
+        cores: Those of before.
+        group: The group of each segment now, -1 for none.
+        same: What became of each group.
+    """
+    import scipy.sparse
+
+    count = int(same.max()) + 1
+    several = np.bincount(same, minlength=count) > 1
+    index = np.append(np.cumsum(several) - 1, -1)
+    anew = _cores(table, seen, np.where(np.append(several, False)[group], index[group], -1))
+    last = np.zeros(count, np.int64)
+    last[same] = np.arange(len(same))
+    rows = np.where(several, len(same) + index[:-1], last)
+    found: Any = scipy.sparse.vstack((cores, anew), format="csr")
+    return found[rows]
+
+
+def _held_most(table: SegmentTable, group: NDArray[np.int64]) -> Any:
+    """Sparse (groups, Gaussians): mass where a group holds most of what its own segments touch.
 
     Views whose segments do not touch the Gaussian are to be counted yet; this leaves out most of
     what is no core without looking at them.
     """
-    mass = table.votes(group, np.ones(len(group)))
-    touched = replace(table, mass=table.seen).votes(group, np.ones(len(group)))
+    import scipy.sparse
+
+    ones = np.ones(len(group))
+    mass = table.masses(group, ones)
+    touched = replace(table, mass=table.seen).masses(group, ones)
     # A view with several segments of a group touches a Gaussian at most so many times.
     pairs = np.stack((group[group >= 0], table.view[group >= 0]))
     (names, _), times = np.unique(pairs, axis=1, return_counts=True)
-    repeats = np.ones(mass.shape[1])
+    repeats = np.ones(mass.shape[0])
     np.maximum.at(repeats, names, times)
     # The same segments give both, so that both have the same entries in the same order.
-    entries = mass.tocoo()
-    most = entries.data * repeats[entries.col] >= 0.99 * _MIN_HELD * touched.data
-    return entries.row[most], entries.col[most], entries.data[most]
+    factor = np.repeat(repeats, np.diff(mass.indptr))
+    most = mass.data * factor >= 0.99 * _MIN_HELD * touched.data
+    ends = np.append(0, np.cumsum(most))[mass.indptr]
+    return scipy.sparse.csr_matrix((mass.data[most], mass.indices[most], ends), shape=mass.shape)
 
 
 def _forbidden(nested: Nesting, group: NDArray[np.int64], count: int) -> NDArray[np.bool_]:

@@ -62,11 +62,18 @@ class _Ballot:
     ) -> NDArray[np.float64]:
         """Votes that each Gaussian has for its own node."""
         table = self.table
-        of = node_of_segment[table.segment]
-        mine = (of >= 0) & (of == node[table.gaussian])
-        values = (table.mass * self.weight[table.segment])[mine]
-        votes = np.bincount(table.gaussian[mine], values, minlength=table.gaussians)
-        return votes.astype(np.float64)
+        of_segment, of_gaussian = node_of_segment.astype(np.int32), node.astype(np.int32)
+        gaussians, values = [np.zeros(0, np.int32)], [np.zeros(0)]
+        for entries in table.slices():
+            segment, gaussian = table.segment[entries], table.gaussian[entries]
+            of = of_segment[segment]
+            mine = np.flatnonzero((of == of_gaussian[gaussian]) & (of >= 0))
+            gaussians.append(gaussian[mine])
+            values.append(table.mass[entries][mine] * self.weight[segment[mine]])
+        votes = np.bincount(
+            np.concatenate(gaussians), np.concatenate(values), minlength=table.gaussians
+        )
+        return votes.astype(np.float64, copy=False)
 
 
 def tree_votes(
