@@ -144,6 +144,29 @@ def features_layer(
     return Features(values=values, weights=result.visibility, metadata=metadata)
 
 
+def runner(train_features: Callable[..., Features]) -> Callable[[MethodInputs, Any], Layer]:
+    """The `Method.run` of a method that trains features with a head.
+
+    Args:
+        train_features: Takes Gaussians, views and evidence, and by keyword the options, the
+            names of classes and a `TrainingContext`.
+    """
+
+    def run(inputs: MethodInputs, options: LabelTrainingOptions) -> Layer:
+        """Train, and read the features as the options say."""
+        features = train_features(
+            inputs.gaussians,
+            inputs.views,
+            inputs.evidence,
+            options=options,
+            classes=inputs.label_names,
+            context=context_of(inputs),
+        )
+        return features if options.readout == "rendered" else hard_labels(features, options)
+
+    return run
+
+
 def context_of(inputs: MethodInputs) -> TrainingContext:
     """What a method was given, as a training takes it."""
     told = inputs.progress
@@ -160,8 +183,3 @@ def hard_labels(features: Features, options: LabelTrainingOptions) -> Labels:
     kept = {name: value for name, value in features.metadata.items() if name != "head"}
     head = ClassifierHead.of(features)
     return head.labels(features, min_share=options.min_share, metadata=kept)
-
-
-def layer_of(features: Features, options: LabelTrainingOptions) -> Layer:
-    """The layer that the options ask for."""
-    return features if options.readout == "rendered" else hard_labels(features, options)

@@ -33,22 +33,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, Layer, View
+from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, View
 from splatseg.core.sh import SH_C0
 from splatseg.errors import RangeError
 from splatseg.lift.heads import Blend, ClassifierHead
 from splatseg.lift.training import TrainingProgress
 from splatseg.methods._identity_loss import NeighbourLoss
 from splatseg.methods._label_models import IdentityModel, linear_start
-from splatseg.methods._method import Method, MethodInputs
+from splatseg.methods._method import Method
 from splatseg.methods._trained_labels import (
     LabelData,
-    context_of,
     features_layer,
     hard_labels,
     label_data,
     layer_metadata,
-    layer_of,
+    runner,
     train_labels,
 )
 from splatseg.methods._trained_labels import TrainingContext as TrainingContext
@@ -253,26 +252,13 @@ def _model(
     )
 
 
-def run(inputs: MethodInputs, options: IdentityOptions) -> Layer:
-    """Train identities, and read them as the options say."""
-    features = train_identity(
-        inputs.gaussians,
-        inputs.views,
-        inputs.evidence,
-        options=options,
-        classes=inputs.label_names,
-        context=context_of(inputs),
-    )
-    return layer_of(features, options)
-
-
 METHOD = Method(
     name="identity",
     summary="features of 16 channels and a classifier are trained, with a term for neighbours",
     reference="Gaussian Grouping (Ye et al. 2024), eq. 3 to 5",
     evidence=("labels", "tracked"),
     options=IdentityOptions,
-    run=run,
+    run=runner(train_identity),
     keeps_ids=True,
     seeded=True,
     published=IdentityOptions.published(),

@@ -5,10 +5,10 @@ r"""Logits of each Gaussian's own, trained on label maps; see `methods._trained_
 
 from collections.abc import Sequence
 
-from splatseg.core import ClassTable, Features, Gaussians, LabelSource, Layer, View
-from splatseg.methods._method import Method, MethodInputs
+from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
+from splatseg.methods._method import Method
 from splatseg.methods._trained_labels import TrainingContext as TrainingContext
-from splatseg.methods._trained_labels import context_of, layer_of
+from splatseg.methods._trained_labels import runner
 from splatseg.methods._trained_logits import LogitOptions as LogitOptions
 from splatseg.methods._trained_logits import train_own_logits
 
@@ -35,26 +35,13 @@ def train_logits(
     )
 
 
-def run(inputs: MethodInputs, options: LogitOptions) -> Layer:
-    """Train them, and read them as the options say."""
-    features = train_logits(
-        inputs.gaussians,
-        inputs.views,
-        inputs.evidence,
-        options=options,
-        classes=inputs.label_names,
-        context=context_of(inputs),
-    )
-    return layer_of(features, options)
-
-
 METHOD = Method(
     name="logits",
     summary="a logit of each id for every Gaussian, rendered and then classified; no network",
     reference="docs/training.md",
     evidence=("labels", "tracked"),
     options=LogitOptions,
-    run=run,
+    run=runner(train_logits),
     keeps_ids=True,
     seeded=True,
 )

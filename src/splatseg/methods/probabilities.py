@@ -6,10 +6,10 @@ r"""Probabilities of each Gaussian's own, trained on label maps; see `methods._t
 
 from collections.abc import Sequence
 
-from splatseg.core import ClassTable, Features, Gaussians, LabelSource, Layer, View
-from splatseg.methods._method import Method, MethodInputs
+from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
+from splatseg.methods._method import Method
 from splatseg.methods._trained_labels import TrainingContext as TrainingContext
-from splatseg.methods._trained_labels import context_of, layer_of
+from splatseg.methods._trained_labels import runner
 from splatseg.methods._trained_logits import LogitOptions as LogitOptions
 from splatseg.methods._trained_logits import train_own_logits
 
@@ -36,26 +36,13 @@ def train_probabilities(
     )
 
 
-def run(inputs: MethodInputs, options: LogitOptions) -> Layer:
-    """Train them, and read them as the options say."""
-    features = train_probabilities(
-        inputs.gaussians,
-        inputs.views,
-        inputs.evidence,
-        options=options,
-        classes=inputs.label_names,
-        context=context_of(inputs),
-    )
-    return layer_of(features, options)
-
-
 METHOD = Method(
     name="probabilities",
     summary="a logit of each id for every Gaussian, whose probabilities are rendered; no network",
     reference="docs/training.md",
     evidence=("labels", "tracked"),
     options=LogitOptions,
-    run=run,
+    run=runner(train_probabilities),
     keeps_ids=True,
     seeded=True,
 )
