@@ -111,6 +111,7 @@ def test_sentences_flow_and_placeholders_are_short(capsys, monkeypatch) -> None:
 
 def test_words() -> None:
     assert flowing("a\n  b\n\n  c") == "a b\n\nc"
+    assert flowing("a\n\n- b\n  c\n- d") == "a\n\n- b c\n- d"
     assert option_value(["--method", "a", "--method=b"], "--method") == "b"
     assert option_value(["--method"], "--method") is None
     assert listed("--x", ["a,b", "c d"]) == ("a", "b", "c d")
@@ -129,3 +130,11 @@ def test_long_lines_are_wrapped_and_commands_stay_whole() -> None:
     assert command in lines
     assert all(len(line) <= 80 for line in lines if line != command)
     assert lines[-1] == "short"
+
+
+def test_items_of_lists_hang_and_empty_lines_do_not_double() -> None:
+    lines = wrapped("- " + "word " * 30 + "\n\n \n\nend\n").splitlines()
+    assert lines[0].startswith("- word")
+    assert all(line.startswith("  word") for line in lines[1:-2])
+    assert lines[-2:] == ["", "end"]
+    assert lines[-3]

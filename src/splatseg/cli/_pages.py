@@ -74,12 +74,15 @@ def made_page(name: str, module: str, words: Sequence[str] = ()) -> str:
 
 
 def wrapped(page: str) -> str:
-    """A page without lines that are too long, nor blanks at their ends."""
+    """A page without lines that are too long, blanks at their ends or two empty lines in a row."""
     lines: list[str] = []
     for line in page.rstrip().splitlines():
+        if not line.strip() and lines and not lines[-1]:
+            continue
         # A command line is to be copied in one piece.
         long = len(line) > _WIDTH and not line.startswith("splatseg ")
-        lines += textwrap.wrap(line, _WIDTH) if long else [line.rstrip()]
+        further = "  " if line.startswith("- ") else ""
+        lines += textwrap.wrap(line, _WIDTH, subsequent_indent=further) if long else [line.rstrip()]
     return "\n".join(lines) + "\n"
 
 

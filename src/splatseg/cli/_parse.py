@@ -7,6 +7,7 @@ which both are as a person wants to read them, and its answer is copied back.
 
 import dataclasses
 import inspect
+import re
 import types
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -34,14 +35,17 @@ def parse(
 
 
 def flowing(text: str) -> str:
-    r"""Text without the line breaks of the source; blank lines between paragraphs stay.
+    r"""Text without the line breaks of the source; paragraphs and items of lists stay.
 
     Example:
-        >>> flowing("one line,\n    and its end.\n\n    Another.")
-        'one line, and its end.\n\nAnother.'
+        >>> flowing("one line,\n    and its end.\n\n    - an\n      item\n    - another")
+        'one line, and its end.\n\n- an item\n- another'
     """
-    paragraphs = inspect.cleandoc(text).split("\n\n")
-    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    blocks = re.split(r"(\n{2,}|\n(?=- ))", inspect.cleandoc(text))
+    return "".join(
+        "\n" * min(block.count("\n"), 2) if not block.strip() else " ".join(block.split())
+        for block in blocks
+    )
 
 
 def _readable(command: type[Any], names: Collection[str]) -> type[Any]:

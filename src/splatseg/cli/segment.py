@@ -106,7 +106,7 @@ def command_for(words: Sequence[str]) -> type[Any]:
 
 def _with_summaries() -> type[Any]:
     """The command without a method, whose help lists the methods."""
-    rows = "\n".join(f"{method.name}: {method.summary}" for method in methods())
+    rows = "\n".join(f"- {method.name}: {method.summary}" for method in methods())
     made = make_dataclass(
         "Command",
         [("options", Annotated[Any, tyro.conf.Suppress], field(default=None))],

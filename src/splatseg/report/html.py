@@ -317,7 +317,7 @@ thead th { color: var(--quiet); font-weight: 550; font-size: .88rem; }
 .gallery { width: 100%; }
 .gallery th, .gallery td { border: 0; padding: .2rem .35rem .2rem 0; }
 .gallery tbody th { font-weight: 450; font-size: .82rem; color: var(--quiet);
-  overflow-wrap: anywhere; min-width: 4.5rem; }
+  overflow-wrap: anywhere; min-width: 6rem; }
 figure { margin: 0; }
 figcaption { color: var(--quiet); font-size: .78rem; }
 img { display: block; width: 100%; min-width: 10rem; max-width: 24rem; height: auto;
