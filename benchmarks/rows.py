@@ -26,7 +26,7 @@ from memory import room
 from lift import HEIGHT, WIDTH, camera
 from splatseg import load_scene
 from splatseg import render as splat
-from splatseg.render import CompactRows, SparseImage, SparseWeights
+from splatseg.render import CompactRows, SparseImage, SparseSignal, SparseWeights
 from splatseg.render.cpu import isa, set_threads
 
 PIXELS, VIEWS, GAUSSIANS = 8192, 16, 200_000
@@ -190,6 +190,17 @@ def one_hot(view: splat.PreparedView, labels: torch.Tensor, ids: int) -> None:
         view.back_project((labels.unsqueeze(-1) == names).float())
 
 
+def dense_argmax(view: splat.PreparedView, signal: SparseSignal) -> None:
+    """The largest channel of a signal 64 channels at a time, with a running maximum."""
+    best = torch.full((HEIGHT, WIDTH), -1.0)
+    winner = torch.zeros(HEIGHT, WIDTH, dtype=torch.int64)
+    for start in range(0, signal.count, 64):
+        names = torch.arange(start, min(start + 64, signal.count))
+        value, column = view.render(signal.dense(names)).image.max(dim=-1)
+        better = value > best
+        best, winner = torch.where(better, value, best), torch.where(better, names[column], winner)
+
+
 def views(repeats: int) -> None:
     """One view used for several things."""
     use_threads(1)
@@ -229,6 +240,13 @@ def views(repeats: int) -> None:
             calls = {
                 f"label map of {ids} ids, one-hot images": partial(one_hot, view, labels, ids),
                 f"label map of {ids} ids, sparse image": partial(view.back_project_sparse, sparse),
+            }
+            # Thin slices of the room, so that a tile meets many ids.
+            of_gaussians = (scene.means[:, :1] * 997).long() % ids
+            signal = SparseSignal(channels=of_gaussians.int(), count=ids)
+            calls |= {
+                f"argmax of {ids} ids, dense": partial(dense_argmax, view, signal),
+                f"argmax of {ids} ids": partial(view.argmax, signal, background=0),
             }
             for name, value in medians(calls, max(repeats // 3, 1), time.process_time).items():
                 print(f"{name:68}{value:9.1f}")

@@ -83,6 +83,24 @@ struct TileImage {
   const int32_t* columns[16];
   const float* values[16];
 };
+
+// A signal of many channels of which a Gaussian has few: `per_row` a Gaussian, channels below 0
+// are none; `values` may be null, all are 1 then.
+struct SparseSignal {
+  const int32_t* channels;
+  const float* values;
+  int32_t per_row;
+  int32_t background;  // the channel of the light that no Gaussian stops
+};
+
+// Sums of those channels that a tile meets, 256 floats each, and memory to find them.
+struct ChannelSums {
+  int32_t* slot;      // of each channel; -1 outside of the kernel
+  int32_t* channels;  // of each slot
+  float* sums;
+  int32_t* entries;  // kChunk * per_row slots
+  int32_t used;
+};
 struct CellTree;    // neighbours.h
 struct Bundle;
 struct Candidates;
@@ -180,6 +198,10 @@ struct Kernels {
   // one a channel of the tile, and its weight. `chunk_rows` has kChunk times the widest block.
   void (*sparse_adjoint)(const Frame&, int tile, void* scratch, const TileImage& image,
                          float* chunk_rows, float* rows, int64_t row_stride);
+
+  // The channel with the largest sum of each pixel of a tile, and the sum, see argmax.cpp.
+  void (*argmax)(const Frame&, int tile, void* scratch, const SparseSignal& signal,
+                 ChannelSums& sums, int32_t* winner, float* score);
 
   // Neighbours of queries [begin, end) of a bundle's order, see neighbours.h. The first returns
   // how many distances to points were computed.

@@ -9,6 +9,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "channels.h"
 #include "pool.h"
 #include "segments.h"
 #include "view.h"
@@ -300,6 +301,23 @@ NB_MODULE(_native, m) {
     return nb::make_tuple(hand_over(std::move(found.gaussians)), hand_over(std::move(found.columns)),
                           hand_over(std::move(found.sums)));
   });
+
+  view.def("argmax", [](BoundView& self, const Array<const int32_t>& channels,
+                        const MaybeIn& values, int64_t count, int background,
+                        const Array<int32_t>& winner, const Out& score) {
+    const size_t pixels = static_cast<size_t>(self.pixels());
+    require(self.prepared && channels.ndim() == 2 &&
+                static_cast<int64_t>(channels.shape(0)) == self.gaussians &&
+                (!values || values->size() == channels.size()),
+            "signal");
+    require(winner.size() == pixels && score.size() == pixels, "image");
+    require(background >= 0 && background < count, "background");
+    for (size_t i = 0; i < channels.size(); ++i) require(channels.data()[i] < count, "channels");
+    const SparseSignal signal{channels.data(), in(values),
+                              static_cast<int32_t>(channels.shape(1)), background};
+    nb::gil_scoped_release release;
+    argmax(self.view, signal, count, winner.data(), score.data());
+  }, nb::arg(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg());
 
   nb::class_<BlockMatrix>(m, "BlockMatrix")
       .def(nb::init<>())

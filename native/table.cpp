@@ -28,6 +28,7 @@ SPLATSEG_KERNEL(gather_rows)
 SPLATSEG_KERNEL(scatter_rows)
 SPLATSEG_KERNEL(ids_below)
 SPLATSEG_KERNEL(sparse_adjoint)
+SPLATSEG_KERNEL(argmax)
 SPLATSEG_KERNEL(nearest_points)
 SPLATSEG_KERNEL(count_points)
 SPLATSEG_KERNEL(points_within)
@@ -37,7 +38,8 @@ const Kernels& table() {
                                   forward_features, adjoint, backward_colour, backward_features,
                                   chain, block_weights, block_sums, blocks_forward, blocks_adjoint,
                                   tile_weights, gather_rows, scatter_rows, ids_below,
-                                  sparse_adjoint, nearest_points, count_points, points_within};
+                                  sparse_adjoint, argmax, nearest_points, count_points,
+                                  points_within};
   return kernels;
 }
 

@@ -119,6 +119,16 @@ class View:
     def sparse_adjoint(
         self, indptr: Tensor, columns: Tensor, values: Tensor, weights: Tensor, /
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]: ...
+    def argmax(
+        self,
+        channels: Tensor,
+        values: Tensor | None,
+        count: int,
+        background: int,
+        winner: Tensor,
+        score: Tensor,
+        /,
+    ) -> None: ...
     def pixel_rows(
         self, pixels: Tensor, k: int, /
     ) -> tuple[

@@ -17,6 +17,8 @@ from splatseg.render._values import Contributors as Contributors
 from splatseg.render._values import Rendered as Rendered
 from splatseg.render._values import SparseBackProjected as SparseBackProjected
 from splatseg.render._values import SparseImage as SparseImage
+from splatseg.render._values import SparseSignal as SparseSignal
+from splatseg.render._values import StrongestChannels as StrongestChannels
 from splatseg.render._view_weights import ImageWeights as ImageWeights
 from splatseg.render._view_weights import PartSums as PartSums
 from splatseg.render._view_weights import ViewWeights as ViewWeights

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, Literal, Self
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
@@ -24,13 +24,15 @@ from splatseg.render._values import (
     Rendered,
     SparseBackProjected,
     SparseImage,
+    SparseSignal,
+    StrongestChannels,
 )
 from splatseg.render._view_weights import ImageWeights, ViewWeights
 
 Layout = Literal["csr", "blocks"]
 
 _CHANNELS = 64
-"""Channels of a sparse image that are made dense at a time, where there is no sparse kernel."""
+"""Channels of a sparse image or signal made dense at a time, where there is no sparse kernel."""
 
 
 class BackendView(ABC):
@@ -110,6 +112,37 @@ class BackendView(ABC):
             sums=torch.cat(sums)[order],
             weights=torch.zeros(0) if weights is None else weights,
         )
+
+    def argmax(self, signal: SparseSignal, background: int) -> StrongestChannels:
+        """The largest channel of ``W @ signal`` plus the transmittance in `background`. On the CPU.
+
+        Args:
+            signal: The signal, with a row a Gaussian.
+            background: The channel of the light that no Gaussian stops.
+        """
+        names = self._channels_in_view(signal, background)
+        best = torch.full(self.size, -1.0)
+        winner = torch.full(self.size, -1, dtype=torch.int32)
+        for part in names.split(_CHANNELS):
+            with torch.no_grad():
+                drawn = self.render(signal.dense(part))
+            values = drawn.image.float().cpu()
+            own = torch.nonzero(part == background).flatten().tolist()
+            values[..., own] += (1 - drawn.alpha.float().cpu()).clamp_min(0).unsqueeze(-1)
+            value, column = values.max(dim=-1)
+            better = value > best
+            best = torch.where(better, value, best)
+            winner = torch.where(better, part.to(torch.int32)[column], winner)
+        return StrongestChannels(channels=winner, values=best)
+
+    def _channels_in_view(self, signal: SparseSignal, background: int) -> Int64[Tensor, "m"]:
+        """The channels that can be the largest of a pixel, ascending. On the CPU."""
+        channels = signal.channels
+        if signal.count > _CHANNELS:
+            nothing = torch.zeros(*self.size, 1, device=channels.device)
+            channels = channels[self.back_project(nothing).weights > 0]
+        found = torch.unique(channels).cpu().long()
+        return torch.unique(torch.cat((found[found >= 0], torch.tensor([background]))))
 
 
 class Backend(ABC):

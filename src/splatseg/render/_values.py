@@ -40,6 +40,65 @@ class BackProjected:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SparseSignal:
+    """A signal of many channels of which each Gaussian has few: its id, its likeliest ids.
+
+    Gaussian i has ``values[i, j]`` in ``channels[i, j]`` and 0 in all others; a channel that it
+    has several times counts with the sum.
+    """
+
+    channels: Int32[Tensor, "n k"]
+    """Channels, from 0; -1 is none."""
+
+    values: Float[Tensor, "n k"] | None = None
+    """Their values, float32; None is 1 everywhere."""
+
+    count: int
+    """Number of channels."""
+
+    def __post_init__(self) -> None:
+        check_shape("channels", self.channels, (None, None))
+        if self.channels.dtype != torch.int32:
+            raise InputError(f"channels: expected int32, got {self.channels.dtype}.")
+        if self.values is not None:
+            check_shape("values", self.values, tuple(self.channels.shape))
+            if self.values.dtype != torch.float32:
+                raise InputError(f"values: expected float32, got {self.values.dtype}.")
+        if self.channels.numel():
+            low, high = (int(end) for end in torch.aminmax(self.channels))
+            if low < -1 or high >= self.count:
+                raise InputError(
+                    f"channels: expected values in [-1, {self.count}), got {low} to {high}."
+                )
+
+    def to(self, device: torch.device | str) -> "SparseSignal":
+        """The signal on another device."""
+        values = None if self.values is None else self.values.to(device)
+        return SparseSignal(channels=self.channels.to(device), values=values, count=self.count)
+
+    def dense(self, channels: Int64[Tensor, "m"]) -> Float[Tensor, "n m"]:
+        """Some channels, ascending, as columns."""
+        wanted = channels.to(self.channels)
+        column = torch.searchsorted(wanted, self.channels.contiguous())
+        mine = wanted[column.clamp_max(len(wanted) - 1)] == self.channels
+        row, entry = torch.nonzero(mine, as_tuple=True)
+        values = torch.ones_like(mine, dtype=torch.float32) if self.values is None else self.values
+        signal = torch.zeros(len(self.channels), len(wanted), device=wanted.device)
+        return signal.index_put_((row, column[row, entry]), values[row, entry], accumulate=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StrongestChannels:
+    """The channel with the largest value of each pixel."""
+
+    channels: Int32[Tensor, "height width"]
+    """The channel, the smaller of equal ones."""
+
+    values: Float[Tensor, "height width"]
+    """Its value."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SparseImage:
     """An image of many channels of which each pixel has few: segments, labels, masks.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.core import Camera, Gaussians
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render._backend import Backend, Layout
 from splatseg.render._checks import check_columns, check_k, check_pixels, check_scene
 from splatseg.render._options import RenderOptions
@@ -25,6 +25,8 @@ from splatseg.render._values import (
     Rendered,
     SparseBackProjected,
     SparseImage,
+    SparseSignal,
+    StrongestChannels,
 )
 from splatseg.render._view_weights import ViewWeights
 from splatseg.render.warp import WarpMode, undistorted_camera, warp_into_photograph
@@ -79,6 +81,7 @@ class PreparedView:
     ) -> None:
         """Take what `prepare` checked; nothing is projected before it is needed."""
         self._count = len(gaussians)
+        self._device = gaussians.device
         self._camera = camera
         self._view = backend.prepare(gaussians, undistorted_camera(camera), options=options)
 
@@ -179,6 +182,39 @@ class PreparedView:
             sums=found.sums[~counted],
             weights=weights,
         )
+
+    def argmax(self, signal: SparseSignal, *, background: int) -> StrongestChannels:
+        r"""The largest channel of ``W @ signal`` at each pixel, of any number of channels.
+
+        .. math:: \arg\max_c \sum_i w_{pi} f_{ic} + [c = b] \Bigl(1 - \sum_i w_{pi}\Bigr)
+
+        One pass whose cost does not grow with the number of channels (on the CPU backend), with
+        the bits that a render of dense channels gives. With distortion a pixel takes what the
+        pinhole pixel has that its centre falls into, and `background` with the value 0 where
+        there is none. Not differentiable. On the CPU.
+
+        Args:
+            signal: A signal with a row a Gaussian.
+            background: The channel b of the light that no Gaussian stops.
+
+        Raises:
+            ShapeError: If the signal has another number of rows than there are Gaussians.
+            RangeError: If `background` is none of the channels.
+        """
+        if len(signal.channels) != self._count:
+            raise ShapeError(
+                f"signal: expected {self._count} rows, one a Gaussian, got {len(signal.channels)}."
+            )
+        if not 0 <= background < signal.count:
+            raise RangeError(f"background: expected 0 to {signal.count - 1}, got {background}.")
+        found = self._view.argmax(signal.to(self._device), background)
+        if self._camera.is_pinhole:
+            return found
+        warp = warp_into_photograph(self._camera, "nearest")
+        # float64 holds every int32 exactly.
+        both = warp.apply(torch.stack((found.channels.double(), found.values.double()), dim=-1))
+        channels = torch.where(warp.valid, both[..., 0].to(torch.int32), background)
+        return StrongestChannels(channels=channels, values=both[..., 1].float())
 
     def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
         """The k strongest Gaussians of pixels (column, row), the front-most and the median one.

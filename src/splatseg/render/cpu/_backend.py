@@ -17,6 +17,8 @@ from splatseg.render._values import (
     Rendered,
     SparseBackProjected,
     SparseImage,
+    SparseSignal,
+    StrongestChannels,
 )
 from splatseg.render._view_weights import ImageWeights
 from splatseg.render.cpu._view import MAX_COLOUR_CHANNELS, CpuView
@@ -184,6 +186,13 @@ class CpuBackendView(BackendView):
         return SparseBackProjected(
             gaussians=gaussians, channels=channels, sums=sums, weights=weights
         )
+
+    def argmax(self, signal: SparseSignal, background: int) -> StrongestChannels:
+        """The largest channel of ``W @ signal``, in one pass, however many channels there are."""
+        channels, values = self._prepared().argmax(
+            signal.channels, signal.values, count=signal.count, background=background
+        )
+        return StrongestChannels(channels=channels, values=values)
 
     def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
         """The k strongest Gaussians of pixels (column, row), ties front to back."""

@@ -219,6 +219,22 @@ class CpuView:
         gaussians, names, sums = (torch.from_numpy(array) for array in found)
         return gaussians, names, sums, weights
 
+    def argmax(
+        self, channels: Tensor, values: Tensor | None, *, count: int, background: int
+    ) -> tuple[Tensor, Tensor]:
+        """Of each pixel the largest channel of a `SparseSignal`, and its value, each (h, w)."""
+        winner = torch.empty(self._height, self._width, dtype=torch.int32)
+        score = torch.empty(self._height, self._width)
+        self._view.argmax(
+            channels.contiguous(),
+            None if values is None else values.contiguous(),
+            count,
+            background,
+            winner,
+            score,
+        )
+        return winner, score
+
     def backward(
         self,
         v_image: Float[Tensor, "height width channels"],
