@@ -228,4 +228,4 @@ def _background(labels: Labels) -> str:
     id = labels.background
     if id == UNLABELLED:
         return "none"
-    return str(labels.metadata["names"].get(str(id), f"id {id}"))
+    return labels.info.names.get(id, f"id {id}")

@@ -107,7 +107,7 @@ def apply_rows(layer: Layer, edited: Edited) -> Layer:
         edited: The edit.
 
     Returns:
-        A layer of the Gaussians after it, of the same kind, with the same metadata.
+        A layer of the Gaussians after it, of the same kind, with the same info.
 
     Raises:
         ShapeError: If the edit leads to rows that the layer does not have.

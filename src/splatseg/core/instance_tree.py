@@ -3,20 +3,17 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, overload
 
 import torch
 from torch import Tensor
 
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.layer_info import InstanceFacts, LayerInfo
 from splatseg.core.layers import Features, Labels, Selection
+from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
+from splatseg.core.tree_levels import TreeLevel as TreeLevel
 from splatseg.errors import InputError, RangeError
-
-TreeLevel = Literal["group", "object", "part"]
-"""Levels from the root down. A table with what stands on it is a group, a lamp on it an object,
-the shade of the lamp a part."""
-
-TREE_LEVELS: tuple[TreeLevel, ...] = get_args(TreeLevel)
 
 _FOLLOWS: dict[TreeLevel, tuple[TreeLevel | None, ...]] = {
     "group": (None, "group"),
@@ -104,9 +101,9 @@ class InstanceTree:
         return replace(self, labels=self.labels[index])
 
     @property
-    def metadata(self) -> Mapping[str, Any]:
-        """How it was made, in values that JSON holds."""
-        return self.labels.metadata
+    def info(self) -> LayerInfo:
+        """How it was made, and what was done to it since."""
+        return self.labels.info
 
     @property
     def depth(self) -> int:
@@ -167,9 +164,8 @@ class InstanceTree:
                 gives the roots. A number in [0, 1] gives the deepest nodes that are no finer.
 
         Returns:
-            Labels with the ids of nodes. The metadata says the level (``cut``) and has ``names``
-            and ``class_of`` for the ids of the cut, and ``instances`` where the tree was
-            associated.
+            Labels with the ids of nodes. Their info says the level (``cut``), and has the names,
+            the classes and the facts of the nodes of the cut.
 
         Raises:
             InputError: If there is no such level.
@@ -194,7 +190,7 @@ class InstanceTree:
             background=background,
             candidates=None,
             shares=None,
-            metadata=self._cut_metadata(level, set(wanted.values())),
+            info=self._cut_info(level, set(wanted.values())),
         )
 
     def with_cut(self, labels: Labels, level: TreeLevel | float = "object") -> "InstanceTree":
@@ -220,11 +216,7 @@ class InstanceTree:
                 evidence=labels.evidence,
                 effective_views=labels.effective_views,
                 inferred=labels.inferred,
-                metadata={
-                    key: value
-                    for key, value in labels.metadata.items()
-                    if key not in ("cut", "names", "class_of", "instances")
-                },
+                info=replace(labels.info, cut=None, names={}, class_of={}, instances={}),
             ),
         )
 
@@ -256,16 +248,19 @@ class InstanceTree:
             for id, path in paths.items()
         }
 
-    def _cut_metadata(self, level: TreeLevel | float, ids: set[int]) -> dict[str, Any]:
+    def _cut_info(self, level: TreeLevel | float, ids: set[int]) -> LayerInfo:
         nodes = [node for node in self.nodes if node.id in ids]
-        said = dict(self.metadata) | {
-            "cut": level,
-            "names": {str(node.id): node.name for node in nodes},
-            "class_of": {str(node.id): node.class_id for node in nodes if node.class_id > 0},
-        }
-        if "instances" in said:
-            said["instances"] = [node_row(node) for node in nodes]
-        return said
+        return replace(
+            self.info,
+            cut=level,
+            names={node.id: node.name for node in nodes},
+            class_of={node.id: node.class_id for node in nodes if node.class_id > 0},
+            instances={
+                node.id: InstanceFacts(segments=node.segments, views=node.views)
+                for node in nodes
+                if node.segments
+            },
+        )
 
 
 FlatLayer = Labels | Features | Selection
@@ -300,6 +295,17 @@ def flat_layer(layer: Layer, level: TreeLevel | float | None, *, name: str) -> F
     if level is not None:
         raise InputError(f"layer {name!r}: expected a tree, of which {level} is a level, got none.")
     return layer
+
+
+@overload
+def with_info(layer: InstanceTree, info: LayerInfo) -> InstanceTree: ...
+@overload
+def with_info(layer: Layer, info: LayerInfo) -> Layer: ...
+def with_info(layer: Layer, info: LayerInfo) -> Layer:
+    """The layer with another record of how it was made."""
+    if isinstance(layer, InstanceTree):
+        return replace(layer, labels=replace(layer.labels, info=info))
+    return replace(layer, info=info)
 
 
 def node_row(node: TreeNode) -> dict[str, Any]:

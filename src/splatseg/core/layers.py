@@ -1,8 +1,6 @@
 """What is known of each Gaussian: labels, features, selections. One row a Gaussian."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,6 +8,7 @@ from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.layer_info import LayerInfo, check_layer_info
 from splatseg.errors import InputError, RangeError, ShapeError
 
 
@@ -43,11 +42,12 @@ class Labels:
     inferred: Bool[Tensor, "n"] | None = None
     """True where the id comes from neighbours and not from evidence of the Gaussian's own."""
 
-    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """How it was made, in values that JSON holds: method, options, evidence, id names."""
+    info: LayerInfo = field(default_factory=LayerInfo)
+    """How it was made, what its ids are called, and what was done to it since."""
 
     def __post_init__(self) -> None:
         check_shape("ids", self.ids, (None,))
+        check_layer_info("info", self.info)
         n = len(self.ids)
         check_shape("confidence", self.confidence, (n,))
         if n and int(self.ids.min()) < UNLABELLED:
@@ -81,7 +81,7 @@ class Labels:
             evidence=None if self.evidence is None else self.evidence[index],
             effective_views=None if self.effective_views is None else self.effective_views[index],
             inferred=None if self.inferred is None else self.inferred[index],
-            metadata=self.metadata,
+            info=self.info,
         )
 
     @property
@@ -102,11 +102,12 @@ class Features:
     weights: Float[Tensor, "n"] | None = None
     """Visibility: blending weight summed over pixels and views."""
 
-    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """How it was made, in values that JSON holds."""
+    info: LayerInfo = field(default_factory=LayerInfo)
+    """How it was made, and what was done to it since."""
 
     def __post_init__(self) -> None:
         check_shape("values", self.values, (None, None))
+        check_layer_info("info", self.info)
         if self.weights is not None:
             check_shape("weights", self.weights, (len(self.values),))
 
@@ -118,7 +119,7 @@ class Features:
         return Features(
             values=self.values[index],
             weights=None if self.weights is None else self.weights[index],
-            metadata=self.metadata,
+            info=self.info,
         )
 
 
@@ -135,11 +136,12 @@ class Selection:
     mask: Bool[Tensor, "n"]
     """True where a Gaussian is selected."""
 
-    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """How it was made, in values that JSON holds. Algebra drops it."""
+    info: LayerInfo = field(default_factory=LayerInfo)
+    """How it was made. Algebra drops it."""
 
     def __post_init__(self) -> None:
         check_shape("mask", self.mask, (None,))
+        check_layer_info("info", self.info)
         if self.mask.dtype != torch.bool:
             raise InputError(f"mask: expected booleans, got {self.mask.dtype}.")
 
@@ -148,7 +150,7 @@ class Selection:
 
     def __getitem__(self, index: slice | Tensor) -> "Selection":
         """Rows, in step with `Gaussians.__getitem__`."""
-        return Selection(mask=self.mask[index], metadata=self.metadata)
+        return Selection(mask=self.mask[index], info=self.info)
 
     @property
     def count(self) -> int:

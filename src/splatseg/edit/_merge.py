@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from splatseg.core import (
     InstanceTree,
     Labels,
     Layer,
+    LayerInfo,
     Selection,
     apply_rows,
 )
@@ -27,7 +27,7 @@ def merged_layers(
 
     Layers of the same name and kind are joined. An id of the other scene keeps its number
     where the first does not use it, or uses it under the same name; else it gets the next free
-    one, and the metadata says so under ``merged_ids``. A layer that only one of them has is
+    one, and the edit ``merge`` in its info says so. A layer that only one of them has is
     empty in the rows of the other. Features are joined where they have as many channels.
 
     Args:
@@ -98,9 +98,6 @@ def _joined_trees(
     )
     first, second = apply_rows(own.labels, edited), apply_rows(moved.labels, behind)
     new = edited.rows < 0
-    metadata = dict(own.metadata)
-    if table:
-        metadata["merged_ids"] = {str(old): now for old, now in table.items()}
     return InstanceTree(
         nodes=own.nodes + moved.nodes,
         labels=replace(
@@ -110,7 +107,7 @@ def _joined_trees(
             evidence=_either(first.evidence, second.evidence, new),
             effective_views=_either(first.effective_views, second.effective_views, new),
             inferred=_either(first.inferred, second.inferred, new),
-            metadata=metadata,
+            info=_with_new_ids(own.info, table),
         ),
     )
 
@@ -122,11 +119,6 @@ def _joined_labels(own: Labels, other: Labels, edited: Edited, behind: Edited) -
     first = apply_rows(_widened(own, width), edited)
     second = apply_rows(_widened(moved, width), behind)
     new = edited.rows < 0
-    metadata = dict(own.metadata)
-    if names:
-        metadata["names"] = names
-    if table:
-        metadata["merged_ids"] = {str(old): now for old, now in table.items()}
     return replace(
         first,
         ids=torch.where(new, second.ids, first.ids),
@@ -136,23 +128,30 @@ def _joined_labels(own: Labels, other: Labels, edited: Edited, behind: Edited) -
         evidence=_either(first.evidence, second.evidence, new),
         effective_views=_either(first.effective_views, second.effective_views, new),
         inferred=_either(first.inferred, second.inferred, new),
-        metadata=metadata,
+        info=_with_new_ids(replace(own.info, names=names), table),
     )
 
 
-def _renumbered(own: Labels, other: Labels) -> tuple[Labels, dict[str, str], dict[int, int]]:
+def _with_new_ids(info: LayerInfo, table: Mapping[int, int]) -> LayerInfo:
+    """The record, with what ids of the other layer became where they changed."""
+    if not table:
+        return info
+    return info.with_edit("merge", {"ids": {str(old): now for old, now in table.items()}})
+
+
+def _renumbered(own: Labels, other: Labels) -> tuple[Labels, dict[int, str], dict[int, int]]:
     """`other` with ids that clash with no id of `own`, the names of both, and what changed."""
     used, wanted = _ids_of(own), sorted(_ids_of(other))
-    names, others = _names(own), _names(other)
+    names, others = own.info.names, other.info.names
     table: dict[int, int] = {}
     following = max([0, *used, *wanted]) + 1
     for id in wanted:
-        same = names.get(str(id)) is not None and names.get(str(id)) == others.get(str(id))
+        same = id in names and names[id] == others.get(id)
         if id in used and not same:
             table[id] = following
             following += 1
     joined = dict(names)
-    joined |= {str(table.get(id, id)): others[str(id)] for id in wanted if str(id) in others}
+    joined |= {table.get(id, id): others[id] for id in wanted if id in others}
     moved = replace(
         other,
         ids=_mapped(other.ids, table),
@@ -166,13 +165,6 @@ def _ids_of(labels: Labels) -> set[int]:
     if labels.candidates is not None:
         ids |= set(torch.unique(labels.candidates).tolist())
     return ids - {UNLABELLED}
-
-
-def _names(labels: Labels) -> dict[str, str]:
-    own = labels.metadata.get("names")
-    if not isinstance(own, Mapping):
-        return {}
-    return {str(key): str(name) for key, name in cast("Mapping[str, Any]", own).items()}
 
 
 def _mapped(ids: Tensor, table: Mapping[int, int]) -> Tensor:

@@ -164,18 +164,15 @@ def _of_layer(layer: FlatLayer, where: Where) -> torch.Tensor:
 def ids_named(
     labels: Labels, names: Sequence[str], *, classes: ClassTable | None = None
 ) -> tuple[int, ...]:
-    """Ids of a layer whose name is one of `names`, by its metadata or the class table.
+    """Ids of a layer whose name is one of `names`, by its own record or the class table.
 
     A name may be that of several objects; all of them are meant.
 
     Raises:
         InputError: If no id has one of the names.
     """
-    own = labels.metadata.get("names")
-    known: dict[int, str] = {}
-    if isinstance(own, Mapping) and own:
-        known = {int(key): str(name) for key, name in cast("Mapping[str, Any]", own).items()}
-    elif classes is not None:
+    known = dict(labels.info.names)
+    if not known and classes is not None:
         known = {row.id: row.name for row in classes.rows}
     present = set(labels.present.tolist())
     found: list[int] = []

@@ -175,7 +175,7 @@ def evaluate_binary(
 def labels_of(selection: Selection) -> Labels:
     """A selection as labels, 1 inside and none outside, to be drawn as a mask."""
     ids = torch.where(selection.mask, 1, UNLABELLED)
-    return Labels(ids=ids, confidence=selection.mask.float(), metadata=selection.metadata)
+    return Labels(ids=ids, confidence=selection.mask.float(), info=selection.info)
 
 
 def drawn_and_true(
@@ -236,6 +236,5 @@ def with_truth(views: Sequence[View], truth: LabelSource) -> list[View]:
 
 def learned_from(layer: Labels | Selection, views: Sequence[View]) -> tuple[str, ...]:
     """Names of those views that a layer says it was made from."""
-    voters = layer.metadata.get("views")
-    known = set(map(str, voters)) if isinstance(voters, (list, tuple)) else set[str]()  # pyright: ignore[reportUnknownArgumentType]
+    known = set(layer.info.views or ())
     return tuple(view.name for view in views if view.name in known)

@@ -7,7 +7,6 @@ does not grow with the number of views.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -215,22 +214,17 @@ def _true_maps(
 
 
 def classes_of_instances(instances: Labels) -> dict[int, int]:
-    """Class by instance id, -1 none, as the layer's metadata lists it under ``instances``.
+    """Class by instance id, -1 none, as the layer's info tells it.
 
     Raises:
-        InputError: If it does not.
+        InputError: If it tells none.
     """
-    rows: Any = instances.metadata.get("instances")
-    listed = cast(list[Any], rows) if isinstance(rows, list) else []
-    found: dict[int, int] = {}
-    for row in listed:
-        fields = cast(Mapping[str, Any], row) if isinstance(row, Mapping) else {}
-        id, category = fields.get("id"), fields.get("class")
-        if isinstance(id, int) and isinstance(category, int):
-            found[id] = category if category > 0 else UNLABELLED
+    info = instances.info
+    found = dict.fromkeys(info.instances, UNLABELLED)
+    found |= {id: category for id, category in info.class_of.items() if category > 0}
     if not found:
         raise InputError(
-            "instances: expected a layer whose metadata tells the class of each instance, "
+            "instances: expected a layer whose info tells the class of each instance, "
             "as associate writes it, or a layer of classes beside it."
         )
     return found

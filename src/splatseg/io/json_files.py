@@ -1,12 +1,12 @@
 """JSON in files: read with clear errors, written whole."""
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.core.json_values import plain_json
+from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.atomic import atomic_file
 
 
@@ -52,8 +52,7 @@ def json_text(name: str, value: Mapping[str, Any], *, indent: int | None = None)
         InputError: If it holds a key that is no string, NaN, infinity, or an object that JSON
             has no word for; `name` starts the message.
     """
-    _check(name, value)
-    return json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
+    return json.dumps(plain_json(name, value), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -65,21 +64,3 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
     text = json_text(path.name, value, indent=1)
     with atomic_file(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
-
-
-def _check(name: str, value: object) -> None:
-    if isinstance(value, Mapping):
-        for key, entry in cast(Mapping[object, object], value).items():
-            if not isinstance(key, str):
-                raise InputError(f"{name}: expected keys that are strings, got {key!r}.")
-            _check(f"{name}.{key}", entry)
-    elif isinstance(value, (list, tuple)):
-        for i, entry in enumerate(cast("list[object]", value)):
-            _check(f"{name}[{i}]", entry)
-    elif isinstance(value, float):
-        if not math.isfinite(value):
-            raise InputError(f"{name}: expected a finite number, got {value}.")
-    elif value is not None and not isinstance(value, (str, int)):
-        raise InputError(
-            f"{name}: expected a value that JSON holds, got one of type {type(value).__name__}."
-        )

@@ -19,8 +19,12 @@ from splatseg.core import (
     InstanceTree,
     Labels,
     Layer,
+    LayerInfo,
     Selection,
     TreeNode,
+    layer_info_from_json,
+    layer_info_from_metadata,
+    layer_info_to_json,
     node_row,
 )
 from splatseg.errors import FileFormatError, InputError, MissingFileError
@@ -28,11 +32,11 @@ from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import json_text, parse_object
 
 FORMAT = "splatseg-layer"
-VERSION = 2
-"""Versions up to it are read. Trees came with version 2."""
+VERSION = 3
+"""Versions up to it are read. Trees came with version 2, and `LayerInfo` with version 3."""
 
-_FLAT_VERSION = 1
-"""Version of the files of layers without levels: readers of version 1 know all of them."""
+_INFO_VERSION = 3
+"""Files before it have a flat object of any keys instead, under ``metadata``."""
 
 _HEADER = "header"
 _VOID = 0
@@ -44,10 +48,10 @@ def save_layer(path: Path, layer: Layer) -> None:
     In the file 0 is the id of what has no label, so -1 is written as 0.
 
     Raises:
-        InputError: If an id is 0 (ids in use start at 1), or the metadata has no place in JSON.
+        InputError: If an id is 0 (ids in use start at 1).
         MissingFileError: If the folder of `path` does not exist.
     """
-    header: dict[str, Any] = {"format": FORMAT, "version": _FLAT_VERSION, "count": len(layer)}
+    header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "count": len(layer)}
     match layer:
         case Labels():
             header |= {"kind": "labels", "background": _void(layer.background)}
@@ -72,7 +76,6 @@ def save_layer(path: Path, layer: Layer) -> None:
             labels = layer.labels
             header |= {
                 "kind": "tree",
-                "version": VERSION,
                 "background": _void(labels.background),
                 "nodes": [node_row(node) for node in layer.nodes],
             }
@@ -86,8 +89,8 @@ def save_layer(path: Path, layer: Layer) -> None:
         case Selection():
             header |= {"kind": "selection"}
             arrays = {"mask": layer.mask.cpu().numpy()}
-    header["metadata"] = dict(layer.metadata)
-    text = json_text(f"{path}: metadata", header)
+    header["info"] = layer_info_to_json(layer.info)
+    text = json_text(f"{path}: header", header)
     arrays = {_HEADER: np.frombuffer(text.encode(), np.uint8)} | arrays
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
@@ -102,7 +105,7 @@ def load_layer(path: Path) -> Layer:
     """
     arrays = _arrays(path)
     header = _header(path, arrays)
-    count, metadata = int(header["count"]), header["metadata"]
+    count, info = int(header["count"]), _info(path, header)
     match header.get("kind"):
         case "labels":
             pair = "candidates" in arrays or "shares" in arrays
@@ -127,7 +130,7 @@ def load_layer(path: Path) -> Layer:
                 inferred=torch.from_numpy(_array(path, arrays, "inferred", "?", (count,)))
                 if "inferred" in arrays
                 else None,
-                metadata=metadata,
+                info=info,
             )
         case "features":
             return Features(
@@ -135,13 +138,13 @@ def load_layer(path: Path) -> Layer:
                 weights=torch.from_numpy(_array(path, arrays, "weights", "f", (count,)))
                 if "weights" in arrays
                 else None,
-                metadata=metadata,
+                info=info,
             )
         case "tree":
-            return _tree(path, header, arrays)
+            return _tree(path, header, arrays, info)
         case "selection":
             mask = torch.from_numpy(_array(path, arrays, "mask", "?", (count,)))
-            return Selection(mask=mask, metadata=metadata)
+            return Selection(mask=mask, info=info)
         case kind:
             raise FileFormatError(
                 f"{path}: expected a layer of labels, features, a tree or a selection, "
@@ -150,7 +153,7 @@ def load_layer(path: Path) -> Layer:
 
 
 def _tree(
-    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
 ) -> InstanceTree:
     count = int(header["count"])
     rows = header.get("nodes")
@@ -169,7 +172,7 @@ def _tree(
         inferred=torch.from_numpy(_array(path, arrays, "inferred", "?", (count,)))
         if "inferred" in arrays
         else None,
-        metadata=header["metadata"],
+        info=info,
     )
     try:
         nodes = tuple(_node(row) for row in cast("list[Any]", rows))
@@ -241,9 +244,21 @@ def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
             f"{path}: expected a layer of version {VERSION} or less, got version {version}; "
             "a later splatseg wrote it."
         )
-    if not isinstance(count, int) or count < 0 or not isinstance(header.get("metadata"), dict):
-        raise FileFormatError(f"{path}: expected a header with a count and metadata.")
+    if not isinstance(count, int) or count < 0:
+        raise FileFormatError(f"{path}: expected a header with a count of 0 or more.")
     return header
+
+
+def _info(path: Path, header: Mapping[str, Any]) -> LayerInfo:
+    """The record of how the layer was made, of whatever version the file is."""
+    key = "info" if int(header["version"]) >= _INFO_VERSION else "metadata"
+    record = header.get(key)
+    if not isinstance(record, dict):
+        raise FileFormatError(
+            f"{path}: expected an object {key!r} in the header, got {type(record).__name__}."
+        )
+    read = layer_info_from_json if key == "info" else layer_info_from_metadata
+    return read(cast("dict[str, Any]", record), where=f"{path}: {key}")
 
 
 def _background(path: Path, header: Mapping[str, Any]) -> int:

@@ -11,15 +11,15 @@ Probabilities are not.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast, get_args
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_choice, check_shape
-from splatseg.core import UNLABELLED, Camera, Features, Gaussians, LabelMap, Labels
+from splatseg.core import JSON, UNLABELLED, Camera, Features, Gaussians, LabelMap, Labels, LayerInfo
 from splatseg.errors import InputError, ShapeError
 from splatseg.render import RenderOptions, options_for, render
 
@@ -64,11 +64,12 @@ class ClassifierHead:
         return torch.softmax(self.logits(features), dim=-1)
 
     def labels(
-        self, features: Features, *, min_share: float = 0.0, metadata: Mapping[str, Any]
+        self, features: Features, *, min_share: float = 0.0, info: LayerInfo | None = None
     ) -> Labels:
         """The hard readout: each Gaussian's most likely id, with its probability as confidence.
 
-        Gaussians with a weight of 0 and those below `min_share` have the id -1.
+        Gaussians with a weight of 0 and those below `min_share` have the id -1. The labels have
+        the `info` that is given, or that of the features without the head.
         """
         count = len(features)
         seen = torch.ones(count) if features.weights is None else features.weights
@@ -82,7 +83,7 @@ class ClassifierHead:
             ids=torch.where(sure, self.ids[index], UNLABELLED),
             confidence=torch.where(sure, share.clamp(0, 1), 0.0),
             evidence=seen,
-            metadata=metadata,
+            info=replace(features.info, head=None) if info is None else info,
         )
 
     def label_map(
@@ -141,8 +142,8 @@ class ClassifierHead:
             confidence=torch.where(labelled, best, 1 - claimed).clamp(0, 1),
         )
 
-    def metadata(self) -> dict[str, Any]:
-        """The head in values that JSON holds, for the metadata of a layer of features."""
+    def to_json(self) -> dict[str, JSON]:
+        """The head in values that JSON holds, for the info of a layer of features."""
         return {
             "blend": self.blend,
             "ids": self.ids.tolist(),
@@ -152,13 +153,13 @@ class ClassifierHead:
 
     @classmethod
     def of(cls, features: Features) -> "ClassifierHead":
-        """The head that a layer of features holds in its metadata. Inverse of `metadata`.
+        """The head that a layer of features holds in its info. Inverse of `to_json`.
 
         Raises:
             InputError: If it holds none.
         """
-        found = features.metadata.get("head")
-        if not isinstance(found, Mapping) or not {"ids", "blend"} <= set(found):
+        found = cast("Mapping[str, Any] | None", features.info.head)
+        if found is None or not {"ids", "blend"} <= set(found):
             raise InputError("features: expected a layer with a classifier head, got one without.")
         return cls(
             ids=torch.tensor(_numbers(found["ids"]), dtype=torch.int64),

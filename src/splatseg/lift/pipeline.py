@@ -41,7 +41,7 @@ def lift_labels(
         confusion: How the evidence errs. None takes the ids with most votes, and so do rules
             other than ``share``.
         completion: How neighbours' labels spread. None leaves unseen Gaussians without.
-        classes: Names of the ids, for the metadata.
+        classes: Names of the ids, for the info.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
@@ -68,7 +68,7 @@ def lift_labels(
     )
     if relabel:
         labels = correct_confusion(
-            labels, options=confusion, view_correlation=labels.metadata["view_correlation"]
+            labels, options=confusion, view_correlation=labels.info.view_correlation
         )
         if hard:
             labels = replace(labels, candidates=None, shares=None)

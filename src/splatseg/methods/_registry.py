@@ -60,7 +60,7 @@ def keeps_ids(method: object) -> bool:
     """Whether layers of this method have the ids of the evidence that they were made from.
 
     Args:
-        method: Its name, as the metadata of a layer has it; no method keeps no ids.
+        method: Its name, as the info of a layer has it; no method keeps no ids.
     """
     return isinstance(method, str) and method in _known() and find_method(method).keeps_ids
 

@@ -9,7 +9,16 @@ import numpy as np
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg.core import ClassTable, Features, Gaussians, Labels, LabelSource, Layer, View
+from splatseg.core import (
+    ClassTable,
+    Features,
+    Gaussians,
+    Labels,
+    LabelSource,
+    Layer,
+    LayerInfo,
+    View,
+)
 from splatseg.lift.heads import ClassifierHead
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training import (
@@ -111,37 +120,41 @@ def train_labels(
     )
 
 
-def layer_metadata(
+def layer_info(
     method: str,
     options: dict[str, Any],
     data: LabelData,
     result: TrainingResult,
     *,
+    head: ClassifierHead,
     classes: ClassTable | None,
     seed: int,
-) -> dict[str, Any]:
-    """How a layer was made, in values that JSON holds."""
+) -> LayerInfo:
+    """How a layer was made."""
     known = () if classes is None else classes.rows
     present = set(data.ids.tolist())
-    return {
-        "method": method,
-        "options": options,
-        "views": [view.name for view in data.views],
-        "names": {str(row.id): row.name for row in known if row.id in present},
-        "seed": seed,
-        "loss": float(np.mean(result.losses[-20:])),
-        "steps": len(result.losses),
-        "best_step": result.best_step,
-        "stopped": result.stopped,
-        "scores": [[step, score] for step, score in result.scores],
-    }
+    return LayerInfo(
+        method=method,
+        options=options,
+        views=tuple(view.name for view in data.views),
+        names={row.id: row.name for row in known if row.id in present},
+        seed=seed,
+        head=head.to_json(),
+        details={
+            "loss": float(np.mean(result.losses[-20:])),
+            "steps": len(result.losses),
+            "best_step": result.best_step,
+            "stopped": result.stopped,
+            "scores": [[step, score] for step, score in result.scores],
+        },
+    )
 
 
 def features_layer(
-    values: Float[Tensor, "n channels"], result: TrainingResult, metadata: dict[str, Any]
+    values: Float[Tensor, "n channels"], result: TrainingResult, info: LayerInfo
 ) -> Features:
     """Trained values as a layer; Gaussians that no drawn pixel shows have a weight of 0."""
-    return Features(values=values, weights=result.visibility, metadata=metadata)
+    return Features(values=values, weights=result.visibility, info=info)
 
 
 def runner(train_features: Callable[..., Features]) -> Callable[[MethodInputs, Any], Layer]:
@@ -180,6 +193,4 @@ def context_of(inputs: MethodInputs) -> TrainingContext:
 
 def hard_labels(features: Features, options: LabelTrainingOptions) -> Labels:
     """Each Gaussian's most likely id, by the head that the layer holds."""
-    kept = {name: value for name, value in features.metadata.items() if name != "head"}
-    head = ClassifierHead.of(features)
-    return head.labels(features, min_share=options.min_share, metadata=kept)
+    return ClassifierHead.of(features).labels(features, min_share=options.min_share)

@@ -24,7 +24,7 @@ from splatseg.methods._trained_labels import (
     TrainingContext,
     features_layer,
     label_data,
-    layer_metadata,
+    layer_info,
     train_labels,
 )
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
@@ -68,13 +68,13 @@ def train_own_logits(
     """Train logits of Gaussians.
 
     Args:
-        method: The method's name, for the metadata.
+        method: The method's name, for the info.
         blend: Whether logits are rendered and then classified, or probabilities rendered.
         gaussians: The Gaussians of the scene; their geometry stays as it is.
         views: Those to learn from.
         evidence: Their label maps; ids mean the same in all of them.
         options: How logits are trained.
-        classes: Names of the ids, for the metadata.
+        classes: Names of the ids, for the info.
         context: Backend, seed, checkpoint and progress.
 
     Returns:
@@ -97,7 +97,7 @@ def train_own_logits(
     settings: dict[str, Any] = {"method": method} | asdict(options)
     result = train_labels(data, model, options=options, settings=settings, context=context)
     head = ClassifierHead(ids=data.ids, weight=None, bias=None, blend=blend)
-    metadata = layer_metadata(
-        method, asdict(options), data, result, classes=classes, seed=context.seed
+    info = layer_info(
+        method, asdict(options), data, result, head=head, classes=classes, seed=context.seed
     )
-    return features_layer(result.rows["logits"], result, metadata | {"head": head.metadata()})
+    return features_layer(result.rows["logits"], result, info)

@@ -34,11 +34,14 @@ from splatseg._check import check_range
 from splatseg.core import (
     ClassTable,
     Gaussians,
+    InstanceFacts,
     InstanceTree,
     Labels,
+    LayerInfo,
     SegmentSource,
     View,
     tree_level,
+    with_info,
 )
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
@@ -146,10 +149,10 @@ def associate(
         progress: Called with the views done and their number.
 
     Returns:
-        Labels, or a tree of groups, objects and parts where masks may overlap. The metadata says
-        under ``associate`` how many segments there were, what was joined within a view, and what
-        was left out. That of labels lists ``instances`` (id, name, class, segments, views); the
-        nodes of a tree say the same.
+        Labels, or a tree of groups, objects and parts where masks may overlap. The info says
+        among its details, under ``associate``, how many segments there were, what was joined
+        within a view, and what was left out. That of labels has names, classes and facts of the
+        instances; the nodes of a tree say the same.
 
     Raises:
         InputError: If there are no views, if one has no segments, or none has any.
@@ -176,7 +179,6 @@ def associate(
         group = chosen_groups(table, agreement, group, overlap=options.overlap)
     votes = table.votes(group, _say(table, group, options.small_things))
     group, votes = by_mass(group, votes)
-    rows = _instances(table, group, classes)
     labels = majority(votes)
     if confusion is not None:
         labels = correct_confusion(labels, options=confusion)
@@ -184,16 +186,19 @@ def associate(
         labels,
         candidates=None,
         shares=None,
-        metadata=dict(labels.metadata)
-        | {
-            "method": "associate",
-            "options": asdict(options),
-            "views": list(table.views),
-            "names": {str(row["id"]): row["name"] for row in rows},
-            "class_of": {str(row["id"]): row["class"] for row in rows if row["class"] > 0},
-            "instances": rows,
-            "associate": _account(table, group, tracked=source.persistent),
-        },
+        info=_with_instances(
+            replace(
+                labels.info,
+                method="associate",
+                options=asdict(options),
+                views=tuple(table.views),
+                details=dict(labels.info.details)
+                | {"associate": _account(table, group, tracked=source.persistent)},
+            ),
+            table,
+            group,
+            classes,
+        ),
     )
 
 
@@ -222,13 +227,14 @@ def _tree(
     )
     tree = instance_tree(table, found, level, votes, classes)
     account = _account(table, found.node, tracked=False) | {"instances": len(votes.object_rows)}
-    metadata = dict(tree.metadata) | {
-        "method": "associate",
-        "options": asdict(options),
-        "views": list(table.views),
-        "associate": account | {"nodes": len(tree.nodes)},
-    }
-    return replace(tree, labels=replace(tree.labels, metadata=metadata))
+    info = replace(
+        tree.info,
+        method="associate",
+        options=asdict(options),
+        views=tuple(table.views),
+        details=dict(tree.info.details) | {"associate": account | {"nodes": len(tree.nodes)}},
+    )
+    return with_info(tree, info)
 
 
 def _seen_often(table: SegmentTable, group: NDArray[np.int64], least: int) -> NDArray[np.int64]:
@@ -250,26 +256,24 @@ def _say(table: SegmentTable, group: NDArray[np.int64], exponent: float) -> NDAr
     return np.where(there, np.maximum(size, 1e-12)[group] ** -exponent, 1.0)
 
 
-def _instances(
-    table: SegmentTable, group: NDArray[np.int64], classes: ClassTable | None
-) -> list[dict[str, Any]]:
-    """One row an instance: id, name, class (0 for none), segments and views."""
-    rows: list[dict[str, Any]] = []
-    for place in range(int(group.max(initial=-1)) + 1):
-        members = np.flatnonzero(group == place)
+def _with_instances(
+    info: LayerInfo, table: SegmentTable, group: NDArray[np.int64], classes: ClassTable | None
+) -> LayerInfo:
+    """The record with the name, the class where it is known, and the facts of each instance."""
+    names: dict[int, str] = {}
+    class_of: dict[int, int] = {}
+    facts: dict[int, InstanceFacts] = {}
+    for index in range(int(group.max(initial=-1)) + 1):
+        id, members = index + 1, np.flatnonzero(group == index)
         category = category_of(table, members)
         named = category > 0 and classes is not None
         name = classes.name_of(category) if named and classes is not None else "object"
-        rows.append(
-            {
-                "id": place + 1,
-                "name": f"{name} {place + 1}",
-                "class": category,
-                "segments": len(members),
-                "views": len(np.unique(table.view[members])),
-            }
-        )
-    return rows
+        names[id] = f"{name} {id}"
+        if category > 0:
+            class_of[id] = category
+        views = np.unique(table.view[members])
+        facts[id] = InstanceFacts(segments=len(members), views=len(views))
+    return replace(info, names=names, class_of=class_of, instances=facts)
 
 
 def _account(table: SegmentTable, group: NDArray[np.int64], *, tracked: bool) -> dict[str, Any]:

@@ -46,7 +46,7 @@ from splatseg.methods._trained_labels import (
     features_layer,
     hard_labels,
     label_data,
-    layer_metadata,
+    layer_info,
     runner,
     train_labels,
 )
@@ -153,7 +153,7 @@ def identity(
         views: Those to learn from: a method that is to be measured uses train views only.
         evidence: Their label maps, as large as the photographs or reduced in proportion.
         options: How identities are trained.
-        classes: Names of the ids, for the metadata.
+        classes: Names of the ids, for the info.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the steps done and all there are to do.
@@ -161,7 +161,7 @@ def identity(
 
     Returns:
         Each Gaussian's most likely id, with its probability as the confidence. Gaussians that no
-        sampled pixel shows have the id -1. The metadata holds the loss in the end, and the
+        sampled pixel shows have the id -1. The info holds the loss in the end, and the
         scores on held-out views.
 
     Raises:
@@ -217,10 +217,10 @@ def train_identity(
         bias=result.shared["bias"],
         blend=options.blend,
     )
-    metadata = layer_metadata(
-        "identity", asdict(options), data, result, classes=classes, seed=context.seed
+    info = layer_info(
+        "identity", asdict(options), data, result, head=head, classes=classes, seed=context.seed
     )
-    return features_layer(result.rows["features"], result, metadata | {"head": head.metadata()})
+    return features_layer(result.rows["features"], result, info)
 
 
 def _model(

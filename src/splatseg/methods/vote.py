@@ -38,6 +38,7 @@ from splatseg.core import (
     LabelMap,
     Labels,
     LabelSource,
+    LayerInfo,
     View,
     camera_of_map,
 )
@@ -146,7 +147,7 @@ def vote(
         views: Those that vote: a method that is to be measured uses train views only.
         evidence: Their label maps, as large as the photographs or reduced in proportion.
         options: How views vote.
-        classes: Names of the ids, for the metadata.
+        classes: Names of the ids, for the info.
         render_options: Switches of the blending model, for occlusion and transmittance.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
@@ -261,7 +262,7 @@ def _decide(
     options: VoteOptions,
     *,
     views: Sequence[View],
-    names: dict[str, str],
+    names: dict[int, str],
 ) -> Labels:
     ranking = table.rank(options.candidates)
     total = ranking.total + against if options.count_void else ranking.total
@@ -278,18 +279,18 @@ def _decide(
         candidates=ranking.ids if soft else None,
         shares=shares if soft else None,
         evidence=ranking.total,
-        metadata={
-            "method": "vote",
-            "options": asdict(options),
-            "views": [view.name for view in views],
-            "names": names,
-        },
+        info=LayerInfo(
+            method="vote",
+            options=asdict(options),
+            views=tuple(view.name for view in views),
+            names=names,
+        ),
     )
 
 
-def _names(classes: ClassTable | None, ids: set[int]) -> dict[str, str]:
+def _names(classes: ClassTable | None, ids: set[int]) -> dict[int, str]:
     known = () if classes is None else classes.rows
-    return {str(row.id): row.name for row in known if row.id in ids}
+    return {row.id: row.name for row in known if row.id in ids}
 
 
 def run(inputs: MethodInputs, options: VoteOptions) -> Labels:

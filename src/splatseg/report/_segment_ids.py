@@ -2,7 +2,7 @@
 
 from splatseg.core import ClassInfo, ClassTable, Labels, LabelSource
 from splatseg.io.evidence import Evidence
-from splatseg.report.legend import colour_of, own_names
+from splatseg.report.legend import colour_of
 
 
 def ids_agree(labels: Labels, source: LabelSource, *, otherwise: bool) -> bool:
@@ -11,7 +11,7 @@ def ids_agree(labels: Labels, source: LabelSource, *, otherwise: bool) -> bool:
     They do where every name that the layer has is the source's name of the same id. Where one
     of them has no names, `otherwise` says.
     """
-    named = own_names(labels)
+    named = labels.info.names
     table = source.classes if isinstance(source, Evidence) else None
     if table is None or not table.rows or not named:
         return otherwise
@@ -35,7 +35,7 @@ def class_table(
         classes: Of the scene. Their colours are taken where id and name agree.
         unnamed_are_classes: A layer without names has the ids of these classes.
     """
-    named = own_names(labels)
+    named = labels.info.names
     theirs = {row.id: row for row in classes.rows} if classes is not None else {}
     rows: list[ClassInfo] = []
     for id in labels.present.tolist():

@@ -101,13 +101,13 @@ def segmentation_page(data: SegmentationReportData, *, longest: int) -> Report:
     if data.seen_of:
         blocks.append(coverage_bars(data.seen, views=data.seen_of))
     blocks += conflict_tables(labels, data.compared, data.classes)
-    blocks += association_tables(labels.metadata)
+    blocks += association_tables(labels.info)
     scores = data.score.per_class if isinstance(data.score, SemanticScore) else {}
     blocks.append(id_table(labels, data.classes, scores=scores, scored=data.scored))
     blocks += _cost(data)
     if data.command:
         blocks.append(Commands(title="The same from the shell", lines=(data.command,)))
-    method = labels.metadata.get("method", "unknown")
+    method = labels.info.method or "unknown"
     return Report(
         title=f"Segmentation {data.layer}",
         summary=f"{len(data.classes.rows)} labels on {count_text(len(labels))} Gaussians, by "
@@ -188,7 +188,7 @@ def _cost(data: SegmentationReportData) -> list[Table]:
     if data.peak_bytes is not None:
         rows.append(("largest memory", f"{data.peak_bytes / 2**30:.2f} GiB resident"))
     tables = [Table(title="What it cost", columns=("what", "value"), rows=tuple(rows))]
-    options = fact_rows(data.labels.metadata.get("options"))
+    options = fact_rows(data.labels.info.options)
     if options:
         tables.append(
             Table(title="Options of the method", columns=("option", "value"), rows=tuple(options))

@@ -7,7 +7,12 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, ClassTable, Labels
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    Labels,
+    LayerInfo,
+)
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
 from splatseg.report._common import count_text
 from splatseg.report._segment_panels import ViewPanel
@@ -144,9 +149,9 @@ def conflict_tables(
     return blocks
 
 
-def association_tables(metadata: Mapping[str, Any]) -> list[Block]:
-    """What a method that joins ids says of it in the layer's metadata, as far as it says it."""
-    facts = metadata.get("associate")
+def association_tables(info: LayerInfo) -> list[Block]:
+    """What a method that joins ids says of it in the layer's info, as far as it says it."""
+    facts = info.details.get("associate")
     if not isinstance(facts, Mapping):
         return []
     facts = cast(Mapping[str, Any], facts)
@@ -173,8 +178,10 @@ def id_table(
 
     Where the method lists its instances, also how many segments and views each was seen in.
     """
-    instances = _instance_rows(labels.metadata)
-    also = [key for key in ("segments", "views") if any(key in row for row in instances.values())]
+    instances = labels.info.instances
+    known = {"segments": {id: facts.segments for id, facts in instances.items()}}
+    known["views"] = {id: facts.views for id, facts in instances.items()}
+    also = [key for key, counts in known.items() if any(n is not None for n in counts.values())]
     ids, confidence = labels.ids.cpu().long(), labels.confidence.detach().double().cpu()
     rows: list[tuple[Cell, ...]] = []
     for row in classes.rows:
@@ -182,7 +189,7 @@ def id_table(
         count = int(mask.sum())
         mean = float(confidence[mask].mean()) if count else None
         values: list[Cell] = [row.id, row.name, count, mean]
-        values += [_cell(instances.get(row.id, {}).get(key)) for key in also]
+        values += [known[key].get(row.id) for key in also]
         if scores:
             values.append(scores.get(row.id))
         rows.append(tuple(values))
@@ -193,14 +200,6 @@ def id_table(
         notes.append(f"IoU is of {scored}; a dash where the truth has none of it.")
     columns = ("id", "name", "Gaussians", "confidence", *also, *(("IoU",) if scores else ()))
     return Table(title="Labels", columns=columns, rows=tuple(rows[:_ROWS]), note=" ".join(notes))
-
-
-def _instance_rows(metadata: Mapping[str, Any]) -> dict[int, Mapping[str, Any]]:
-    """What the metadata lists under ``instances``, by id."""
-    rows: Any = metadata.get("instances")
-    listed = cast(list[Any], rows) if isinstance(rows, list) else []
-    objects = [cast(Mapping[str, Any], row) for row in listed if isinstance(row, Mapping)]
-    return {row["id"]: row for row in objects if isinstance(row.get("id"), int)}
 
 
 def fact_rows(values: object) -> list[tuple[Cell, ...]]:

@@ -1,8 +1,7 @@
 """What ids mean to the eye: the one colour and the name that each has everywhere."""
 
 import colorsys
-from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import torch
 from jaxtyping import Int, UInt8
@@ -45,27 +44,21 @@ def colour_labels(
     return torch.tensor(colours, dtype=torch.uint8)[index]
 
 
-def own_names(labels: Labels) -> dict[int, str]:
-    """Names that the layer itself gives its ids; none where it gives none."""
-    names: Any = labels.metadata.get("names")
-    return {int(id): str(name) for id, name in names.items()} if isinstance(names, Mapping) else {}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-
-
 def names_of(labels: Labels, classes: ClassTable | None) -> dict[int, str]:
     """Names of the ids in use: the layer's own, or the scene's where it has none."""
     present = set(labels.present.tolist())
     rows = () if classes is None else classes.rows
-    return own_names(labels) or {row.id: row.name for row in rows if row.id in present}
+    return dict(labels.info.names) or {row.id: row.name for row in rows if row.id in present}
 
 
 def legend_of(labels: Labels, classes: ClassTable | None) -> dict[str, Any]:
     """The content of legend.json for a layer."""
     names = names_of(labels, classes)
-    sources = cast(Mapping[str, int], labels.metadata.get("source_ids") or {})
+    sources = labels.info.source_ids or {}
     rows: dict[str, dict[str, Any]] = {}
     for id in labels.present.tolist():
         rows[str(id)] = {"name": names.get(id, ""), "colour": list(colour_of(id, classes))}
-        if str(id) in sources:
-            rows[str(id)]["source_id"] = sources[str(id)]
+        if id in sources:
+            rows[str(id)]["source_id"] = sources[id]
     background = 0 if labels.background == UNLABELLED else labels.background
     return {"none": 0, "background": background, "ids": rows}

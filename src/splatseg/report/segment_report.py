@@ -69,7 +69,7 @@ def write_segmentation_report(
         ShapeError: If a truth does not have its photograph's proportions.
     """
     same = evidence is not None and ids_agree(
-        labels, evidence, otherwise=keeps_ids(labels.metadata.get("method", "uplift"))
+        labels, evidence, otherwise=keeps_ids(labels.info.method or "uplift")
     )
     panels, further = _panels(
         scene, labels, views, evidence=evidence, truth=truth, same_ids=same, backend=backend
@@ -175,7 +175,7 @@ def _scores(
     scored = held_out or with_truth
     kind = "held-out view" if held_out else "view that the layer was made from"
     words = f"{len(scored)} {kind.replace('view', 'views', 1) if len(scored) > 1 else kind}"
-    otherwise = ids_are_classes(evidence) and keeps_ids(labels.metadata.get("method", "uplift"))
+    otherwise = ids_are_classes(evidence) and keeps_ids(labels.info.method or "uplift")
     if ids_agree(labels, truth, otherwise=otherwise):
         pooled = Confusion.none()
         for panel in scored:
@@ -190,13 +190,13 @@ def _scores(
 
 
 def _facts(labels: Labels, layer: str, backend: str) -> dict[str, Any]:
-    made = labels.metadata
+    made = labels.info
     facts = {
         "layer": layer,
-        "method": made.get("method"),
-        "evidence": made.get("evidence"),
-        "views asked for": made.get("views_asked"),
-        "seed": made.get("seed"),
+        "method": made.method,
+        "evidence": made.evidence,
+        "views asked for": made.views_asked,
+        "seed": made.seed,
         "backend": backend,
         "coverage": f"in pictures of at most {SEEN_LONGEST} pixels",
     }

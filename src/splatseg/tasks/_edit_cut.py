@@ -1,13 +1,16 @@
 """Where Gaussians are cut at the boundary of what is selected, and what that changes."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from torch import Tensor
 
-from splatseg.core import Gaussians, View
+from splatseg.core import (
+    Gaussians,
+    LayerInfo,
+    View,
+)
 from splatseg.edit import CutBy, Document, Where
 from splatseg.errors import InputError
 from splatseg.evaluate import psnr, render_and_photograph
@@ -56,17 +59,17 @@ def _masks(document: Document, where: Where, cut: Cut) -> CutBy | None:
     """The label maps that a layer was made from; None where auto has to do without."""
     asked = cut.by == "masks"
     layer = document.layers.get(where.layer or "")
-    metadata: Mapping[str, Any] = {} if layer is None else layer.metadata
-    name = cut.evidence or metadata.get("evidence")
+    info = LayerInfo() if layer is None else layer.info
+    name = cut.evidence or info.evidence
     scene = document.scene
-    if cut.by == "layer" or not where.ids or not isinstance(name, str):
+    if cut.by == "layer" or not where.ids or name is None:
         if asked:
             raise InputError("cut: masks needs a layer made from label maps, got none.")
         return None
-    if not asked and (document.history or not keeps_ids(metadata.get("method"))):
+    if not asked and (document.history or not keeps_ids(info.method)):
         return None
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    zero_is_class = "source_ids" in metadata
+    zero_is_class = info.source_ids is not None
     try:
         evidence = open_evidence(find_evidence(folders, name), zero_is_class=zero_is_class)
     except InputError:
@@ -77,7 +80,7 @@ def _masks(document: Document, where: Where, cut: Cut) -> CutBy | None:
         if asked:
             raise InputError(f"cut: masks needs label maps, {name} is {evidence.kind}.")
         return None
-    views = tuple(view.name for view in views_that_made(scene, metadata, evidence))
+    views = tuple(view.name for view in views_that_made(scene, info, evidence))
     if not views:
         if asked:
             raise InputError(f"cut: masks: {name} has no label map of a view that may be used.")

@@ -8,7 +8,16 @@ from typing import Any
 
 from torch import Tensor
 
-from splatseg.core import Features, Gaussians, Labels, Layer, Scene, Similarity, View
+from splatseg.core import (
+    Features,
+    Gaussians,
+    Labels,
+    Layer,
+    Scene,
+    Similarity,
+    View,
+    with_info,
+)
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import is_scene, load_scene, save_scene, save_scene_layer, scene_layer_names
@@ -305,7 +314,7 @@ def _facts(work: _Work, found: Attached) -> dict[str, Any]:
 
 def _carried(work: _Work, found: Attached, layer: Layer) -> Layer:
     carried = found.carry(layer)
-    return replace(carried, metadata=dict(layer.metadata) | {"attached": _facts(work, found)})
+    return with_info(carried, carried.info.with_edit("attach", _facts(work, found)))
 
 
 def _like(source: Gaussians, edited: Gaussians) -> Gaussians:

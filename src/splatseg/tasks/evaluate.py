@@ -53,7 +53,7 @@ class EvaluationOptions:
 
     instances: str | None = None
     """With panoptic: name of the layer of instances; `layer` is that of the classes. None takes
-    `layer` for both: its metadata must tell each instance's class, as that of associate does."""
+    `layer` for both: its record must tell each instance's class, as that of associate does."""
 
     truth_instances: Path | None = None
     """With panoptic: folder of the true instance maps; `truth` is that of the classes."""

@@ -9,7 +9,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Gaussians, Labels, Layer, Scene, Selection
+from splatseg.core import (
+    UNLABELLED,
+    Gaussians,
+    Labels,
+    Layer,
+    LayerInfo,
+    Scene,
+    Selection,
+)
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import (
     BoxMethod,
@@ -264,7 +272,7 @@ def _labels_of_selection(selection: Selection, name: str) -> Labels:
     return Labels(
         ids=torch.where(selection.mask, _SELECTED, UNLABELLED),
         confidence=selection.mask.float(),
-        metadata={"names": {str(_SELECTED): name}},
+        info=LayerInfo(names={_SELECTED: name}),
     )
 
 
@@ -334,7 +342,7 @@ def _objects(job: _Job) -> tuple[ObjectRow, ...]:
         names=names_of(objects, job.scene.classes),
         classes=None if job.instances is None else job.classes,
         class_names=_class_names(job.scene, job.classes),
-        class_of=_class_of(objects),
+        class_of=objects.info.class_of,
         up=job.scene.up,
         box=job.options.box,
     )
@@ -348,14 +356,6 @@ def _class_names(scene: Scene, classes: Labels | None) -> dict[int, str]:
     rows = () if scene.classes is None else scene.classes.rows
     names = {row.id: row.name for row in rows}
     return names | ({} if classes is None else names_of(classes, scene.classes))
-
-
-def _class_of(objects: Labels) -> dict[int, int]:
-    """The class of each object, where the layer says: ``metadata["class_of"]``."""
-    said = objects.metadata.get("class_of")
-    if not isinstance(said, Mapping):
-        return {}
-    return {int(str(id)): int(str(value)) for id, value in said.items()}
 
 
 def _splat(job: _Job) -> Exported:
@@ -426,7 +426,7 @@ def _coco(job: _Job) -> Exported:
         things,
         stuff,
         names=names,
-        class_of=_class_of(things),
+        class_of=things.info.class_of,
         are_classes=job.instances is None,
     )
     with job.observer.stage("export") as step:

@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 import torch
 
-from splatseg.core import UNLABELLED, ClassTable, Labels, Selection
+from splatseg.core import UNLABELLED, ClassTable, Labels, Selection, layer_info_to_json
 from splatseg.report.legend import colour_of, names_of
 
 _NONE = 0
@@ -28,7 +28,7 @@ def label_tables(
             "background": _NONE if layer.background == UNLABELLED else layer.background,
             "confidence": "confidence" if kind == "class" else "instance_confidence",
             "ids": _rows(layer, classes),
-            "made": dict(layer.metadata),
+            "made": layer_info_to_json(layer.info),
         }
     }
 

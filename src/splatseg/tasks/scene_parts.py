@@ -1,9 +1,8 @@
 """Parts of a scene by the names that people give them: views of a split, layers, evidence."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
 
-from splatseg.core import FlatLayer, Layer, Scene, View, flat_layer, layer_address
+from splatseg.core import FlatLayer, Layer, LayerInfo, Scene, View, flat_layer, layer_address
 from splatseg.errors import InputError
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.evidence import Evidence
@@ -65,13 +64,10 @@ def whole_layer(scene: Scene, name: str, layers: Mapping[str, Layer] | None = No
     return load_scene_layer(scene.root, name)
 
 
-def views_that_made(
-    scene: Scene, metadata: Mapping[str, Any], evidence: Evidence
-) -> tuple[View, ...]:
+def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:
     """Views with evidence that made a layer, where it says which; else the training views."""
     known = set(evidence.view_names)
-    used = metadata.get("views")
-    names = set(cast("list[str]", used)) if isinstance(used, list) else None
+    names = None if info.views is None else set(info.views)
     return tuple(
         view
         for view in scene.views

@@ -18,6 +18,7 @@ from splatseg.core import (
     Layer,
     Scene,
     View,
+    with_info,
 )
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -174,7 +175,7 @@ def segment(
         raise InputError(
             f"classes: goes with methods that give labels; {method.name} gives {method.returns}."
         )
-    layer = _described(layer, evidence_name, evidence, options)
+    layer = _described(layer, method, evidence_name, evidence, views=views, options=options)
     return Segmentation(layer=layer, name=name, evidence=evidence, views=views, timings=timings)
 
 
@@ -204,24 +205,32 @@ def _completed(
 
 
 def _described(
-    layer: Layer, evidence_name: str, evidence: Evidence, options: SegmentOptions
+    layer: Layer,
+    method: Method,
+    evidence_name: str,
+    evidence: Evidence,
+    *,
+    views: Sequence[View],
+    options: SegmentOptions,
 ) -> Layer:
-    """The layer with a record of what it was made from."""
-    metadata = dict(layer.metadata) | {
-        "evidence": evidence_name,
-        "views_asked": views_recorded(options.views),
-        "seed": options.seed,
-        "versions": {
+    """The layer with a record of what it was made from; a method's own record comes first."""
+    own = layer.info.views
+    info = replace(
+        layer.info,
+        method=layer.info.method or method.name,
+        evidence=evidence_name,
+        views=tuple(view.name for view in views) if own is None else own,
+        views_asked=views_recorded(options.views),
+        seed=options.seed,
+        versions={
             "splatseg": importlib.metadata.version("splatseg"),
             "torch": str(torch.__version__),
         },
-    }
+    )
     if isinstance(layer, Labels) and evidence.source_ids is not None:
         present = layer.present.tolist()
-        metadata["source_ids"] = {str(id): evidence.source_ids[id] for id in present}
-    if isinstance(layer, InstanceTree):
-        return replace(layer, labels=replace(layer.labels, metadata=metadata))
-    return replace(layer, metadata=metadata)
+        info = replace(info, source_ids={id: evidence.source_ids[id] for id in present})
+    return with_info(layer, info)
 
 
 def _classes_to_merge(

@@ -174,7 +174,7 @@ def merged(layer: Labels, found: Sharpened) -> Labels:
         evidence=evidence,
         effective_views=views,
         inferred=inferred if bool(inferred.any()) else None,
-        metadata=dict(layer.metadata) | {"sharpened": new.metadata["sharpened"]},
+        info=layer.info.with_edit("sharpen", new.info.edit("sharpen") or {}),
     )
 
 
@@ -184,7 +184,7 @@ def views_to_learn_from(scene: Scene, layer: Labels, evidence: Evidence) -> tupl
     Raises:
         InputError: If there is none.
     """
-    views = views_that_made(scene, layer.metadata, evidence)
+    views = views_that_made(scene, layer.info, evidence)
     views = tuple(view for view in views if view.image is not None)
     if not views:
         raise InputError(
@@ -248,18 +248,18 @@ def _source(
     scene: Scene, layer: Labels, options: SharpenSceneOptions, backend: BackendName
 ) -> tuple[Evidence, LabelSource, tuple[View, ...]]:
     """The evidence, label maps of it with the layer's ids, and the views to learn from."""
-    name = options.evidence or layer.metadata.get("evidence")
-    if not isinstance(name, str):
+    name = options.evidence or layer.info.evidence
+    if name is None:
         raise InputError(
             f"evidence: expected a name, as layer {options.layer} does not say what it was "
             "made from; got none."
         )
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    own = name == layer.metadata.get("evidence")
-    zero = own and "source_ids" in layer.metadata
+    own = name == layer.info.evidence
+    zero = own and layer.info.source_ids is not None
     evidence = open_evidence(find_evidence(folders, name), zero_is_class=zero)
     views = views_to_learn_from(scene, layer, evidence)
-    same = own and keeps_ids(layer.metadata.get("method"))
+    same = own and keeps_ids(layer.info.method)
     if same and evidence.kind in ("labels", "tracked"):
         return evidence, evidence, views
     if evidence.kind not in ("masks", "panoptic", "tracked"):

@@ -110,7 +110,7 @@ class Attached:
         """A layer of the source as one of the edited Gaussians.
 
         What was not found gets no label (confidence and evidence 0), features of zeros, and is
-        not selected. Background, names and the rest of the metadata stay.
+        not selected. Background, names and the rest of the info stay.
 
         Raises:
             ShapeError: If the layer has not one row a Gaussian of the source.

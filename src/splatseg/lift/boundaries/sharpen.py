@@ -206,10 +206,10 @@ def _refined(
         if progress is not None:
             progress(done + 1, options.sharpen_steps)
     record = {"options": asdict(options), "seed": fit.seed, "agreement": [before, after]}
-    metadata = dict(labels.metadata) | {"sharpened": record}
+    info = labels.info.with_edit("sharpen", record)
     return Sharpened(
         gaussians=gaussians,
-        labels=replace(labels, metadata=metadata),
+        labels=replace(labels, info=info),
         agreement=(before, after),
         exposures=refinement.exposures,
     )
@@ -238,7 +238,7 @@ class _LabelUpdate:
         )
         labels = votes
         if self.confusion is not None:
-            correlation = votes.metadata["view_correlation"]
+            correlation = votes.info.view_correlation
             labels = correct_confusion(votes, options=self.confusion, view_correlation=correlation)
         return labels, _agreement(votes, labels)
 

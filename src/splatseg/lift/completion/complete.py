@@ -124,8 +124,8 @@ def complete(
     Returns:
         The layer with `inferred` set where an id comes from neighbours: where there was none, or
         where smoothing chose another one. Their confidence is the share that arrived. Gaussians
-        that no evidence reaches in `spread_steps` keep the id -1. The metadata holds how many
-        there were of each.
+        that no evidence reaches in `spread_steps` keep the id -1. The edit in its info says
+        how many there were of each.
 
     Raises:
         ShapeError: If the numbers of Gaussians, labels and features differ.
@@ -324,4 +324,4 @@ def _with_record(
         "corrected": corrected,
         "unreached": unreached,
     }
-    return replace(labels, metadata=dict(labels.metadata) | {"completion": record})
+    return replace(labels, info=labels.info.with_edit("complete", record))

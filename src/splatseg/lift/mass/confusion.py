@@ -106,11 +106,11 @@ def correct_confusion(
         options: How the evidence errs.
         view_correlation: How much better the nearest view predicts the votes of a held-out view
             than other views do, at most 1: `uplift` measures it on the training views and records
-            it in the metadata. None where that is not known: views count as independent.
+            it in the info. None where that is not known: views count as independent.
 
     Returns:
         The layer with ids, candidates and shares by probability, as many as before. Gaussians
-        without a label keep none. The metadata holds how many labels changed, and how
+        without a label keep none. The edit in its info holds how many labels changed, and how
         many independent views votes amounted to at most.
 
     Raises:
@@ -266,4 +266,4 @@ def _posterior(
 
 
 def _with_record(labels: Labels, record: dict[str, Any]) -> Labels:
-    return replace(labels, metadata=dict(labels.metadata) | {"confusion": record})
+    return replace(labels, info=labels.info.with_edit("correct_confusion", record))

@@ -25,6 +25,7 @@ from splatseg.core import (
     Features,
     FeatureSource,
     Gaussians,
+    LayerInfo,
     View,
     camera_of_map,
 )
@@ -117,11 +118,11 @@ def uplift_features(
     return Features(
         values=values,
         weights=weights,
-        metadata={
-            "method": "uplift_features",
-            "options": asdict(options),
-            "views": [view.name for view in ordered],
-        },
+        info=LayerInfo(
+            method="uplift_features",
+            options=asdict(options),
+            views=tuple(view.name for view in ordered),
+        ),
     )
 
 

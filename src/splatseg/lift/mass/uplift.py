@@ -21,7 +21,6 @@ References:
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,6 +33,7 @@ from splatseg.core import (
     LabelMap,
     Labels,
     LabelSource,
+    LayerInfo,
     View,
     camera_of_map,
 )
@@ -147,14 +147,14 @@ def uplift(
         views: Those that vote: a method that is to be measured uses train views only.
         evidence: Their label maps, as large as the photographs or reduced in proportion.
         options: How votes become labels.
-        classes: Names of the ids, for the metadata.
+        classes: Names of the ids, for the info.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are to do.
 
     Returns:
         The layer, with the votes of each Gaussian as its evidence. Gaussians that no voting
-        pixel saw have the id -1 and confidence 0. The metadata holds the method, its options,
+        pixel saw have the id -1 and confidence 0. The info holds the method, its options,
         the views, what the background rests on, and the largest error bound of a count, as a share
         of the Gaussian's votes (0 where the table was exact).
 
@@ -239,7 +239,7 @@ def _collected(
 
 
 def _labels(
-    votes: _Votes, ordered: Sequence[View], options: UpliftOptions, names: dict[str, Any]
+    votes: _Votes, ordered: Sequence[View], options: UpliftOptions, names: dict[int, str]
 ) -> Labels:
     """The layer that the votes decide."""
     ranking = votes.table.rank(options.candidates)
@@ -263,24 +263,26 @@ def _labels(
         evidence=ranking.total,
         # Kish's effective sample size: a view that shows hardly anything counts hardly anything.
         effective_views=torch.where(squares > 0, votes.visibility**2 / squares, 0.0),
-        metadata={
-            "method": "uplift",
-            "options": asdict(options),
-            "views": [view.name for view in ordered],
-            "names": names,
-            "background_votes": record,
-            "largest_error_bound": _largest_share(ranking.error_bound, ranking.total),
-        }
-        | _correlation(votes.by_view, ranking),
+        info=LayerInfo(
+            method="uplift",
+            options=asdict(options),
+            views=tuple(view.name for view in ordered),
+            names=names,
+            view_correlation=_correlation(votes.by_view, ranking),
+            details={
+                "background_votes": record,
+                "largest_error_bound": _largest_share(ranking.error_bound, ranking.total),
+            },
+        ),
     )
 
 
-def _correlation(by_view: ViewVotes | None, ranking: Ranking) -> dict[str, float | None]:
+def _correlation(by_view: ViewVotes | None, ranking: Ranking) -> float | None:
     """How alike neighbouring views err, where the layer is soft."""
     if by_view is None:
-        return {}
+        return None
     shares = ranking.votes / ranking.total.clamp_min(1e-30).unsqueeze(1)
-    return {"view_correlation": by_view.correlation(ranking.ids, shares)}
+    return by_view.correlation(ranking.ids, shares)
 
 
 def _without_edges(label_map: LabelMap, options: UpliftOptions) -> LabelMap:
@@ -313,9 +315,9 @@ def _background(label_mass: LabelMass, options: UpliftOptions) -> tuple[int, dic
     return (strongest if enough and clear else UNLABELLED), record
 
 
-def _names(classes: ClassTable | None, label_mass: LabelMass) -> dict[str, Any]:
+def _names(classes: ClassTable | None, label_mass: LabelMass) -> dict[int, str]:
     known = () if classes is None else classes.rows
-    return {str(row.id): row.name for row in known if row.id in label_mass.total}
+    return {row.id: row.name for row in known if row.id in label_mass.total}
 
 
 def _largest_share(part: Tensor, whole: Tensor) -> float:

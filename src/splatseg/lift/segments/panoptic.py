@@ -16,7 +16,6 @@ References:
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, cast
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, ClassTable, Gaussians, Labels
+from splatseg.core import UNLABELLED, ClassTable, Gaussians, InstanceFacts, Labels, LayerInfo
 from splatseg.errors import InputError, ShapeError
 from splatseg.neighbours import NeighbourIndex
 
@@ -44,9 +43,9 @@ def merge_panoptic(
         table: Which classes are things. A class that it does not know is stuff.
 
     Returns:
-        The layer: things with their ids in `instances`, stuff with ids above them. Its metadata
-        has the class of each segment (``class_of``, and ``instances`` with a row each), their
-        names, and under ``panoptic`` how many instances were stuff. Confidence is that of the
+        The layer: things with their ids in `instances`, stuff with ids above them. Its info has
+        the class and the name of each segment, what is known of each instance, and the edit
+        ``merge_panoptic``, which says how many instances were stuff. Confidence is that of the
         layer a label came from.
 
     Raises:
@@ -94,16 +93,15 @@ def merge_panoptic(
         effective_views=_either(is_thing, instances.effective_views, classes.effective_views),
         inferred=_either(is_thing, instances.inferred, classes.inferred),
         background=numbered.get(classes.background, UNLABELLED),
-        metadata=dict(instances.metadata)
-        | _table(instances, kept, numbered, table)
-        | {
-            "panoptic": {
+        info=_segments(instances.info, kept, numbered, table).with_edit(
+            "merge_panoptic",
+            {
                 "things": len(kept),
                 "stuff": len(numbered),
                 "instances_of_stuff": len(class_of) - len(kept),
-                "classes_by": classes.metadata.get("method", "unknown"),
-            }
-        },
+                "classes_by": classes.info.method or "unknown",
+            },
+        ),
     )
 
 
@@ -191,20 +189,17 @@ def _either(is_thing: Tensor, first: Tensor | None, second: Tensor | None) -> Te
     return torch.where(is_thing, first.cpu(), second.cpu())
 
 
-def _table(
-    instances: Labels, kept: Mapping[int, int], numbered: Mapping[int, int], table: ClassTable
-) -> dict[str, Any]:
-    """The segments, as the metadata of a layer lists them."""
-    said = cast("list[dict[str, Any]]", instances.metadata.get("instances") or [])
-    told = {int(row["id"]): row for row in said}
-    rows: list[dict[str, Any]] = []
-    for id, kind in sorted(kept.items()):
-        name = f"{table.name_of(kind)} {id}"
-        rows.append(dict(told.get(id, {})) | {"id": id, "name": name, "class": kind})
-    for kind, id in numbered.items():
-        rows.append({"id": id, "name": table.name_of(kind), "class": kind, "stuff": True})
-    return {
-        "names": {str(row["id"]): row["name"] for row in rows},
-        "class_of": {str(row["id"]): row["class"] for row in rows},
-        "instances": rows,
-    }
+def _segments(
+    info: LayerInfo, kept: Mapping[int, int], numbered: Mapping[int, int], table: ClassTable
+) -> LayerInfo:
+    """The record of the instances, with the segments that there are now."""
+    things = dict(sorted(kept.items()))
+    stuff = {id: kind for kind, id in numbered.items()}
+    facts = {id: info.instances.get(id, InstanceFacts()) for id in things}
+    return replace(
+        info,
+        names={id: f"{table.name_of(kind)} {id}" for id, kind in things.items()}
+        | {id: table.name_of(kind) for id, kind in stuff.items()},
+        class_of=things | stuff,
+        instances=facts | {id: InstanceFacts(stuff=True) for id in stuff},
+    )

@@ -1,0 +1,63 @@
+"""Values that JSON holds, checked before they are kept or written."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias, cast
+
+from splatseg.errors import InputError
+
+JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
+"""What JSON has a word for; numbers are finite, keys are strings."""
+
+_MAX_DEPTH = 100
+
+
+def plain_json(name: str, value: object) -> JSON:
+    """A copy in the types that JSON gives back: dicts, and lists for tuples.
+
+    Args:
+        name: What the value is called; starts the message of an error.
+        value: The value.
+
+    Raises:
+        InputError: If it holds a key that is no string, NaN, infinity, an object that JSON has no
+            word for, or groups more than 100 deep.
+
+    Example:
+        >>> plain_json("options", {"sizes": (1, 2.5)})
+        {'sizes': [1, 2.5]}
+    """
+    return _plain(name, value, _MAX_DEPTH)
+
+
+def plain_object(name: str, value: object) -> dict[str, JSON]:
+    """A copy of a mapping as JSON holds it, see `plain_json`.
+
+    Raises:
+        InputError: Also if it is no mapping.
+    """
+    if not isinstance(value, Mapping):
+        raise InputError(f"{name}: expected a mapping, got {type(value).__name__}.")
+    return cast("dict[str, JSON]", plain_json(name, cast("Mapping[object, object]", value)))
+
+
+def _plain(name: str, value: object, depth: int) -> JSON:
+    if depth < 0:
+        raise InputError(f"{name}: expected values at most {_MAX_DEPTH} deep, got deeper ones.")
+    if isinstance(value, Mapping):
+        entries: dict[str, JSON] = {}
+        for key, entry in cast("Mapping[object, object]", value).items():
+            if not isinstance(key, str):
+                raise InputError(f"{name}: expected keys that are strings, got {key!r}.")
+            entries[key] = _plain(f"{name}.{key}", entry, depth - 1)
+        return entries
+    if isinstance(value, (list, tuple)):
+        items = cast("Sequence[object]", value)
+        return [_plain(f"{name}[{i}]", entry, depth - 1) for i, entry in enumerate(items)]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{name}: expected a finite number, got {value}.")
+    if value is None or isinstance(value, (str, int, float)):
+        return value
+    raise InputError(
+        f"{name}: expected a value that JSON holds, got one of type {type(value).__name__}."
+    )
