@@ -148,7 +148,7 @@ def semantic(bench: Bench) -> None:
         "semantic",
         lambda: complete(gaussians, soft, options=smooth),
     )
-    again = correct_confusion(soft, view_correlation=soft.metadata["view_correlation"])
+    again = correct_confusion(soft, view_correlation=soft.info.view_correlation)
     hard = replace(again, candidates=None, shares=None)
     bench.row("labels_semantic, relabelled", "semantic", lambda: complete(gaussians, hard))
     bench.row(

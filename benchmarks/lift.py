@@ -132,7 +132,7 @@ def nested(scene: Path, evidence: Path, views: int | None) -> str:
     )
     wall, done = time.perf_counter() - wall, time.process_time()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    account = labels.metadata["associate"]
+    account = labels.info.details["associate"]
     return (
         f"nested: {len(train)} views, {account['segments']} masks onto {len(gaussians)} Gaussians, "
         f"{account['instances']} instances: {wall:.1f} s ({done - cpu:.1f} s of CPU, of which "

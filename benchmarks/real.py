@@ -79,7 +79,7 @@ def camvid(job: Job) -> None:
         begin = time.monotonic()
         soft = uplift(job.scene.gaussians, train, found, options=UpliftOptions(candidates=8))
         seconds = time.monotonic() - begin
-        measured = soft.metadata["view_correlation"]
+        measured = soft.info.view_correlation
         relabelled = correct_confusion(soft, view_correlation=measured)
         for name, labels in (("uplift", soft), ("confusion corrected", relabelled)):
             hard = complete(job.scene.gaussians, replace(labels, candidates=None, shares=None))

@@ -171,7 +171,7 @@ def things_of(data: Path, labels: Labels) -> dict[int, str]:
 def lifted(scene: Scene, truth: Evidence) -> Labels:
     """The layer of things, with the candidates that a cut at all boundaries needs."""
     labels = uplift(scene.gaussians, scene.train_views, truth, options=UpliftOptions(candidates=4))
-    return replace(labels, metadata=dict(labels.metadata) | {"evidence": FOLDER})
+    return replace(labels, info=replace(labels.info, evidence=FOLDER))
 
 
 def together(

@@ -181,12 +181,12 @@ class Bench:
             context=context,
         )
         used, begin = cpu_seconds() - used, time.monotonic() - begin
-        told, head = layer.metadata, ClassifierHead.of(layer)
+        told, head = layer.info.details, ClassifierHead.of(layer)
         held = max((score for _, score in told["scores"]), default=float("nan"))
         text = f"{evidence:20s} {title:34s}"
         if not self.arguments.held_out:
             truth = "semantic" if evidence.startswith("labels_semantic") else "instance"
-            labels = head.labels(layer, metadata={})
+            labels = head.labels(layer)
             gaussians = self.scene.gaussians
             hard = self.score(truth, lambda camera: label_map(gaussians, camera, labels))
             rendered = self.score(truth, lambda camera: head.label_map(gaussians, camera, layer))

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Features, Labels, Selection, Similarity
+from splatseg.core import (
+    Features,
+    Labels,
+    LayerInfo,
+    Selection,
+    Similarity,
+)
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer, scene_layer_names
 from splatseg.io.splats import read_splats, write_splats
@@ -39,7 +45,7 @@ def labelled(small, rng):
         Labels(
             ids=torch.where(ids == 0, -1, ids),
             confidence=noise[:, 7].abs().clamp(0, 1),
-            metadata={"names": {"3": "third"}},
+            info=LayerInfo(names={3: "third"}),
         ),
     )
     save_scene_layer(small.scene, "high", Selection(mask=noise[:, 8] > 0))
@@ -82,8 +88,8 @@ def test_a_new_scene(labelled, kept, edited, splatseg, tmp_path) -> None:
             name
         ]:
             assert torch.equal(getattr(got, field), getattr(old, field)[kept])
-        assert got.metadata["attached"]["found"] == len(kept)
-    assert load_scene_layer(new, "fifths").metadata["names"] == {"3": "third"}
+        assert got.info.edit("attach")["found"] == len(kept)
+    assert load_scene_layer(new, "fifths").info.names == {3: "third"}
     assert after.provenance["command"] == "attach"
     # The command never replaces a scene.
     status, _, err = splatseg("attach", labelled.scene, edited, "-o", new)

@@ -174,7 +174,7 @@ def test_sixteen_bits_whose_zero_is_a_class(splatseg, small, labels) -> None:
     command = ("segment", small.scene, "--method", "uplift", "--zero-is-class")
     assert splatseg(*command)[0] == 0
     layer = load_scene_layer(small.scene, labels.name)
-    assert layer.metadata["source_ids"] == {"301": 300}
+    assert layer.info.source_ids == {301: 300}
     # The same through see, whose evidence tells what its ids were.
     see = ("see", small.scene, "--model", labels, "--evidence", "copy", "--zero-is-class")
     assert splatseg(*see)[0] == 0
@@ -182,7 +182,7 @@ def test_sixteen_bits_whose_zero_is_a_class(splatseg, small, labels) -> None:
     assert copy.source_ids is not None
     assert (len(copy.source_ids), copy.source_ids[301]) == (301, 300)
     assert splatseg(*command[:-1], "--evidence", "copy")[0] == 0
-    assert load_scene_layer(small.scene, "copy").metadata["source_ids"] == {"301": 300}
+    assert load_scene_layer(small.scene, "copy").info.source_ids == {301: 300}
 
 
 def test_ids_beyond_what_files_hold(splatseg, small, labels) -> None:

@@ -1,6 +1,7 @@
 """`splatseg edit` as a person types it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def room(tmp_path):
     labels = uplift(
         gaussians, views, Maps(maps), options=UpliftOptions(candidates=2), backend="cpu"
     )
-    metadata = dict(labels.metadata) | {"evidence": "truth", "names": {"3": "thing", "8": "wall"}}
+    info = replace(labels.info, evidence="truth", names={3: "thing", 8: "wall"})
     save_scene_layer(
         root,
         "objects",
@@ -67,7 +68,7 @@ def room(tmp_path):
                 f: getattr(labels, f)
                 for f in ("ids", "confidence", "background", "candidates", "shares")
             },
-            metadata=metadata,
+            info=info,
         ),
     )
     return root

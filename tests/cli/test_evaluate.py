@@ -9,7 +9,12 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Labels, Selection
+from splatseg.core import (
+    InstanceFacts,
+    Labels,
+    LayerInfo,
+    Selection,
+)
 from splatseg.evaluate import labels_of_points
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 
@@ -26,7 +31,7 @@ def labels_of(ids: torch.Tensor, background: int = -1) -> Labels:
         ids=ids,
         confidence=torch.ones(len(ids)),
         background=background,
-        metadata={"views": ["train_0"]},
+        info=LayerInfo(views=("train_0",)),
     )
 
 
@@ -110,9 +115,9 @@ def test_panoptic_agrees_with_the_scorer(labelled, both, tmp_path, ranked) -> No
 def test_a_layer_that_tells_the_classes_of_its_instances(labelled, both) -> None:
     capture = labelled.capture
     layer = load_scene_layer(labelled.scene, "objects")
-    rows = [{"id": 4, "class": 2}, {"id": 5, "class": 7}, {"id": 600, "class": 0}, "odd"]
-    metadata = {**layer.metadata, "instances": rows}
-    save_scene_layer(labelled.scene, "objects", replace(layer, metadata=metadata))
+    # Of the instance 600 no class is known.
+    info = replace(layer.info, class_of={4: 2, 5: 7}, instances={600: InstanceFacts(segments=2)})
+    save_scene_layer(labelled.scene, "objects", replace(layer, info=info))
     (both.out / "named").mkdir()
     for path in (both.out / "objects").glob("*.png"):
         ids = np.array(Image.open(path))

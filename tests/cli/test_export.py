@@ -9,7 +9,11 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Labels, Selection
+from splatseg.core import (
+    Labels,
+    LayerInfo,
+    Selection,
+)
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.io.splats import read_splats
 from splatseg.lift import label_map
@@ -36,7 +40,7 @@ def labelled(small):
         Labels(
             ids=piece,
             confidence=torch.full((len(x),), 0.5),
-            metadata={"names": {"11": "near piece", "300": "far piece"}},
+            info=LayerInfo(names={11: "near piece", 300: "far piece"}),
         ),
     )
     save_scene_layer(small.scene, "chosen", Selection(mask=x > 0))
@@ -189,7 +193,7 @@ def test_coco_of_instances_alone(labelled, splatseg, tmp_path) -> None:
     # A layer that says what class its objects are.
     piece = load_scene_layer(labelled.scene, "pieces")
     said = Labels(
-        ids=piece.ids, confidence=piece.confidence, metadata={"class_of": {"11": 2, "300": 7}}
+        ids=piece.ids, confidence=piece.confidence, info=LayerInfo(class_of={11: 2, 300: 7})
     )
     save_scene_layer(labelled.scene, "said", said)
     arguments = ("--what", "coco", "--instances", "said", "-o", out, "--backend", "cpu")

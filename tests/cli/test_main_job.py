@@ -38,21 +38,21 @@ def test_segment_writes_a_layer_that_tells_how(segmented) -> None:
     clear &= (means[:, 0].abs() < 0.9) & (means[:, 1] > 0.2) & (means[:, 1] < 0.7)
     expected = torch.where(means[:, 0] < 0, 2, 7)
     assert torch.equal(layer.ids[clear], expected[clear].int())
-    metadata = layer.metadata
-    assert metadata["method"] == "uplift"
-    assert metadata["evidence"] == "labels_semantic"
-    assert metadata["views"] == ["train_0", "train_1", "train_3"]
-    assert (metadata["views_asked"], metadata["seed"]) == ("train", 0)
-    assert metadata["names"] == {"1": "sky", "2": "left wall", "7": "right wall"}
-    assert set(metadata["versions"]) == {"splatseg", "torch"}
+    info = layer.info
+    assert info.method == "uplift"
+    assert info.evidence == "labels_semantic"
+    assert info.views == ("train_0", "train_1", "train_3")
+    assert (info.views_asked, info.seed) == ("train", 0)
+    assert info.names == {1: "sky", 2: "left wall", 7: "right wall"}
+    assert set(info.versions) == {"splatseg", "torch"}
 
 
 def test_segment_views(small, splatseg) -> None:
     def views(asked: str) -> list[str]:
         assert splatseg("segment", small.scene, *SEGMENT, "--views", asked)[0] == 0
         layer = load_scene_layer(small.scene, "labels_semantic")
-        assert layer.metadata["views_asked"] == asked
-        return layer.metadata["views"]
+        assert layer.info.views_asked == asked
+        return list(layer.info.views)
 
     assert views("train_1,train_3") == ["train_1", "train_3"]
     assert views("all") == ["train_0", "train_1", "train_3"]
@@ -83,7 +83,7 @@ def test_a_source_whose_zero_is_a_class(small, splatseg, tmp_path) -> None:
     assert status == 0, err
     layer = load_scene_layer(small.scene, "labels_zero")
     assert layer.background == 1
-    assert layer.metadata["source_ids"] == {"1": 0, "2": 1, "7": 6}
+    assert layer.info.source_ids == {1: 0, 2: 1, 7: 6}
     arguments = ("--layer", "labels_zero", "--truth", small.capture / "truth_zero", "--json")
     status, text, err = splatseg("evaluate", small.scene, *arguments, *rule)
     assert status == 0, err
@@ -101,7 +101,7 @@ def test_segment_is_repeatable(small, splatseg) -> None:
         assert splatseg("segment", small.scene, *SEGMENT, "--layer", "a", "--seed", 5)[0] == 0
         first, second = path.read_bytes(), path.read_bytes()
     assert first == second
-    assert load_scene_layer(small.scene, "a").metadata["seed"] == 5
+    assert load_scene_layer(small.scene, "a").info.seed == 5
 
 
 def test_render_writes_what_was_asked(segmented, splatseg, tmp_path) -> None:

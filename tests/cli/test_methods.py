@@ -77,8 +77,8 @@ def test_a_method_of_another_package_is_installed_and_runs(small, tmp_path) -> N
     )
     assert "majority: the id with most votes" in " ".join(listed.stdout.split())
     layer = load_scene_layer(small.scene, "labels_semantic")
-    assert layer.metadata["method"] == "uplift"
-    assert layer.metadata["options"]["min_share"] == 0.6
+    assert layer.info.method == "uplift"
+    assert layer.info.options["min_share"] == 0.6
 
 
 def test_the_same_file_is_a_method_of_ours(small, splatseg, monkeypatch) -> None:
@@ -91,7 +91,7 @@ def test_the_same_file_is_a_method_of_ours(small, splatseg, monkeypatch) -> None
         *("--evidence", "labels_semantic"),
     )
     assert status == 0, error
-    assert load_scene_layer(small.scene, "labels_semantic").metadata["options"]["min_share"] == 0.6
+    assert load_scene_layer(small.scene, "labels_semantic").info.options["min_share"] == 0.6
     assert "the id with most votes" in splatseg("segment", "--method", "majority", "--help")[1]
     assert not keeps_ids("majority")
     assert keeps_ids("vote")
@@ -153,7 +153,7 @@ def test_published_takes_the_options_of_the_publication(small, splatseg) -> None
     assert splatseg(*words, "--layer", "default")[0] == 0
     assert splatseg(*words, "--published", "--share", "0.6", "--layer", "other")[0] == 0
     options = {
-        name: load_scene_layer(small.scene, name).metadata["options"]
+        name: load_scene_layer(small.scene, name).info.options
         for name in ("published", "default", "other")
     }
     assert options["published"]["rule"] == "published"
@@ -179,7 +179,7 @@ def test_python_gives_what_the_command_gives(small, splatseg) -> None:
     assert made.name == "labels_semantic"
     assert made.labels.ids.equal(saved.ids)
     assert made.labels.confidence.equal(saved.confidence)
-    assert made.layer.metadata == saved.metadata
+    assert made.layer.info == saved.info
 
 
 def test_options_of_another_method_are_refused_in_python(small) -> None:

@@ -238,8 +238,8 @@ def test_names_by_comma_and_by_space(small, splatseg, words) -> None:
     command = ("--method", "uplift", "--backend", "cpu", "--views", *words)
     assert splatseg("segment", small.scene, *command)[0] == 0
     layer = load_scene_layer(small.scene, "labels_semantic")
-    assert layer.metadata["views_asked"] == "train_0,train_3"
-    assert sorted(layer.metadata["views"]) == ["train_0", "train_3"]
+    assert layer.info.views_asked == "train_0,train_3"
+    assert sorted(layer.info.views) == ["train_0", "train_3"]
     see = ("see", small.scene, "--model", "classical", "--evidence", "masks", "--views", *words)
     assert splatseg(*see, "--json")[0] == 0
 

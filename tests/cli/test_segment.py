@@ -76,8 +76,8 @@ def test_labels_that_mean_the_same_in_all_views(small, splatseg, method) -> None
     status, out, err = splatseg("segment", small.scene, "--method", method, *quick)
     assert (status, err.strip()) == (0, ""), err
     layer = layer_of(small.scene, "labels_semantic")
-    assert layer.metadata["method"] == method
-    assert layer.metadata["names"][str(LEFT)] == "left wall"
+    assert layer.info.method == method
+    assert layer.info.names[LEFT] == "left wall"
     expected = sides(small.scene)
     certain = (expected >= 0) & (layer.ids >= 0)
     assert certain.sum() > 100
@@ -91,7 +91,7 @@ def test_masks_become_instances(masks, splatseg) -> None:
     assert (status, err.strip()) == (0, ""), err
     layer = layer_of(masks.scene, "masks")
     assert layer.present.tolist() == [1, 2]
-    assert sorted(layer.metadata["names"].values()) == ["object 1", "object 2"]
+    assert sorted(layer.info.names.values()) == ["object 1", "object 2"]
     expected = sides(masks.scene)
     known = (expected >= 0) & (layer.ids >= 0)
     left = int(layer.ids[expected == LEFT].mode().values)
@@ -108,10 +108,10 @@ def test_instances_have_classes_where_segments_do(panoptic, splatseg) -> None:
     )  # fmt: skip
     assert (status, err.strip()) == (0, ""), err
     layer = layer_of(panoptic.scene, "things")
-    assert sorted(layer.metadata["class_of"].values()) == [LEFT, RIGHT]
-    names = {layer.metadata["class_of"][i]: n for i, n in layer.metadata["names"].items()}
+    assert sorted(layer.info.class_of.values()) == [LEFT, RIGHT]
+    names = {layer.info.class_of[i]: n for i, n in layer.info.names.items()}
     assert names[LEFT].startswith("left wall ")
-    assert layer.metadata["associate"]["instances"] == 2
+    assert layer.info.details["associate"]["instances"] == 2
 
 
 def test_instances_and_classes_merge(panoptic, splatseg) -> None:
@@ -123,9 +123,9 @@ def test_instances_and_classes_merge(panoptic, splatseg) -> None:
     )
     assert (status, err.strip()) == (0, ""), err
     layer = layer_of(panoptic.scene, "whole")
-    assert sorted(layer.metadata["class_of"].values()) == [LEFT, RIGHT]
-    assert layer.metadata["panoptic"]["things"] == 2
-    kinds = {int(i): kind for i, kind in layer.metadata["class_of"].items()}
+    assert sorted(layer.info.class_of.values()) == [LEFT, RIGHT]
+    assert layer.info.edit("merge_panoptic")["things"] == 2
+    kinds = layer.info.class_of
     expected = sides(panoptic.scene)
     known = (expected >= 0) & (layer.ids >= 0)
     found = torch.tensor([kinds.get(i, -1) for i in layer.ids.tolist()])
@@ -159,19 +159,19 @@ def test_confusion_is_corrected_unless_told_not_to(small, splatseg) -> None:
     command = ("segment", small.scene, "--method", "uplift")
     assert splatseg(*command)[0] == 0
     layer = layer_of(small.scene, "labels_semantic")
-    said = layer.metadata["confusion"]
+    said = layer.info.edit("correct_confusion")
     assert said["options"]["effective_views"] == 10
-    assert said["view_correlation"] == layer.metadata["view_correlation"]
+    assert said["view_correlation"] == layer.info.view_correlation
     assert layer.effective_views is not None
     assert layer.candidates is None
     assert splatseg(*command, "--candidates", 3, "--effective-views", 4, "--layer", "soft")[0] == 0
     soft = layer_of(small.scene, "soft")
-    assert soft.metadata["confusion"]["options"]["effective_views"] == 4
+    assert soft.info.edit("correct_confusion")["options"]["effective_views"] == 4
     assert soft.candidates is not None
     assert soft.candidates.shape[1] == 3
     for words in (("--no-correct-confusion",), ("--label-rule", "flashsplat")):
         assert splatseg(*command, *words, "--layer", "plain")[0] == 0
-        assert "confusion" not in layer_of(small.scene, "plain").metadata
+        assert layer_of(small.scene, "plain").info.edit("correct_confusion") is None
 
 
 def test_files_and_report_of_one_command(masks, splatseg) -> None:

@@ -9,7 +9,11 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Labels, Selection
+from splatseg.core import (
+    Labels,
+    LayerInfo,
+    Selection,
+)
 from splatseg.errors import InputError
 from splatseg.fit import recorded_exposures
 from splatseg.io.evidence import open_evidence
@@ -58,9 +62,9 @@ def test_a_new_scene_with_all_layers_and_what_was_done(labelled, splatseg, tmp_p
     old, new = (load_scene_layer(root, "classes") for root in (labelled.scene, tmp_path / "new"))
     assert isinstance(old, Labels)
     assert isinstance(new, Labels)
-    assert dict(new.metadata["names"]) == dict(old.metadata["names"])
-    assert new.metadata["evidence"] == "labels_semantic"
-    assert new.metadata["sharpened"]["agreement"] == [first, last]
+    assert new.info.names == old.info.names
+    assert new.info.evidence == "labels_semantic"
+    assert new.info.edit("sharpen")["agreement"] == [first, last]
     assert float((new.ids == old.ids).float().mean()) > 0.9
     picked = load_scene_layer(tmp_path / "new", "picked")
     assert isinstance(picked, Selection)
@@ -145,12 +149,12 @@ def test_views_are_those_of_the_layer(labelled) -> None:
     train = [view.name for view in scene.train_views]
     assert [view.name for view in _views(scene, layer, every)] == train
     assert len(train) < len(scene.views)
-    test = replace(layer, metadata={"views": ["test_2", "train_0"]})
+    test = replace(layer, info=LayerInfo(views=("test_2", "train_0")))
     assert [view.name for view in _views(scene, test, every)] == ["train_0", "test_2"]
-    unknown = replace(layer, metadata={})
+    unknown = replace(layer, info=LayerInfo())
     assert [view.name for view in _views(scene, unknown, every)] == train
     with pytest.raises(InputError, match="expected evidence of a view"):
-        _views(scene, replace(layer, metadata={"views": ["nobody"]}), every)
+        _views(scene, replace(layer, info=LayerInfo(views=("nobody",))), every)
 
 
 def test_label_maps_of_something_else_are_refused(labelled, splatseg, tmp_path) -> None:
@@ -294,13 +298,13 @@ def test_what_no_pixel_shows_keeps_its_label(labelled) -> None:
         confidence=torch.tensor([0.9, 0.8, 0.3]),
         evidence=torch.tensor([5.0, 4.0, 0.0]),
         inferred=torch.tensor([False, True, True]),
-        metadata={"names": {"2": "wall"}},
+        info=LayerInfo(names={2: "wall"}),
     )
     new = Labels(
         ids=torch.tensor([2, 2, -1], dtype=torch.int32),
         confidence=torch.tensor([1.0, 0.7, 0.0]),
         evidence=torch.tensor([6.0, 3.0, 0.0]),
-        metadata={"sharpened": {}},
+        info=LayerInfo().with_edit("sharpen", {}),
     )
     scene = load_scene(labelled.scene).gaussians
     found = merged(old, Sharpened(gaussians=scene, labels=new, agreement=(0.5, 0.6)))
@@ -310,4 +314,4 @@ def test_what_no_pixel_shows_keeps_its_label(labelled) -> None:
     assert found.evidence.tolist() == [6.0, 3.0, 0.0]
     assert found.inferred is not None
     assert found.inferred.tolist() == [False, False, True]
-    assert found.metadata["names"] == {"2": "wall"}
+    assert found.info.names == {2: "wall"}

@@ -17,6 +17,7 @@ from splatseg.core import (
     Features,
     LabelMap,
     Labels,
+    LayerInfo,
     MaskSet,
     Rle,
     Selection,
@@ -101,7 +102,7 @@ def test_layers_slice_in_step() -> None:
         evidence=torch.tensor([4.0, 0.0, 2.5]),
         effective_views=torch.tensor([3.0, 0.0, 1.5]),
         inferred=torch.tensor([False, True, False]),
-        metadata={"method": "by hand"},
+        info=LayerInfo(method="by hand"),
     )
     part = labels[torch.tensor([2, 0])]
     assert part.evidence is not None
@@ -121,7 +122,7 @@ def test_layers_slice_in_step() -> None:
     assert part.candidates is not None
     assert part.candidates.tolist() == [[5, 3], [3, 5]]
     assert part.background == 7
-    assert part.metadata["method"] == "by hand"
+    assert part.info.method == "by hand"
     assert labels.present.tolist() == [3, 5, 7]
     with pytest.raises(InputError, match="both or neither"):
         Labels(ids=labels.ids, confidence=labels.confidence, shares=labels.shares)

@@ -13,6 +13,7 @@ from splatseg.core import (
     Gaussians,
     InstanceTree,
     Labels,
+    LayerInfo,
     Selection,
     TreeNode,
     apply_rows,
@@ -40,7 +41,7 @@ def labels(ids, **more) -> Labels:
     return Labels(ids=ids, confidence=torch.linspace(0.5, 1, len(ids)), **more)
 
 
-TREE = InstanceTree(nodes=NODES, labels=labels(IDS, metadata={"method": "associate"}))
+TREE = InstanceTree(nodes=NODES, labels=labels(IDS, info=LayerInfo(method="associate")))
 
 
 @pytest.mark.parametrize(
@@ -66,10 +67,10 @@ def test_a_cut_is_of_objects_unless_another_is_asked_for() -> None:
 
 def test_a_cut_says_what_its_ids_are_and_is_unsure_of_none() -> None:
     cut = TREE.cut("object")
-    assert cut.metadata["cut"] == "object"
-    assert cut.metadata["method"] == "associate"
-    assert cut.metadata["names"] == {"2": "lamp", "3": "cup", "7": "wall"}
-    assert cut.metadata["class_of"] == {"2": 8}
+    assert cut.info.cut == "object"
+    assert cut.info.method == "associate"
+    assert cut.info.names == {2: "lamp", 3: "cup", 7: "wall"}
+    assert cut.info.class_of == {2: 8}
     expected = TREE.labels.confidence.clone()
     expected[[5, 7]] = 0
     assert torch.equal(cut.confidence, expected)
@@ -157,7 +158,7 @@ def test_changes_of_a_cut_leave_what_stays_in_its_part() -> None:
     tree = TREE.with_cut(changed)
     assert tree.labels.ids.tolist() == [6, 3, 5, 2, 3, 1, 7, 7]
     assert tree.cut().ids.tolist() == changed.ids.tolist()
-    assert "names" not in tree.metadata
+    assert tree.info == TREE.info, "names are those of the nodes again"
 
 
 def test_rows_follow_an_edit() -> None:

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Camera, Features, Gaussians, Labels, Selection
+from splatseg.core import (
+    Camera,
+    Features,
+    Gaussians,
+    Labels,
+    LayerInfo,
+    Selection,
+)
 
 BACKEND = "cpu"
 
@@ -63,7 +70,7 @@ def layers_of(rng: np.random.Generator, count: int):
             evidence=torch.from_numpy(rng.uniform(0, 9, count).astype(np.float32)),
             effective_views=torch.from_numpy(rng.uniform(1, 9, count).astype(np.float32)),
             inferred=torch.from_numpy(rng.random(count) < 0.5),
-            metadata={"names": {"3": "chair"}},
+            info=LayerInfo(names={3: "chair"}),
         ),
         "colours": Features(
             values=torch.from_numpy(rng.normal(size=(count, 4)).astype(np.float32)),

@@ -6,7 +6,15 @@ import math
 import pytest
 import torch
 
-from splatseg.core import Features, Labels, Scene, Selection, Similarity, View
+from splatseg.core import (
+    Features,
+    Labels,
+    LayerInfo,
+    Scene,
+    Selection,
+    Similarity,
+    View,
+)
 from splatseg.edit import (
     CutBy,
     Document,
@@ -201,7 +209,7 @@ def test_merged_ids_keep_out_of_each_others_way(rng, some) -> None:
     own = Labels(
         ids=torch.tensor([1, 2] * 12).int(),
         confidence=torch.ones(24),
-        metadata={"names": {"1": "floor", "2": "cup"}},
+        info=LayerInfo(names={1: "floor", 2: "cup"}),
     )
     ids = torch.tensor([1, 2, 3, 4]).int()
     other = Labels(
@@ -209,14 +217,14 @@ def test_merged_ids_keep_out_of_each_others_way(rng, some) -> None:
         confidence=torch.ones(4),
         candidates=torch.stack((ids, torch.tensor([2, -1, -1, -1]).int()), dim=1),
         shares=torch.tensor([[1.0, 0.0]]).expand(4, 2).clone(),
-        metadata={"names": {"1": "floor", "2": "plate", "3": "cup"}},
+        info=LayerInfo(names={1: "floor", 2: "plate", 3: "cup"}),
     )
     edited = merge(some, random_gaussians(rng, 4))
     joined = merged_layers({"objects": own}, {"objects": other}, edited)["objects"]
     # 1 is the same thing in both, 2 is not, 3 and 4 are free.
     assert joined.ids[24:].tolist() == [1, 5, 3, 4]
-    assert joined.metadata["names"] == {"1": "floor", "2": "cup", "5": "plate", "3": "cup"}
-    assert joined.metadata["merged_ids"] == {"2": 5}
+    assert joined.info.names == {1: "floor", 2: "cup", 5: "plate", 3: "cup"}
+    assert joined.info.edit("merge") == {"ids": {"2": 5}}
     assert joined.candidates[24].tolist() == [1, 5]
     assert joined.candidates[1].tolist() == [2, -1]
     assert joined.shares[1].tolist() == [1.0, 0.0]
@@ -402,9 +410,9 @@ def test_a_similarity_stays_exact_in_a_history() -> None:
 
 def test_a_wrong_name_is_answered_with_those_most_like_it() -> None:
     """Of more names than a sentence holds, those that share words come first."""
-    names = {str(i): f"book {i}" for i in range(1, 12)} | {"12": "navy train on the table"}
+    names = {i: f"book {i}" for i in range(1, 12)} | {12: "navy train on the table"}
     labels = Labels(
-        ids=torch.arange(1, 13).int(), confidence=torch.ones(12), metadata={"names": names}
+        ids=torch.arange(1, 13).int(), confidence=torch.ones(12), info=LayerInfo(names=names)
     )
     with pytest.raises(InputError) as caught:
         ids_named(labels, ["Train"])

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Edited, Gaussians, Selection, Similarity, apply_rows
+from splatseg.core import (
+    Edited,
+    Gaussians,
+    LayerInfo,
+    Selection,
+    Similarity,
+    apply_rows,
+)
 from splatseg.edit import duplicate, extract, merge, recolour, remove, transform
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render import render
@@ -140,7 +147,7 @@ def test_layers_follow_every_edit(rng, some, half) -> None:
         assert torch.equal(objects.evidence, layers["objects"].evidence[numbers])
         assert torch.equal(objects.inferred, layers["objects"].inferred[numbers])
         assert objects.background == 7
-        assert objects.metadata == {"names": {"3": "chair"}}
+        assert objects.info == LayerInfo(names={3: "chair"})
         colours = apply_rows(layers["colours"], edited)
         assert torch.equal(colours.values, layers["colours"].values[numbers])
         assert torch.equal(colours.weights, layers["colours"].weights[numbers])

@@ -15,8 +15,10 @@ from splatseg.core import (
     ClassInfo,
     ClassTable,
     Gaussians,
+    InstanceFacts,
     LabelMap,
     Labels,
+    LayerInfo,
     MaskSet,
     Scene,
     View,
@@ -86,13 +88,12 @@ def layer_of(scene: Scene, **fields) -> Labels:
     left = scene.gaussians.means[:, 0] < 0
     ids = torch.where(left, 2, 3)
     words = {"method": "uplift", "options": {"candidates": 2}, "seed": 5, "evidence": "said"}
-    metadata = words | {"names": {str(row.id): row.name for row in CLASSES.rows}}
-    metadata |= fields.pop("metadata", {})
+    words |= {"names": {row.id: row.name for row in CLASSES.rows}} | fields.pop("info", {})
     return Labels(
         ids=ids,
         confidence=torch.full((len(ids),), 0.75),
         background=1,
-        metadata=metadata,
+        info=LayerInfo(**words),
         **fields,
     )
 
@@ -204,7 +205,7 @@ def test_truth_with_other_ids_is_matched(write) -> None:
     same = maps_of(write.scene, ["v4", "v5"])
     other = Maps({n: torch.where(m == 2, 70, torch.where(m == 3, 80, -1)) for n, m in
                   same.maps.items()})  # fmt: skip
-    labels = layer_of(write.scene, metadata={"method": "associate", "names": {}})
+    labels = layer_of(write.scene, info={"method": "associate", "names": {}})
     page = write(truth=other, labels=labels, evidence=other, views=write.scene.train_views)
     assert "mIoU of instances" in page
     assert "matched one to one, 2 held-out views" in page
@@ -249,16 +250,16 @@ def test_what_association_says_is_shown(write) -> None:
         "odd": {"a": [1] * 500},
         "empty": [],
     }
-    listed = [{"id": 2, "segments": 31, "views": 4}, {"id": 3, "segments": 17}, "odd", {"id": "x"}]
-    metadata = {"associate": said, "instances": listed}
-    page = write(labels=layer_of(write.scene, metadata=metadata))
+    listed = {2: InstanceFacts(segments=31, views=4), 3: InstanceFacts(segments=17)}
+    info = {"details": {"associate": said}, "instances": listed}
+    page = write(labels=layer_of(write.scene, info=info))
     row = re.search(r"<td>red &lt;wall&gt;</td>.*?</tr>", page)
     assert re.findall(r">([^<>]+)</td>", row[0])[3:] == ["31", "4"]
     for words in ("Segments to instances", "812", "Merged", "Split", "4, 5", "x &amp; y", "Odd"):
         assert words in page, words
     assert "Empty" not in page
     assert "500: 1, 1" in page
-    broken = write(labels=layer_of(write.scene, metadata={"associate": "yes"}))
+    broken = write(labels=layer_of(write.scene, info={"details": {"associate": "yes"}}))
     assert "Segments to instances" not in broken
 
 
@@ -298,7 +299,7 @@ def test_masks_are_painted_from_large_to_small(write) -> None:
     assert ids[22, 7] == 1
     assert ids[16, 7] == 2
     assert ids[3, 3] == -1
-    labels = layer_of(write.scene, metadata={"method": "associate"})
+    labels = layer_of(write.scene, info={"method": "associate"})
     page = write(evidence=evidence, labels=labels)
     assert "evidence as it came" in page
 
@@ -310,19 +311,19 @@ def test_ids_agree_by_their_names(write) -> None:
     source = open_evidence(folder)
     named = layer_of(write.scene)
     assert _segment_ids.ids_agree(named, source, otherwise=False)
-    other = layer_of(write.scene, metadata={"names": {"2": "blue wall"}})
+    other = layer_of(write.scene, info={"names": {2: "blue wall"}})
     assert not _segment_ids.ids_agree(other, source, otherwise=True)
     # A name of an id that is not in use is no contradiction.
-    unused = layer_of(write.scene, metadata={"names": {"2": "red <wall>", "77": "pole"}})
+    unused = layer_of(write.scene, info={"names": {2: "red <wall>", 77: "pole"}})
     assert _segment_ids.ids_agree(unused, source, otherwise=False)
     for otherwise in (True, False):
-        bare = layer_of(write.scene, metadata={"names": {}})
+        bare = layer_of(write.scene, info={"names": {}})
         assert _segment_ids.ids_agree(bare, source, otherwise=otherwise) == otherwise
         assert _segment_ids.ids_agree(named, Maps({}), otherwise=otherwise) == otherwise
 
 
 def test_names_and_colours(write) -> None:
-    bare = layer_of(write.scene, metadata={"names": {}})
+    bare = layer_of(write.scene, info={"names": {}})
     known = _segment_ids.class_table(bare, CLASSES, unnamed_are_classes=True)
     assert known.rows[1].name == "red <wall>"
     assert known.rows[1].colour == (200, 0, 0)

@@ -1,10 +1,11 @@
 """Makes the golden files of the current format versions in tests/golden.
 
 Run from the project's root: ``python tests/golden/make_io.py``. It makes what is not there:
-scene-v1, a scene folder with one view of each lens, evidence of each kind that is written and a
-layer of each kind that version 1 of layers has; and layers-v2, a layer of the kind that came with
-version 2. A version's files are made once and then kept: later versions of splatseg must read
-them.
+scene-v1, a scene folder with one view of each lens and evidence of each kind that is written; and
+layers-v3, a layer of each kind, with a record that says something in every field. A version's
+files are made once and then kept: later versions of splatseg must read them. The layers in
+scene-v1 are of version 1 and the one in layers-v2 of version 2, as the scripts of then made them;
+their records are of version 0.
 """
 
 import json
@@ -20,14 +21,19 @@ from splatseg.core import (
     FeatureMap,
     Features,
     Gaussians,
+    InstanceFacts,
     InstanceTree,
     LabelMap,
     Labels,
+    Layer,
+    LayerEdit,
+    LayerInfo,
     MaskSet,
     Scene,
     Selection,
     TreeNode,
     View,
+    with_info,
 )
 from splatseg.io.evidence import create_evidence, save_features, save_label_map, save_masks
 from splatseg.io.layers import VERSION as LAYER_VERSION
@@ -93,7 +99,7 @@ def golden_scene() -> Scene:
 
 
 def golden_layers() -> dict[str, Labels | Features | Selection]:
-    """A layer of each kind."""
+    """Layers as they are in scene-v1."""
     return {
         "semantic": Labels(
             ids=torch.tensor([7, -1, 1]),
@@ -101,14 +107,16 @@ def golden_layers() -> dict[str, Labels | Features | Selection]:
             background=1,
             candidates=torch.tensor([[7, 1], [-1, -1], [1, -1]], dtype=torch.int32),
             shares=torch.tensor([[0.5, 0.25], [0.0, 0.0], [1.0, 0.0]]),
-            metadata={"method": "uplift", "names": {"7": "Stuhl"}},
+            info=LayerInfo(method="uplift", names={7: "Stuhl"}),
         ),
         "features": Features(
             values=torch.tensor([[0.5, -1.0], [2.0, 0.0], [0.125, 3.0]]),
             weights=torch.tensor([1.5, 0.0, 3.0]),
-            metadata={"method": "uplift"},
+            info=LayerInfo(method="uplift"),
         ),
-        "chosen": Selection(mask=torch.tensor([True, False, True]), metadata={"by": "point"}),
+        "chosen": Selection(
+            mask=torch.tensor([True, False, True]), info=LayerInfo(details={"by": "point"})
+        ),
     }
 
 
@@ -130,9 +138,43 @@ def golden_tree() -> InstanceTree:
             evidence=torch.tensor([3.0, 0.0, 1.5, 2.0, 0.5, 8.0]),
             effective_views=torch.tensor([1.0, 0.0, 2.5, 1.25, 1.0, 4.0]),
             inferred=torch.tensor([False, False, True, False, True, False]),
-            metadata={"method": "associate", "views": ["left/1"]},
+            info=LayerInfo(method="associate", views=("left/1",)),
         ),
     )
+
+
+def full_info() -> LayerInfo:
+    """A record that says something in every field."""
+    return LayerInfo(
+        method="uplift",
+        options={"candidates": 2, "label_rule": "share", "sizes": [1, 2.5, None, True]},
+        evidence="labels_semantic",
+        views=("left/1", "left/2"),
+        views_asked="train",
+        seed=7,
+        versions={"splatseg": "0.1.0", "torch": "2.6.0"},
+        names={1: "Wand", 7: "Stuhl — chair"},
+        source_ids={1: 0, 7: 6},
+        class_of={7: 3},
+        instances={
+            1: InstanceFacts(stuff=True),
+            7: InstanceFacts(segments=9, views=2, details={"track": 4}),
+        },
+        cut=0.25,
+        view_correlation=0.5,
+        head={"blend": "features", "ids": [1, 7], "weight": [[0.5, -1.0], [0.0, 2.0]]},
+        edits=(
+            LayerEdit(name="complete", details={"inferred": 1, "options": {"smooth": True}}),
+            LayerEdit(name="merge", details={"ids": {"2": 5}}),
+        ),
+        details={"largest_error_bound": 0.125, "by": "point"},
+    )
+
+
+def golden_layers_of_version_3() -> dict[str, Layer]:
+    """A layer of each kind with a full record."""
+    layers: dict[str, Layer] = {**golden_layers(), "tree": golden_tree()}
+    return {name: with_info(layer, full_info()) for name, layer in layers.items()}
 
 
 def golden_evidence() -> tuple[LabelMap, MaskSet, FeatureMap]:
@@ -160,7 +202,8 @@ def main() -> None:
         make_scene()
     if not LAYERS.exists():
         LAYERS.mkdir()
-        save_layer(LAYERS / "tree.npz", golden_tree())
+        for name, layer in golden_layers_of_version_3().items():
+            save_layer(LAYERS / f"{name}.npz", layer)
 
 
 def make_scene() -> None:

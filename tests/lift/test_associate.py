@@ -1,7 +1,6 @@
 """Segments of unordered views become instances."""
 
 import importlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import ClassInfo, ClassTable, LabelMap, MaskSet, Rle, View
+from splatseg.core import (
+    ClassInfo,
+    ClassTable,
+    InstanceFacts,
+    LabelMap,
+    MaskSet,
+    Rle,
+    View,
+)
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import ConfusionOptions
 from splatseg.lift.segments.ballots import majority
@@ -105,16 +112,15 @@ def test_ids_of_each_views_own_become_instances() -> None:
     assert bool((labels.confidence[:12] > 0.95).all())
     # Outer things are as large as each other, and larger than the middle one in no way; each has
     # a segment in all four views.
-    rows = labels.metadata["instances"]
-    assert [row["segments"] for row in rows] == [4, 4, 4]
-    assert [row["views"] for row in rows] == [4, 4, 4]
-    assert labels.metadata["associate"] == {
+    facts = InstanceFacts(segments=4, views=4)
+    assert labels.info.instances == {1: facts, 2: facts, 3: facts}
+    assert labels.info.details["associate"] == {
         "segments": 12,
         "instances": 3,
         "left_out": 0,
         "joined_within_views": 0,
     }
-    json.dumps(labels.metadata)
+    assert labels.info.views == ("v0", "v1", "v2", "v3")
 
 
 def test_neither_order_nor_names_matter() -> None:
@@ -124,7 +130,7 @@ def test_neither_order_nor_names_matter() -> None:
     )
     assert torch.equal(one.ids, other.ids)
     assert torch.equal(one.confidence, other.confidence)
-    assert one.metadata["associate"] == other.metadata["associate"]
+    assert one.info.details["associate"] == other.info.details["associate"]
 
 
 def test_a_split_in_one_view_is_outvoted() -> None:
@@ -133,7 +139,7 @@ def test_a_split_in_one_view_is_outvoted() -> None:
     halves = mapped(columns(VIEWS[2], -1.2, -0.62, -0.3, 0.3, 1.2), [10, 11, 12, 13])
     labels = run(Segments({**source.of, "v2": halves}))
     assert groups(labels.ids) == THINGS
-    assert labels.metadata["associate"]["segments"] == 13
+    assert labels.info.details["associate"]["segments"] == 13
 
 
 def test_a_merger_in_one_view_is_outvoted() -> None:
@@ -146,7 +152,7 @@ def test_a_merger_in_one_view_is_outvoted() -> None:
 def test_a_switch_of_tracks_is_repaired() -> None:
     """Ids that mean the same in all views but for two that change places: geometry decides."""
     switched = clean({**SAME, "v3": [2, 1, 3]})
-    told = run(replace(switched, persistent=True)).metadata["associate"]
+    told = run(replace(switched, persistent=True)).info.details["associate"]
     left, middle = (int(i) for i in run(switched).ids[[0, 4]])
     assert told["merged"] == [{"id": i, "from": [1, 2]} for i in sorted((left, middle))]
     assert told["split"] == [{"from": i, "ids": sorted((left, middle))} for i in (1, 2)]
@@ -165,7 +171,7 @@ def test_things_that_are_out_of_a_picture_are_not_missed_there() -> None:
         of[name] = LabelMap(ids=ids)
     labels = run(Segments(of))
     assert groups(labels.ids) == THINGS
-    assert sorted(row["segments"] for row in labels.metadata["instances"]) == [2, 3, 3]
+    assert sorted(facts.segments for facts in labels.info.instances.values()) == [2, 3, 3]
 
 
 def test_small_things_speak_louder_than_what_swallows_them() -> None:
@@ -317,7 +323,11 @@ def test_confusion_is_corrected_unless_told_otherwise(monkeypatch) -> None:
 
     def turned(labels, *, options):
         asked.append((labels, options))
-        return replace(labels, ids=labels.ids.flip(0), metadata={"confusion": "said"})
+        return replace(
+            labels,
+            ids=labels.ids.flip(0),
+            info=labels.info.with_edit("correct_confusion", {"a": 1}),
+        )
 
     monkeypatch.setattr(module, "correct_confusion", turned)
     three = ConfusionOptions(effective_views=3)
@@ -328,8 +338,8 @@ def test_confusion_is_corrected_unless_told_otherwise(monkeypatch) -> None:
     assert torch.equal(asked[0][0].ids, plain.ids)
     assert asked[0][0].candidates is not None
     assert torch.equal(told.ids, plain.ids.flip(0))
-    assert told.metadata["confusion"] == "said"
-    assert "confusion" not in plain.metadata
+    assert told.info.edit("correct_confusion") == {"a": 1}
+    assert plain.info.edits == ()
     assert (told.candidates, plain.candidates) == (None, None)
 
 
@@ -339,10 +349,10 @@ def test_accidents_are_left_out() -> None:
     ids = source.of["v1"].ids.clone()
     ids[:16][ids[:16] == 7] = 4
     source = Segments({**source.of, "v1": LabelMap(ids=ids)})
-    assert run(source, least_views=2).metadata["associate"]["instances"] == 3
-    assert run(source, least_views=5).metadata["associate"]["instances"] == 3, "4 views are all"
+    assert run(source, least_views=2).info.details["associate"]["instances"] == 3
+    assert run(source, least_views=5).info.details["associate"]["instances"] == 3, "4 views are all"
     alone = run(source, VIEWS[1:2], least_views=2)
-    assert alone.metadata["associate"]["instances"] == 4, "one view is all there is"
+    assert alone.info.details["associate"]["instances"] == 4, "one view is all there is"
 
 
 def test_names_come_from_categories() -> None:
@@ -355,11 +365,12 @@ def test_names_come_from_categories() -> None:
     )
     labels = associate(GAUSSIANS, VIEWS, source, classes=classes, backend=BACKEND)
     by_thing = {int(labels.ids[4 * i]): i for i in range(3)}
-    rows = {by_thing[row["id"]]: row for row in labels.metadata["instances"]}
-    assert [rows[i]["class"] for i in range(3)] == [5, 6, 0]
-    assert rows[0]["name"] == f"cup {rows[0]['id']}"
-    assert rows[2]["name"] == f"object {rows[2]['id']}"
-    assert labels.metadata["names"][str(rows[1]["id"])] == rows[1]["name"]
+    id_of = {thing: id for id, thing in by_thing.items()}
+    info = labels.info
+    assert info.class_of == {id_of[0]: 5, id_of[1]: 6}
+    assert info.names[id_of[0]] == f"cup {id_of[0]}"
+    assert info.names[id_of[1]] == f"book {id_of[1]}"
+    assert info.names[id_of[2]] == f"object {id_of[2]}"
 
 
 def nested(view: View, *, parts: bool, pair: bool, whole: bool) -> MaskSet:
@@ -446,4 +457,4 @@ def test_hostile_input() -> None:
     corner[0, 0] = 1
     empty = run(Segments(dict.fromkeys(NAMES, LabelMap(ids=corner))))
     assert empty.ids.unique().tolist() == [-1]
-    assert empty.metadata["associate"]["instances"] == 0
+    assert empty.info.details["associate"]["instances"] == 0

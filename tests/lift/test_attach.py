@@ -6,7 +6,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatseg.core import Features, Gaussians, Labels, Selection, Similarity
+from splatseg.core import (
+    Features,
+    Gaussians,
+    Labels,
+    LayerInfo,
+    Selection,
+    Similarity,
+)
 from splatseg.core.rigid import normalised, rotation_from_quaternion
 from splatseg.errors import RangeError, ShapeError
 from splatseg.io.splats import read_splats, write_splats
@@ -205,7 +212,7 @@ def test_layers_go_along() -> None:
         evidence=torch.arange(40.0) + 1,
         effective_views=torch.arange(40.0) + 2,
         inferred=torch.ones(40, dtype=torch.bool),
-        metadata={"names": {"1": "chair"}},
+        info=LayerInfo(names={1: "chair"}),
     )
     features = Features(values=torch.arange(80.0).reshape(40, 2) + 1, weights=torch.ones(40))
     selection = Selection(mask=torch.ones(40, dtype=torch.bool))
@@ -214,7 +221,7 @@ def test_layers_go_along() -> None:
     got = found.carry(labels)
     assert got.ids.tolist() == [6, 7, -1]
     assert got.confidence[2] == 0
-    assert (got.background, got.metadata["names"]) == (77, {"1": "chair"})
+    assert (got.background, got.info.names) == (77, {1: "chair"})
     assert got.candidates is not None
     assert got.candidates.tolist() == [[10, 11], [12, 13], [-1, -1]]
     assert got.shares is not None

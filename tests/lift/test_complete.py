@@ -1,6 +1,5 @@
 """Labels that spread to Gaussians without evidence."""
 
-import json
 import math
 
 import numpy as np
@@ -8,7 +7,12 @@ import pytest
 import scipy.sparse
 import torch
 
-from splatseg.core import Features, Gaussians, Labels
+from splatseg.core import (
+    Features,
+    Gaussians,
+    Labels,
+    LayerInfo,
+)
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import CompletionOptions, complete
 from splatseg.lift.completion.graph import (
@@ -157,7 +161,7 @@ def test_the_unknown_between_two_known_takes_the_nearer_label() -> None:
     assert bool((completed.confidence[1:3] < 1.0).all())
     assert completed.evidence is not None
     assert completed.evidence.tolist() == [5.0, 0.0, 0.0, 5.0]
-    facts = completed.metadata["completion"]
+    facts = completed.info.edit("complete")
     assert (facts["inferred"], facts["corrected"], facts["unreached"]) == (2, 0, 0)
 
 
@@ -177,7 +181,7 @@ def test_labels_go_no_farther_than_asked() -> None:
     for steps in (1, 2):
         completed = labelled(gaussians, labels, neighbours=1, spread_steps=steps)
         assert completed.ids.tolist() == [1] * (1 + steps) + [-1] * (3 - steps)
-        assert completed.metadata["completion"]["unreached"] == 3 - steps
+        assert completed.info.edit("complete")["unreached"] == 3 - steps
     unsure = labelled(gaussians, labels, neighbours=1, spread_steps=2, min_inferred=0.3)
     assert unsure.ids.tolist() == [1, 1, -1, -1]
     assert unsure.confidence.tolist()[2:] == [0.0, 0.0]
@@ -265,7 +269,7 @@ def test_smoothing_corrects_what_little_evidence_says() -> None:
     strong = labelled(gaussians, labels, smoothing=8.0, **given)
     assert strong.ids.tolist() == [1, 1, 1]
     assert strong.inferred.tolist() == [False, True, False]
-    assert strong.metadata["completion"]["corrected"] == 1
+    assert strong.info.edit("complete")["corrected"] == 1
     for result, strength in ((weak, 0.4), (strong, 8.0)):
         expected = smoothed_by_hand(labels, strength=strength).amax(dim=1)
         torch.testing.assert_close(result.confidence.double(), expected, rtol=0, atol=1e-5)
@@ -308,7 +312,7 @@ def test_order_of_the_gaussians_changes_nothing(rng) -> None:
 def test_nothing_known_nothing_there() -> None:
     unknown = complete(on_a_line([0.0, 1.0]), hard([-1, -1]))
     assert unknown.ids.tolist() == [-1, -1]
-    assert unknown.metadata["completion"]["unreached"] == 2
+    assert unknown.info.edit("complete")["unreached"] == 2
     assert len(complete(gaussians_at(torch.zeros(0, 3)), hard([]))) == 0
     assert complete(on_a_line([0.0]), hard([3])).ids.tolist() == [3]
     assert complete(on_a_line([0.0]), hard([-1])).ids.tolist() == [-1]
@@ -318,10 +322,10 @@ def test_nothing_known_nothing_there() -> None:
 
 
 def test_what_was_done_is_recorded() -> None:
-    labels = hard([1, -1], metadata={"method": "uplift"})
-    metadata = json.loads(json.dumps(dict(complete(on_a_line([0.0, 1.0]), labels).metadata)))
-    assert metadata["method"] == "uplift"
-    assert metadata["completion"]["options"]["spread_steps"] == 50
+    labels = hard([1, -1], info=LayerInfo(method="uplift"))
+    info = complete(on_a_line([0.0, 1.0]), labels).info
+    assert info.method == "uplift"
+    assert info.edit("complete")["options"]["spread_steps"] == 50
 
 
 def test_bad_input_is_refused() -> None:

@@ -1,6 +1,5 @@
 """Labels decided under how often ids are taken for one another."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -8,7 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Labels
+from splatseg.core import (
+    Labels,
+    LayerInfo,
+)
 from splatseg.errors import InputError, RangeError
 from splatseg.lift import ConfusionOptions, correct_confusion
 
@@ -90,7 +92,7 @@ def test_the_posterior_is_the_formula(rng, options, seen) -> None:
                 column = int(np.searchsorted(names, id))
                 assert float(share) == pytest.approx(expected[row, column], abs=1e-5)
     changed = int((expected.argmax(axis=1) != dense.argmax(axis=1)).sum())
-    assert result.metadata["confusion"]["changed"] == changed
+    assert result.info.edit("correct_confusion")["changed"] == changed
 
 
 def desk_and_mouse(*, evidence=20.0) -> Labels:
@@ -126,7 +128,7 @@ def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
         expected = correct_confusion(labels, options=ConfusionOptions(effective_views=views))
         assert torch.equal(found.shares, expected.shares)
         assert (found.ids[19] == 2) == (views == 10)
-        facts = found.metadata["confusion"]
+        facts = found.info.edit("correct_confusion")
         assert (facts["effective_views"], facts["view_correlation"]) == (views, correlation)
     independent = ConfusionOptions(max_correlation=1.0, correlated_views=1.5)
     found = correct_confusion(labels, options=independent, view_correlation=1.0)
@@ -134,7 +136,7 @@ def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
     # Never more than there are at most.
     few = ConfusionOptions(effective_views=2.0)
     found = correct_confusion(labels, options=few, view_correlation=0.9)
-    assert found.metadata["confusion"]["effective_views"] == 2.0
+    assert found.info.edit("correct_confusion")["effective_views"] == 2.0
 
 
 def test_evidence_counts_up_to_the_max_evidence() -> None:
@@ -168,8 +170,8 @@ def test_gaussians_without_a_label_keep_none() -> None:
     assert result.background == 4
     nobody = soft([[-1, -1]], [[0.0, 0.0]])
     assert correct_confusion(nobody).ids.tolist() == [-1]
-    assert nobody.metadata == {}
-    assert json.loads(json.dumps(correct_confusion(nobody).metadata))["confusion"]["changed"] == 0
+    assert nobody.info == LayerInfo()
+    assert correct_confusion(nobody).info.edit("correct_confusion")["changed"] == 0
 
 
 def test_order_and_names_change_nothing(rng) -> None:

@@ -1,6 +1,5 @@
 """Features of views, carried onto the Gaussians."""
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,10 +88,10 @@ def test_features_are_weighted_means(rng, lens, channels_at_once) -> None:
     torch.testing.assert_close(found.values.double(), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(found.weights.double(), weights, rtol=1e-5, atol=1e-6)
     assert calls == [(1, 2), (2, 2)]
-    metadata = json.loads(json.dumps(dict(found.metadata)))
-    assert metadata["method"] == "uplift_features"
-    assert metadata["views"] == ["v0", "v1"]
-    assert metadata["options"]["resampling"] == "bilinear"
+    info = found.info
+    assert info.method == "uplift_features"
+    assert info.views == ("v0", "v1")
+    assert info.options["resampling"] == "bilinear"
 
 
 def test_a_constant_stays_itself(rng, views) -> None:

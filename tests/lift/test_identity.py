@@ -1,13 +1,18 @@
 """Identity features: the losses, training, and both readouts."""
 
-import json
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from splatseg.core import ClassInfo, ClassTable, LabelMap, View
+from splatseg.core import (
+    ClassInfo,
+    ClassTable,
+    LabelMap,
+    LayerInfo,
+    View,
+)
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift import label_map
@@ -177,13 +182,13 @@ def test_training_finds_what_is_where(blend) -> None:
     assert labels.evidence is not None
     assert float(labels.evidence[18]) == 0.0
     assert calls == [(i + 1, 120) for i in range(120)]
-    metadata = json.loads(json.dumps(dict(labels.metadata)))
-    assert metadata["method"] == "identity"
-    assert metadata["names"] == {"7": "door"}
-    assert metadata["seed"] == 5
-    assert metadata["loss"] < 0.3
-    assert metadata["options"]["blend"] == blend
-    assert (metadata["steps"], metadata["stopped"]) == (120, "steps")
+    info = labels.info
+    assert info.method == "identity"
+    assert info.names == {7: "door"}
+    assert info.seed == 5
+    assert info.details["loss"] < 0.3
+    assert info.options["blend"] == blend
+    assert (info.details["steps"], info.details["stopped"]) == (120, "steps")
     least = float(labels.confidence[:18].median())
     sure = IdentityOptions(**FAST, blend=blend, min_share=least)
     some = identity(gaussians, views, maps, options=sure, backend=BACKEND, seed=5)
@@ -207,7 +212,7 @@ def test_the_rendered_readout_and_its_file(tmp_path, blend) -> None:
     assert layer.values.shape == (19, 16)
     assert head.ids.tolist() == [7, 40]
     hard = identity(gaussians, views, maps, options=options, backend=BACKEND, seed=5)
-    assert torch.equal(head.labels(layer, metadata={}).ids, hard.ids)
+    assert torch.equal(head.labels(layer).ids, hard.ids)
     shown = head.label_map(gaussians, views[0].camera, layer, backend=BACKEND)
     covered = matrix_of(gaussians, views[0].camera).sum(dim=-1)
     assert float((shown.ids == ids)[covered > 0.8].float().mean()) > 0.95
@@ -266,7 +271,7 @@ def test_same_seed_same_output(rng, views) -> None:
 
     first, again, other = fit(1), fit(1, order=-1), fit(2)
     assert torch.equal(first.values, again.values)
-    assert first.metadata == again.metadata
+    assert first.info == again.info
     assert not torch.equal(first.values, other.values)
 
 
@@ -286,7 +291,7 @@ def test_an_interrupted_training_goes_on(rng, views, tmp_path) -> None:
         train_identity(gaussians, views, maps, options=other, context=resuming)
     again = train_identity(gaussians, views, maps, options=options, context=resuming)
     assert torch.equal(whole.values, again.values)
-    assert whole.metadata == again.metadata
+    assert whole.info == again.info
 
 
 def test_published_is_the_published_setting() -> None:
@@ -344,7 +349,7 @@ def test_every_option_is_heeded(rng) -> None:
 
     def scored(**changes) -> tuple[list[int], str]:
         options = IdentityOptions(**base | changes)
-        found = train_identity(gaussians, views, maps, options=options, context=here()).metadata
+        found = train_identity(gaussians, views, maps, options=options, context=here()).info.details
         return [step for step, _ in found["scores"]], found["stopped"]
 
     assert scored() == ([2, 4, 6, 8, 10, 12], "steps")
@@ -377,12 +382,12 @@ def test_the_readout_is_that_asked_for(name) -> None:
     )
     hard = method.run(inputs, method.options(**options))
     assert hard.ids.tolist() == [40] * 9 + [7] * 9 + [-1]
-    assert hard.metadata["method"] == name
-    assert "head" not in hard.metadata
+    assert hard.info.method == name
+    assert hard.info.head is None
     assert told == [(step + 1, 150) for step in range(150)]
     rendered = method.run(inputs, method.options(**options, readout="rendered"))
     head = ClassifierHead.of(rendered)
-    assert torch.equal(head.labels(rendered, metadata={}).ids, hard.ids)
+    assert torch.equal(head.labels(rendered).ids, hard.ids)
     least = float(hard.confidence[:18].median())
     sure = method.run(inputs, method.options(**options, min_share=least))
     assert -1 in sure.ids[:18].tolist()
@@ -407,14 +412,14 @@ def test_neighbours_pull_together(rng, views) -> None:
 def test_heads_without_a_classifier_read_logits() -> None:
     head = ClassifierHead(ids=torch.tensor([4, 9]), weight=None, bias=None, blend="probabilities")
     again = ClassifierHead.of(
-        train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), {"head": head.metadata()})
+        train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), LayerInfo(head=head.to_json()))
     )
     assert (again.weight, again.bias, again.ids.tolist()) == (None, None, [4, 9])
     layer = train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), {})
-    found = again.labels(layer, metadata={"method": "m"})
+    found = again.labels(layer, info=LayerInfo(method="m"))
     assert found.ids.tolist() == [9, 4]
     assert found.confidence.tolist() == pytest.approx([1 / (1 + math.exp(-2))] * 2)
-    assert found.metadata["method"] == "m"
+    assert found.info.method == "m"
     with pytest.raises(InputError, match="a layer with a classifier head"):
         ClassifierHead.of(layer)
     with pytest.raises(InputError, match="blend"):
@@ -423,10 +428,10 @@ def test_heads_without_a_classifier_read_logits() -> None:
         ClassifierHead(ids=torch.tensor([1]), weight=torch.zeros(2, 3), bias=None, blend="features")
 
 
-def train_layer(values, metadata):
+def train_layer(values, info):
     from splatseg.core import Features
 
-    return Features(values=values, metadata=metadata)
+    return Features(values=values, info=info)
 
 
 def test_the_rendered_readout_equals_the_hard_one_where_gaussians_are_sure(rng) -> None:
@@ -437,7 +442,7 @@ def test_the_rendered_readout_equals_the_hard_one_where_gaussians_are_sure(rng) 
     layer = train_layer(logits, {})
     head = ClassifierHead(ids=torch.tensor([4, 9]), weight=None, bias=None, blend="probabilities")
     soft = head.label_map(gaussians, camera, layer, backend=BACKEND)
-    hard = label_map(gaussians, camera, head.labels(layer, metadata={}), backend=BACKEND)
+    hard = label_map(gaussians, camera, head.labels(layer), backend=BACKEND)
     different = soft.ids != hard.ids
     # Where a pixel is as much covered as not, -1 wins in one and a single id in the other.
     assert float(different.float().mean()) < 0.2

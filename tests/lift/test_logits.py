@@ -109,12 +109,12 @@ def test_contradictions_are_settled_by_majority(train) -> None:
     layer = train(gaussians, views, maps, options=LogitOptions(**QUICK), context=here())
     head = ClassifierHead.of(layer)
     assert (head.weight, head.bias, head.ids.tolist()) == (None, None, [7, 40])
-    labels = head.labels(layer, metadata={})
+    labels = head.labels(layer)
     assert labels.ids.tolist() == [40] * 9
     shown = head.label_map(gaussians, views[3].camera, layer, backend=BACKEND)
     assert int(shown.ids[6, 8]) == 40
     name = "logits" if train is train_logits else "probabilities"
-    assert layer.metadata["method"] == name
+    assert layer.info.method == name
     assert head.blend == ("features" if train is train_logits else "probabilities")
     if train is train_probabilities:
         assert float(labels.confidence[4]) == pytest.approx(0.75, abs=0.05)

@@ -1,16 +1,15 @@
 """Instances and classes merged: scenes solved by hand, one for each rule."""
 
-import json
-
 import pytest
 import torch
 
-from splatseg.core import ClassInfo, ClassTable, Gaussians, Labels
+from splatseg.core import ClassInfo, ClassTable, Gaussians, InstanceFacts, Labels, LayerInfo
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.held_out_segments import classes_of_instances
 from splatseg.lift import merge_panoptic
 
 FLOOR, WALL, CUP, CHAIR = 1, 2, 3, 4
+SEEN = InstanceFacts(segments=4, views=9)
 TABLE = ClassTable(
     rows=(
         ClassInfo(id=FLOOR, name="floor", isthing=False),
@@ -51,11 +50,10 @@ def test_things_keep_their_ids_and_stuff_is_one_segment_a_class() -> None:
     # Instance 8 is a part of the floor, and so is what has no instance.
     found = merged(labels([5, 5, 8, -1, -1, 6]), labels([CUP, CUP, FLOOR, FLOOR, WALL, CHAIR]))
     assert found.ids.tolist() == [5, 5, 9, 9, 10, 6]
-    metadata = json.loads(json.dumps(dict(found.metadata)))
-    assert metadata["class_of"] == {"5": CUP, "6": CHAIR, "9": FLOOR, "10": WALL}
-    assert metadata["names"] == {"5": "cup 5", "6": "chair 6", "9": "floor", "10": "wall"}
+    assert found.info.class_of == {5: CUP, 6: CHAIR, 9: FLOOR, 10: WALL}
+    assert found.info.names == {5: "cup 5", 6: "chair 6", 9: "floor", 10: "wall"}
     assert classes_of_instances(found) == {5: CUP, 6: CHAIR, 9: FLOOR, 10: WALL}
-    assert metadata["panoptic"] == {
+    assert found.info.edit("merge_panoptic") == {
         "things": 2,
         "stuff": 2,
         "instances_of_stuff": 1,
@@ -67,11 +65,11 @@ def test_evidence_decides_the_class_and_the_instance_its_gaussians() -> None:
     """One Gaussian with much evidence outvotes two with little; without evidence it does not."""
     ids, kinds = [7, 7, 7], [CUP, CHAIR, CHAIR]
     loud = labels(kinds, [0.5, 1.0, 1.0], evidence=torch.tensor([9.0, 2.0, 2.0]))
-    assert merged(labels(ids), loud).metadata["class_of"] == {"7": CUP}
-    assert merged(labels(ids), labels(kinds)).metadata["class_of"] == {"7": CHAIR}
+    assert merged(labels(ids), loud).info.class_of == {7: CUP}
+    assert merged(labels(ids), labels(kinds)).info.class_of == {7: CHAIR}
     # Equals go to the smaller class.
     even = merged(labels([7, 7]), labels([CHAIR, CUP]))
-    assert even.metadata["class_of"] == {"7": CUP}
+    assert even.info.class_of == {7: CUP}
     assert even.ids.tolist() == [7, 7]
 
 
@@ -94,7 +92,7 @@ def test_what_has_no_class_and_what_lies_behind() -> None:
     found = merged(labels([4, -1, 6]), labels([-1, -1, WALL], background=FLOOR))
     assert found.ids.tolist() == [-1, -1, 8]
     assert found.background == 7
-    assert found.metadata["names"] == {"7": "floor", "8": "wall"}
+    assert found.info.names == {7: "floor", 8: "wall"}
     # A background that is a thing is none.
     assert merged(labels([-1]), labels([WALL], background=CUP)).background == -1
 
@@ -115,14 +113,12 @@ def test_columns_come_from_where_the_label_does() -> None:
     assert merged(labels([1, -1]), labels([CUP, WALL], **other)).evidence is None
 
 
-def test_rows_of_the_instances_stay() -> None:
-    told = {"method": "associate", "instances": [{"id": 1, "name": "object 1", "views": 9}]}
-    found = merged(labels([1, -1], metadata=told), labels([CUP, WALL]))
-    assert found.metadata["method"] == "associate"
-    assert found.metadata["instances"] == [
-        {"id": 1, "name": "cup 1", "views": 9, "class": CUP},
-        {"id": 2, "name": "wall", "class": WALL, "stuff": True},
-    ]
+def test_facts_of_the_instances_stay() -> None:
+    told = LayerInfo(method="associate", names={1: "object 1"}, instances={1: SEEN, 7: SEEN})
+    found = merged(labels([1, -1], info=told), labels([CUP, WALL]))
+    assert found.info.method == "associate"
+    assert found.info.names == {1: "cup 1", 2: "wall"}
+    assert found.info.instances == {1: SEEN, 2: InstanceFacts(stuff=True)}
 
 
 def test_bad_input_is_refused() -> None:

@@ -82,7 +82,7 @@ def test_what_straddles_takes_a_side(scene) -> None:
     assert bool(
         (found.gaussians.means[straddling, 0] > gaussians.means[straddling, 0] + 0.004).all()
     )
-    facts = found.labels.metadata["sharpened"]
+    facts = found.labels.info.edit("sharpen")
     assert facts["agreement"] == [before, after]
     assert facts["options"]["sharpen_steps"] == 200
 
@@ -264,7 +264,7 @@ def test_confusion_is_corrected_unless_told_not_to(scene) -> None:
     votes = uplift(
         gaussians, views, maps, options=UpliftOptions(candidates=8, slots=8), backend="cpu"
     )
-    measured = votes.metadata["view_correlation"]
+    measured = votes.info.view_correlation
     again = sharpen(gaussians, views, maps, options=none, backend="cpu").labels
     assert again.shares is not None
     assert torch.equal(again.shares, correct_confusion(votes, view_correlation=measured).shares)

@@ -1,7 +1,5 @@
 """Votes of label maps on Gaussians."""
 
-import json
-
 import pytest
 import torch
 
@@ -84,7 +82,7 @@ def test_candidates_are_exact_whatever_the_memory(rng, views, memory) -> None:
     assert torch.equal(labels.candidates[real].long(), torch.tensor(IDS)[order[:, :3]][real])
     assert bool((labels.candidates[~real] == -1).all())
     assert calls == [(1, 3), (2, 3), (3, 3)]
-    assert labels.metadata["largest_error_bound"] == 0
+    assert labels.info.details["largest_error_bound"] == 0
 
 
 def test_voids_cast_no_vote_and_unseen_gaussians_have_no_label(views) -> None:
@@ -115,7 +113,7 @@ def test_a_pixel_votes_with_its_confidence() -> None:
     assert labels.ids.tolist() == [1]
     assert labels.confidence.tolist() == pytest.approx([0.75], abs=1e-6)
     passing = 1 - matrix_of(gaussians, camera_at()).sum(dim=-1)
-    facts = labels.metadata["background_votes"]
+    facts = labels.info.details["background_votes"]
     assert labels.background == 1
     assert facts["share"] == pytest.approx(0.75, abs=1e-6)
     light = float((passing * confidence).sum() / confidence.sum())
@@ -181,7 +179,7 @@ def test_the_sky_is_what_passes() -> None:
 
     matrix = matrix_of(gaussians, view.camera)
     residual = 1 - matrix.sum(dim=-1)
-    facts = labels.metadata["background_votes"]
+    facts = labels.info.details["background_votes"]
     assert facts["light"] == pytest.approx(float(residual.mean()), abs=1e-6)
     assert facts["share"] == pytest.approx(float(residual[:6].sum() / residual.sum()), abs=1e-6)
 
@@ -206,16 +204,16 @@ def test_reduced_label_maps_vote_through_a_reduced_camera(rng) -> None:
     assert torch.equal(a.confidence, b.confidence)
 
 
-def test_metadata_says_how_it_was_made(rng, views) -> None:
+def test_info_says_how_it_was_made(rng, views) -> None:
     classes = ClassTable(rows=(ClassInfo(id=4, name="chair"), ClassInfo(id=77, name="unseen")))
     labels = uplift(
         random_gaussians(rng), views, random_maps(rng, views, IDS), classes=classes, backend=BACKEND
     )
-    metadata = json.loads(json.dumps(dict(labels.metadata)))
-    assert metadata["method"] == "uplift"
-    assert metadata["options"]["candidates"] == 1
-    assert metadata["views"] == ["v0", "v1", "v2"]
-    assert metadata["names"] == {"4": "chair"}
+    info = labels.info
+    assert info.method == "uplift"
+    assert info.options["candidates"] == 1
+    assert info.views == ("v0", "v1", "v2")
+    assert info.names == {4: "chair"}
 
 
 def test_bad_input_is_refused(rng, views) -> None:

@@ -101,9 +101,9 @@ def test_lifting_measures_it_and_counts_views() -> None:
     expected = shown.sum(dim=0) ** 2 / (shown**2).sum(dim=0)
     assert labels.effective_views is not None
     torch.testing.assert_close(labels.effective_views.double(), expected, rtol=1e-4, atol=0)
-    assert labels.metadata["view_correlation"] > 0.3
+    assert labels.info.view_correlation > 0.3
     hard = uplift(gaussians, views, maps, backend=BACKEND)
-    assert "view_correlation" not in hard.metadata
+    assert hard.info.view_correlation is None
     unseen = uplift(
         gaussians_at([[0, 0, -2]]), views, maps, options=options, backend=BACKEND
     ).effective_views

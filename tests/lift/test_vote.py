@@ -1,6 +1,5 @@
 """Votes at the pixels that centres fall into."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -247,15 +246,15 @@ def test_order_of_views_changes_nothing(rng, views) -> None:
     assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_metadata_says_how_it_was_made(rng, views) -> None:
+def test_info_says_how_it_was_made(rng, views) -> None:
     classes = ClassTable(rows=(ClassInfo(id=4, name="chair"), ClassInfo(id=77, name="unseen")))
     maps = random_maps(rng, views, (1, 4))
     labels = vote(random_gaussians(rng, 30), views, maps, classes=classes, backend=BACKEND)
-    metadata = json.loads(json.dumps(dict(labels.metadata)))
-    assert metadata["method"] == "vote"
-    assert metadata["options"]["rule"] == "visible"
-    assert metadata["views"] == ["v0", "v1", "v2"]
-    assert metadata["names"] == {"4": "chair"}
+    info = labels.info
+    assert info.method == "vote"
+    assert info.options["rule"] == "visible"
+    assert info.views == ("v0", "v1", "v2")
+    assert info.names == {4: "chair"}
 
 
 def test_an_empty_scene_has_no_votes() -> None:

@@ -212,7 +212,7 @@ def _check_id(name: str, key: object) -> None:
 def _tuple(name: str, values: object, kind: type[_Value]) -> tuple[_Value, ...]:
     if not isinstance(values, (list, tuple)):
         raise InputError(f"{name}: expected a tuple, got {type(values).__name__}.")
-    entries = cast("tuple[object, ...]", tuple(cast("tuple[object, ...]", values)))
+    entries = tuple(cast("tuple[object, ...]", values))
     for i, entry in enumerate(entries):
         _check_type(f"{name}[{i}]", entry, kind)
     return cast("tuple[_Value, ...]", entries)

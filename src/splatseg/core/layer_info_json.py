@@ -139,7 +139,6 @@ def layer_info_from_metadata(metadata: Mapping[str, Any], *, where: str) -> Laye
     take("names", _names)
     take("class_of", _classes)
     take("source_ids", _classes)
-    take("instances", _rows_of_instances)
     if details.get("view_correlation", 0) is None:
         del details["view_correlation"]
     edits: list[tuple[str, Any]] = []
@@ -149,8 +148,12 @@ def layer_info_from_metadata(metadata: Mapping[str, Any], *, where: str) -> Laye
     if isinstance(details.get("merged_ids"), Mapping):
         edits.append(("merge", {"ids": details.pop("merged_ids")}))
     try:
-        if "instances" in values:
-            _add_rows(values, values.pop("instances"))
+        rows, others = _rows_of_instances(details.get("instances"))
+        if rows:
+            _add_rows(values, rows)
+            details["instances"] = others
+            if not others:
+                del details["instances"]
         made = tuple(LayerEdit(name=name, details=said) for name, said in edits)
         return LayerInfo(**values, edits=made, details=details)
     except InputError as error:
@@ -277,23 +280,29 @@ def _classes(value: Any) -> dict[int, int] | None:
     return known if len(known) == len(table) else None
 
 
-def _rows_of_instances(value: Any) -> list[dict[str, Any]] | None:
-    """Rows of instances, where each has an id that is a whole number."""
-    if not isinstance(value, list):
-        return None
-    rows = cast("list[Any]", value)
-    found = [row for row in map(_object, rows) if row is not None]
-    fits = len(found) == len(rows) and all((_whole(row.get("id")) or 0) > 0 for row in found)
-    return found if fits and len({row["id"] for row in found}) == len(found) else None
+def _rows_of_instances(value: object) -> tuple[dict[int, dict[str, Any]], list[Any]]:
+    """Rows of instances by id, the last where there are several; and what is no such row."""
+    rows: dict[int, dict[str, Any]] = {}
+    others: list[Any] = []
+    for entry in cast("list[Any]", value) if isinstance(value, list) else []:
+        row = _object(entry)
+        id = None if row is None else _whole(row.get("id"))
+        if row is None or id is None or id < 0:
+            others.append(entry)
+            continue
+        if id in rows:
+            others.append(rows[id])
+        rows[id] = row
+    return rows, others
 
 
-def _add_rows(values: dict[str, Any], rows: Sequence[dict[str, Any]]) -> None:
+def _add_rows(values: dict[str, Any], rows: Mapping[int, dict[str, Any]]) -> None:
     """Rows of instances of version 0 to names, classes and facts by id."""
     names: dict[int, str] = {}
     classes: dict[int, int] = {}
     facts: dict[int, InstanceFacts] = {}
-    for row in rows:
-        id, own = row["id"], {key: value for key, value in row.items() if key != "id"}
+    for id, row in rows.items():
+        own = {key: value for key, value in row.items() if key != "id"}
         if isinstance(own.get("name"), str):
             names[id] = own.pop("name")
         category = _whole(own.get("class"))

@@ -10,21 +10,22 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Features, InstanceTree, Labels, Selection, TreeNode
+from splatseg.core import Features, InstanceTree, Labels, LayerInfo, Selection, TreeNode
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.layers import load_layer, save_layer
 
-METADATA = {"method": "uplift", "names": {"3": "Stuhl — chair"}, "list": [1, 2.5, None, True]}
+INFO = LayerInfo(
+    method="uplift", names={3: "Stuhl — chair"}, details={"list": [1, 2.5, None, True]}
+)
 
 
 def labels(n: int = 5, **more) -> Labels:
     ids = torch.tensor([-1, 3, 70000, 1, 2**31 - 1])[:n]
-    return Labels(ids=ids, confidence=torch.linspace(0, 1, n), metadata=METADATA, **more)
+    return Labels(ids=ids, confidence=torch.linspace(0, 1, n), info=INFO, **more)
 
 
 def same(a, b) -> None:
     assert type(a) is type(b)
-    assert dict(a.metadata) == dict(b.metadata)
     for name in type(a).__dataclass_fields__:
         one, other = getattr(a, name), getattr(b, name)
         if isinstance(one, torch.Tensor):
@@ -32,7 +33,7 @@ def same(a, b) -> None:
             assert torch.equal(one, other), name
         elif isinstance(one, Labels):
             same(one, other)
-        elif name != "metadata":
+        else:
             assert one == other
 
 
@@ -46,7 +47,7 @@ LAYERS = {
         effective_views=torch.tensor([1.0, 2.5, 0.0, 7.25, 3.0]),
         inferred=torch.tensor([False, True, False, False, True]),
     ),
-    "features": Features(values=torch.randn(4, 3), weights=torch.rand(4), metadata=METADATA),
+    "features": Features(values=torch.randn(4, 3), weights=torch.rand(4), info=INFO),
     "half": Features(values=torch.randn(4, 3).half()),
     "tree": InstanceTree(
         nodes=(
@@ -61,7 +62,7 @@ LAYERS = {
             inferred=torch.tensor([False, True, False, False, True]),
         ),
     ),
-    "selection": Selection(mask=torch.tensor([True, False, True]), metadata=METADATA),
+    "selection": Selection(mask=torch.tensor([True, False, True]), info=INFO),
     "empty": Labels(ids=torch.zeros(0, dtype=torch.int32), confidence=torch.zeros(0)),
     "none": Selection(mask=torch.zeros(0, dtype=torch.bool)),
 }
@@ -98,27 +99,26 @@ def test_a_tree_of_version_2_is_read(golden, project_root) -> None:
 
 
 @pytest.mark.parametrize("name", ["semantic", "features", "chosen"])
-def test_layers_of_version_1_are_read_and_stay_of_version_1(
-    golden, project_root, tmp_path, name
-) -> None:
+def test_layers_of_version_1_are_read(golden, project_root, name) -> None:
     layer = load_layer(project_root / f"tests/golden/scene-v1/layers/{name}.npz")
     same(golden.golden_layers()[name], layer)
+
+
+@pytest.mark.parametrize("name", ["semantic", "features", "chosen", "tree"])
+def test_layers_of_version_3_are_read_and_written_as_they_were(
+    golden, project_root, tmp_path, name
+) -> None:
+    path = project_root / f"tests/golden/layers-v3/{name}.npz"
+    layer = load_layer(path)
+    same(golden.golden_layers_of_version_3()[name], layer)
     save_layer(tmp_path / "again.npz", layer)
-    with np.load(tmp_path / "again.npz", allow_pickle=False) as archive:
-        assert json.loads(archive["header"].tobytes())["version"] == 1
+    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
 
 
 def test_layers_of_a_later_version_are_refused(tmp_path) -> None:
-    path = changed(tmp_path, lambda h, a: h.update(version=3), layer="tree")
-    with pytest.raises(FileFormatError, match="version 2 or less, got version 3"):
+    path = changed(tmp_path, lambda h, a: h.update(version=4), layer="tree")
+    with pytest.raises(FileFormatError, match="version 3 or less, got version 4"):
         load_layer(path)
-
-
-def test_layers_without_levels_are_files_that_older_readers_know(tmp_path) -> None:
-    for name, version in (("soft", 1), ("features", 1), ("selection", 1), ("tree", 2)):
-        save_layer(tmp_path / "a.npz", LAYERS[name])
-        with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
-            assert json.loads(archive["header"].tobytes())["version"] == version
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,13 @@ def test_none_is_0_in_the_file(tmp_path) -> None:
         assert archive["candidates"][0].tolist() == [0, 0]
         header = json.loads(archive["header"].tobytes())
     assert header["background"] == 0
-    assert header["metadata"] == METADATA
+    assert "metadata" not in header
+    assert header["info"] == {
+        "version": 1,
+        "method": "uplift",
+        "names": {"3": "Stuhl — chair"},
+        "details": {"list": [1, 2.5, None, True]},
+    }
 
 
 @pytest.mark.parametrize(
@@ -154,15 +160,6 @@ def test_none_is_0_in_the_file(tmp_path) -> None:
     [
         (Labels(ids=torch.tensor([0, 1]), confidence=torch.ones(2)), "0, which is void"),
         (labels(background=0), "0, which is void"),
-        (Selection(mask=torch.ones(1).bool(), metadata={"a": {1: 2}}), "keys that are strings"),
-        (
-            Selection(mask=torch.ones(1).bool(), metadata={"a": [float("nan")]}),
-            r"a\[0\]: expected a finite number",
-        ),
-        (
-            Selection(mask=torch.ones(1).bool(), metadata={"t": torch.ones(1)}),
-            "metadata.*t: expected a value that JSON holds, got one of type Tensor",
-        ),
     ],
 )
 def test_layers_that_have_no_place_in_a_file(tmp_path, layer, message) -> None:
@@ -187,14 +184,18 @@ def changed(tmp_path, change, layer="soft"):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h, a: h.update(version=3), "version 2 or less, got version 3; a later splatseg"),
+        (lambda h, a: h.update(version=4), "version 3 or less, got version 4; a later splatseg"),
         (lambda h, a: h.update(version=0), "got version 0"),
         (lambda h, a: h.update(format="other"), "expected a layer, got 'other'"),
         (lambda h, a: h.update(kind="voxels"), "got 'voxels'"),
         (lambda h, a: h.update(count=4), r"'ids' of type i4 and shape \(4\), got int32 of \(5,\)"),
         (lambda h, a: h.update(count=-1), "a header with a count"),
         (lambda h, a: h.update(background=-1), "background id of 0 or more"),
-        (lambda h, a: h.pop("metadata"), "metadata"),
+        (lambda h, a: h.pop("info"), "expected an object 'info' in the header, got NoneType"),
+        (lambda h, a: h.update(info=[]), "expected an object 'info' in the header, got list"),
+        (lambda h, a: h.update(version=2), "expected an object 'metadata' in the header"),
+        (lambda h, a: h["info"].update(version=2), "info: .*version 1 or less, got version 2"),
+        (lambda h, a: h["info"].update(names=["a"]), "info: names: expected an object, got list"),
         (lambda h, a: a.pop("ids"), "an array 'ids', which is not there"),
         (lambda h, a: a.pop("shares"), "an array 'shares', which is not there"),
         (lambda h, a: a.update(ids=a["ids"].astype(float)), "'ids' of type i4"),

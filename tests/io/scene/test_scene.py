@@ -77,7 +77,7 @@ def test_version_1_is_read(version_1, golden) -> None:
     for name, layer in golden.golden_layers().items():
         read = load_scene_layer(version_1, name)
         assert type(read) is type(layer)
-        assert dict(read.metadata) == dict(layer.metadata)
+        assert read.info == layer.info
         for field in ("ids", "confidence", "candidates", "shares", "values", "weights", "mask"):
             if hasattr(layer, field):
                 assert torch.equal(getattr(read, field), getattr(layer, field)), field
@@ -108,7 +108,8 @@ def test_version_1_is_written_as_it_was(golden, project_root, tmp_path, monkeypa
         p.relative_to(written) for p in written.rglob("*") if p.is_file()
     )
     for file in files:
-        if file.suffix != ".png":  # Compressed bytes are zlib's business.
+        # Compressed bytes are zlib's business; layers are of a later version than those of then.
+        if file.suffix != ".png" and file.parts[0] != "layers":
             assert (written / file).read_bytes() == (committed / file).read_bytes(), file
 
 
