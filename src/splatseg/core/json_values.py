@@ -9,28 +9,30 @@ from splatseg.errors import InputError
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
 """What JSON has a word for; numbers are finite, keys are strings."""
 
-_MAX_DEPTH = 100
+MAX_DEPTH = 100
+"""Groups in each other that a file may hold."""
 
 
-def plain_json(name: str, value: object) -> JSON:
+def plain_json(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> JSON:
     """A copy in the types that JSON gives back: dicts, and lists for tuples.
 
     Args:
         name: What the value is called; starts the message of an error.
         value: The value.
+        max_depth: How many groups may lie in each other.
 
     Raises:
         InputError: If it holds a key that is no string, NaN, infinity, an object that JSON has no
-            word for, or groups more than 100 deep.
+            word for, or groups deeper than that.
 
     Example:
         >>> plain_json("options", {"sizes": (1, 2.5)})
         {'sizes': [1, 2.5]}
     """
-    return _plain(name, value, _MAX_DEPTH)
+    return _plain(name, value, max_depth, max_depth)
 
 
-def plain_object(name: str, value: object) -> dict[str, JSON]:
+def plain_object(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> dict[str, JSON]:
     """A copy of a mapping as JSON holds it, see `plain_json`.
 
     Raises:
@@ -38,22 +40,27 @@ def plain_object(name: str, value: object) -> dict[str, JSON]:
     """
     if not isinstance(value, Mapping):
         raise InputError(f"{name}: expected a mapping, got {type(value).__name__}.")
-    return cast("dict[str, JSON]", plain_json(name, cast("Mapping[object, object]", value)))
+    return cast(
+        "dict[str, JSON]",
+        plain_json(name, cast("Mapping[object, object]", value), max_depth=max_depth),
+    )
 
 
-def _plain(name: str, value: object, depth: int) -> JSON:
+def _plain(name: str, value: object, depth: int, max_depth: int) -> JSON:
     if depth < 0:
-        raise InputError(f"{name}: expected values at most {_MAX_DEPTH} deep, got deeper ones.")
+        raise InputError(f"{name}: expected values at most {max_depth} deep, got deeper ones.")
     if isinstance(value, Mapping):
         entries: dict[str, JSON] = {}
         for key, entry in cast("Mapping[object, object]", value).items():
             if not isinstance(key, str):
                 raise InputError(f"{name}: expected keys that are strings, got {key!r}.")
-            entries[key] = _plain(f"{name}.{key}", entry, depth - 1)
+            entries[key] = _plain(f"{name}.{key}", entry, depth - 1, max_depth)
         return entries
     if isinstance(value, (list, tuple)):
         items = cast("Sequence[object]", value)
-        return [_plain(f"{name}[{i}]", entry, depth - 1) for i, entry in enumerate(items)]
+        return [
+            _plain(f"{name}[{i}]", entry, depth - 1, max_depth) for i, entry in enumerate(items)
+        ]
     if isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"{name}: expected a finite number, got {value}.")
     if value is None or isinstance(value, (str, int, float)):

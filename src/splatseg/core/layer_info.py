@@ -4,9 +4,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar, cast
 
-from splatseg.core.json_values import JSON, plain_object
+from splatseg.core.json_values import JSON, MAX_DEPTH, plain_object
 from splatseg.core.tree_levels import TREE_LEVELS, TreeLevel
 from splatseg.errors import InputError, RangeError
+
+_MAX_DEPTH = MAX_DEPTH - 10
+"""Files hold a record within other groups."""
 
 _Value = TypeVar("_Value")
 
@@ -36,7 +39,9 @@ class InstanceFacts:
         _check_count("segments", self.segments)
         _check_count("views", self.views)
         _check_type("stuff", self.stuff, bool)
-        object.__setattr__(self, "details", plain_object("details", self.details))
+        object.__setattr__(
+            self, "details", plain_object("details", self.details, max_depth=_MAX_DEPTH)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +58,9 @@ class LayerEdit:
         _check_type("name", self.name, str)
         if not self.name:
             raise InputError("name: expected what was done to the layer, got an empty word.")
-        object.__setattr__(self, "details", plain_object("details", self.details))
+        object.__setattr__(
+            self, "details", plain_object("details", self.details, max_depth=_MAX_DEPTH)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,8 +138,9 @@ class LayerInfo:
         _set(self, "views", None if self.views is None else _tuple("views", self.views, str))
         _set(self, "edits", _tuple("edits", self.edits, LayerEdit))
         for name in ("options", "details"):
-            _set(self, name, plain_object(name, getattr(self, name)))
-        _set(self, "head", None if self.head is None else plain_object("head", self.head))
+            _set(self, name, plain_object(name, getattr(self, name), max_depth=_MAX_DEPTH))
+        if self.head is not None:
+            _set(self, "head", plain_object("head", self.head, max_depth=_MAX_DEPTH))
         _set(self, "versions", _table("versions", self.versions, str, check_key=_check_word))
         _set(self, "names", _table("names", self.names, str))
         if self.source_ids is not None:

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Features, InstanceTree, Labels, LayerInfo, Selection, TreeNode
+from splatseg.core import (
+    Features,
+    InstanceFacts,
+    InstanceTree,
+    Labels,
+    LayerInfo,
+    Selection,
+    TreeNode,
+)
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.layers import load_layer, save_layer
 
@@ -113,6 +121,27 @@ def test_layers_of_version_3_are_read_and_written_as_they_were(
     same(golden.golden_layers_of_version_3()[name], layer)
     save_layer(tmp_path / "again.npz", layer)
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
+
+
+def test_records_as_deep_as_they_may_be_have_a_place_in_files(tmp_path) -> None:
+    deep: list = []
+    for _ in range(89):
+        deep = [deep]
+    facts = {1: InstanceFacts(details={"a": deep})}
+    info = LayerInfo(instances=facts, details={"a": deep}).with_edit("merge", {"a": deep})
+    save_layer(tmp_path / "a.npz", Selection(mask=torch.ones(1).bool(), info=info))
+    assert load_layer(tmp_path / "a.npz").info == info
+
+
+def test_a_record_of_version_0_is_that_of_a_file_without_its_version(tmp_path) -> None:
+    """A method could call a key of its own version."""
+
+    def flat(header, arrays) -> None:
+        del header["info"]
+        header.update(version=1, metadata={"method": "m", "version": "2.0", "names": {"3": "a"}})
+
+    info = load_layer(changed(tmp_path, flat)).info
+    assert info == LayerInfo(method="m", names={3: "a"}, details={"version": "2.0"})
 
 
 def test_layers_of_a_later_version_are_refused(tmp_path) -> None:
