@@ -30,8 +30,8 @@ from splatseg.core.layer_info import LayerEditName as LayerEditName
 from splatseg.core.layer_info import LayerInfo as LayerInfo
 from splatseg.core.layer_info_json import LAYER_INFO_VERSION as LAYER_INFO_VERSION
 from splatseg.core.layer_info_json import layer_info_from_json as layer_info_from_json
-from splatseg.core.layer_info_json import layer_info_from_metadata as layer_info_from_metadata
 from splatseg.core.layer_info_json import layer_info_to_json as layer_info_to_json
+from splatseg.core.layer_info_version_0 import layer_info_from_metadata as layer_info_from_metadata
 from splatseg.core.layers import Features as Features
 from splatseg.core.layers import Labels as Labels
 from splatseg.core.layers import Selection as Selection

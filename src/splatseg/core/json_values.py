@@ -46,6 +46,12 @@ def plain_object(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> dic
     )
 
 
+def id_of_key(key: object) -> int | None:
+    """An id as JSON writes it as a key, in digits alone; None where it is something else."""
+    text = str(key)
+    return int(text) if text.isascii() and text.isdigit() and str(int(text)) == text else None
+
+
 def _plain(name: str, value: object, depth: int, max_depth: int) -> JSON:
     if depth < 0:
         raise InputError(f"{name}: expected values at most {max_depth} deep, got deeper ones.")
