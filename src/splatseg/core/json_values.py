@@ -13,6 +13,10 @@ MAX_DEPTH = 100
 """Groups in each other that a file may hold."""
 
 
+_MAX_DIGITS = 18
+"""Of an id, which has 64 bits at most."""
+
+
 def plain_json(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> JSON:
     """A copy in the types that JSON gives back: dicts, and lists for tuples.
 
@@ -40,16 +44,15 @@ def plain_object(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> dic
     """
     if not isinstance(value, Mapping):
         raise InputError(f"{name}: expected a mapping, got {type(value).__name__}.")
-    return cast(
-        "dict[str, JSON]",
-        plain_json(name, cast("Mapping[object, object]", value), max_depth=max_depth),
-    )
+    values = cast("Mapping[object, object]", value)
+    return cast("dict[str, JSON]", plain_json(name, values, max_depth=max_depth))
 
 
 def id_of_key(key: object) -> int | None:
     """An id as JSON writes it as a key, in digits alone; None where it is something else."""
     text = str(key)
-    return int(text) if text.isascii() and text.isdigit() and str(int(text)) == text else None
+    digits = text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS
+    return int(text) if digits and str(int(text)) == text else None
 
 
 def _plain(name: str, value: object, depth: int, max_depth: int) -> JSON:
@@ -60,17 +63,32 @@ def _plain(name: str, value: object, depth: int, max_depth: int) -> JSON:
         for key, entry in cast("Mapping[object, object]", value).items():
             if not isinstance(key, str):
                 raise InputError(f"{name}: expected keys that are strings, got {key!r}.")
-            entries[key] = _plain(f"{name}.{key}", entry, depth - 1, max_depth)
+            # Names are made where they may be needed: layers hold tables of many numbers.
+            entries[key] = (
+                cast("JSON", entry)
+                if _is_scalar(entry)
+                else _plain(f"{name}.{key}", entry, depth - 1, max_depth)
+            )
         return entries
     if isinstance(value, (list, tuple)):
         items = cast("Sequence[object]", value)
         return [
-            _plain(f"{name}[{i}]", entry, depth - 1, max_depth) for i, entry in enumerate(items)
+            cast("JSON", entry)
+            if _is_scalar(entry)
+            else _plain(f"{name}[{i}]", entry, depth - 1, max_depth)
+            for i, entry in enumerate(items)
         ]
-    if isinstance(value, float) and not math.isfinite(value):
+    if _is_scalar(value):
+        return cast("JSON", value)
+    if isinstance(value, float):
         raise InputError(f"{name}: expected a finite number, got {value}.")
-    if value is None or isinstance(value, (str, int, float)):
-        return value
     raise InputError(
         f"{name}: expected a value that JSON holds, got one of type {type(value).__name__}."
     )
+
+
+def _is_scalar(value: object) -> bool:
+    """Whether JSON has a word for it that holds nothing else."""
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return value is None or isinstance(value, (str, int))

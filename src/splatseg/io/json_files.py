@@ -18,7 +18,7 @@ def parse_object(text: str | bytes, *, where: str) -> dict[str, Any]:
     """
     try:
         value = json.loads(text)
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(
             f"{where}: expected JSON, but it cannot be parsed ({error})."
         ) from error

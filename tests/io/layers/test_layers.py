@@ -133,6 +133,15 @@ def test_records_as_deep_as_they_may_be_have_a_place_in_files(tmp_path) -> None:
     assert load_layer(tmp_path / "a.npz").info == info
 
 
+def test_a_number_of_more_digits_than_python_reads_is_refused(tmp_path) -> None:
+    path = tmp_path / "a.npz"
+    save_layer(path, LAYERS["labels"])
+    text = '{"format": "splatseg-layer", "count": ' + "1" * 5000 + "}"
+    np.savez(path, header=np.frombuffer(text.encode(), np.uint8))
+    with pytest.raises(FileFormatError, match=f"^{path}: expected JSON"):
+        load_layer(path)
+
+
 def test_a_record_of_version_0_is_that_of_a_file_without_its_version(tmp_path) -> None:
     """A method could call a key of its own version."""
 
