@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Features, Labels, Selection
+from splatseg.core import Features, Labels, Selection, layer_info_to_json
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.io.splats import read_splats
 from splatseg.lift import label_map
@@ -312,6 +312,7 @@ def test_export_writes_columns_and_a_table(segmented, splatseg, tmp_path) -> Non
     assert entry["background"] == 1
     assert entry["ids"]["7"]["name"] == "right wall"
     assert entry["ids"]["7"]["gaussians"] == int((layer.ids == 7).sum())
+    assert entry["made"] == layer_info_to_json(layer.info)
     assert entry["made"]["evidence"] == "labels_semantic"
     # The header says int and float in so many words, for readers that go by it.
     header = output.read_bytes().split(b"end_header")[0].decode()

@@ -9,9 +9,12 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import torch
 
 import splatseg as package
+from splatseg.core import Labels, LayerInfo, with_info
 from splatseg.errors import FileFormatError, InputError, MissingPackageError
+from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods import (
     ENTRY_POINT_GROUP,
@@ -180,6 +183,36 @@ def test_python_gives_what_the_command_gives(small, splatseg) -> None:
     assert made.labels.ids.equal(saved.ids)
     assert made.labels.confidence.equal(saved.confidence)
     assert made.layer.info == saved.info
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_method_need_not_tell_its_name_and_views(small, told) -> None:
+    own = LayerInfo(method="mine", views=("train_3",), seed=9, details={"loss": 0.5})
+
+    def run(inputs, options) -> Labels:
+        count = len(inputs.gaussians)
+        labels = Labels(ids=torch.ones(count).int(), confidence=torch.ones(count))
+        return with_info(labels, own) if told else labels
+
+    method = Method(
+        name="ones",
+        summary="all of them are 1",
+        reference="tests",
+        evidence=("labels",),
+        options=find_method("uplift").options,
+        run=run,
+    )
+    scene = load_scene(small.scene, data=small.capture)
+    options = package.tasks.SegmentOptions(evidence="labels_semantic", seed=3, views=("all",))
+    info = package.segment(scene, method, options=options).layer.info
+    assert (info.evidence, info.views_asked, info.seed) == ("labels_semantic", "all", 3)
+    assert set(info.versions) == {"splatseg", "torch"}
+    if told:
+        assert (info.method, info.views, info.details) == ("mine", ("train_3",), {"loss": 0.5})
+    else:
+        known = open_evidence(small.capture / "labels_semantic").view_names
+        assert info.method == "ones"
+        assert sorted(info.views or ()) == sorted(v.name for v in scene.views if v.name in known)
 
 
 def test_options_of_another_method_are_refused_in_python(small) -> None:

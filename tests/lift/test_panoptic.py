@@ -3,7 +3,16 @@
 import pytest
 import torch
 
-from splatseg.core import ClassInfo, ClassTable, Gaussians, InstanceFacts, Labels, LayerInfo
+from splatseg.core import (
+    ClassInfo,
+    ClassTable,
+    Gaussians,
+    InstanceFacts,
+    InstanceTree,
+    Labels,
+    LayerInfo,
+    TreeNode,
+)
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.held_out_segments import classes_of_instances
 from splatseg.lift import merge_panoptic
@@ -119,6 +128,16 @@ def test_facts_of_the_instances_stay() -> None:
     assert found.info.method == "associate"
     assert found.info.names == {1: "cup 1", 2: "wall"}
     assert found.info.instances == {1: SEEN, 2: InstanceFacts(stuff=True)}
+
+
+def test_classes_come_from_all_that_a_record_tells() -> None:
+    info = LayerInfo(class_of={1: CUP, 2: 0}, instances={2: SEEN, 5: SEEN})
+    assert classes_of_instances(labels([1], info=info)) == {1: CUP, 2: -1, 5: -1}
+    nodes = (TreeNode(id=1, class_id=CUP), TreeNode(id=2, segments=3, views=2))
+    tree = InstanceTree(nodes=nodes, labels=labels([1, 2]))
+    assert classes_of_instances(tree.cut()) == {1: CUP, 2: -1}
+    with pytest.raises(InputError, match="expected a layer whose info tells the class"):
+        classes_of_instances(labels([1], info=LayerInfo(names={1: "cup"})))
 
 
 def test_bad_input_is_refused() -> None:
