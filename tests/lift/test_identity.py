@@ -1,6 +1,7 @@
 """Identity features: the losses, training, and both readouts."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -415,13 +416,23 @@ def test_heads_without_a_classifier_read_logits() -> None:
         train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), LayerInfo(head=head.to_json()))
     )
     assert (again.weight, again.bias, again.ids.tolist()) == (None, None, [4, 9])
-    layer = train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), {})
+    layer = train_layer(torch.tensor([[1.0, 3.0], [2.0, 0.0]]), LayerInfo())
     found = again.labels(layer, info=LayerInfo(method="m"))
     assert found.ids.tolist() == [9, 4]
     assert found.confidence.tolist() == pytest.approx([1 / (1 + math.exp(-2))] * 2)
     assert found.info.method == "m"
     with pytest.raises(InputError, match="a layer with a classifier head"):
         ClassifierHead.of(layer)
+    for wrong in (
+        {"ids": 3},
+        {"ids": ["x"]},
+        {"weight": [[1], [1, 2]]},
+        {"bias": "x"},
+        {"blend": "a"},
+    ):
+        broken = LayerInfo(head=head.to_json() | wrong)
+        with pytest.raises(InputError, match="features: expected a classifier head, got one that"):
+            ClassifierHead.of(replace(layer, info=broken))
     with pytest.raises(InputError, match="blend"):
         ClassifierHead(ids=torch.tensor([1]), weight=None, bias=None, blend="colours")
     with pytest.raises(ShapeError, match="weight"):
@@ -439,7 +450,7 @@ def test_the_rendered_readout_equals_the_hard_one_where_gaussians_are_sure(rng) 
     camera = camera_at()
     logits = torch.zeros(25, 2)
     logits[torch.arange(25), torch.arange(25) % 2] = 60.0
-    layer = train_layer(logits, {})
+    layer = train_layer(logits, LayerInfo())
     head = ClassifierHead(ids=torch.tensor([4, 9]), weight=None, bias=None, blend="probabilities")
     soft = head.label_map(gaussians, camera, layer, backend=BACKEND)
     hard = label_map(gaussians, camera, head.labels(layer), backend=BACKEND)

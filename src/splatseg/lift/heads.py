@@ -161,12 +161,18 @@ class ClassifierHead:
         found = cast("Mapping[str, Any] | None", features.info.head)
         if found is None or not {"ids", "blend"} <= set(found):
             raise InputError("features: expected a layer with a classifier head, got one without.")
-        return cls(
-            ids=torch.tensor(_numbers(found["ids"]), dtype=torch.int64),
-            weight=None if found.get("weight") is None else torch.tensor(found["weight"]),
-            bias=None if found.get("bias") is None else torch.tensor(found["bias"]),
-            blend=found["blend"],
-        )
+        weight, bias = found.get("weight"), found.get("bias")
+        try:
+            return cls(
+                ids=torch.tensor(_numbers(found["ids"]), dtype=torch.int64),
+                weight=None if weight is None else torch.tensor(weight, dtype=torch.float32),
+                bias=None if bias is None else torch.tensor(bias, dtype=torch.float32),
+                blend=found["blend"],
+            )
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"features: expected a classifier head, got one that cannot be read ({error})."
+            ) from error
 
 
 def _numbers(values: Any) -> Sequence[int]:
