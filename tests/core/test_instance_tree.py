@@ -71,6 +71,7 @@ def test_a_cut_says_what_its_ids_are_and_is_unsure_of_none() -> None:
     assert cut.info.method == "associate"
     assert cut.info.names == {2: "lamp", 3: "cup", 7: "wall"}
     assert cut.info.class_of == {2: 8}
+    assert cut.info.instances == {}, "nothing is known of what nodes by hand were made of"
     expected = TREE.labels.confidence.clone()
     expected[[5, 7]] = 0
     assert torch.equal(cut.confidence, expected)

@@ -247,6 +247,7 @@ def test_a_tree_has_the_record_of_its_labels() -> None:
         ({"names": {"cup": "7"}}, "names: expected ids of 0 or more as keys, got 'cup'"),
         ({"names": {"07": "cup"}}, "names: expected ids of 0 or more as keys, got '07'"),
         ({"names": {"1" * 5000: "cup"}}, "names: expected ids of 0 or more as keys, got '111"),
+        ({"names": {"²": "cup"}}, "names: expected ids of 0 or more as keys, got '²'"),
         ({"names": {"٣": "cup"}}, "names: expected ids of 0 or more as keys, got '٣'"),
         ({"names": {"-1": "cup"}}, "names: expected ids of 0 or more as keys, got '-1'"),
         ({"names": {"7": 5}}, r"names\[7\]: expected str, got int"),
