@@ -14,6 +14,7 @@ from splatseg.core import (
     LayerInfo,
     View,
 )
+from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift import label_map
@@ -282,13 +283,15 @@ def test_an_interrupted_training_goes_on(rng, views, tmp_path) -> None:
     whole = train_identity(gaussians, views, maps, options=options, context=here())
     asked = []
     stopping = TrainingContext(
-        backend=BACKEND, checkpoint=path, cancelled=lambda: asked.append(1) or len(asked) == 7
+        backend=BACKEND,
+        checkpoints=Checkpoints(path=path),
+        cancelled=lambda: asked.append(1) or len(asked) == 7,
     )
     with pytest.raises(KeyboardInterrupt):
         train_identity(gaussians, views, maps, options=options, context=stopping)
-    resuming = TrainingContext(backend=BACKEND, checkpoint=path, resume=True)
+    resuming = TrainingContext(backend=BACKEND, checkpoints=Checkpoints(path=path, resume=True))
     other = IdentityOptions(**QUICK | {"steps": 20}, kl_every=3)
-    with pytest.raises(InputError, match="with kl_every 3, got one with 5"):
+    with pytest.raises(InputError, match="got one with kl_every 5 instead of 3"):
         train_identity(gaussians, views, maps, options=other, context=resuming)
     again = train_identity(gaussians, views, maps, options=options, context=resuming)
     assert torch.equal(whole.values, again.values)

@@ -2,7 +2,10 @@
 
 import json
 import math
+import signal
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ import torch
 
 from splatseg import _native
 from splatseg.core import LabelMap, View
+from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, SplatsegError
 from splatseg.lift.training import (
     Batch,
@@ -18,8 +22,13 @@ from splatseg.lift.training import (
     RowSampler,
     SamplingOptions,
     TrainingOptions,
+    TrainingProgress,
+    TrainingSummary,
     Values,
+    _file,
+    discard_training,
     train,
+    training_summary,
 )
 from splatseg.lift.training._options import rate_factor
 
@@ -236,18 +245,21 @@ def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
     sampler = many_views(rng, 6)
     options = TrainingOptions(
         steps=25, batch=50, passes=passes, held_out=0.34, score_every=4, patience=9,
-        schedule="cosine", warmup=3, held_out_pixels=10, checkpoint_every=100,
+        schedule="cosine", warmup=3, held_out_pixels=10,
     )  # fmt: skip
     whole_model = Regression()
     whole = train(whole_model, sampler, options=options, seed=5)
     path = tmp_path / "training.npz"
     with pytest.raises(KeyboardInterrupt):
-        train(Regression(), sampler, options=options, seed=5, checkpoint=path, cancelled=Stop(stop))
+        train(
+            Regression(), sampler, options=options, seed=5, checkpoints=Checkpoints(path=path),
+            cancelled=Stop(stop),
+        )  # fmt: skip
     assert path.is_file()
     model = Regression()
     steps = []
     again = train(
-        model, sampler, options=options, seed=5, checkpoint=path, resume=True,
+        model, sampler, options=options, seed=5, checkpoints=Checkpoints(path=path, resume=True),
         progress=lambda state: steps.append(state.step),
     )  # fmt: skip
     assert steps == list(range(stop + 1, 26))
@@ -257,61 +269,147 @@ def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
     assert torch.equal(whole.visibility, again.visibility)
     assert (whole.losses, whole.scores) == (again.losses, again.scores)
     assert (whole.best_step, whole.stopped) == (again.best_step, again.stopped)
-    assert not list(tmp_path.iterdir())  # done: nothing is left to resume
+    assert training_summary(path) == TrainingSummary(step=stop, steps=25)
+    discard_training(path)
+    assert not tmp_path.exists()
 
 
 def test_checkpoints_are_written_every_so_often(sampler, tmp_path) -> None:
     path, found = tmp_path / "training.npz", []
-    options = TrainingOptions(**SHORT | {"checkpoint_every": 4})
-    train(
-        Regression(), sampler, options=options, checkpoint=path,
-        progress=lambda state: found.append(path.is_file()),
-    )  # fmt: skip
-    assert found == [False] * 4 + [True] * 8  # told before the one of its own step is written
+    checkpoints = Checkpoints(path=path, steps=5)
+
+    def step(_: object) -> None:
+        found.append(training_summary(path).step if path.is_file() else 0)
+
+    options = TrainingOptions(**SHORT)
+    train(Regression(), sampler, options=options, checkpoints=checkpoints, progress=step)
+    assert found == [0] * 5 + [5] * 5 + [10] * 2  # told before the one of its own step is written
+    assert training_summary(path).step == 10
+    at_end = replace(checkpoints, at_end=True)
+    first = train(Regression(), sampler, options=options, checkpoints=at_end)
+    assert training_summary(path).step == 12
+    going_on, found[:] = replace(at_end, resume=True), []
+    again = train(Regression(), sampler, options=options, checkpoints=going_on, progress=step)
+    assert not found, "nothing was left to do"
+    assert torch.equal(first.rows["values"], again.rows["values"])
+
+
+def test_checkpoints_by_the_clock(sampler, tmp_path, monkeypatch) -> None:
+    """A minute passes with each step: one is written every third."""
+    path, found, now = tmp_path / "training.npz", [], [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+
+    def step(_: object) -> None:
+        now[0] += 60.0
+        found.append(training_summary(path).step if path.is_file() else 0)
+
+    checkpoints = Checkpoints(path=path, seconds=180.0)
+    options = TrainingOptions(**SHORT)
+    train(Regression(), sampler, options=options, checkpoints=checkpoints, progress=step)
+    assert found == [0] * 3 + [3] * 3 + [6] * 3 + [9] * 3
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_what_progress_raises_leaves_a_checkpoint(sampler, tmp_path, error) -> None:
+    path = tmp_path / "folder" / "training.npz"
+
+    def step(state: TrainingProgress) -> None:
+        if state.step == 3:
+            raise error
+
+    with pytest.raises(error):
+        train(
+            Regression(), sampler, options=TrainingOptions(**SHORT),
+            checkpoints=Checkpoints(path=path), progress=step,
+        )  # fmt: skip
+    assert training_summary(path) == TrainingSummary(step=3, steps=12)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_are_answered_between_two_steps(sampler, tmp_path, number) -> None:
+    class Interrupting(Regression):
+        def loss(self, batch: Batch, values: Values) -> torch.Tensor:
+            if values.step == 4:
+                signal.raise_signal(number)
+            return super().loss(batch, values)
+
+    path, options = tmp_path / "training.npz", TrainingOptions(**SHORT)
+    whole = train(Regression(), sampler, options=options)
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt):
+        train(Interrupting(), sampler, options=options, checkpoints=Checkpoints(path=path))
+    assert signal.getsignal(number) is before
+    assert training_summary(path).step == 4
+    going_on = Checkpoints(path=path, resume=True)
+    again = train(Regression(), sampler, options=options, checkpoints=going_on)
+    assert torch.equal(whole.rows["values"], again.rows["values"])
+    assert whole.losses == again.losses
+
+
+def test_a_signal_during_the_last_write_is_not_lost(sampler, tmp_path, monkeypatch) -> None:
+    write = _file.write_state
+
+    def slow(*args) -> None:
+        signal.raise_signal(signal.SIGINT)
+        write(*args)
+
+    monkeypatch.setattr(_file, "write_state", slow)
+    checkpoints = Checkpoints(path=tmp_path / "training.npz", at_end=True)
+    with pytest.raises(KeyboardInterrupt):
+        train(Regression(), sampler, options=TrainingOptions(**SHORT), checkpoints=checkpoints)
+    assert training_summary(checkpoints.path).step == 12
 
 
 def test_a_broken_write_leaves_the_older_checkpoint(sampler, tmp_path, monkeypatch) -> None:
     path = tmp_path / "training.npz"
-    options = TrainingOptions(**SHORT | {"checkpoint_every": 2})
+    options, checkpoints = TrainingOptions(**SHORT), Checkpoints(path=path, steps=2)
 
     def fails(file, *_args, **_kwargs) -> None:
         file.write(b"half")
         raise OSError("full")
 
     with pytest.raises(KeyboardInterrupt):
-        train(Regression(), sampler, options=options, checkpoint=path, cancelled=Stop(3))
+        train(Regression(), sampler, options=options, checkpoints=checkpoints, cancelled=Stop(3))
     before = path.read_bytes()
     monkeypatch.setattr(np, "savez", fails)
     with pytest.raises(SplatsegError, match="cannot be written"):
-        train(Regression(), sampler, options=options, checkpoint=path, resume=True)
+        train(Regression(), sampler, options=options, checkpoints=replace(checkpoints, resume=True))
     assert path.read_bytes() == before
 
 
-def test_a_checkpoint_of_another_training_is_refused(rng, views, sampler, tmp_path) -> None:
+def test_a_checkpoint_of_another_training_is_refused(rng, views, tmp_path) -> None:
+    gaussians, maps = random_gaussians(rng, N), random_maps(rng, views, IDS)
+    sampler = sampler_of(gaussians, views, maps, pixels=60)
     path = tmp_path / "training.npz"
-    options = TrainingOptions(**SHORT)
 
-    def run(which=sampler, *, seed=0, settings=None, resume=True, cancelled=None, **changes):
+    def run(
+        which=sampler, *, seed=0, settings=None, defaults=None, resume=True, cancelled=None,
+        **changes,
+    ):  # fmt: skip
         return train(
             Regression(), which, options=TrainingOptions(**SHORT | changes), seed=seed,
-            checkpoint=path, resume=resume, settings=settings, cancelled=cancelled,
+            checkpoints=Checkpoints(path=path, resume=resume), settings=settings,
+            defaults=defaults, cancelled=cancelled,
         )  # fmt: skip
 
     with pytest.raises(MissingFileError, match="no such checkpoint"):
-        run()
-    with pytest.raises(InputError, match="expected a checkpoint to resume from"):
-        train(Regression(), sampler, options=options, resume=True)
+        training_summary(path)
     with pytest.raises(KeyboardInterrupt):
         run(settings={"blend": "a"}, resume=False, cancelled=Stop(2))
-    with pytest.raises(InputError, match="with seed 1, got one with 0"):
+    with pytest.raises(InputError, match=r"got one with seed 0 instead of 1\."):
         run(seed=1, settings={"blend": "a"})
-    with pytest.raises(InputError, match="with blend 'b', got one with 'a'"):
+    with pytest.raises(InputError, match='blend "a" instead of "b"'):
         run(settings={"blend": "b"})
-    with pytest.raises(InputError, match=r"with beta1 0\.5, got one with 0\.9"):
+    with pytest.raises(InputError, match=r"got one with beta1 0\.9 instead of 0\.5\."):
         run(settings={"blend": "a"}, beta1=0.5)
     other = sampler_of(random_gaussians(rng, N), views, random_maps(rng, views, IDS), pixels=60)
-    with pytest.raises(InputError, match="of this scene and evidence"):
+    with pytest.raises(InputError, match="got one with other Gaussians, other evidence"):
         run(other, settings={"blend": "a"})
+    fewer = sampler_of(gaussians, views, maps, pixels=59)
+    with pytest.raises(InputError, match="got one with pixels 60 instead of 59"):
+        run(fewer, settings={"blend": "a"})
+    with pytest.raises(InputError, match=r"later 7 instead of 8\."):
+        run(settings={"blend": "a", "later": 8}, defaults={"later": 7})
 
     saved = path.read_bytes()
     with np.load(path) as file:
@@ -327,9 +425,17 @@ def test_a_checkpoint_of_another_training_is_refused(rng, views, sampler, tmp_pa
 
     # An option that the file does not know yet counts as its default.
     rewritten(lambda edited: edited["identity"]["options"].pop("beta1"))
-    with pytest.raises(InputError, match=r"with beta1 0\.5, got one with 0\.9"):
+    with pytest.raises(InputError, match=r"got one with beta1 0\.9 instead of 0\.5\."):
         run(settings={"blend": "a"}, beta1=0.5)
     assert len(run(settings={"blend": "a"}).losses) == 12
+
+    # So does one that only the model has, and none that this program does not know any more.
+    rewritten(lambda edited: edited["identity"]["options"].update(gone=1))
+    with pytest.raises(InputError, match="gone 1, an option that this splatseg does not have"):
+        run(settings={"blend": "a"})
+    rewritten(lambda edited: None)
+    settings, defaults = {"blend": "a", "later": 7}, {"blend": "b", "later": 7}
+    assert len(run(settings=settings, defaults=defaults).losses) == 12
 
     rewritten(lambda edited: edited.update(version=2))
     with pytest.raises(FileFormatError, match="of version 1, got version 2"):
@@ -426,7 +532,6 @@ def test_bad_options_are_refused() -> None:
         {"score_every": 0},
         {"patience": -1},
         {"min_gain": math.nan},
-        {"checkpoint_every": 0},
     ):
         with pytest.raises(RangeError, match=next(iter(wrong))):
             TrainingOptions(**wrong)

@@ -325,10 +325,10 @@ def test_held_out_views_are_spread() -> None:
     assert held_out_views(views[:3], 0.1)[1] == []
 
 
-def test_the_fingerprint_tells_data_apart(rng, views) -> None:
+def test_fingerprints_tell_what_is_other(rng, views) -> None:
     gaussians, maps = random_gaussians(rng), random_maps(rng, views, IDS)
-    first = sampler_of(gaussians, views, maps).fingerprint
-    assert sampler_of(gaussians, views[::-1], maps).fingerprint == first
+    first = sampler_of(gaussians, views, maps).fingerprints
+    assert sampler_of(gaussians, views[::-1], maps).fingerprints == first
     moved = gaussians.replace(means=gaussians.means + 1e-3)
     other = random_maps(rng, views, IDS)
     turned = [View(name=view.name, camera=camera_at(0.7)) for view in views]
@@ -338,13 +338,14 @@ def test_the_fingerprint_tells_data_apart(rng, views) -> None:
             for name, found in maps.maps.items()
         }
     )
-    for changed in (
-        sampler_of(moved, views, maps),
-        sampler_of(gaussians, views, other),
-        sampler_of(gaussians, turned, maps),
-        sampler_of(gaussians, views, sure),
+    for changed, what in (
+        (sampler_of(moved, views, maps), "Gaussians"),
+        (sampler_of(gaussians, views, other), "evidence"),
+        (sampler_of(gaussians, turned, maps), "views"),
+        (sampler_of(gaussians, views, sure), "evidence"),
     ):
-        assert changed.fingerprint != first
+        found = changed.fingerprints
+        assert {name for name in first if found[name] != first[name]} == {what}
 
 
 def test_bad_input_is_refused(rng, views) -> None:

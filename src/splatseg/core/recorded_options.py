@@ -6,6 +6,7 @@ only the record has was taken away since; at its default of then it changed noth
 value the work cannot go on as it began.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -32,6 +33,23 @@ class OptionDifference:
 
     wanted: Any
     """The value that is asked for; `ABSENT` where the program does not know the option."""
+
+    @property
+    def text(self) -> str:
+        """The difference in words: ``seed 1 instead of 2``."""
+        if self.recorded is ABSENT:
+            return f"no {self.name} instead of {json.dumps(self.wanted)}"
+        recorded = f"{self.name} {json.dumps(self.recorded)}"
+        if self.wanted is ABSENT:
+            return f"{recorded}, an option that this splatseg does not have"
+        return f"{recorded} instead of {json.dumps(self.wanted)}"
+
+
+def differing_names(recorded: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the entries that are not equal in both, in order."""
+    return tuple(
+        name for name in sorted({*recorded, *wanted}) if recorded.get(name) != wanted.get(name)
+    )
 
 
 def option_differences(

@@ -4,12 +4,12 @@
 photographs and from any other differentiable loss.
 """
 
+from splatseg.core.checkpoints import Checkpoints as Checkpoints
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
 from splatseg.fit._checkpoint import CheckpointVersionError as CheckpointVersionError
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
 from splatseg.fit._checkpoint import discard_checkpoint as discard_checkpoint
 from splatseg.fit._exposure import Exposure as Exposure
-from splatseg.fit._interrupts import deferred_interrupts as deferred_interrupts
 from splatseg.fit._loop import fit as fit
 from splatseg.fit._options import FitOptions as FitOptions
 from splatseg.fit._options import Preset as Preset
@@ -24,6 +24,5 @@ from splatseg.fit._records import FitRecord as FitRecord
 from splatseg.fit._records import FitResult as FitResult
 from splatseg.fit._refine import Refinement as Refinement
 from splatseg.fit._refine import refine as refine
-from splatseg.fit._resume import Checkpoints as Checkpoints
 from splatseg.fit._start import random_point_count as random_point_count
 from splatseg.fit._step import ExtraLoss as ExtraLoss

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Camera, Capture, View
-from splatseg.core.recorded_options import ABSENT, option_differences
+from splatseg.core.recorded_options import differing_names, option_differences
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 
@@ -65,8 +65,8 @@ def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any])
     Raises:
         InputError: Naming everything that differs.
     """
-    before, after = _of(saved, "data"), _of(now, "data")
-    differing = [f"other {name}" for name in _differing(before, after)]
+    other = differing_names(_of(saved, "data"), _of(now, "data"))
+    differing = [f"other {name}" for name in other]
     differing += _other_options(saved, now)
     if saved.get("backend") != now.get("backend"):
         differing.append(f"backend {saved.get('backend')!r} instead of {now.get('backend')!r}")
@@ -87,19 +87,7 @@ def _other_options(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
     )
     names = {difference.name for difference in differences}
     free = {*_LENGTH, _WITH_LENGTH} if not _LENGTH.isdisjoint(names) else set[str]()
-    found: list[str] = []
-    for one in differences:
-        if one.name in free:
-            continue
-        if one.wanted is ABSENT:
-            found.append(
-                f"{one.name} {json.dumps(one.recorded)}, an option that this splatseg does not have"
-            )
-        else:
-            found.append(
-                f"{one.name} {json.dumps(one.recorded)} instead of {json.dumps(one.wanted)}"
-            )
-    return found
+    return [difference.text for difference in differences if difference.name not in free]
 
 
 def _as_recorded(options: FitOptions) -> dict[str, Any]:
@@ -110,11 +98,6 @@ def _as_recorded(options: FitOptions) -> dict[str, Any]:
 def _of(identity: Mapping[str, Any], group: str) -> Mapping[str, Any]:
     found = identity.get(group)
     return found if isinstance(found, dict) else {}  # pyright: ignore[reportUnknownVariableType]
-
-
-def _differing(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    names = sorted({*before, *after})
-    return [name for name in names if before.get(name) != after.get(name)]
 
 
 def _digest(values: Iterable[object]) -> str:

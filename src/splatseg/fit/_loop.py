@@ -1,19 +1,18 @@
 """The fit: one view after another is rendered, compared and optimised."""
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-
-import torch
+from collections.abc import Callable
 
 from splatseg.core import Capture
+from splatseg.core.checkpoints import Checkpoints
+from splatseg.core.interrupts import Interrupts, deferred_interrupts
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit._identity import fit_identity
-from splatseg.fit._interrupts import Interrupts, deferred_interrupts
 from splatseg.fit._options import FitOptions
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._prune import without_floaters
 from splatseg.fit._records import FitProgress, FitResult
-from splatseg.fit._resume import CheckpointClock, Checkpoints
+from splatseg.fit._resume import CheckpointClock
 from splatseg.fit._run import FitRun
 from splatseg.render import get_backend
 
@@ -117,14 +116,3 @@ def _write_checkpoint(run: FitRun, clock: CheckpointClock | None) -> None:
     if clock is not None:
         seconds = clock.write(run.state())
         run.stages["checkpoint"] = run.stages.get("checkpoint", 0.0) + seconds
-
-
-@contextmanager
-def one_torch_thread() -> Generator[None]:
-    """Limit torch to one thread: its idle threads spin on the cores that the kernels need."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import Gaussians, View
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit._exposure import Exposure
 from splatseg.fit._initialise import scene_extent
-from splatseg.fit._loop import one_torch_thread
 from splatseg.fit._options import FitOptions
 from splatseg.fit._parameters import Parameters, final_gaussians
 from splatseg.fit._photographs import Photographs

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Literal
 
 from splatseg.core import ClassTable, Gaussians, Layer, View
+from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, EvidenceKind, TrackedEvidence
 
@@ -35,6 +36,10 @@ class MethodInputs:
 
     progress: Callable[[int, int], None] | None = None
     """Called with the steps done and all there are. An exception from it ends the method."""
+
+    checkpoints: Checkpoints | None = None
+    """Where and how often a method that declares `resumes` keeps its state, and whether it goes
+    on from it; None keeps none."""
 
     @property
     def label_names(self) -> ClassTable | None:
@@ -87,6 +92,10 @@ class Method:
 
     seeded: bool = False
     """Whether the seed makes a difference."""
+
+    resumes: bool = False
+    """Whether it keeps its state as `MethodInputs.checkpoints` says, so that what was interrupted
+    goes on to the result of a run that was not."""
 
     published: Any = None
     """The options of the publication, an instance of `options`; None where the defaults are."""

@@ -1,8 +1,7 @@
 """From label maps to trained features with a head: what methods trained on label maps share."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from splatseg.core import (
     LayerInfo,
     View,
 )
+from splatseg.core.checkpoints import Checkpoints
 from splatseg.lift.heads import ClassifierHead
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training import (
@@ -32,6 +32,9 @@ from splatseg.lift.training import (
 from splatseg.methods._method import MethodInputs
 from splatseg.methods._trained_options import LabelTrainingOptions
 from splatseg.render import RenderOptions
+
+_NOT_TRAINED = ("readout", "min_share", "memory", "max_bytes")
+"""Options that decide how what was trained is read, and where rows are kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,11 +53,8 @@ class TrainingContext:
     cancelled: Callable[[], bool] | None = None
     """Asked after each step."""
 
-    checkpoint: Path | None = None
-    """Where the state is kept while training goes on."""
-
-    resume: bool = False
-    """Go on from the checkpoint."""
+    checkpoints: Checkpoints | None = None
+    """Where and how often the state is written; None writes none."""
 
     seed: int = 0
     """Of the pixels, the first values and the order of batches."""
@@ -99,25 +99,31 @@ def label_data(
 
 
 def train_labels(
+    method: str,
     data: LabelData,
     model: Model,
     *,
     options: LabelTrainingOptions,
-    settings: dict[str, Any],
     context: TrainingContext,
 ) -> TrainingResult:
-    """Train a model on label maps, see `splatseg.lift.training.train`."""
+    """Train a model of the method of this name, see `splatseg.lift.training.train`."""
     return train(
         model,
         data.sampler,
         options=options.training(),
         seed=context.seed,
-        checkpoint=context.checkpoint,
-        resume=context.resume,
-        settings=settings,
+        checkpoints=context.checkpoints,
+        settings={"method": method} | _settings(options),
+        defaults=_settings(type(options)()),
         progress=context.progress,
         cancelled=context.cancelled,
     )
+
+
+def _settings(options: LabelTrainingOptions) -> dict[str, Any]:
+    """Options without those that change nothing that is trained."""
+    values = asdict(options)
+    return {name: values[name] for name in values if name not in _NOT_TRAINED}
 
 
 def layer_info(
@@ -188,7 +194,12 @@ def context_of(inputs: MethodInputs) -> TrainingContext:
         if told is not None:
             told(state.step, state.steps)
 
-    return TrainingContext(backend=inputs.backend, progress=tell, seed=inputs.seed)
+    return TrainingContext(
+        backend=inputs.backend,
+        progress=tell,
+        checkpoints=inputs.checkpoints,
+        seed=inputs.seed,
+    )
 
 
 def hard_labels(features: Features, options: LabelTrainingOptions) -> Labels:

@@ -14,7 +14,6 @@ what of its strength comes from the loss.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.errors import InputError, RangeError
@@ -94,8 +93,7 @@ def train_own_logits(
             f"{len(data.ids)} ids, got {options.max_bytes}; the method identity needs less."
         )
     model = LogitModel(len(gaussians), len(data.ids), blend=blend, rate=options.rate)
-    settings: dict[str, Any] = {"method": method} | asdict(options)
-    result = train_labels(data, model, options=options, settings=settings, context=context)
+    result = train_labels(method, data, model, options=options, context=context)
     head = ClassifierHead(ids=data.ids, weight=None, bias=None, blend=blend)
     info = layer_info(
         method, asdict(options), data, result, head=head, classes=classes, seed=context.seed

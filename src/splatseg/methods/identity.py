@@ -28,7 +28,6 @@ References:
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -208,9 +207,8 @@ def train_identity(
     """
     options, context = options or IdentityOptions(), context or TrainingContext()
     data = label_data(gaussians, views, evidence, options=options, context=context)
-    settings: dict[str, Any] = {"method": "identity"} | asdict(options)
     model = _model(gaussians, data, options, context.seed)
-    result = train_labels(data, model, options=options, settings=settings, context=context)
+    result = train_labels("identity", data, model, options=options, context=context)
     head = ClassifierHead(
         ids=data.ids,
         weight=result.shared["weight"],
@@ -261,5 +259,6 @@ METHOD = Method(
     run=runner(train_identity),
     keeps_ids=True,
     seeded=True,
+    resumes=True,
     published=IdentityOptions.published(),
 )

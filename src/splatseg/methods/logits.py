@@ -44,4 +44,5 @@ METHOD = Method(
     run=runner(train_logits),
     keeps_ids=True,
     seeded=True,
+    resumes=True,
 )

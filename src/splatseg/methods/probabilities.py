@@ -45,4 +45,5 @@ METHOD = Method(
     run=runner(train_probabilities),
     keeps_ids=True,
     seeded=True,
+    resumes=True,
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture, Scene
+from splatseg.core.interrupts import deferred_interrupts
 from splatseg.errors import InputError
 from splatseg.evaluate import PhotographReport
 from splatseg.fit import (
@@ -14,7 +15,6 @@ from splatseg.fit import (
     Checkpoints,
     FitOptions,
     FitResult,
-    deferred_interrupts,
     discard_checkpoint,
     exposures_record,
     fit,

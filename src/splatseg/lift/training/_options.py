@@ -59,11 +59,8 @@ class TrainingOptions:
     min_gain: float = 0.0
     """What a score must exceed the best by to be better."""
 
-    checkpoint_every: int = 200
-    """Steps from one checkpoint to the next, where checkpoints are asked for."""
-
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "held_out_pixels", "score_every", "checkpoint_every"):
+        for name in ("steps", "batch", "held_out_pixels", "score_every"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
         for name in ("passes", "warmup", "patience"):

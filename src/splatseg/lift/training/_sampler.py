@@ -19,7 +19,14 @@ from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training._pixels import Sampling, draw_by_group, draw_uniformly
 from splatseg.lift.training._store import DrawnView, RowStore
 from splatseg.lift.training._targets import Ragged, Target, Targets, TargetSource
-from splatseg.render import CompactRows, RenderOptions, SparseWeights, options_for, weights
+from splatseg.render import (
+    CompactRows,
+    RenderOptions,
+    SparseWeights,
+    get_backend,
+    options_for,
+    weights,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,19 +253,32 @@ class RowSampler:
         )
 
     @property
-    def fingerprint(self) -> str:
-        """A digest of Gaussians, cameras and targets: equal where draws with a seed are."""
-        digest = hashlib.sha256(self._source.fingerprint.encode())
-        columns = ("means", "rotations", "scales", "opacities")
-        for name in columns:
-            digest.update(getattr(self._gaussians, name).detach().cpu().numpy().tobytes())
+    def options(self) -> SamplingOptions:
+        """Which pixels are drawn."""
+        return self._options
+
+    @property
+    def backend(self) -> str:
+        """Name of the backend that renders, ``auto`` no more."""
+        return get_backend(self._backend, like=self._gaussians.means).name
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """Digests of all data that draws depend on, by what it is."""
+        gaussians, cameras = hashlib.sha256(), hashlib.sha256()
+        for name in ("means", "rotations", "scales", "opacities"):
+            gaussians.update(getattr(self._gaussians, name).detach().cpu().numpy().tobytes())
         for view in self._views:
             camera = view.camera
             numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            digest.update(repr((view.name, numbers, camera.model, camera.distortion)).encode())
-            digest.update(camera.cam_from_world.detach().cpu().numpy().tobytes())
-        digest.update(repr(self._render_options).encode())
-        return digest.hexdigest()
+            cameras.update(repr((view.name, numbers, camera.model, camera.distortion)).encode())
+            cameras.update(camera.cam_from_world.detach().cpu().numpy().tobytes())
+        cameras.update(repr(self._render_options).encode())
+        return {
+            "Gaussians": gaussians.hexdigest(),
+            "views": cameras.hexdigest(),
+            "evidence": self._source.fingerprint,
+        }
 
     def draw(self, rng: np.random.Generator, *, batch: int, pixels: int | None = None) -> DrawnRows:
         """Draw pixels of all views.

@@ -6,7 +6,7 @@ JSON. It is written under a second name and takes the place of the one before wh
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg.core.recorded_options import differing_names, option_differences
 from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
 from splatseg.lift.training._adam import RowMoments
 
@@ -120,6 +121,7 @@ def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -
     arrays |= {name: tensor.cpu().numpy() for name, tensor in state.arrays().items()}
     unfinished = path.with_name(f"{path.name}.new")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
         unfinished.replace(path)
@@ -127,10 +129,36 @@ def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -
         raise SplatsegError(f"{path}: the checkpoint cannot be written ({error}).") from error
 
 
-def discard_state(path: Path) -> None:
-    """Remove a checkpoint and what is left of an unfinished one."""
+def discard_training(path: Path) -> None:
+    """Remove a training's checkpoint, and its folder if nothing else is in it."""
     for file in (path, path.with_name(f"{path.name}.new")):
         file.unlink(missing_ok=True)
+    if path.parent.is_dir() and not any(path.parent.iterdir()):
+        path.parent.rmdir()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingSummary:
+    """Where a training was when its checkpoint was written."""
+
+    step: int
+    """Steps done."""
+
+    steps: int
+    """Steps at most."""
+
+
+def training_summary(path: Path) -> TrainingSummary:
+    """Steps of a checkpoint. Reads nothing else.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no checkpoint, damaged, or of another version.
+    """
+    header, _ = _read(path, names=())
+    return TrainingSummary(
+        step=int(header["step"]), steps=int(header["identity"]["options"]["steps"])
+    )
 
 
 def read_state(path: Path, start: TrainingState, identity: Mapping[str, Any]) -> TrainingState:
@@ -139,31 +167,16 @@ def read_state(path: Path, start: TrainingState, identity: Mapping[str, Any]) ->
     Args:
         path: The file.
         start: The training before its first step, for names and shapes.
-        identity: What is to be trained: its options, seed and digest of the data. Options that
-            the file does not name count as the defaults in ``identity["defaults"]``.
+        identity: What is to be trained: ``data``, its digests by what they are of, ``options``,
+            and ``defaults``, what options count as that the file does not name.
 
     Raises:
         MissingFileError: If there is no such file.
         FileFormatError: If it is no checkpoint, damaged, or of another version.
         InputError: If it is of another training.
     """
-    if not path.is_file():
-        raise MissingFileError(f"{path}: there is no such checkpoint.")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise FileFormatError(f"{path}: {damaged} is damaged.")
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(bytes(arrays.pop(_HEADER)))
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(
-            f"{path}: expected the checkpoint of a training, but it is damaged or none ({error})."
-        ) from error
-    _check_header(path, header, identity)
+    header, arrays = _read(path)
+    _check_identity(path, header["identity"], identity)
     _fill(path, start, arrays, best=header["best"])
     start.step, start.draw = int(header["step"]), int(header["draw"])
     start.draw_began = int(header["draw_began"])
@@ -172,7 +185,27 @@ def read_state(path: Path, start: TrainingState, identity: Mapping[str, Any]) ->
     return start
 
 
-def _check_header(path: Path, header: Any, identity: Mapping[str, Any]) -> None:
+def _read(
+    path: Path, names: Collection[str] | None = None
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """The header and the arrays of these names; None reads all of them."""
+    if not path.is_file():
+        raise MissingFileError(f"{path}: there is no such checkpoint.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip() if names is None else None
+        if damaged is not None:
+            raise FileFormatError(f"{path}: {damaged} is damaged.")
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(bytes(file[_HEADER]))
+            wanted = [name for name in file.files if names is None or name in names]
+            arrays = {name: file[name] for name in wanted if name != _HEADER}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise FileFormatError(
+            f"{path}: expected the checkpoint of a training, but it is damaged or none ({error})."
+        ) from error
     if not isinstance(header, dict) or cast(dict[str, Any], header).get("format") != FORMAT:
         raise FileFormatError(f"{path}: expected the checkpoint of a training, got another file.")
     found = cast(dict[str, Any], header)
@@ -181,15 +214,23 @@ def _check_header(path: Path, header: Any, identity: Mapping[str, Any]) -> None:
             f"{path}: expected a checkpoint of version {VERSION}, got version "
             f"{found.get('version')!r}; another splatseg wrote it."
         )
-    saved = found["identity"]
-    if saved["data"] != identity["data"]:
-        raise InputError(f"{path}: expected a training of this scene and evidence, got of another.")
-    for name, value in identity["options"].items():
-        before = saved["options"].get(name, identity["defaults"].get(name, value))
-        if before != value:
-            raise InputError(
-                f"{path}: expected a training with {name} {value!r}, got one with {before!r}."
-            )
+    return found, arrays
+
+
+def _check_identity(path: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    differing = [f"other {name}" for name in differing_names(saved["data"], wanted["data"])]
+    options = option_differences(
+        saved["options"],
+        wanted["options"],
+        defaults=wanted["defaults"],
+        recorded_defaults=saved["defaults"],
+    )
+    differing += [difference.text for difference in options]
+    if differing:
+        raise InputError(
+            f"{path}: expected a checkpoint with the data and options of this training, got one "
+            f"with {', '.join(differing)}."
+        )
 
 
 def _fill(path: Path, start: TrainingState, arrays: dict[str, NDArray[Any]], *, best: bool) -> None:

@@ -1,9 +1,8 @@
 """The loop: draw, step, score, stop."""
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -11,12 +10,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.errors import InputError
+from splatseg.core.checkpoints import Checkpoints
+from splatseg.core.interrupts import Interrupts, deferred_interrupts
+from splatseg.core.threads import one_torch_thread
 from splatseg.lift.training._adam import AdamConstants, RowAdam
+from splatseg.lift.training._file import TrainingFile
 from splatseg.lift.training._model import Model, Values
 from splatseg.lift.training._options import TrainingOptions, rate_factor
-from splatseg.lift.training._sampler import Batch, DrawnRows, RowSampler, held_out_views
-from splatseg.lift.training._state import TrainingState, discard_state, read_state, write_state
+from splatseg.lift.training._sampler import (
+    Batch,
+    DrawnRows,
+    RowSampler,
+    SamplingOptions,
+    held_out_views,
+)
+from splatseg.lift.training._state import TrainingState
 
 # What the generators of a training are seeded with besides the seed and a number.
 _DRAW, _ORDER, _STEP, _HELD_OUT, _SCORE = range(5)
@@ -75,9 +83,9 @@ def train(
     *,
     options: TrainingOptions | None = None,
     seed: int = 0,
-    checkpoint: Path | None = None,
-    resume: bool = False,
+    checkpoints: Checkpoints | None = None,
     settings: Mapping[str, Any] | None = None,
+    defaults: Mapping[str, Any] | None = None,
     progress: Callable[[TrainingProgress], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> TrainingResult:
@@ -91,53 +99,78 @@ def train(
         sampler: Where pixels come from. A share of its views is held out.
         options: How training goes.
         seed: Of drawn pixels, the order of batches and the model's random choices.
-        checkpoint: Where the state is kept while it goes on; removed at the end.
-        resume: Go on from the checkpoint, which must be there.
+        checkpoints: Where and how often the state is written. With them, Ctrl-C and SIGTERM are
+            answered between two steps, by a checkpoint and then a `KeyboardInterrupt`; the third
+            signal interrupts at once. The last checkpoint stays until `discard_training` removes
+            it. None writes none.
         settings: What else must be the same to resume, in values that JSON holds: the model's
             own options.
-        progress: Told after each step.
-        cancelled: Asked after each step; where it says so, a checkpoint is written.
+        defaults: Their defaults: what counts where a checkpoint does not name one.
+        progress: Called after each step. An exception from it leaves a checkpoint, too.
+        cancelled: Called after each step; True is as good as Ctrl-C.
 
     Raises:
-        KeyboardInterrupt: If it was cancelled.
-        InputError: If a checkpoint is of another training, or resuming is asked for without one.
-        MissingFileError: If there is no checkpoint to resume.
-        FileFormatError: If the checkpoint is damaged.
+        KeyboardInterrupt: If it was interrupted.
+        InputError: If the checkpoint to resume from is of another training.
+        FileFormatError: If it is damaged.
+        SplatsegError: If a checkpoint cannot be written.
     """
     options = options or TrainingOptions()
-    if resume and checkpoint is None:
-        raise InputError("resume: expected a checkpoint to resume from, got none.")
     run = _Run(model, sampler, options, seed)
-    identity = _identity(sampler, options, seed, settings or {}) if checkpoint else {}
-    if checkpoint is not None and resume:
-        run.state = read_state(checkpoint, run.state, identity)
-    try:
-        while not run.finished:
-            run.advance()
-            if progress is not None:
-                progress(run.progress())
-            if checkpoint is not None and run.state.step % options.checkpoint_every == 0:
-                write_state(checkpoint, run.state, identity)
-            if cancelled is not None and not run.finished and cancelled():
-                if checkpoint is not None:
-                    write_state(checkpoint, run.state, identity)
-                raise KeyboardInterrupt
-    finally:
-        run.close()
-    if checkpoint is not None:
-        discard_state(checkpoint)
+    file: TrainingFile | None = None
+    if checkpoints is not None:
+        identity = _identity(sampler, options, seed, settings or {}, defaults or {})
+        file = TrainingFile(checkpoints, identity)
+        run.state = file.saved(run.state)
+    with nullcontext(Interrupts()) if file is None else deferred_interrupts() as interrupts:
+        try:
+            _run_steps(run, file, interrupts, progress=progress, cancelled=cancelled)
+        finally:
+            run.close()
+        if interrupts.requested:  # while the last checkpoint was written
+            raise KeyboardInterrupt
     return run.result()
 
 
+def _run_steps(
+    run: "_Run",
+    file: TrainingFile | None,
+    interrupts: Interrupts,
+    *,
+    progress: Callable[[TrainingProgress], None] | None,
+    cancelled: Callable[[], bool] | None,
+) -> None:
+    """Step until the training is finished; what ends it earlier leaves a checkpoint."""
+    while not run.finished:
+        run.advance()
+        with nullcontext() if file is None else file.written_on_error(run.state):
+            if progress is not None:
+                progress(run.progress())
+            if interrupts.requested or (cancelled is not None and cancelled()):
+                raise KeyboardInterrupt
+        if file is not None and file.due(run.state):
+            file.write(run.state)
+    if file is not None and file.at_end:
+        file.write(run.state)
+
+
 def _identity(
-    sampler: RowSampler, options: TrainingOptions, seed: int, settings: Mapping[str, Any]
+    sampler: RowSampler,
+    options: TrainingOptions,
+    seed: int,
+    settings: Mapping[str, Any],
+    defaults: Mapping[str, Any],
 ) -> dict[str, Any]:
-    given = asdict(options)
-    del given["checkpoint_every"]  # when it was saved does not change what was
+    """What must be the same to resume: where drawn rows are kept changes nothing."""
+    drawn = asdict(sampler.options)
+    default = asdict(SamplingOptions())
+    for name in ("memory", "folder"):
+        del drawn[name], default[name]
+    given = {"seed": seed, "backend": sampler.backend} | drawn | asdict(options) | dict(settings)
     return {
-        "data": sampler.fingerprint,
-        "options": {"seed": seed} | given | dict(settings),
-        "defaults": {field.name: field.default for field in fields(TrainingOptions)},
+        "data": sampler.fingerprints,
+        "options": given,
+        "defaults": default | asdict(TrainingOptions()) | dict(defaults),
     }
 
 
@@ -191,7 +224,7 @@ class _Run:
         state, options = self.state, self._options
         batch = self._next_batch()
         state.step += 1
-        with _single_threaded():
+        with one_torch_thread():
             self._step(batch)
         last = state.step == options.steps
         due = state.step % options.score_every == 0 or last
@@ -300,23 +333,9 @@ class _Run:
             step=state.step,
             differentiable=False,
         )
-        with torch.no_grad(), _single_threaded():
+        with torch.no_grad(), one_torch_thread():
             score = self._model.score(self._scored, values)
         state.scores.append((state.step, float(score)))
         if self._options.patience > 0 and self._best_index == len(state.scores) - 1:
             state.best_rows = {name: value.clone() for name, value in state.rows.items()}
             state.best_shared = {name: value.clone() for name, value in state.shared.items()}
-
-
-@contextmanager
-def _single_threaded() -> Generator[None]:
-    """Torch sums in one thread, so that results do not depend on how many there are.
-
-    Kernels of this library share their work among threads all the same, in a fixed order.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

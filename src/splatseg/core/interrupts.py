@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM are deferred until a fit is between two steps."""
+"""Ctrl-C and SIGTERM are deferred until long work is between two steps."""
 
 import signal
 import threading
