@@ -28,8 +28,10 @@ SHARED = {
     "overwrite": "Overwrite",
     "quiet": "Quiet",
     "scene": "SceneFolder",
+    "seed": "Seed",
 }
 OWN = {("fit", "frames")}  # of a video
+OWN_HELP = {"frames": ["fit"], "data CAPTURE": ["import"], "seed": ["attach", "demo"]}
 
 
 def annotations(name: str) -> dict[str, str]:
@@ -78,7 +80,8 @@ def test_shared_flags_have_the_shared_type(name) -> None:
 
 
 @pytest.mark.parametrize(
-    "flag", ["backend", "cut", "data CAPTURE", "format", "frames", "json", "overwrite", "quiet"]
+    "flag",
+    ["backend", "cut", "data CAPTURE", "format", "frames", "json", "overwrite", "quiet", "seed"],
 )
 def test_shared_flags_say_the_same_on_every_page(flag) -> None:
     found = {
@@ -86,7 +89,8 @@ def test_shared_flags_say_the_same_on_every_page(flag) -> None:
         for path in FOLDER.glob("*.txt")
         if (text := help_of(path.read_text(encoding="utf-8"), flag)) is not None
     }
-    found.pop("import" if flag.startswith("data") else "fit" if flag == "frames" else "", None)
+    for command in OWN_HELP.get(flag, ()):
+        del found[command]
     assert found
     assert len(set(found.values())) == 1, found
 

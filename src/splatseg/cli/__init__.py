@@ -133,8 +133,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # flushes once more at exit; give it somewhere to write so that it stays silent.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        how = f": {error}" if error.args else ""
+        print(f"interrupted{how}", file=sys.stderr)
         return EXIT_FAILED
     except InputError as error:
         return _report(error, str(error), status=EXIT_USAGE, debug=debug)
@@ -213,9 +214,10 @@ def _run(module: CommandModule, name: str, words: list[str]) -> int:
         raise
     try:
         module.run(command)
-    except InputError as error:
+    except (InputError, KeyboardInterrupt) as error:
         # Tasks speak of options by their names in Python.
-        error.args = (with_flags(str(error), field_names(command)),)
+        if error.args:
+            error.args = (with_flags(str(error), field_names(command)),)
         raise
     return EXIT_DONE
 

@@ -10,21 +10,22 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder
+from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder, Seed
 from splatseg.cli._words import option_value
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import UNLABELLED, Features, Labels
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
-from splatseg.io.scene import save_scene_layer
 from splatseg.lift import CompletionOptions
 from splatseg.methods import Method, find_method, methods
 from splatseg.tasks import (
+    CheckpointOptions,
     Segmentation,
     SegmentOptions,
     check_layer_exports,
     export_layer,
     report_layer,
+    save_segmentation,
     segment,
 )
 
@@ -32,11 +33,32 @@ CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 """Options of the method and the shared ones are flags without a prefix, completion's have one."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Shared(SegmentOptions):
+    seed: Seed = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Checkpoints(CheckpointOptions):
+    overwrite: Overwrite = False
+
+
+_HIDDEN_CHECKPOINTS = (
+    "checkpoint",
+    Annotated[_Checkpoints, tyro.conf.OmitArgPrefixes, tyro.conf.Suppress],
+    field(default_factory=_Checkpoints),
+)
+"""The flags of trainings for a method that does not train: not in its help, and refused by the
+task, which says why."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """Lift what was seen in photographs onto the Gaussians: evidence becomes a layer.
 
-    The layer is written to SCENE/layers. An older layer of the same name is replaced.
+    The layer is written to SCENE/layers. An older layer of the same name is replaced. Ctrl-C
+    ends a method that trains and keeps where it was in SCENE/training; --resume goes on from
+    there, and from the last checkpoint of one that was killed.
 
     For example:
 
@@ -52,7 +74,7 @@ class Command:
     method: Annotated[str, tyro.conf.arg(metavar="METHOD")]
     """How. `splatseg segment --method METHOD --help` shows the options of one."""
 
-    shared: tyro.conf.OmitArgPrefixes[SegmentOptions] = field(default_factory=SegmentOptions)
+    shared: tyro.conf.OmitArgPrefixes[_Shared] = field(default_factory=_Shared)
     """What every method shares."""
 
     export: bool = False
@@ -69,6 +91,9 @@ class Command:
     data: Data = None
     json: Json = False
     quiet: Quiet = False
+
+    checkpoint: tyro.conf.OmitArgPrefixes[_Checkpoints] = field(default_factory=_Checkpoints)
+    """How a training that was stopped goes on."""
 
     completion: CompletionOptions = field(default_factory=CompletionOptions)
     """How neighbours' labels spread."""
@@ -93,9 +118,10 @@ def command_for(words: Sequence[str]) -> type[Any]:
         tyro.conf.OmitArgPrefixes,
         tyro.conf.arg(help=f"Options of method {name}: {method.summary} ({method.reference})."),
     ]
+    own = [("options", options, field(default=default))]
     made = make_dataclass(
         "Command",
-        [("options", options, field(default=default))],
+        own if method.resumes else [*own, _HIDDEN_CHECKPOINTS],
         bases=(Command,),
         frozen=True,
         kw_only=True,
@@ -109,7 +135,7 @@ def _with_summaries() -> type[Any]:
     rows = "\n".join(f"- {method.name}: {method.summary}" for method in methods())
     made = make_dataclass(
         "Command",
-        [("options", Annotated[Any, tyro.conf.Suppress], field(default=None))],
+        [("options", Annotated[Any, tyro.conf.Suppress], field(default=None)), _HIDDEN_CHECKPOINTS],
         bases=(Command,),
         frozen=True,
         kw_only=True,
@@ -136,12 +162,13 @@ def run(command: Command) -> None:
         options=command.shared,
         method_options=command.options,
         completion=command.completion,
+        checkpoints=command.checkpoint,
         backend=command.backend,
         observer=observer,
     )
     if command.export:
         check_layer_exports(scene, command.scene, result.name)
-    path = save_scene_layer(command.scene, result.name, result.layer)
+    path = save_segmentation(command.scene, result)
     lines = [_summary(result, time.monotonic() - started), str(path)]
     made = _facts(result, path)
     timings = {"load": opened}

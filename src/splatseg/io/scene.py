@@ -8,6 +8,7 @@
       layers/<name>.npz         what is known of each Gaussian
       reports/
       fit/checkpoint.npz        state of a fit that was stopped
+      training/<layer>.npz      state of a training of this layer that was stopped
       capture/                  poses that were found for bare photographs
 
 Photographs stay where they are: a scene knows its capture by a path relative to itself and an
@@ -43,6 +44,9 @@ SCENE_FILE = "scene.json"
 GAUSSIANS_FILE = "gaussians.ply"
 CAMERAS_FILE = "cameras/transforms.json"
 CHECKPOINT_FILE = "fit/checkpoint.npz"
+TRAINING_FOLDER = "training"
+"""Where methods that train keep their state until the layer is written."""
+
 POSES_FOLDER = "capture"
 """Where `fit` keeps the poses that it found for bare photographs."""
 
@@ -67,6 +71,16 @@ def is_unfinished(path: Path) -> bool:
         and _holds_only(checkpoint.parent, (checkpoint.name, f"{checkpoint.name}.new"))
         and _holds_only(poses, _POSES_ENTRIES)
     )
+
+
+def training_file(root: Path, layer: str) -> Path:
+    """Where the training of a layer keeps its state."""
+    return root / TRAINING_FOLDER / f"{layer}.npz"
+
+
+def training_files(root: Path) -> tuple[Path, ...]:
+    """States of all trainings that were stopped, by the names of their layers."""
+    return tuple(sorted((root / TRAINING_FOLDER).glob("*.npz")))
 
 
 def _holds_only(folder: Path, names: Sequence[str]) -> bool:

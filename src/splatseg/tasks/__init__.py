@@ -9,6 +9,7 @@ from splatseg.tasks._observer import Observer as Observer
 from splatseg.tasks.attach import AttachedLayers as AttachedLayers
 from splatseg.tasks.attach import AttachLayersOptions as AttachLayersOptions
 from splatseg.tasks.attach import attach_layers as attach_layers
+from splatseg.tasks.checkpoint_options import CheckpointOptions as CheckpointOptions
 from splatseg.tasks.demo import Demo as Demo
 from splatseg.tasks.demo import DemoOptions as DemoOptions
 from splatseg.tasks.demo import make_demo as make_demo
@@ -39,6 +40,7 @@ from splatseg.tasks.see import SeeOptions as SeeOptions
 from splatseg.tasks.see import see as see
 from splatseg.tasks.segment import Segmentation as Segmentation
 from splatseg.tasks.segment import SegmentOptions as SegmentOptions
+from splatseg.tasks.segment import save_segmentation as save_segmentation
 from splatseg.tasks.segment import segment as segment
 from splatseg.tasks.sharpen import SharpenedScene as SharpenedScene
 from splatseg.tasks.sharpen import SharpenSceneOptions as SharpenSceneOptions

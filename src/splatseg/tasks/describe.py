@@ -31,9 +31,11 @@ from splatseg.io.scene import (
     load_scene,
     load_scene_layer,
     scene_layer_names,
+    training_files,
 )
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
 from splatseg.tasks.stopped_fit import where_it_stopped
+from splatseg.tasks.stopped_training import where_training_stopped
 
 _LAYOUTS = ("auto", *FORMATS)
 _CAPTURE_FILES = (
@@ -180,6 +182,11 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
         stopped = where_it_stopped(root / CHECKPOINT_FILE)
         if stopped is not None:
             notes.append(f"its fit {stopped}; fit --resume continues it")
+    notes += [
+        f"the training of layer {file.stem} {where_training_stopped(file)}; segment --resume "
+        "continues it"
+        for file in training_files(root)
+    ]
     facts |= {
         "classes": None if scene.classes is None else len(scene.classes.rows),
         "up": None if scene.up is None else list(scene.up),

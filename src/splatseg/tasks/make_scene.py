@@ -1,6 +1,5 @@
 """Photographs become a scene: poses where they lack them, a fit, scores, a report."""
 
-import math
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -12,7 +11,6 @@ from splatseg.errors import InputError
 from splatseg.evaluate import PhotographReport
 from splatseg.fit import (
     EXPOSURES,
-    Checkpoints,
     FitOptions,
     FitResult,
     discard_checkpoint,
@@ -27,11 +25,12 @@ from splatseg.render import BackendName
 from splatseg.tasks._fit_report import score_and_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._photographs import Poses, capture_of
+from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.stopped_fit import check_fit_output
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MakeSceneOptions:
+class MakeSceneOptions(CheckpointOptions):
     """What is around a fit: how photographs are read, and how it is kept and goes on."""
 
     format: str = "auto"
@@ -44,18 +43,6 @@ class MakeSceneOptions:
     frames: int = 120
     """Frames to take from a video."""
 
-    resume: bool = False
-    """Go on with the fit that was stopped in the folder."""
-
-    overwrite: bool = False
-    """Begin again where a fit was stopped in the folder."""
-
-    checkpoint_every: float = 60.0
-    """Seconds between two checkpoints."""
-
-    checkpoint_steps: int | None = None
-    """Steps between two checkpoints, instead of seconds."""
-
     keep_checkpoint: bool = False
     """Keep the checkpoint of the finished fit, so that it can be made longer."""
 
@@ -63,11 +50,7 @@ class MakeSceneOptions:
     """Name of the preset that the fit's options came from; it is recorded."""
 
     def __post_init__(self) -> None:
-        every = self.checkpoint_every
-        if not (math.isfinite(every) and every > 0):
-            raise InputError(f"checkpoint_every: expected a positive number, got {every}.")
-        if self.checkpoint_steps is not None and self.checkpoint_steps < 1:
-            raise InputError(f"checkpoint_steps: expected at least 1, got {self.checkpoint_steps}.")
+        CheckpointOptions.__post_init__(self)
         if self.frames < 1:
             raise InputError(f"frames: expected at least 1, got {self.frames}.")
 
@@ -130,7 +113,7 @@ def make_scene(
     """
     options = options or MakeSceneOptions()
     fit_options = fit_options or FitOptions()
-    resumed = check_fit_output(folder, resume=options.resume, overwrite=options.overwrite)
+    resumed = check_fit_output(folder, options)
     capture, poses = capture_of(
         data,
         scene=folder,
@@ -153,7 +136,9 @@ def make_scene(
                 options=fit_options,
                 backend=backend,
                 progress=step,
-                checkpoints=_checkpoints(folder, options),
+                checkpoints=options.checkpoints(
+                    folder / CHECKPOINT_FILE, at_end=options.keep_checkpoint
+                ),
             )
         provenance = _provenance(options, fit_options, backend, result)
         _save(folder, capture, result, provenance, keep=options.keep_checkpoint)
@@ -195,16 +180,6 @@ def _save(
     save_scene(scene, folder)
     if not (result.interrupted or keep):
         discard_checkpoint(folder / CHECKPOINT_FILE)
-
-
-def _checkpoints(folder: Path, options: MakeSceneOptions) -> Checkpoints:
-    return Checkpoints(
-        path=folder / CHECKPOINT_FILE,
-        seconds=options.checkpoint_every,
-        steps=options.checkpoint_steps,
-        resume=options.resume,
-        at_end=options.keep_checkpoint,
-    )
 
 
 def _beginning(capture: Capture, options: FitOptions) -> str:

@@ -28,13 +28,16 @@ from splatseg.io.evidence import (
     find_evidence,
     open_evidence,
 )
-from splatseg.io.scene import check_name
+from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.lift.completion.complete import CompletionOptions, complete
 from splatseg.lift.segments.panoptic import merge_panoptic
+from splatseg.lift.training import discard_training
 from splatseg.methods import Method, MethodInputs, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.scene_parts import layer_of, views_asked, views_recorded
+from splatseg.tasks.stopped_training import told_how_to_resume, training_checkpoints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +89,9 @@ class Segmentation:
     timings: Mapping[str, float]
     """Seconds by stage."""
 
+    checkpoint: Path | None = None
+    """What a method that trains keeps until the layer is written, see `save_segmentation`."""
+
     @property
     def labels(self) -> Labels:
         """The layer, where it is one of labels; of a tree its objects.
@@ -109,6 +115,7 @@ def segment(
     options: SegmentOptions | None = None,
     method_options: Any = None,
     completion: CompletionOptions | None = None,
+    checkpoints: CheckpointOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
@@ -119,12 +126,15 @@ def segment(
     the evidence errs, and Gaussians that no view explains are completed from their neighbours.
 
     Args:
-        scene: The scene; it stays as it is. `io.scene.save_scene_layer` writes a layer into it.
+        scene: The scene; it stays as it is. `save_segmentation` writes the layer into it.
         method: The method, or its name (`methods.method_names`).
         options: Which evidence and views, and what follows the method.
         method_options: An instance of the method's options; None is its default, or the
             published setting where `options` ask for it.
         completion: How neighbours' labels spread.
+        checkpoints: How often a method that trains keeps its state, in ``training/LAYER.npz`` of
+            the scene's folder, and whether it goes on from there. Ctrl-C, SIGTERM and exceptions
+            out of the observer leave a checkpoint of the last step. None keeps nothing.
         layers: Layers at hand; others are read from the scene's folder.
         backend: Who renders.
         observer: Is told of the progress.
@@ -132,6 +142,7 @@ def segment(
     Raises:
         InputError: If there is no such method, evidence or layer, or they do not fit together.
         ShapeError: If evidence does not have its photograph's proportions.
+        KeyboardInterrupt: If it was interrupted; the message says how to go on.
     """
     started = time.monotonic()
     options = options or SegmentOptions()
@@ -143,40 +154,46 @@ def segment(
     name = options.layer or evidence_name
     check_name("layer", name)
     views = _views(scene, evidence, options.views, observer)
+    kept = training_checkpoints(scene, name, method, checkpoints, observer)
+    inputs = MethodInputs(
+        gaussians=scene.gaussians,
+        views=views,
+        evidence=evidence,
+        classes=scene.classes,
+        backend=backend,
+        seed=options.seed,
+        checkpoints=kept,
+    )
     timings = {"open": time.monotonic() - started}
-    with observer.stage("segment") as step:
-        began = time.monotonic()
-        layer = method.run(
-            MethodInputs(
-                gaussians=scene.gaussians,
-                views=views,
-                evidence=evidence,
-                classes=scene.classes,
-                backend=backend,
-                seed=options.seed,
-                progress=step,
-            ),
-            chosen,
-        )
-        timings[method.name] = time.monotonic() - began
-    wanted = options.complete and method.complete and not options.published
-    if isinstance(layer, InstanceTree):
-        if wanted:
-            labels = _completed(scene, layer.labels, completion, timings)
-            layer = replace(layer, labels=labels)
-        if merged is not None:
-            layer = merge_panoptic(scene.gaussians, layer.cut(), *merged)
-    elif isinstance(layer, Labels):
-        if wanted:
+    with told_how_to_resume(kept, observer):
+        with observer.stage("segment") as step:
+            began = time.monotonic()
+            layer = method.run(replace(inputs, progress=step), chosen)
+            timings[method.name] = time.monotonic() - began
+        if options.complete and method.complete and not options.published:
             layer = _completed(scene, layer, completion, timings)
         if merged is not None:
-            layer = merge_panoptic(scene.gaussians, layer, *merged)
-    elif merged is not None:
-        raise InputError(
-            f"classes: goes with methods that give labels; {method.name} gives {method.returns}."
-        )
-    layer = _described(layer, method, evidence_name, evidence, views=views, options=options)
-    return Segmentation(layer=layer, name=name, evidence=evidence, views=views, timings=timings)
+            layer = _panoptic(scene, layer, merged, method)
+    return Segmentation(
+        layer=_described(layer, method, evidence_name, evidence, views=views, options=options),
+        name=name,
+        evidence=evidence,
+        views=views,
+        timings=timings,
+        checkpoint=None if kept is None else kept.path,
+    )
+
+
+def save_segmentation(root: Path, made: Segmentation) -> Path:
+    """Write the layer into the scene's folder; then its training needs its checkpoint no more.
+
+    Returns:
+        The file of the layer.
+    """
+    path = save_scene_layer(root, made.name, made.layer)
+    if made.checkpoint is not None:
+        discard_training(made.checkpoint)
+    return path
 
 
 def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
@@ -192,16 +209,30 @@ def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
 
 def _completed(
     scene: Scene,
-    labels: Labels,
+    layer: Layer,
     completion: CompletionOptions | None,
     timings: dict[str, float],
-) -> Labels:
-    if not bool((labels.ids != UNLABELLED).any()):
-        return labels
+) -> Layer:
+    """The layer with labels for Gaussians that have none, where it is one of labels."""
+    labels = layer.labels if isinstance(layer, InstanceTree) else layer
+    if not isinstance(labels, Labels) or not bool((labels.ids != UNLABELLED).any()):
+        return layer
     began = time.monotonic()
     labels = complete(scene.gaussians, labels, options=completion)
     timings["complete"] = time.monotonic() - began
-    return labels
+    return replace(layer, labels=labels) if isinstance(layer, InstanceTree) else labels
+
+
+def _panoptic(
+    scene: Scene, layer: Layer, classes: tuple[Labels, ClassTable], method: Method
+) -> Labels:
+    """Instances merged with classes."""
+    instances = layer.cut() if isinstance(layer, InstanceTree) else layer
+    if not isinstance(instances, Labels):
+        raise InputError(
+            f"classes: goes with methods that give labels; {method.name} gives {method.returns}."
+        )
+    return merge_panoptic(scene.gaussians, instances, *classes)
 
 
 def _described(

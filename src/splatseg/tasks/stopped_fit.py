@@ -5,16 +5,16 @@ from pathlib import Path
 from splatseg.errors import FileFormatError, InputError
 from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
 from splatseg.io.scene import CHECKPOINT_FILE, is_scene
+from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.new_scene import check_replaceable_scene
 
 
-def check_fit_output(root: Path, *, resume: bool, overwrite: bool) -> str | None:
+def check_fit_output(root: Path, options: CheckpointOptions) -> str | None:
     """Refuse before a fit what could not be written after it.
 
     Args:
         root: The scene folder to be.
-        resume: A fit that was stopped there is to go on.
-        overwrite: A fit that was stopped there may be lost.
+        options: Whether a fit that was stopped there is to go on, or may be lost.
 
     Returns:
         A sentence on where the fit goes on, None where nothing is to be said.
@@ -23,13 +23,12 @@ def check_fit_output(root: Path, *, resume: bool, overwrite: bool) -> str | None
         InputError: If the folder holds what would be lost, or nothing can be resumed.
         FileFormatError: If the checkpoint to resume from is damaged.
     """
-    if resume and overwrite:
-        raise InputError("resume, overwrite: expected one of the two, got both.")
+    options.check_not_both()
     check_replaceable_scene(root, unfinished=True)
     checkpoint = root / CHECKPOINT_FILE
-    if resume:
+    if options.resume:
         return _resumed(root, checkpoint)
-    if checkpoint.is_file() and not overwrite:
+    if checkpoint.is_file() and not options.overwrite:
         stopped = where_it_stopped(checkpoint)
         if stopped is not None:
             raise InputError(
