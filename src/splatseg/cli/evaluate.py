@@ -1,20 +1,19 @@
 """``splatseg evaluate``: a layer against truth, and renders against photographs."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import tyro
 from rich.console import Console
 from rich.table import Table
 
 from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Split
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Scene
-from splatseg.evaluate.solid import PointRule
 from splatseg.io.json_files import write_json
 from splatseg.tasks import EvaluationOptions, evaluate
-from splatseg.tasks.evaluate import Metric
 
 _PER_CLASS = {
     "per_class": "classes",
@@ -22,6 +21,11 @@ _PER_CLASS = {
     "AP50_per_class": "average precision of each class of things",
     "points_per_class": "classes of points",
 }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Options(EvaluationOptions):
+    split: Split = "test"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,61 +48,11 @@ class Command:
 
     scene: SceneFolder
 
-    layer: str | None = None
-    """Name of the layer to score. None scores renders only."""
-
-    truth: Path | None = None
-    """Folder of the true id maps, one PNG a view; 0 is void. Of classes, or of instances with
-    --metric instances."""
-
-    instances: str | None = None
-    """With panoptic: name of the layer of instances; --layer is that of the classes. None takes
-    --layer for both: its record must tell each instance's class, as that of associate does."""
-
-    truth_instances: Path | None = None
-    """With panoptic: folder of the true instance maps; --truth is that of the classes."""
-
-    metadata: Path | None = None
-    """With panoptic: JSON whose "classes" say which are things (id, name, isthing). None takes
-    the metadata.json beside the truth, else the classes of the scene."""
-
-    scores: Path | None = None
-    """With panoptic: JSON object of a score by instance id, by which AP50 ranks. None ranks all
-    alike."""
-
-    points: Path | None = None
-    """Also score labels of points: an .npz with xyz (n x 3, world) and, as the metric asks,
-    semantic or instance (n, 0 is void)."""
-
-    points_rule: PointRule = "weighted"
-    """How a point takes its label: weighted, by the density there of the Gaussians around it;
-    nearest, that of the nearest centre."""
-
-    zero_is_class: bool = False
-    """The id 0 of the truth's files is a class and not void: ids grow by 1."""
-
-    void: int | None = None
-    """A further id of the truth's files that means void, such as 255."""
-
-    split: Split = "test"
-
-    metric: Metric = "semantic"
-    """What to score: semantic, classes; instances, objects whatever their ids; panoptic, both
-    together; binary, one id or a selection as a mask."""
-
-    id: int | None = None
-    """With binary: the id to score. None takes every labelled pixel."""
-
-    photographs: bool = False
-    """Insist on scoring renders (PSNR, SSIM). Without it they are scored where the
-    photographs are at hand."""
-
-    lpips: tuple[Path, ...] = ()
-    """Also score LPIPS with your weights: AlexNet's or VGG-16's, and the heads', as .safetensors
-    or .npz with the names of torchvision and of the lpips package."""
+    scoring: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
+    """What is scored against what."""
 
     json_file: Path | None = None
-    """Also write that object to this file."""
+    """Also write what --json prints to this file."""
 
     backend: Backend = "auto"
     data: Data = None
@@ -109,10 +63,9 @@ class Command:
 def run(command: Command) -> None:
     """Evaluate a scene."""
     scene = open_scene(command.scene, command.data)
-    asked = {field.name: getattr(command, field.name) for field in fields(EvaluationOptions)}
     figures = evaluate(
         scene,
-        options=EvaluationOptions(**asked),
+        options=command.scoring,
         backend=command.backend,
         observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )

@@ -45,11 +45,11 @@ class EvaluationOptions:
     """What is scored against what."""
 
     layer: str | None = None
-    """Name of the layer to score. None scores the pictures only."""
+    """Name of the layer to score. None scores renders only."""
 
     truth: Path | None = None
-    """Folder of the true id maps, one PNG a view; 0 is void. Of classes, or of instances with
-    metric instances."""
+    """Folder of the true id maps, one PNG a view; 0 is void. Of classes, or of instances where
+    `metric` is instances."""
 
     instances: str | None = None
     """With panoptic: name of the layer of instances; `layer` is that of the classes. None takes
@@ -91,7 +91,7 @@ class EvaluationOptions:
     """With binary: the id to score. None takes every labelled pixel."""
 
     photographs: bool = False
-    """Insist on scoring the pictures (PSNR, SSIM). Without it they are scored where the
+    """Insist on scoring renders (PSNR, SSIM). Without it they are scored where the
     photographs are at hand."""
 
     lpips: tuple[Path, ...] = ()

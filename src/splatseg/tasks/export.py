@@ -61,7 +61,7 @@ class ExportOptions:
 
     splat_format: WritableFormat | None = None
     """Format of splats: ply, compressed.ply, splat, spz, spz3 (SPZ version 3). Default: what
-    the output ends in, ply for objects."""
+    the file is named, ply for objects."""
 
     only: tuple[str, ...] = ()
     """Only these objects, by id or name. Other Gaussians are left out."""
