@@ -10,7 +10,7 @@ import tyro
 from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder, SplitOrPath
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.tasks import ExportOptions, export
-from splatseg.tasks.export import What
+from splatseg.tasks.export_options import What
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,15 +15,15 @@ from splatseg.tasks.demo import DemoOptions as DemoOptions
 from splatseg.tasks.demo import make_demo as make_demo
 from splatseg.tasks.describe import describe as describe
 from splatseg.tasks.edit import EditedScene as EditedScene
-from splatseg.tasks.edit import EditOptions as EditOptions
 from splatseg.tasks.edit import edit_scene as edit_scene
+from splatseg.tasks.edit_options import EditOptions as EditOptions
 from splatseg.tasks.evaluate import EvaluationOptions as EvaluationOptions
 from splatseg.tasks.evaluate import evaluate as evaluate
 from splatseg.tasks.examine import Examination as Examination
 from splatseg.tasks.examine import examine_capture as examine_capture
 from splatseg.tasks.export import Exported as Exported
-from splatseg.tasks.export import ExportOptions as ExportOptions
 from splatseg.tasks.export import export as export
+from splatseg.tasks.export_options import ExportOptions as ExportOptions
 from splatseg.tasks.import_scene import ImportedScene as ImportedScene
 from splatseg.tasks.import_scene import ImportOptions as ImportOptions
 from splatseg.tasks.import_scene import import_scene as import_scene

@@ -18,7 +18,8 @@ from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.synthetic import cameras, room, write_capture
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate
-from splatseg.tasks.export import ExportOptions, export
+from splatseg.tasks.export import export
+from splatseg.tasks.export_options import ExportOptions
 from splatseg.tasks.make_scene import MadeScene, make_scene
 from splatseg.tasks.new_scene import check_parent
 from splatseg.tasks.outputs import export_layer, report_layer

@@ -12,7 +12,8 @@ from splatseg.io.export import write_node_table
 from splatseg.render import BackendName
 from splatseg.report.segment_report import write_segmentation_report
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.export import Exported, ExportOptions, What, check_export, export
+from splatseg.tasks.export import Exported, check_export, export
+from splatseg.tasks.export_options import ExportOptions, What
 from splatseg.tasks.render import Rendering, RenderingOptions, render_views
 from splatseg.tasks.segment import Segmentation
 
