@@ -104,13 +104,7 @@ def import_scene(
     gaussians = read_with_notes(file, observer)
     if not len(gaussians):
         raise InputError(f"{file}: expected Gaussians, got a file of none.")
-    provenance = {
-        "command": "import",
-        "file": file.name,
-        "format": splat_format(file),
-        "backend": backend,
-        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
-    }
+    provenance = _provenance(file, backend)
     alignment, placed = None, None
     if options.data is not None:
         capture = read_capture(options.data, format=options.format)
@@ -136,6 +130,16 @@ def import_scene(
         scene = _with_cameras(gaussians, up, placed, provenance)
         observer.info(_placed(placed))
     return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=placed)
+
+
+def _provenance(file: Path, backend: str) -> dict[str, Any]:
+    return {
+        "command": "import",
+        "file": file.name,
+        "format": splat_format(file),
+        "backend": backend,
+        "versions": {name: metadata.version(name) for name in ("splatseg", "torch")},
+    }
 
 
 def read_with_notes(file: Path, observer: Observer) -> Gaussians:

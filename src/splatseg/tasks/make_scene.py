@@ -114,35 +114,10 @@ def make_scene(
     options = options or MakeSceneOptions()
     fit_options = fit_options or FitOptions()
     resumed = check_fit_output(folder, options)
-    capture, poses = capture_of(
-        data,
-        scene=folder,
-        format=options.format,
-        poses=options.poses,
-        frames=options.frames,
-        seed=fit_options.seed,
-        observer=observer,
-    )
-    for note in (*capture.notes, reduction_note(capture.train_views, longest=fit_options.longest)):
-        if note is not None:
-            observer.note(note)
-    observer.info(_beginning(capture, fit_options))
+    capture, poses = _capture(data, folder, options, fit_options, observer)
     if resumed is not None:
         observer.info(resumed)
-    with deferred_interrupts() as interrupts:
-        with observer.fit_stage() as step:
-            result = fit(
-                capture,
-                options=fit_options,
-                backend=backend,
-                progress=step,
-                checkpoints=options.checkpoints(
-                    folder / CHECKPOINT_FILE, at_end=options.keep_checkpoint
-                ),
-            )
-        provenance = _provenance(options, fit_options, backend, result)
-        _save(folder, capture, result, provenance, keep=options.keep_checkpoint)
-    stopped = interrupts.requested or result.interrupted
+    result, stopped = _fitted(capture, folder, options, fit_options, backend, observer)
     scores, report = score_and_report(
         folder,
         capture,
@@ -162,6 +137,54 @@ def make_scene(
         report=report,
         poses=poses,
     )
+
+
+def _capture(
+    data: Path,
+    folder: Path,
+    options: MakeSceneOptions,
+    fit_options: FitOptions,
+    observer: Observer,
+) -> tuple[Capture, PoseReport | None]:
+    """The capture with its poses; the observer is told what it is."""
+    capture, poses = capture_of(
+        data,
+        scene=folder,
+        format=options.format,
+        poses=options.poses,
+        frames=options.frames,
+        seed=fit_options.seed,
+        observer=observer,
+    )
+    for note in (*capture.notes, reduction_note(capture.train_views, longest=fit_options.longest)):
+        if note is not None:
+            observer.note(note)
+    observer.info(_beginning(capture, fit_options))
+    return capture, poses
+
+
+def _fitted(
+    capture: Capture,
+    folder: Path,
+    options: MakeSceneOptions,
+    fit_options: FitOptions,
+    backend: BackendName,
+    observer: Observer,
+) -> tuple[FitResult, bool]:
+    """Fit and write the scene. Tells whether it was asked to stop, while it wrote too."""
+    checkpoints = options.checkpoints(folder / CHECKPOINT_FILE, at_end=options.keep_checkpoint)
+    with deferred_interrupts() as interrupts:
+        with observer.fit_stage() as step:
+            result = fit(
+                capture,
+                options=fit_options,
+                backend=backend,
+                progress=step,
+                checkpoints=checkpoints,
+            )
+        provenance = _provenance(options, fit_options, backend, result)
+        _save(folder, capture, result, provenance, keep=options.keep_checkpoint)
+    return result, interrupts.requested or result.interrupted
 
 
 def _save(

@@ -132,9 +132,8 @@ def segment(
         method_options: An instance of the method's options; None is its default, or the
             published setting where `options` ask for it.
         completion: How neighbours' labels spread.
-        checkpoints: How often a method that trains keeps its state, in ``training/LAYER.npz`` of
-            the scene's folder, and whether it goes on from there. Ctrl-C, SIGTERM and exceptions
-            out of the observer leave a checkpoint of the last step. None keeps nothing.
+        checkpoints: How often a method that trains keeps its state in the scene's folder, and
+            whether it goes on from there. What ends it early leaves a checkpoint; None keeps none.
         layers: Layers at hand; others are read from the scene's folder.
         backend: Who renders.
         observer: Is told of the progress.
@@ -148,40 +147,28 @@ def segment(
     options = options or SegmentOptions()
     method = find_method(method) if isinstance(method, str) else method
     chosen = _method_options(method, method_options, options)
-    evidence_name, evidence = _evidence(scene, options)
-    method.check_evidence(evidence)
+    evidence_name, evidence = _evidence(scene, method, options)
     merged = _classes_to_merge(scene, options, evidence, layers)
     name = options.layer or evidence_name
     check_name("layer", name)
-    views = _views(scene, evidence, options.views, observer)
-    kept = training_checkpoints(scene, name, method, checkpoints, observer)
     inputs = MethodInputs(
         gaussians=scene.gaussians,
-        views=views,
+        views=_views(scene, evidence, options.views, observer),
         evidence=evidence,
         classes=scene.classes,
         backend=backend,
         seed=options.seed,
-        checkpoints=kept,
+        checkpoints=training_checkpoints(scene, name, method, checkpoints, observer),
     )
     timings = {"open": time.monotonic() - started}
-    with told_how_to_resume(kept, observer):
-        with observer.stage("segment") as step:
-            began = time.monotonic()
-            layer = method.run(replace(inputs, progress=step), chosen)
-            timings[method.name] = time.monotonic() - began
+    with told_how_to_resume(inputs.checkpoints, observer):
+        layer = _run(method, inputs, chosen, timings, observer)
         if options.complete and method.complete and not options.published:
             layer = _completed(scene, layer, completion, timings)
         if merged is not None:
             layer = _panoptic(scene, layer, merged, method)
-    return Segmentation(
-        layer=_described(layer, method, evidence_name, evidence, views=views, options=options),
-        name=name,
-        evidence=evidence,
-        views=views,
-        timings=timings,
-        checkpoint=None if kept is None else kept.path,
-    )
+    layer = _described(layer, method, evidence_name, inputs, options)
+    return _segmentation(layer, name, inputs, timings)
 
 
 def save_segmentation(root: Path, made: Segmentation) -> Path:
@@ -194,6 +181,34 @@ def save_segmentation(root: Path, made: Segmentation) -> Path:
     if made.checkpoint is not None:
         discard_training(made.checkpoint)
     return path
+
+
+def _run(
+    method: Method,
+    inputs: MethodInputs,
+    options: Any,
+    timings: dict[str, float],
+    observer: Observer,
+) -> Layer:
+    """Run the method as the stage ``segment``."""
+    with observer.stage("segment") as step:
+        began = time.monotonic()
+        layer = method.run(replace(inputs, progress=step), options)
+        timings[method.name] = time.monotonic() - began
+    return layer
+
+
+def _segmentation(
+    layer: Layer, name: str, inputs: MethodInputs, timings: Mapping[str, float]
+) -> Segmentation:
+    return Segmentation(
+        layer=layer,
+        name=name,
+        evidence=inputs.evidence,
+        views=inputs.views,
+        timings=timings,
+        checkpoint=None if inputs.checkpoints is None else inputs.checkpoints.path,
+    )
 
 
 def _method_options(method: Method, given: Any, options: SegmentOptions) -> Any:
@@ -290,7 +305,7 @@ def _classes_to_merge(
     return layer, table
 
 
-def _evidence(scene: Scene, options: SegmentOptions) -> tuple[str, Evidence]:
+def _evidence(scene: Scene, method: Method, options: SegmentOptions) -> tuple[str, Evidence]:
     folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
     name = options.evidence
     if name is None:
@@ -300,7 +315,9 @@ def _evidence(scene: Scene, options: SegmentOptions) -> tuple[str, Evidence]:
             raise InputError(f"evidence: expected a name ({known}), got none.")
         name = names[0]
     folder = find_evidence(folders, name)
-    return name, open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
+    evidence = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
+    method.check_evidence(evidence)
+    return name, evidence
 
 
 def _views(

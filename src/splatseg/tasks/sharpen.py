@@ -2,7 +2,6 @@
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -96,9 +95,8 @@ def sharpen_scene(
 ) -> SharpenedScene:
     """Go on learning from photographs and evidence until Gaussians have one label each.
 
-    The new scene has as many Gaussians in the same order. The layer is decided anew; other
-    layers come along, and the evidence if it is the scene's own. It is written whole or not at
-    all.
+    The new scene has as many Gaussians in the same order. The layer is decided anew; other layers
+    and the scene's own evidence come along. It is written whole or not at all.
 
     Args:
         document: The scene with its layers, read from its folder.
@@ -119,7 +117,6 @@ def sharpen_scene(
     evidence, source, views = _source(scene, layer, options, backend)
     spaced = _spaced(scene, options.measure)
     before = _psnr(scene, scene.gaussians, spaced, backend)
-    exposures = recorded_exposures(scene.provenance)
     with observer.stage("sharpen") as step:
         found = sharpen(
             scene.gaussians,
@@ -128,21 +125,16 @@ def sharpen_scene(
             options=how,
             confusion=confusion,
             fit_options=fit_options_of(scene, views),
-            exposures=exposures,
+            exposures=recorded_exposures(scene.provenance),
             seed=options.seed,
             backend=backend,
             progress=step,
         )
     after = _psnr(scene, found.gaussians, spaced, backend)
-    provenance = _provenance(scene, options, how, found, psnr=[before, after])
-    if found.exposures:
-        provenance[EXPOSURES] = exposures_record({**exposures, **found.exposures})
     layers = {**document.layers, **_sharpened(document, options.layer, merged(layer, found))}
-    new = replace(scene, gaussians=found.gaussians, provenance=provenance)
+    new = _sharpened_scene(scene, options, how, found, psnr=[before, after])
     saved = save_document(Document(scene=new, layers=layers), folder)
-    # What lies in the scene's own folder would be out of reach from the new one.
-    if scene.root is not None and _lies_in(evidence.folder, scene.root / "evidence"):
-        copy_evidence(evidence.folder, folder)
+    _bring_evidence(evidence, scene, folder)
     return SharpenedScene(
         folder=folder,
         document=saved,
@@ -202,14 +194,15 @@ def fit_options_of(scene: Scene, views: tuple[View, ...]) -> FitOptions:
     return options
 
 
-def _provenance(
+def _sharpened_scene(
     scene: Scene,
     options: SharpenSceneOptions,
     how: SharpenOptions,
     found: Sharpened,
     *,
     psnr: list[float | None],
-) -> dict[str, Any]:
+) -> Scene:
+    """The scene with new Gaussians, and how they were made."""
     provenance = {
         key: value for key, value in scene.provenance.items() if key not in (HISTORY, BASE)
     }
@@ -221,11 +214,18 @@ def _provenance(
         "agreement": list(found.agreement),
         "psnr": psnr,
     }
-    return provenance
+    if found.exposures:
+        exposures = recorded_exposures(scene.provenance) | dict(found.exposures)
+        provenance[EXPOSURES] = exposures_record(exposures)
+    return replace(scene, gaussians=found.gaussians, provenance=provenance)
 
 
-def _lies_in(folder: Path, parent: Path) -> bool:
-    return folder.resolve().parent == parent.resolve()
+def _bring_evidence(evidence: Evidence, scene: Scene, folder: Path) -> None:
+    """Copy evidence that lies in the scene's own folder, which the new one could not find."""
+    if scene.root is None:
+        return
+    if evidence.folder.resolve().parent == (scene.root / "evidence").resolve():
+        copy_evidence(evidence.folder, folder)
 
 
 def _sharpened(document: Document, address: str, labels: Labels) -> dict[str, Layer]:
