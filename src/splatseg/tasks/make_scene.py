@@ -117,7 +117,9 @@ def make_scene(
     capture, poses = _capture(data, folder, options, fit_options, observer)
     if resumed is not None:
         observer.info(resumed)
-    result, stopped = _fitted(capture, folder, options, fit_options, backend, observer)
+    result, stopped = _fitted(
+        capture, folder, options, fit_options, backend=backend, observer=observer
+    )
     scores, report = score_and_report(
         folder,
         capture,
@@ -168,6 +170,7 @@ def _fitted(
     folder: Path,
     options: MakeSceneOptions,
     fit_options: FitOptions,
+    *,
     backend: BackendName,
     observer: Observer,
 ) -> tuple[FitResult, bool]:

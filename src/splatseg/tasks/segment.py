@@ -149,8 +149,7 @@ def segment(
     chosen = _method_options(method, method_options, options)
     evidence_name, evidence = _evidence(scene, method, options)
     merged = _classes_to_merge(scene, options, evidence, layers)
-    name = options.layer or evidence_name
-    check_name("layer", name)
+    check_name("layer", name := options.layer or evidence_name)
     inputs = MethodInputs(
         gaussians=scene.gaussians,
         views=_views(scene, evidence, options.views, observer),
