@@ -56,7 +56,8 @@ def walls(rng) -> Gaussians:
 def make_capture(tmp_path: Path):
     """A nerfstudio capture whose photographs are renders of some Gaussians."""
 
-    def make(gaussians: Gaussians, **more: object) -> Capture:
+    def make(gaussians: Gaussians, *, size: int = 80, **more: object) -> Capture:
+        width, height, focal = size, size * 4 // 5, size * 7 // 8
         folder = tmp_path / "capture"
         (folder / "images").mkdir(parents=True)
         middle = gaussians.means.double().mean(dim=0).numpy()
@@ -71,7 +72,7 @@ def make_capture(tmp_path: Path):
             pose[:3, :3] = np.stack((right, np.cross(forward, right), forward))
             pose[:3, 3] = -pose[:3, :3] @ eye
             camera = Camera(
-                width=80, height=64, fx=70, fy=70, cx=40, cy=32,
+                width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2,
                 cam_from_world=torch.from_numpy(pose),
             )  # fmt: skip
             image = folder / "images" / f"{i:02d}.png"
@@ -80,7 +81,8 @@ def make_capture(tmp_path: Path):
             matrix = np.linalg.inv(pose) @ np.diag([1.0, -1, -1, 1])
             name = f"images/{image.name}"
             frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
-        content = {"w": 80, "h": 64, "fl_x": 70, "cx": 40, "cy": 32, "frames": frames, **more}
+        lens = {"w": width, "h": height, "fl_x": focal, "cx": width / 2, "cy": height / 2}
+        content = {**lens, "frames": frames, **more}
         (folder / "transforms.json").write_text(json.dumps(content))
         return read_capture(folder)
 

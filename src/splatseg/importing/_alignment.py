@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Camera, Capture, Gaussians, PointCloud, Similarity, View
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.io.images import image_camera, load_image
 from splatseg.pose.doctor import (
@@ -60,6 +61,7 @@ class Alignment:
         return bool(self.what)
 
 
+@one_torch_thread()  # its sums would round differently with the number of threads
 def align(
     gaussians: Gaussians,
     capture: Capture,

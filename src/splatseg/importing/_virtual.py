@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import Camera, Gaussians, View
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.importing._candidates import VIEWS_A_PLACE, Frame, inside, outside
 from splatseg.importing._extent import Extent, extent_of
@@ -52,6 +53,7 @@ class VirtualViews:
     """Share of the visible mass (opacity times area) that at least one view shows."""
 
 
+@one_torch_thread()  # its sums would round differently with the number of threads
 def place_cameras(
     gaussians: Gaussians,
     *,
