@@ -16,12 +16,6 @@ Instances are scored without classes, matched one to one over the scene (`score.
 classes by pooled mean IoU (`score.py semantic`).
 """
 
-import argparse
-import json
-import shutil
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -30,10 +24,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from scored import ScoredScene, run_rows
 
-from splatseg.core import Gaussians, InstanceTree, LabelMap, Labels, Scene
+from splatseg.core import Gaussians, InstanceTree, LabelMap, Labels, View
 from splatseg.io.evidence import Evidence, open_evidence
-from splatseg.io.scene import load_scene
 from splatseg.lift import (
     CompletionOptions,
     ConfusionOptions,
@@ -41,24 +35,20 @@ from splatseg.lift import (
     UpliftOptions,
     complete,
     correct_confusion,
-    label_map,
     uplift,
 )
 from splatseg.methods.associate import associate
 from splatseg.methods.identity import identity
 from splatseg.methods.vote import VoteOptions, vote
 
-_SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 
+class Bench(ScoredScene):
+    """A scene that recorded evidence is lifted onto."""
 
-class Bench:
-    """A scene, its capture, and a place for pictures."""
-
-    def __init__(self, scene: Scene, data: Path, work: Path) -> None:
-        self.scene = scene
-        self.data = data
-        self.work = work
-        self.train = scene.train_views
+    @property
+    def train(self) -> tuple[View, ...]:
+        """The views to learn from."""
+        return self.scene.train_views
 
     def evidence(self, name: str) -> Evidence:
         """A folder of the capture."""
@@ -69,26 +59,11 @@ class Bench:
         begin = time.monotonic()
         labels = make()
         seconds = time.monotonic() - begin
-        folder = self.work / title.replace(" ", "_").replace("/", "_")
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        for view in self.scene.test_views:
-            drawn = label_map(self.scene.gaussians, view.camera, labels).ids
-            ids = drawn.clamp_min(0).numpy().astype(np.uint16)
-            Image.fromarray(ids).save(folder / f"{view.name}.png")
+        folder = self.draw(labels, title.replace(" ", "_").replace("/", "_"))
         command = "semantic" if truth == "semantic" else "instances"
-        said = self.score(command, folder, truth, "test_*")
+        said = self.score(command, [folder], truth)
         print(f"{title:44s} mIoU {said['mIoU']:.4f}  {_more(said)}  {seconds:5.1f} s", flush=True)
         return labels
-
-    def score(self, command: str, predicted: Path, truth: str, views: str) -> dict[str, float]:
-        """What the independent scorer says."""
-        said = subprocess.run(
-            [sys.executable, str(_SCORE), command, "--pred", str(predicted), "--truth",
-             str(self.data / truth), "--views", views],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        return json.loads(said.stdout)
 
 
 def _more(said: dict[str, float]) -> str:
@@ -118,7 +93,7 @@ def truth(bench: Bench) -> None:
 
 def semantic(bench: Bench) -> None:
     """Class maps of a model that errs."""
-    said = bench.score("semantic", bench.data / "labels_semantic", "semantic", "train_*")
+    said = bench.score("semantic", [bench.data / "labels_semantic"], "semantic", "train_*")
     print(f"{'labels_semantic as they came (train)':44s} mIoU {said['mIoU']:.4f}  {_more(said)}")
     found, gaussians = bench.evidence("labels_semantic"), bench.scene.gaussians
     for title, options in (
@@ -242,24 +217,5 @@ ROWS = {
 }
 
 
-def main() -> None:
-    """Print one line a row."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
-    parser.add_argument("--work", type=Path, help="keep label maps here")
-    arguments = parser.parse_args()
-    temporary = None if arguments.work else tempfile.mkdtemp()
-    work = arguments.work or Path(temporary or "")
-    try:
-        bench = Bench(load_scene(arguments.scene), arguments.data, work)
-        for name in arguments.rows:
-            ROWS[name](bench)
-    finally:
-        if temporary:
-            shutil.rmtree(temporary)
-
-
 if __name__ == "__main__":
-    main()
+    run_rows(__doc__, Bench, ROWS)

@@ -16,13 +16,8 @@ Rows:
 The truth of the masks is looked at for references and for counting only.
 """
 
-import argparse
 import json
 import resource
-import shutil
-import subprocess
-import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -31,12 +26,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from scored import ScoredScene, run_rows
 
-from splatseg.core import InstanceTree, Labels, MaskSet, Scene
+from splatseg.core import InstanceTree, Labels, MaskSet
 from splatseg.io.evidence import open_evidence
-from splatseg.io.scene import load_scene
-from splatseg.lift import label_map
 from splatseg.lift.completion.complete import complete
 from splatseg.lift.segments.clustering import cluster
 from splatseg.lift.segments.levels import node_levels
@@ -46,7 +39,6 @@ from splatseg.lift.segments.table import segment_table
 from splatseg.lift.segments.tree import SegmentTree, segment_tree
 from splatseg.methods.associate import AssociateOptions, associate
 
-_SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 _LEVELS = ("part", "object", "group")
 _CUTS = ("group", "object", "part", 0.75)
 
@@ -89,33 +81,8 @@ def true_levels(folder: Path, view: str) -> list[dict[str, object]]:
     return json.loads((folder / f"{view}.json").read_text())
 
 
-class Bench:
-    """A scene, its capture, and a place for label maps."""
-
-    def __init__(self, scene: Scene, data: Path, work: Path) -> None:
-        self.scene = scene
-        self.data = data
-        self.work = work
-
-    def draw(self, labels: Labels, name: str) -> Path:
-        """Label maps of the test views."""
-        folder = self.work / name
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        for view in self.scene.test_views:
-            drawn = label_map(self.scene.gaussians, view.camera, labels).ids
-            ids = drawn.clamp_min(0).numpy().astype(np.uint16)
-            Image.fromarray(ids).save(folder / f"{view.name}.png")
-        return folder
-
-    def score(self, command: str, predicted: Sequence[Path], truth: str) -> dict[str, float]:
-        """What the independent scorer says."""
-        said = subprocess.run(
-            [sys.executable, str(_SCORE), command, "--pred", *map(str, predicted), "--truth",
-             str(self.data / truth), "--views", "test_*"],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        return json.loads(said.stdout)
+class Bench(ScoredScene):
+    """A scene that trees are made of."""
 
     def made(self, source: object, **options: object) -> tuple[Labels | InstanceTree, float]:
         """A completed layer and the CPU seconds that it took."""
@@ -295,24 +262,5 @@ ROWS: dict[str, Callable[[Bench], None]] = {
 }
 
 
-def main() -> None:
-    """Print a few lines a row."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
-    parser.add_argument("--work", type=Path, help="keep label maps here")
-    arguments = parser.parse_args()
-    temporary = None if arguments.work else tempfile.mkdtemp()
-    work = arguments.work or Path(temporary or "")
-    try:
-        bench = Bench(load_scene(arguments.scene), arguments.data, work)
-        for name in arguments.rows:
-            ROWS[name](bench)
-    finally:
-        if temporary:
-            shutil.rmtree(temporary)
-
-
 if __name__ == "__main__":
-    main()
+    run_rows(__doc__, Bench, ROWS)
