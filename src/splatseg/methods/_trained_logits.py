@@ -54,24 +54,24 @@ class LogitOptions(LabelTrainingOptions):
 
 
 def train_own_logits(
-    method: str,
-    blend: Blend,
-    *,
     gaussians: Gaussians,
     views: Sequence[View],
     evidence: LabelSource,
-    options: LogitOptions | None,
-    classes: ClassTable | None,
-    context: TrainingContext | None,
+    *,
+    method: str,
+    blend: Blend,
+    options: LogitOptions | None = None,
+    classes: ClassTable | None = None,
+    context: TrainingContext | None = None,
 ) -> Features:
     """Train logits of Gaussians.
 
     Args:
-        method: The method's name, for the info.
-        blend: Whether logits are rendered and then classified, or probabilities rendered.
         gaussians: The Gaussians of the scene; their geometry stays as it is.
         views: Those to learn from.
         evidence: Their label maps; ids mean the same in all of them.
+        method: The method's name, for the info.
+        blend: Whether logits are rendered and then classified, or probabilities rendered.
         options: How logits are trained.
         classes: Names of the ids, for the info.
         context: Backend, seed, checkpoint and progress.

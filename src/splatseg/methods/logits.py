@@ -3,37 +3,16 @@ r"""Logits of each Gaussian's own, trained on label maps; see `methods._trained_
 .. math:: \ell_p = \mathrm{CE}\Bigl(\sum_i w_{pi} z_i, \mathrm{id}(p)\Bigr)
 """
 
-from collections.abc import Sequence
+from functools import partial
 
-from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.methods._method import Method
 from splatseg.methods._trained_labels import TrainingContext as TrainingContext
 from splatseg.methods._trained_labels import runner
 from splatseg.methods._trained_logits import LogitOptions as LogitOptions
 from splatseg.methods._trained_logits import train_own_logits
 
-
-def train_logits(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    evidence: LabelSource,
-    *,
-    options: LogitOptions | None = None,
-    classes: ClassTable | None = None,
-    context: TrainingContext | None = None,
-) -> Features:
-    """Train logits of Gaussians on label maps, see `train_own_logits`."""
-    return train_own_logits(
-        "logits",
-        "features",
-        gaussians=gaussians,
-        views=views,
-        evidence=evidence,
-        options=options,
-        classes=classes,
-        context=context,
-    )
-
+train_logits = partial(train_own_logits, method="logits", blend="features")
+"""Train logits of Gaussians on label maps, see `train_own_logits`."""
 
 METHOD = Method(
     name="logits",

@@ -4,37 +4,16 @@ r"""Probabilities of each Gaussian's own, trained on label maps; see `methods._t
                               {\sum_i w_{pi}}
 """
 
-from collections.abc import Sequence
+from functools import partial
 
-from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.methods._method import Method
 from splatseg.methods._trained_labels import TrainingContext as TrainingContext
 from splatseg.methods._trained_labels import runner
 from splatseg.methods._trained_logits import LogitOptions as LogitOptions
 from splatseg.methods._trained_logits import train_own_logits
 
-
-def train_probabilities(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    evidence: LabelSource,
-    *,
-    options: LogitOptions | None = None,
-    classes: ClassTable | None = None,
-    context: TrainingContext | None = None,
-) -> Features:
-    """Train probabilities of Gaussians on label maps, see `train_own_logits`."""
-    return train_own_logits(
-        "probabilities",
-        "probabilities",
-        gaussians=gaussians,
-        views=views,
-        evidence=evidence,
-        options=options,
-        classes=classes,
-        context=context,
-    )
-
+train_probabilities = partial(train_own_logits, method="probabilities", blend="probabilities")
+"""Train probabilities of Gaussians on label maps, see `train_own_logits`."""
 
 METHOD = Method(
     name="probabilities",
