@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from splatseg.cli import main
 from splatseg.core import Labels
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.scene import load_scene, training_file
-from splatseg.lift.training import training_summary
+from splatseg.lift.training import _train, training_summary
 from splatseg.methods import find_method
 from splatseg.tasks import CheckpointOptions, SegmentOptions, describe, save_segmentation, segment
 from splatseg.tasks import segment as segment_task
@@ -226,29 +227,6 @@ WORDS = [
 ]  # fmt: skip
 
 
-def begin(folder: Path, *words: str, until: int = 0) -> subprocess.Popen[str]:
-    """Start the command; each step takes a moment, so that it can be met between two."""
-    program = (
-        "import sys, time, splatseg.cli, splatseg.tasks.segment\n"
-        "from splatseg.lift.training import _train\n"
-        "step = _train._Run.advance\n"
-        "_train._Run.advance = lambda run: (time.sleep(0.02), step(run))\n"
-        "sys.exit(splatseg.cli.main())"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, "segment", str(folder), *WORDS, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "SPLATSEG_THREADS": "1"},
-    )
-    deadline = time.monotonic() + 120
-    while steps_done(folder) < until and process.poll() is None:
-        assert time.monotonic() < deadline, "no progress"
-        time.sleep(0.002)
-    return process
-
-
 def steps_done(folder: Path) -> int:
     """Steps of the checkpoint, which is whole at any moment."""
     try:
@@ -257,39 +235,54 @@ def steps_done(folder: Path) -> int:
         return 0
 
 
-def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    out, err = process.communicate(timeout=120)
-    return process.returncode, out, err
-
-
-def test_killed_between_two_checkpoints(made, straight) -> None:
-    process = begin(made, until=6)
+def test_killed_between_two_checkpoints(made, straight, capsys) -> None:
+    # Each step takes a moment, so that the process can be met between two.
+    program = (
+        "import sys, time, splatseg.cli, splatseg.tasks.segment\n"
+        "from splatseg.lift.training import _train\n"
+        "step = _train._Run.advance\n"
+        "_train._Run.advance = lambda run: (time.sleep(0.05), step(run))\n"
+        "sys.exit(splatseg.cli.main())"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "segment", str(made), *WORDS],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "SPLATSEG_THREADS": "1"},
+    )
+    deadline = time.monotonic() + 120
+    while steps_done(made) < 6 and process.poll() is None:
+        assert time.monotonic() < deadline, "no progress"
+        time.sleep(0.002)
     process.send_signal(signal.SIGKILL)
-    assert ended(process)[0] == -signal.SIGKILL
+    assert process.wait(timeout=120) == -signal.SIGKILL
     at = steps_done(made)
     assert at >= 6
-    status, _, err = ended(begin(made))
-    assert status == 2
-    assert "--resume continues it, --overwrite begins again" in err
-    process = begin(made, "--resume", until=at + 2)
-    process.send_signal(signal.SIGKILL)
-    assert ended(process)[0] == -signal.SIGKILL
-    status, out, err = ended(begin(made, "--resume"))
-    assert status == 0, err
-    assert "going on from step" in out
+    assert main(["segment", str(made), *WORDS]) == 2
+    assert "--resume continues it, --overwrite begins again" in capsys.readouterr().err
+    assert main(["segment", str(made), *WORDS, "--resume"]) == 0
+    assert f"going on from step {at} of {STEPS}" in capsys.readouterr().out
     assert (made / "layers" / f"{LAYER}.npz").read_bytes() == straight["identity"]
     assert not (made / "training").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_command_with_one_sentence(made, straight, number) -> None:
-    process = begin(made, until=6)
-    process.send_signal(number)
-    status, _, err = ended(process)
-    assert status == 1
+def test_a_signal_ends_the_command_with_one_sentence(
+    made, straight, capsys, monkeypatch, number
+) -> None:
+    step = _train._Run.advance
+
+    def interrupted(run) -> None:
+        step(run)
+        if run.state.step == 7:
+            signal.raise_signal(number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_train._Run, "advance", interrupted)
+        assert main(["segment", str(made), *WORDS]) == 1
+    err = capsys.readouterr().err
     (line,) = [line for line in err.splitlines() if line.startswith("interrupted")]
-    assert f"the training was stopped at step {steps_done(made)} of 24; --resume goes on" in line
+    assert "the training was stopped at step 7 of 24; --resume goes on from" in line
     assert not (made / "layers" / f"{LAYER}.npz").exists()
-    status, _, err = ended(begin(made, "--resume"))
-    assert status == 0, err
+    assert main(["segment", str(made), *WORDS, "--resume"]) == 0
     assert (made / "layers" / f"{LAYER}.npz").read_bytes() == straight["identity"]
