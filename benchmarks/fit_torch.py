@@ -6,7 +6,7 @@ The other one is written here as one would write it in PyTorch: project all Gaus
 them by depth, list those whose ellipse's box touches each tile of 16 x 16 pixels, blend each tile
 with a cumulative product, chunk by chunk until nothing shines through, compare by L1 + D-SSIM, let
 autograd do the rest, and step with `torch.optim.Adam`. Constants are splatseg's, and so is the
-outcome: the difference of pictures and slopes at equal parameters is printed first.
+outcome: the difference of images and gradients at equal parameters is printed first.
 
 Both start from the same Gaussians after some steps of ours, see the same photographs at full size
 and use the same number of threads. Times are of the process's CPU divided by the threads, which
@@ -216,7 +216,7 @@ def l1_dssim_plain(image: Tensor, photograph: Tensor, weight: float) -> Tensor:
 
 
 def agreement(slow: Slow, run: FitRun, camera: Camera, photograph: Tensor) -> str:
-    """How far pictures, loss and slopes in the centres are apart at equal parameters."""
+    """How far images, loss and gradients in the centres are apart at equal parameters."""
     weight = FitOptions().dssim_weight
     gaussians = run._state[0].gaussians()
     gaussians = gaussians.replace(
@@ -235,9 +235,9 @@ def agreement(slow: Slow, run: FitRun, camera: Camera, photograph: Tensor) -> st
     apart = (one - other).norm() / one.norm()
     off = (drawn.detach() - picture.detach()).abs()
     return (
-        f"at equal parameters: pictures apart by {float(off.mean()):.1e} (largest "
-        f"{float(off.max()):.1e}), loss {ours.value:.5f} and {float(theirs.detach()):.5f}, slopes "
-        f"in the centres by {float(apart):.1e} of their size"
+        f"at equal parameters: images apart by {float(off.mean()):.1e} (largest "
+        f"{float(off.max()):.1e}), loss {ours.value:.5f} and {float(theirs.detach()):.5f}, "
+        f"gradients in the centres by {float(apart):.1e} of their size"
     )
 
 

@@ -45,7 +45,7 @@ _SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "scor
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """What is scored and where pictures go."""
+    """What is scored and where images go."""
 
     scene: Scene
     data: Path
@@ -153,9 +153,9 @@ class _Masks:
 def _painted(masks: Any) -> Image.Image:
     """Overlapping masks as one map: large ones first, small ones over them."""
     ids = np.zeros((masks.height, masks.width), np.uint16)
-    order = sorted(range(len(masks.masks)), key=lambda place: -masks.masks[place].area)
-    for number, place in enumerate(order, start=1):
-        ids[masks.masks[place].decode().numpy()] = number
+    order = sorted(range(len(masks.masks)), key=lambda index: -masks.masks[index].area)
+    for number, index in enumerate(order, start=1):
+        ids[masks.masks[index].decode().numpy()] = number
     return Image.fromarray(ids)
 
 

@@ -1,4 +1,4 @@
-"""What removing a thing leaves of it, and what it does to the rest of the picture.
+"""What removing a thing leaves of it, and what it does to the rest of the image.
 
     splatseg fit ../shared/data/toys -o SCENE
     python benchmarks/removal.py SCENE ../shared/data/toys [--split once|each|off]
@@ -19,7 +19,7 @@ things; `each` at the thing's own masks as `splatseg edit --remove` does it, thr
   on pixels that lie more than one, and more than two, pixels inside.
 - outside: mean PSNR against the photographs over the test views that show the thing, of the
   pixels outside its true mask, before and after.
-- split: PSNR between pictures before and after the splits, with nothing removed.
+- split: PSNR between images before and after the splits, with nothing removed.
 """
 
 import argparse
@@ -97,13 +97,13 @@ class Masses:
         self.pixels = dict.fromkeys(things, 0)
         self.outlines = dict.fromkeys(things, 0.0)
 
-    def add(self, gaussians: Gaussians, view: View, paper: LabelMap, gone: dict[int, Tensor]):
+    def add(self, gaussians: Gaussians, view: View, label_map: LabelMap, gone: dict[int, Tensor]):
         """Count one view; `gone` says which Gaussians each thing's removal takes."""
-        shown = set(torch.unique(paper.ids).tolist())
+        shown = set(torch.unique(label_map.ids).tolist())
         here = [thing for thing in self.things if thing in shown]
         if not here:
             return
-        masks = paper.ids[..., None] == torch.tensor(here)
+        masks = label_map.ids[..., None] == torch.tensor(here)
         image = torch.cat([inner(masks, pixels) for pixels in DEPTHS], dim=-1).float()
         sums = back_project(gaussians, view.camera, image).sums.double()
         for column, thing in enumerate(here):
@@ -123,7 +123,7 @@ class Masses:
 
 
 class Pictures:
-    """Pictures of the scene before, and scores outside things."""
+    """Images of the scene before, and scores outside things."""
 
     def __init__(self, scene: Scene, truth: Evidence, thin: int) -> None:
         self.views = scene.test_views[::thin]
@@ -148,7 +148,7 @@ class Pictures:
         return statistics.fmean(first), statistics.fmean(second)
 
     def apart(self, after: Gaussians) -> float:
-        """PSNR between pictures before and after, all pixels of the test views pooled."""
+        """PSNR between images before and after, all pixels of the test views pooled."""
         errors = []
         for view in self.views:
             now, _ = render_and_photograph(after, view)

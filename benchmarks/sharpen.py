@@ -1,4 +1,4 @@
-"""What `splatseg sharpen` does to label maps and pictures of held-out views.
+"""What `splatseg sharpen` does to label maps and images of held-out views.
 
     python benchmarks/sharpen.py SCENE ../shared/data/office [--evidence instance labels_panoptic]
 

@@ -54,8 +54,8 @@ def room(tmp_path):
     root = tmp_path / "room"
     save_scene(Scene(gaussians=gaussians, views=views), root)
     folder = root / "evidence" / "truth"
-    for name, paper in maps.items():
-        save_label_map(folder, name, paper)
+    for name, label_map in maps.items():
+        save_label_map(folder, name, label_map)
     labels = uplift(
         gaussians, views, Maps(maps), options=UpliftOptions(candidates=2), backend="cpu"
     )

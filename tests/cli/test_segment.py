@@ -34,9 +34,9 @@ def sides(scene) -> torch.Tensor:
 @pytest.fixture
 def masks(small):
     """Masks of the two walls in each view, in no order."""
-    for place, name in enumerate(TRAIN):
+    for index, name in enumerate(TRAIN):
         ids = np.array(Image.open(small.capture / "semantic" / f"{name}.png"))
-        wanted = [LEFT, RIGHT] if place % 2 else [RIGHT, LEFT]
+        wanted = [LEFT, RIGHT] if index % 2 else [RIGHT, LEFT]
         found = MaskSet(
             height=ids.shape[0],
             width=ids.shape[1],
@@ -54,12 +54,12 @@ def panoptic(small):
     folder = small.capture / "labels_panoptic"
     folder.mkdir()
     table = {}
-    for place, name in enumerate(TRAIN):
+    for index, name in enumerate(TRAIN):
         ids = np.array(Image.open(small.capture / "semantic" / f"{name}.png"))
         out = np.zeros(ids.shape, np.uint16)
         rows: list[Segment] = []
         for kind in (LEFT, RIGHT):
-            own = 1 + (kind == (LEFT, RIGHT)[place % 2])
+            own = 1 + (kind == (LEFT, RIGHT)[index % 2])
             out[ids == kind] = own
             rows.append(Segment(id=own, category=kind, isthing=True, score=0.9))
         Image.fromarray(out).save(folder / f"{name}.png")

@@ -89,9 +89,9 @@ def test_segments_of_views_take_the_ids_of_the_layer(labelled, splatseg, tmp_pat
     folder = labelled.capture / "labels_panoptic"
     folder.mkdir()
     tables = {}
-    for place, view in enumerate(scene.train_views):
+    for index, view in enumerate(scene.train_views):
         ids = found.label_map(view.name).ids.numpy()
-        own = np.where(ids > 0, (ids * 7 + 31 * place) % 251 + 1, 0)
+        own = np.where(ids > 0, (ids * 7 + 31 * index) % 251 + 1, 0)
         rows = [{"id": int(i), "category_id": 0} for i in np.unique(own) if i]
         tables[view.name] = {"segments_info": rows}
         Image.fromarray(own.astype(np.uint16)).save(folder / f"{view.name}.png")

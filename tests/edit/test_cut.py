@@ -19,7 +19,7 @@ ALL = CutOptions(min_pixels=0, min_weight=0, border_weight=1)
 
 
 class Halves:
-    """Label maps of views: id 1 left of a line through the picture's middle, id 2 right of it."""
+    """Label maps of views: id 1 left of a line through the image's middle, id 2 right of it."""
 
     def __init__(self, views, *, slope: float = 0.0, void: bool = False) -> None:
         self.views = {view.name: view for view in views}

@@ -1,4 +1,4 @@
-"""Splitting: moments to rounding, constants found again, and pictures that stay."""
+"""Splitting: moments to rounding, constants found again, and images that stay."""
 
 import math
 

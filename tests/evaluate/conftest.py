@@ -10,7 +10,7 @@ from PIL import Image
 
 @pytest.fixture
 def maps_in(tmp_path: Path) -> Callable[[str, Sequence[np.ndarray]], Path]:
-    """Write maps of ids (0 none, as in files) or pictures into a folder of this name."""
+    """Write maps of ids (0 none, as in files) or images into a folder of this name."""
 
     def write(name: str, maps: Sequence[np.ndarray]) -> Path:
         folder = tmp_path / name

@@ -82,7 +82,7 @@ def test_views_that_show_a_gaussian() -> None:
     half = views[0].camera
     views[1] = View(name="b", camera=half)
     assert views_that_show(scene, views, backend="cpu").tolist() == [2, 2, 0]
-    # The first covers some 200 pixels, and 4 where the picture is a tenth as wide.
+    # The first covers some 200 pixels, and 4 where the image is a tenth as wide.
     assert views_that_show(scene, views, min_weight=50, backend="cpu").tolist() == [2, 0, 0]
     small = views_that_show(scene, views, min_weight=50, longest=6, backend="cpu")
     assert small.tolist() == [0, 0, 0]

@@ -138,7 +138,7 @@ def test_picture_scores_equal_the_scorers(rng, score, maps_in) -> None:
 
 
 def test_ssim_by_hand() -> None:
-    """Flat pictures: only the means count. And a picture is like itself."""
+    """Flat images: only the means count. And a image is like itself."""
     a, b = torch.full((11, 11, 1), 0.25), torch.full((11, 11, 1), 0.5)
     expected = (2 * 0.25 * 0.5 + 1e-4) / (0.25**2 + 0.5**2 + 1e-4)
     assert ssim(a, b) == pytest.approx(expected, abs=1e-9)

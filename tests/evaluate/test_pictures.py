@@ -1,4 +1,4 @@
-"""Colours of ids, depth and errors; sheets of pictures."""
+"""Colours of ids, depth and errors; sheets of images."""
 
 import numpy as np
 import pytest

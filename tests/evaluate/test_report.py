@@ -1,4 +1,4 @@
-"""The HTML page: whole, escaped, self-contained, and its pictures are the ones given."""
+"""The HTML page: whole, escaped, self-contained, and its images are the ones given."""
 
 import base64
 import io

@@ -158,7 +158,7 @@ def test_the_page_needs_nothing_else_and_says_everything(write) -> None:
         "splatseg segment SCENE --report", "seed", "torch", "candidates", "blue wall",
     ):  # fmt: skip
         assert words in page, words
-    # Four views that it was made from and two held out, six pictures each.
+    # Four views that it was made from and two held out, six images each.
     assert len(pictures(page)) == 6 * 6
 
 

@@ -189,7 +189,7 @@ def spz_4():
 
 
 def webp(rows, size):
-    """A lossless picture of RGBA pixels, filled up with zeros."""
+    """A lossless image of RGBA pixels, filled up with zeros."""
     width, height = size
     pixels = b"".join(bytes(row) for row in rows).ljust(4 * width * height, b"\0")
     buffer = io.BytesIO()

@@ -71,7 +71,7 @@ def test_the_boundary_is_that_of_the_segment(drawn) -> None:
 
 
 def test_what_fits_nothing_well_enough_says_nothing(drawn) -> None:
-    """One segment over the whole picture: its overlap with A is A's share of the picture."""
+    """One segment over the whole image: its overlap with A is A's share of the image."""
     everything = LabelMap(ids=torch.zeros(drawn.shape, dtype=torch.int32))
     share = float((drawn == A).float().mean())
     assert bool((matched(everything, least_overlap=share + 1e-6) == -1).all())

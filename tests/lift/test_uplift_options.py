@@ -114,7 +114,7 @@ NEAR = {
     ),
 }
 """Its pixels with another id, or none, in the square of so many pixels around them. The border
-of the picture is no edge."""
+of the image is no edge."""
 
 
 @pytest.mark.parametrize("width", [1, 2])

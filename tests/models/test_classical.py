@@ -1,4 +1,4 @@
-"""The stand-ins: regions of known pictures, nesting, determinism, GrabCut, descriptor."""
+"""The stand-ins: regions of known images, nesting, determinism, GrabCut, descriptor."""
 
 import subprocess
 import sys
@@ -109,7 +109,7 @@ def test_masks_are_nested_and_levels_come_back_as_partitions(squares) -> None:
 
 
 def test_masks_keep_the_photographs_size_and_outline(squares) -> None:
-    """Worked on at half the size, masks are the picture's own size and still fit."""
+    """Worked on at half the size, masks are the image's own size and still fit."""
     masks = region_masks(squares, RegionOptions(working_size=64, superpixel_size=5))
     assert (masks.height, masks.width) == (96, 128)
     assert best(masks, BLUE) > 0.75

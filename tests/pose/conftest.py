@@ -87,7 +87,7 @@ def orbit(count: int) -> list[Pose]:
 
 
 def save_turned(picture: np.ndarray, path: Path, *, orientation: int = 1) -> Path:
-    """Write a picture as a PNG, stored turned, with the EXIF data that turn it upright."""
+    """Write a image as a PNG, stored turned, with the EXIF data that turn it upright."""
     stored = {1: picture, 6: np.rot90(picture, 1), 3: np.rot90(picture, 2)}[orientation]
     exif = Image.Exif()
     exif[0x0112] = orientation

@@ -68,7 +68,7 @@ def test_the_focal_length_of_film_is_in_terms_of_its_diagonal() -> None:
 
 def test_the_density_of_the_sensor_serves_where_film_is_not_named() -> None:
     tags = {"focal": 50.0, "width": 6000, "height": 4000, "density": 4233.33, "unit": 2}
-    # 4233.33 pixels an inch are 166.67 a millimetre; the picture was made half as large since.
+    # 4233.33 pixels an inch are 166.67 a millimetre; the image was made half as large since.
     assert lens_facts(with_lens((3000, 2000), **tags)).focal == pytest.approx(4166.7, rel=1e-3)
     centimetres = lens_facts(with_lens((3000, 2000), **(tags | {"unit": 3}))).focal
     assert centimetres == pytest.approx(10583, rel=1e-3)

@@ -47,7 +47,7 @@ def test_after_ctrl_c_nothing_runs_and_a_second_run_goes_on(
         recover_poses(folder, folder=kept, options=OPTIONS, progress=stop_at("matches"))
     assert [process.returncode is not None for process in processes] == [True]
     assert [entry.name for entry in kept.iterdir()] == ["work"]
-    # Features are not looked for again: without the pictures they could not be.
+    # Features are not looked for again: without the images they could not be.
     for copy in (kept / "work" / "images").iterdir():
         copy.write_bytes(b"\x89PNG\r\n\x1a\n gone")
     told: list[str] = []

@@ -36,9 +36,9 @@ def _compare(backend, count, channels, rng, **changes):
     certain = inside & ~band.median
     assert_close(fast.median_depth[certain], slow.median_depth[certain], atol=0, rtol=1e-6)
     # What one Gaussian of alpha 1/255 more or less, or one that ends a pixel, can do.
-    loudest = 1.0 if signal is None else float(signal.abs().max()) if count else 0.0
+    largest = 1.0 if signal is None else float(signal.abs().max()) if count else 0.0
     flips = ~band.swap
-    assert_close(fast.image[flips], slow.image[flips], atol=0.02 * max(loudest, 1.0))
+    assert_close(fast.image[flips], slow.image[flips], atol=0.02 * max(largest, 1.0))
     assert_close(fast.alpha[flips], slow.alpha[flips], atol=0.02)
     return slow
 

@@ -80,7 +80,7 @@ def test_the_harmonics_agree_with_finite_differences():
 
 
 def _gradients(backend, scene, camera, signal, v_outputs, options) -> dict[str, torch.Tensor]:
-    """Gradients of <image, slopes> + <alpha, ...> + <depth, ...> towards everything."""
+    """Gradients of <image, gradients> + <alpha, ...> + <depth, ...> towards everything."""
     leaves = {name: getattr(scene, name).clone().requires_grad_() for name in COLUMNS}
     pose = camera.cam_from_world[:3].clone().requires_grad_()
     if signal is not None:

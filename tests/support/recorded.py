@@ -81,8 +81,8 @@ def write_panoptic(folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen]
 def write_tracked(folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen]) -> None:
     """Objects under one id through all views, except every fifth: another id from half on."""
     names, votes = class_names(scene), {}
-    for place, (name, view) in enumerate(seen.items()):
-        broken = (view.instance % 5 == 4) & (2 * place >= len(seen))
+    for index, (name, view) in enumerate(seen.items()):
+        broken = (view.instance % 5 == 4) & (2 * index >= len(seen))
         ids = np.where(broken, view.instance + 100, view.instance)
         for i in np.unique(ids[ids > 0]):
             classes, counts = np.unique(view.semantic[ids == i], return_counts=True)

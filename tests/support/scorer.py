@@ -1,7 +1,7 @@
 """Scores of maps in files, by loops over pixels and segments: a second reading of the measures.
 
 Nothing of splatseg is in it. Figures have the names of the shared score.py, which the same tests
-are held to where it is there. Sums over classes and pictures come from scikit-learn and
+are held to where it is there. Sums over classes and images come from scikit-learn and
 scikit-image, matching and ranking are spelt out.
 """
 

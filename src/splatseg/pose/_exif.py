@@ -43,7 +43,7 @@ class LensFacts:
 def lens_facts(image: Image.Image) -> LensFacts:
     """What the EXIF data of an opened image say of its lens."""
     if image.format == "PNG" and "exif" not in image.info:
-        # Pillow would decode the whole picture to look for them behind the pixels.
+        # Pillow would decode the whole image to look for them behind the pixels.
         return LensFacts(identity=("",) * 5, focal=None)
     exif = image.getexif()
     detail: Mapping[int, Any] = exif.get_ifd(_EXIF_IFD)
@@ -63,7 +63,7 @@ def lens_facts(image: Image.Image) -> LensFacts:
 def _focal(detail: Mapping[int, Any], width: int, height: int) -> float | None:
     taken = (_number(detail, _WIDTH), _number(detail, _HEIGHT))
     if taken[0] and taken[1]:
-        # Either may have been turned; the shape of an uncropped picture is the same.
+        # Either may have been turned; the shape of an uncropped image is the same.
         now, then = max(width, height) / min(width, height), max(taken) / min(taken)
         if abs(now - then) > _SAME_SHAPE * then:
             return None

@@ -85,16 +85,16 @@ def finish_model(
     at halves in COLMAP as in splatseg, so nothing is shifted.
 
     Returns:
-        Places, in `lenses`, of those whose distortion was given up since it folded over.
+        Indices, in `lenses`, of those whose distortion was given up since it folded over.
     """
     of_image = {name: i for i, lens in enumerate(lenses) for name in lens["images"]}
     ids = list(reconstruction.reg_image_ids())
     lens_of = {
         reconstruction.image(id).camera_id: of_image[reconstruction.image(id).name] for id in ids
     }
-    straightened = [id for id in lens_of if _folds(reconstruction.camera(id))]
-    if straightened:
-        _straighten(reconstruction, straightened, threads)
+    without_distortion = [id for id in lens_of if _folds(reconstruction.camera(id))]
+    if without_distortion:
+        _remove_distortion(reconstruction, without_distortion, threads)
     reconstruction.normalize(extent=_EXTENT)
     for id in ids:
         image = reconstruction.image(id)
@@ -105,7 +105,7 @@ def finish_model(
         image.name = lens["images"][image.name]
     for camera_id, index in lens_of.items():
         _scale_camera(reconstruction.camera(camera_id), lenses[index])
-    return sorted(lens_of[id] for id in straightened)
+    return sorted(lens_of[id] for id in without_distortion)
 
 
 def _drop_doubtful(reconstruction: Any) -> None:
@@ -137,7 +137,7 @@ def _folds(camera: Any) -> bool:
     return bool(2.0 / 3.0 / np.sqrt(-3.0 * k1) < _FOLD_MARGIN * corner)
 
 
-def _straighten(reconstruction: Any, camera_ids: Sequence[int], threads: int) -> None:
+def _remove_distortion(reconstruction: Any, camera_ids: Sequence[int], threads: int) -> None:
     """Give up the distortion of lenses and fit everything else to that."""
     for id in camera_ids:
         camera = reconstruction.camera(id)

@@ -264,7 +264,7 @@ def _report(
         if copy not in registered
     ]
     placed = {view.image.name: view.camera for view in capture.views if view.image is not None}
-    straightened = set(result["model"]["straightened"])
+    without_distortion = set(result["model"]["without_distortion"])
     found: list[Lens] = []
     for lens in lenses:
         cameras = [placed[own] for own in lens.images.values() if own in placed]
@@ -296,7 +296,7 @@ def _report(
             f"no distortion was found that fits a lens of {lens.full_width}x{lens.full_height} "
             "pixels; it is taken for one without"
             for i, lens in enumerate(lenses)
-            if i in straightened
+            if i in without_distortion
         ),
     )
 

@@ -18,7 +18,7 @@ from splatseg.io.atomic import atomic_folder
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
 """Suffixes, in lower case, of the files that are taken for videos."""
 
-# Sharpness is judged on pictures no larger than this: noise and the blocks of compression,
+# Sharpness is judged on images no larger than this: noise and the blocks of compression,
 # which look sharp to a Laplacian, are finer.
 _JUDGED = 480
 _QUALITY = 95
@@ -46,7 +46,7 @@ def check_video(path: Path) -> None:
 
 
 def sharpness(frame: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian of a picture's grey values: large where edges are sharp.
+    """Variance of the Laplacian of a image's grey values: large where edges are sharp.
 
     References:
         Pech-Pacheco et al., Diatom autofocusing in brightfield microscopy, ICPR 2000.

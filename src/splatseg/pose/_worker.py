@@ -314,7 +314,7 @@ class Job:
     def _finish(self, best: Model) -> dict[str, Any]:
         reconstruction = best.reconstructions[0]
         facts = model_facts(reconstruction)
-        facts["straightened"] = finish_model(
+        facts["without_distortion"] = finish_model(
             reconstruction, self._lenses, threads=self._options["threads"]
         )
         out = self._empty("model")

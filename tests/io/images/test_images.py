@@ -1,4 +1,4 @@
-"""Photographs: upright, reduced, and refused where they cannot be; pictures written."""
+"""Photographs: upright, reduced, and refused where they cannot be; images written."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def pixels(rng) -> np.ndarray:
     return rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
 
 
-# What a person does to the stored picture to see it upright, by EXIF orientation.
+# What a person does to the stored image to see it upright, by EXIF orientation.
 UPRIGHT = {
     1: lambda a: a,
     2: lambda a: a[:, ::-1],

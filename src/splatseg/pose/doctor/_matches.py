@@ -1,4 +1,4 @@
-"""Features matched between photographs: what the pictures say, whatever the poses say."""
+"""Features matched between photographs: what the images say, whatever the poses say."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
