@@ -294,6 +294,17 @@ def test_checkpoints_are_written_every_so_often(sampler, tmp_path) -> None:
     assert torch.equal(first.rows["values"], again.rows["values"])
 
 
+def test_a_step_is_written_once(sampler, tmp_path, monkeypatch) -> None:
+    """The checkpoint that is due after the last step is that of the end."""
+    written, write = [], _file.write_state
+    monkeypatch.setattr(
+        _file, "write_state", lambda *args: written.append(args[1].step) or write(*args)
+    )
+    checkpoints = Checkpoints(path=tmp_path / "training.npz", steps=6, at_end=True)
+    train(Regression(), sampler, options=TrainingOptions(**SHORT), checkpoints=checkpoints)
+    assert written == [6, 12]
+
+
 def test_checkpoints_by_the_clock(sampler, tmp_path, monkeypatch) -> None:
     """A minute passes with each step: one is written every third."""
     path, found, now = tmp_path / "training.npz", [], [0.0]
