@@ -164,8 +164,7 @@ def segment(
         layer = _run(method, inputs, chosen, timings, observer)
         if options.complete and method.complete and not options.published:
             layer = _completed(scene, layer, completion, timings)
-        if merged is not None:
-            layer = _panoptic(scene, layer, merged, method)
+        layer = _panoptic(scene, layer, merged, method)
     layer = _described(layer, method, evidence_name, inputs, options)
     return _segmentation(layer, name, inputs, timings)
 
@@ -238,9 +237,11 @@ def _completed(
 
 
 def _panoptic(
-    scene: Scene, layer: Layer, classes: tuple[Labels, ClassTable], method: Method
-) -> Labels:
-    """Instances merged with classes."""
+    scene: Scene, layer: Layer, classes: tuple[Labels, ClassTable] | None, method: Method
+) -> Layer:
+    """Instances merged with classes, where these are given."""
+    if classes is None:
+        return layer
     instances = layer.cut() if isinstance(layer, InstanceTree) else layer
     if not isinstance(instances, Labels):
         raise InputError(
@@ -253,9 +254,7 @@ def _described(
     layer: Layer,
     method: Method,
     evidence_name: str,
-    evidence: Evidence,
-    *,
-    views: Sequence[View],
+    inputs: MethodInputs,
     options: SegmentOptions,
 ) -> Layer:
     """The layer with a record of what it was made from; a method's own record comes first."""
@@ -264,7 +263,7 @@ def _described(
         layer.info,
         method=layer.info.method or method.name,
         evidence=evidence_name,
-        views=tuple(view.name for view in views) if own is None else own,
+        views=tuple(view.name for view in inputs.views) if own is None else own,
         views_asked=views_recorded(options.views),
         seed=options.seed,
         versions={
@@ -272,9 +271,9 @@ def _described(
             "torch": str(torch.__version__),
         },
     )
-    if isinstance(layer, Labels) and evidence.source_ids is not None:
-        present = layer.present.tolist()
-        info = replace(info, source_ids={id: evidence.source_ids[id] for id in present})
+    source_ids = inputs.evidence.source_ids
+    if isinstance(layer, Labels) and source_ids is not None:
+        info = replace(info, source_ids={id: source_ids[id] for id in layer.present.tolist()})
     return with_info(layer, info)
 
 
