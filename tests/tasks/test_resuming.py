@@ -136,8 +136,10 @@ def test_only_the_same_training_goes_on(scene) -> None:
     before = path.read_bytes()
 
     def refused(says: str, *, where=scene, **more) -> None:
+        hearing = Stopping()
         with pytest.raises(InputError, match=says) as error:
-            run(where, checkpoints=GOING_ON, **more)
+            run(where, checkpoints=GOING_ON, observer=hearing, **more)
+        assert not any("`resume` goes on" in line for line in hearing.heard)
         assert str(error.value).count(". ") == 0, "one sentence"
 
     refused(r"one with seed 3 instead of 4\.", asked=replace(ASKED, seed=4))
