@@ -49,6 +49,11 @@ from splatseg.core.models import Prompt as Prompt
 from splatseg.core.models import PromptableMasks as PromptableMasks
 from splatseg.core.models import SemanticLabels as SemanticLabels
 from splatseg.core.models import TextFeatures as TextFeatures
+from splatseg.core.renderable import PointLabels as PointLabels
+from splatseg.core.renderable import Renderable as Renderable
+from splatseg.core.renderable import RenderableLayer as RenderableLayer
+from splatseg.core.renderable import RenderableView as RenderableView
+from splatseg.core.renderable import ViewSignals as ViewSignals
 from splatseg.core.rigid import Similarity as Similarity
 from splatseg.core.rle import Rle as Rle
 from splatseg.core.scene import Capture as Capture

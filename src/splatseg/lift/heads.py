@@ -21,7 +21,8 @@ from torch import Tensor
 from splatseg._check import check_choice, check_shape
 from splatseg.core import JSON, UNLABELLED, Camera, Features, Gaussians, LabelMap, Labels, LayerInfo
 from splatseg.errors import InputError, ShapeError
-from splatseg.render import RenderOptions, options_for, render
+from splatseg.lift.view_renderer import ViewRenderer
+from splatseg.render import RenderOptions, prepare
 
 Blend = Literal["features", "probabilities"]
 _ROWS = 65536
@@ -56,8 +57,13 @@ class ClassifierHead:
 
     def logits(self, features: Float[Tensor, "m channels"]) -> Float[Tensor, "m classes"]:
         """``A f + b`` of features, rendered or of Gaussians."""
-        found = features if self.weight is None else features @ self.weight.T
-        return found if self.bias is None else found + self.bias
+        return self._logits_of(features, slice(None))
+
+    def _logits_of(self, features: Tensor, classes: slice) -> Tensor:
+        """The logits of some classes, whatever the axes before the channels."""
+        weight, bias = self.weight, self.bias
+        found = features[..., classes] if weight is None else features @ weight[classes].T
+        return found if bias is None else found + bias[classes]
 
     def probabilities(self, features: Float[Tensor, "m channels"]) -> Float[Tensor, "m classes"]:
         """The softmax of the logits."""
@@ -108,33 +114,77 @@ class ClassifierHead:
             raise ShapeError(
                 f"gaussians: expected {len(features)}, one a feature, got {len(gaussians)}."
             )
-        view = _View(gaussians, camera, options or options_for(gaussians, backend), backend)
-        if self.blend == "features":
-            rendered, _ = view.render(features.values)
-            best, index = self.probabilities(rendered).max(dim=-1)
-            return LabelMap(ids=self.ids[index].to(torch.int32), confidence=best.clamp(0, 1))
-        return self._blended(view, features)
+        with prepare(gaussians, camera, options=options, backend=backend) as view:
+            return self.view_label_map(ViewRenderer(gaussians, view), features)
 
-    def _blended(self, view: "_View", features: Features) -> LabelMap:
-        probabilities = torch.empty(len(features), len(self.ids))
+    def view_label_map(
+        self,
+        view: ViewRenderer,
+        features: Features,
+        *,
+        log_totals: Float[Tensor, "n"] | None = None,
+    ) -> LabelMap:
+        """`label_map` of a view that is prepared, for any number of layers.
+
+        Args:
+            view: The view of the Gaussians that have the features.
+            features: One row a Gaussian.
+            log_totals: `log_totals` of the features, where they are kept from view to view.
+        """
+        if not len(self.ids):
+            raise InputError("ids: expected at least one class, got none.")
+        if self.blend == "features":
+            return self._of_rendered_features(view, features)
+        totals = self.log_totals(features) if log_totals is None else log_totals
+        return self._of_rendered_probabilities(view, features, totals)
+
+    def log_totals(self, features: Features) -> Float[Tensor, "n"]:
+        """The logarithm of the sum of exponentials of each Gaussian's logits."""
+        totals = torch.empty(len(features))
         for start in range(0, len(features), _ROWS):
             rows = slice(start, start + _ROWS)
-            probabilities[rows] = self.probabilities(features.values[rows])
-        if features.weights is not None:
-            probabilities[features.weights <= 0] = 0
-        best, index, claimed = None, None, None
+            totals[rows] = torch.logsumexp(self.logits(features.values[rows]), dim=-1)
+        return totals
+
+    def _of_rendered_features(self, view: ViewRenderer, features: Features) -> LabelMap:
+        rendered = None
+        if self.weight is not None:
+            rendered, _ = view.scores(features.values, warp="nearest")
+        best = torch.full(view.size, -torch.inf)
+        total = torch.full(view.size, -torch.inf)
+        index = torch.zeros(view.size, dtype=torch.int64)
         for start in range(0, len(self.ids), _CHANNELS):
-            rendered, _ = view.render(probabilities[:, start : start + _CHANNELS])
+            classes = slice(start, start + _CHANNELS)
+            if rendered is None:
+                logits, _ = view.scores(features.values[:, classes], warp="nearest")
+                logits = logits if self.bias is None else logits + self.bias[classes]
+            else:
+                logits = self._logits_of(rendered, classes)
+            logit, column = logits.max(dim=-1)
+            index = torch.where(logit > best, column + start, index)
+            best = torch.maximum(logit, best)
+            total = torch.logaddexp(total, torch.logsumexp(logits, dim=-1))
+        return LabelMap(
+            ids=self.ids[index].to(torch.int32), confidence=(best - total).exp().clamp(0, 1)
+        )
+
+    def _of_rendered_probabilities(
+        self, view: ViewRenderer, features: Features, log_totals: Float[Tensor, "n"]
+    ) -> LabelMap:
+        best = torch.full(view.size, -1.0)
+        claimed = torch.zeros(view.size)
+        index = torch.zeros(view.size, dtype=torch.int64)
+        for start in range(0, len(self.ids), _CHANNELS):
+            classes = slice(start, start + _CHANNELS)
+            logits = self._logits_of(features.values, classes)
+            probabilities = (logits - log_totals[:, None]).exp()
+            if features.weights is not None:
+                probabilities[features.weights <= 0] = 0
+            rendered, _ = view.scores(probabilities, warp="nearest")
             score, column = rendered.max(dim=-1)
-            part = rendered.sum(dim=-1)
-            if best is None or index is None or claimed is None:
-                best, index, claimed = score, column, part
-                continue
-            claimed = claimed + part
+            claimed = claimed + rendered.sum(dim=-1)
             index = torch.where(score > best, column + start, index)
             best = torch.maximum(score, best)
-        if best is None or index is None or claimed is None:
-            raise InputError("ids: expected at least one class, got none.")
         # No label loses ties.
         labelled = best >= 1 - claimed
         return LabelMap(
@@ -177,28 +227,3 @@ class ClassifierHead:
 
 def _numbers(values: Any) -> Sequence[int]:
     return [int(value) for value in values]
-
-
-class _View:
-    """One view, drawn with one signal after another; ids by the nearest warp."""
-
-    def __init__(
-        self, gaussians: Gaussians, camera: Camera, options: RenderOptions, backend: str
-    ) -> None:
-        self._gaussians = gaussians
-        self._camera = camera
-        self._options = options
-        self._backend = backend
-
-    def render(self, signal: Float[Tensor, "n channels"]) -> tuple[Tensor, Tensor]:
-        """The image and alpha, on the CPU."""
-        with torch.no_grad():
-            drawn = render(
-                self._gaussians,
-                self._camera,
-                signal.to(self._gaussians.means),
-                options=self._options,
-                backend=self._backend,
-                warp="nearest",
-            )
-        return drawn.image.float().cpu(), drawn.alpha.float().cpu()
