@@ -14,11 +14,17 @@ from splatseg.lift.boundaries.sharpen import sharpen as sharpen
 from splatseg.lift.boundaries.split import split as split
 from splatseg.lift.completion.complete import CompletionOptions as CompletionOptions
 from splatseg.lift.completion.complete import complete as complete
+from splatseg.lift.field import GaussianField as GaussianField
+from splatseg.lift.field import GaussianView as GaussianView
+from splatseg.lift.field_layers import Readout as Readout
 from splatseg.lift.label_maps import label_map as label_map
 from splatseg.lift.mass.confusion import ConfusionOptions as ConfusionOptions
 from splatseg.lift.mass.confusion import correct_confusion as correct_confusion
 from splatseg.lift.mass.uplift import UpliftOptions as UpliftOptions
 from splatseg.lift.mass.uplift import uplift as uplift
+from splatseg.lift.point_labels import PointLabelOptions as PointLabelOptions
+from splatseg.lift.point_labels import PointRule as PointRule
+from splatseg.lift.point_labels import labels_of_points as labels_of_points
 from splatseg.lift.segments.matching import MatchedMaps as MatchedMaps
 from splatseg.lift.segments.panoptic import merge_panoptic as merge_panoptic
 from splatseg.lift.segments.recorded import EvidenceSegments as EvidenceSegments

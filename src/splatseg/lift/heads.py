@@ -55,6 +55,16 @@ class ClassifierHead:
             check_shape("bias", self.bias, (len(self.ids),))
         check_choice("blend", self.blend, get_args(Blend))
 
+    @property
+    def background(self) -> int:
+        """The id of pixels that nothing covers, -1 for none.
+
+        Where features are rendered, the classifier reads zeros there.
+        """
+        if self.blend == "probabilities" or not len(self.ids):
+            return UNLABELLED
+        return int(self.ids[0 if self.bias is None else int(self.bias.argmax())])
+
     def logits(self, features: Float[Tensor, "m channels"]) -> Float[Tensor, "m classes"]:
         """``A f + b`` of features, rendered or of Gaussians."""
         return self._logits_of(features, slice(None))

@@ -1,0 +1,173 @@
+"""Gaussians with their layers as a field: `splatseg.core.Renderable`.
+
+A view is projected and sorted once (`splatseg.render.prepare`); colour, depth and all layers of
+the view are products with it, each exactly what `render` and `label_map` give on their own.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import (
+    Camera,
+    Gaussians,
+    LabelMap,
+    Labels,
+    Layer,
+    PointLabels,
+    RenderableLayer,
+    ViewSignals,
+)
+from splatseg.errors import ShapeError
+from splatseg.lift.field_layers import FieldLayer, field_layer
+from splatseg.lift.point_labels import PointLabelOptions
+from splatseg.lift.view_renderer import ViewRenderer
+from splatseg.render import PreparedView, RenderOptions, prepare
+
+_COVERED = 0.02
+"""Alpha up to which a pixel shows nothing to be sure of."""
+
+
+class GaussianField:
+    """Gaussians with layers, a `splatseg.core.Renderable`.
+
+    Layers go by address: NAME of labels, of a selection, or of features; of a tree of instances
+    NAME are its objects, and NAME@part, NAME@group and NAME@0.3 other cuts; of features with a
+    classifier (`ClassifierHead`) NAME is the rendered readout, and NAME@hard the labels of
+    Gaussians.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        layers: Their layers by name.
+        options: Switches of the blending model; None is what the Gaussians were fitted with.
+        backend: Name of the rendering backend.
+        points: How points take labels from Gaussians.
+
+    Raises:
+        ShapeError: If a layer has another number of rows than there are Gaussians.
+
+    Example:
+        >>> one = Gaussians(means=torch.tensor([[0.0, 0, 2]]), rotations=torch.eye(4)[:1],
+        ...                 scales=torch.ones(1, 3), opacities=torch.ones(1),
+        ...                 sh=torch.zeros(1, 1, 3))
+        >>> cups = Labels(ids=torch.tensor([7]), confidence=torch.ones(1))
+        >>> field = GaussianField(one, {"cups": cups})
+        >>> camera = Camera(width=9, height=9, fx=9, fy=9, cx=4.5, cy=4.5,
+        ...                 cam_from_world=torch.eye(4))
+        >>> with field.view(camera) as view:
+        ...     int(view.label_map("cups").ids[4, 4]), round(float(view.signals().depth[4, 4]), 3)
+        (7, 2.0)
+        >>> field.labels_at(torch.tensor([[0.0, 0, 2]]), "cups").ids.tolist()
+        [7]
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        layers: Mapping[str, Layer] | None = None,
+        *,
+        options: RenderOptions | None = None,
+        backend: str = "auto",
+        points: PointLabelOptions | None = None,
+    ) -> None:
+        self._gaussians = gaussians
+        self._layers = dict(layers or {})
+        for name, layer in self._layers.items():
+            if len(layer) != len(gaussians):
+                raise ShapeError(
+                    f"layer {name!r}: expected {len(gaussians)} rows, one a Gaussian, "
+                    f"got {len(layer)}."
+                )
+        self._options = options
+        self._backend = backend
+        self._points = points or PointLabelOptions()
+        self._found: dict[str, FieldLayer] = {}
+
+    @property
+    def layer_names(self) -> Sequence[str]:
+        """Names of all layers."""
+        return tuple(self._layers)
+
+    def layer(self, layer: str) -> RenderableLayer:
+        """What there is to know of a layer."""
+        return self._find(layer).summary
+
+    def labels(self, layer: str) -> Labels:
+        """The labels of Gaussians of a layer: of features with a classifier the hard readout.
+
+        Raises:
+            InputError: If there is no such layer, or it has no labels.
+        """
+        return self._find(layer).labels
+
+    def view(self, camera: Camera) -> "GaussianView":
+        """What the Gaussians show through a camera."""
+        prepared = prepare(self._gaussians, camera, options=self._options, backend=self._backend)
+        return GaussianView(self._gaussians, prepared, self._find)
+
+    def labels_at(self, points: Float[Tensor, "p 3"], layer: str) -> PointLabels:
+        """Labels of points of the world, see `splatseg.lift.point_labels`."""
+        return self._find(layer).labels_at(self._gaussians, points, self._points)
+
+    def _find(self, address: str) -> FieldLayer:
+        if address not in self._found:
+            self._found[address] = field_layer(self._layers, address)
+        return self._found[address]
+
+
+class GaussianView:
+    """One view of a `GaussianField`, a context; images are on the CPU. `GaussianField.view`."""
+
+    def __init__(
+        self, gaussians: Gaussians, prepared: PreparedView, find: Callable[[str], FieldLayer]
+    ) -> None:
+        """Take a prepared view, and what finds layers by address."""
+        self._count = len(gaussians)
+        self._prepared = prepared
+        self._renderer = ViewRenderer(gaussians, prepared)
+        self._find = find
+        self._label_maps: dict[str, LabelMap] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._prepared.close()
+
+    def signals(self, *, colour: bool = True) -> ViewSignals:
+        """Alpha, depth and median depth; the colour, of spherical harmonics, costs the most."""
+        signal = None if colour else torch.zeros(self._count, 1)
+        rendered = self._renderer.render(signal)
+        return ViewSignals(
+            colour=rendered.image.cpu() if colour else None,
+            alpha=rendered.alpha.cpu(),
+            depth=rendered.depth.cpu(),
+            median_depth=rendered.median_depth.cpu(),
+        )
+
+    def features(self, layer: str) -> Float[Tensor, "height width channels"]:
+        """A layer of features, blended as colours are: sums of weights times features."""
+        return self._find(layer).features(self._renderer)
+
+    def label_map(self, layer: str) -> LabelMap:
+        """Ids of a layer: `splatseg.lift.label_map`, or the classifier's reading of the view."""
+        if layer not in self._label_maps:
+            self._label_maps[layer] = self._find(layer).label_map(self._renderer)
+        return self._label_maps[layer]
+
+    def confidence(self, layer: str) -> Float[Tensor, "height width"]:
+        """Mean confidence of the labels of the Gaussians that a pixel shows, by their weights.
+
+        Of features with a classifier it is the confidence of the pixel's own label.
+        """
+        mean, alpha = self._find(layer).confidence(self._renderer, self.label_map(layer))
+        return torch.where(alpha > _COVERED, mean, -1.0)
