@@ -22,6 +22,7 @@ from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, _loop, _run, _step
 from splatseg.fit._photographs import Photographs
 from splatseg.io.captures import read_capture
+from splatseg.lift import GaussianField
 from splatseg.render import get_backend
 from splatseg.render.cpu import isa, threads
 
@@ -79,7 +80,7 @@ def main() -> None:
                 status = run.step()
                 last = status.count, status.psnr
             begin = clock.now()
-            report = evaluate_photographs(run.gaussians(), capture.test_views)
+            report = evaluate_photographs(GaussianField(run.gaussians()), capture.test_views)
             did = max(1, run.steps - steps)
             parts = {k: round(1e3 * (v - before.get(k, 0)) / did, 1) for k, v in run.stages.items()}
             recent = [record.psnr for record in run.history[-5:]] or [last[1]]

@@ -17,13 +17,14 @@ from splatseg.fit._photographs import Photographs
 from splatseg.fit._prune import without_floaters
 from splatseg.io.images import DEFAULT_LONGEST
 from splatseg.io.scene import load_scene
+from splatseg.lift import GaussianField
 
 _NEEDLE = 50
 
 
 def scored(gaussians: Gaussians, views: list[View]) -> str:
     """PSNR in words."""
-    report = evaluate_photographs(gaussians, views)
+    report = evaluate_photographs(GaussianField(gaussians), views)
     return f"{len(gaussians)} Gaussians, PSNR {report.psnr:.4f} (least {report.psnr_min:.4f})"
 
 

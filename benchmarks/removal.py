@@ -38,7 +38,7 @@ from splatseg.core import Gaussians, LabelMap, Labels, Scene, Selection, View
 from splatseg.edit import CutBy, Document, Operation, Where, load_document, prepare, remove
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import Evidence, open_evidence
-from splatseg.lift import CutOptions, UpliftOptions, cut_labels, uplift
+from splatseg.lift import CutOptions, GaussianField, UpliftOptions, cut_labels, uplift
 from splatseg.render import back_project
 
 LAYER, FOLDER = "things", "instance"
@@ -129,7 +129,8 @@ class Pictures:
         self.views = scene.test_views[::thin]
         self.masks = {view.name: truth.label_map(view.name).ids for view in self.views}
         self.before = {
-            view.name: render_and_photograph(scene.gaussians, view) for view in self.views
+            view.name: render_and_photograph(GaussianField(scene.gaussians), view)
+            for view in self.views
         }
 
     def outside(self, thing: int, after: Gaussians) -> tuple[float, float]:
@@ -139,7 +140,7 @@ class Pictures:
             mask = self.masks[view.name] == thing
             if bool(mask.any()):
                 drawn, photograph = self.before[view.name]
-                now, _ = render_and_photograph(after, view)
+                now, _ = render_and_photograph(GaussianField(after), view)
                 pair = psnr(drawn, photograph, ~mask), psnr(now, photograph, ~mask)
                 scores.append(pair)
         if not scores:
@@ -151,7 +152,7 @@ class Pictures:
         """PSNR between images before and after, all pixels of the test views pooled."""
         errors = []
         for view in self.views:
-            now, _ = render_and_photograph(after, view)
+            now, _ = render_and_photograph(GaussianField(after), view)
             drawn = self.before[view.name][0]
             errors.append(float(((now.double() - drawn.double()) / 255).square().mean()))
         return -10 * math.log10(max(statistics.fmean(errors), 1e-12))

@@ -24,6 +24,7 @@ from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift import (
     EvidenceSegments,
+    GaussianField,
     MatchedMaps,
     SharpenOptions,
     UpliftOptions,
@@ -48,7 +49,10 @@ def layer(bench: Bench, found: Evidence) -> Labels:
 
 
 def pictures(bench: Bench, gaussians: Gaussians) -> float:
-    scores = [psnr(*render_and_photograph(gaussians, view)) for view in bench.scene.test_views]
+    scores = [
+        psnr(*render_and_photograph(GaussianField(gaussians), view))
+        for view in bench.scene.test_views
+    ]
     return statistics.fmean(scores)
 
 

@@ -9,6 +9,7 @@ import torch
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
 from splatseg.fit._exposure import Exposures
+from splatseg.lift import GaussianField
 
 OPTIONS = FitOptions(minutes=None, steps=1, exposure=True, exposure_rate=0.1, exposure_prior=0.0)
 
@@ -100,7 +101,10 @@ def test_unequally_bright_photographs(photograph) -> None:
     options = FitOptions(minutes=None, steps=700, max_gaussians=200, background="black")
     plain = fit(capture, options=options)
     freed = fit(capture, options=replace(options, exposure=True))
-    scores = [evaluate_photographs(r.gaussians, capture.test_views).psnr for r in (plain, freed)]
+    scores = [
+        evaluate_photographs(GaussianField(r.gaussians), capture.test_views).psnr
+        for r in (plain, freed)
+    ]
     assert scores[1] > scores[0] + 4.0, scores
     assert not any(note.startswith("Exposure") for note in plain.notes)
     (note,) = (note for note in freed.notes if note.startswith("Exposure"))

@@ -14,6 +14,7 @@ from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError, MissingFileError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitProgress, FitResult, fit
+from splatseg.lift import GaussianField
 from splatseg.render import render
 
 from .conftest import tiny_scene
@@ -30,7 +31,7 @@ OPTIONS = FitOptions(
 
 
 def _held_out(result: FitResult, capture: Capture) -> float:
-    return evaluate_photographs(result.gaussians, capture.test_views).psnr
+    return evaluate_photographs(GaussianField(result.gaussians), capture.test_views).psnr
 
 
 def _same(one: Gaussians, other: Gaussians) -> bool:

@@ -8,6 +8,7 @@ import torch
 from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.io.images import load_image, save_png
+from splatseg.lift import GaussianField
 
 
 @pytest.fixture
@@ -29,15 +30,17 @@ def spoilt(scene_photographed, photograph, tmp_path):
 
 
 def test_views_are_scored_where_their_masks_keep_them(spoilt, scene_photographed) -> None:
-    as_they_are = evaluate_photographs(scene_photographed, spoilt)
-    kept = evaluate_photographs(scene_photographed, spoilt, masks="ignore")
+    as_they_are = evaluate_photographs(GaussianField(scene_photographed), spoilt)
+    kept = evaluate_photographs(GaussianField(scene_photographed), spoilt, masks="ignore")
     assert len(as_they_are.views) == 3
     assert kept.views == tuple(view.name for view in spoilt[1:])
     assert kept.psnr_min > as_they_are.psnr + 3
     assert kept.ssim > as_they_are.ssim + 0.2
     with pytest.raises(InputError, match="masks keep none of 1"):
-        evaluate_photographs(scene_photographed, spoilt[:1], masks="ignore")
+        evaluate_photographs(GaussianField(scene_photographed), spoilt[:1], masks="ignore")
 
 
 def test_time_that_is_up_ends_the_scoring_after_one_view(spoilt, scene_photographed) -> None:
-    assert len(evaluate_photographs(scene_photographed, spoilt, seconds=0.0).views) == 1
+    assert (
+        len(evaluate_photographs(GaussianField(scene_photographed), spoilt, seconds=0.0).views) == 1
+    )

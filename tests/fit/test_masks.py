@@ -14,6 +14,7 @@ from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
 from splatseg.fit._photographs import Photographs
 from splatseg.io.images import load_alpha, save_png
+from splatseg.lift import GaussianField
 from splatseg.render import render
 
 
@@ -138,8 +139,8 @@ def test_a_thing_is_cut_out_of_its_surroundings(before_a_wall, scene_photographe
     assert max(outside) < 0.06, outside
     assert max(errors) < 0.05, errors
     # With alpha, the renders match the photographs; without, the wall is missing.
-    as_cut = evaluate_photographs(cut, capture.test_views, masks="alpha")
-    as_they_are = evaluate_photographs(cut, capture.test_views)
+    as_cut = evaluate_photographs(GaussianField(cut), capture.test_views, masks="alpha")
+    as_they_are = evaluate_photographs(GaussianField(cut), capture.test_views)
     assert as_cut.psnr > 20
     assert as_they_are.psnr < as_cut.psnr - 5
 

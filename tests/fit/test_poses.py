@@ -18,6 +18,7 @@ from splatseg.fit._poses import (
     pixel_twists,
     twist_gradient,
 )
+from splatseg.lift import GaussianField
 
 OPTIONS = FitOptions(minutes=None, steps=1, refine_poses=True, pose_rate=0.5)
 
@@ -186,7 +187,10 @@ def test_wrong_poses_are_found_again(photograph, rng: np.random.Generator) -> No
     assert [v.camera for v in refined.views if v.split == "test"] == [
         v.camera for v in started.test_views
     ]
-    scores = [evaluate_photographs(r.gaussians, capture.test_views).psnr for r in (plain, refined)]
+    scores = [
+        evaluate_photographs(GaussianField(r.gaussians), capture.test_views).psnr
+        for r in (plain, refined)
+    ]
     assert scores[1] > scores[0] + 1, scores
     assert plain.views == started.views
     assert [note.split(":")[0] for note in refined.notes if "views" in note] == ["Poses"]

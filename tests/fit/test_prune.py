@@ -9,6 +9,7 @@ from splatseg.core import Camera, Capture, Gaussians
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, fit
 from splatseg.fit._prune import MaskedView, needed, reduction_for
+from splatseg.lift import GaussianField
 
 
 def _camera(x: float = 0.0, *, width: int = 64, height: int = 48) -> Camera:
@@ -125,6 +126,7 @@ def test_a_finished_fit_is_pruned_and_looks_the_same(capture: Capture, refine: b
     assert 0 < gone < 0.5 * len(whole.gaussians)
     assert f"{gone} of {len(whole.gaussians)} Gaussians are left out" in pruned.notes[-1]
     before, after = (
-        evaluate_photographs(one.gaussians, capture.test_views).psnr for one in (whole, pruned)
+        evaluate_photographs(GaussianField(one.gaussians), capture.test_views).psnr
+        for one in (whole, pruned)
     )
     assert after > before - 0.02

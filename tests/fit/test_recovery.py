@@ -16,6 +16,7 @@ from splatseg.core import Camera, Capture, Gaussians, PointCloud, View
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, Strategy, fit
 from splatseg.io.images import save_png
+from splatseg.lift import GaussianField
 from splatseg.render import render
 
 COUNT = 216
@@ -105,7 +106,9 @@ def test_a_known_scene_is_recovered(strategy: Strategy, tmp_path, rng) -> None:
 
     result = fit(capture, options=options, backend="cpu")
 
-    psnr = evaluate_photographs(result.gaussians, capture.train_views, backend="cpu").psnr
+    psnr = evaluate_photographs(
+        GaussianField(result.gaussians, backend="cpu"), capture.train_views
+    ).psnr
     after = errors(truth, result.gaussians.means)
     assert psnr >= 35
     assert np.median(after) <= 0.1 * np.median(start)

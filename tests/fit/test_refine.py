@@ -9,6 +9,7 @@ from splatseg.core import Gaussians
 from splatseg.errors import InputError, RangeError, SplatsegError
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.fit import FitOptions, Refinement, refine
+from splatseg.lift import GaussianField
 from splatseg.render.cpu import set_threads, threads
 
 from .conftest import tiny_scene
@@ -32,7 +33,9 @@ def worse(scene):
 
 
 def mean_psnr(gaussians, views) -> float:
-    return sum(psnr(*render_and_photograph(gaussians, view)) for view in views) / len(views)
+    return sum(
+        psnr(*render_and_photograph(GaussianField(gaussians), view)) for view in views
+    ) / len(views)
 
 
 def same(one, other) -> bool:

@@ -12,6 +12,7 @@ from splatseg.core import Capture, Scene
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitResult, fit
 from splatseg.io.scene import save_scene
+from splatseg.lift import GaussianField
 from splatseg.tasks._fit_report import score_and_report
 
 OPTIONS = FitOptions(minutes=None, steps=120, max_gaussians=70, seed=3, background="black")
@@ -54,7 +55,9 @@ def test_a_finished_fit(fitted) -> None:
     found, where = score_and_report(
         root, capture, result, options=OPTIONS, backend="cpu", scoring=True
     )
-    scores = evaluate_photographs(result.gaussians, capture.test_views, backend="cpu")
+    scores = evaluate_photographs(
+        GaussianField(result.gaussians, backend="cpu"), capture.test_views
+    )
     assert found is not None
     assert (found.psnr, found.ssim) == (scores.psnr, scores.ssim)
     assert where == root / "reports" / "fit.html"

@@ -23,13 +23,16 @@ from splatseg.fit import (
 )
 from splatseg.fit._poses import exponential
 from splatseg.io.images import save_png
+from splatseg.lift import GaussianField
 from splatseg.render import render
 
 BLACK = FitOptions(background="black")
 
 
 def mean_psnr(gaussians, views, masks="off") -> float:
-    found = [psnr(*render_and_photograph(gaussians, view, masks=masks)) for view in views]
+    found = [
+        psnr(*render_and_photograph(GaussianField(gaussians), view, masks=masks)) for view in views
+    ]
     return sum(found) / len(found)
 
 

@@ -13,6 +13,7 @@ from splatseg.fit import FitOptions, fit
 from splatseg.fit._photographs import Photographs
 from splatseg.fit._start import depth_range_of_cameras, random_points, with_start_points
 from splatseg.io.images import save_png
+from splatseg.lift import GaussianField
 
 from .conftest import ring_camera, tiny_scene
 
@@ -125,7 +126,7 @@ def test_a_fit_starts_without_points(capture: Capture) -> None:
     )
     bare = replace(capture, points=None)
     result = fit(bare, options=options)
-    assert evaluate_photographs(result.gaussians, capture.test_views).psnr > 22
+    assert evaluate_photographs(GaussianField(result.gaussians), capture.test_views).psnr > 22
     again = fit(bare, options=replace(options, steps=2)).gaussians
     forced = fit(capture, options=replace(options, steps=2, start="random")).gaussians
     assert torch.equal(again.means, forced.means)

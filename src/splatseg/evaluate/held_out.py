@@ -1,7 +1,8 @@
-"""A scene held against truth: its layers drawn in views and scored there.
+"""A field held against truth: its layers rendered in views and scored there.
 
-Predictions are drawn in the pixels of the truth, so nothing that is scored was resized. A layer
-that learned from a view it is scored on is said to, in the report's `learned_from`.
+A field is any `splatseg.core.Renderable`, such as a `splatseg.lift.GaussianField`. Predictions are
+rendered in the pixels of the truth, so nothing that is scored was resized. A layer that learned
+from a view it is scored on is said to, in the report's `learned_from`.
 """
 
 import math
@@ -12,15 +13,14 @@ import torch
 
 from splatseg.core import (
     UNLABELLED,
-    Gaussians,
     LabelMap,
-    Labels,
     LabelSource,
-    Selection,
+    Renderable,
+    RenderableLayer,
     View,
     camera_of_map,
 )
-from splatseg.errors import InputError
+from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.boundary import (
     BoundaryCounts,
     BoundaryScore,
@@ -35,8 +35,6 @@ from splatseg.evaluate.metrics import (
     per_image_miou,
     semantic_score,
 )
-from splatseg.lift import label_map
-from splatseg.render import RenderOptions
 
 Progress = Callable[[int, int], None]
 
@@ -79,24 +77,20 @@ class BinaryReport(ViewsReport):
 
 
 def evaluate_semantic(
-    gaussians: Gaussians,
+    field: Renderable,
     views: Sequence[View],
-    labels: Labels,
+    layer: str,
     truth: LabelSource,
     *,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
     progress: Progress | None = None,
 ) -> SemanticReport:
     """Score the classes of a layer in the views that have a truth.
 
     Args:
-        gaussians: The Gaussians of the scene.
+        field: What is scored.
         views: Where to look; those without a truth are left out.
-        labels: The layer.
+        layer: Name of the layer of the field.
         truth: Label maps by view name; -1 is void.
-        options: Switches of the blending model.
-        backend: Name of the rendering backend.
         progress: Called with the views done and their number.
 
     Raises:
@@ -106,9 +100,7 @@ def evaluate_semantic(
     scored = with_truth(views, truth)
     confusions: list[Confusion] = []
     outlines = BoundaryCounts.none()
-    for drawn, true in drawn_and_true(
-        gaussians, scored, labels, truth, options=options, backend=backend, progress=progress
-    ):
+    for drawn, true in drawn_and_true(field, scored, layer, truth, progress=progress):
         confusions.append(Confusion.of(drawn.ids, true.ids))
         outlines = outlines + BoundaryCounts.of(drawn.ids, true.ids)
     return SemanticReport(
@@ -116,32 +108,28 @@ def evaluate_semantic(
         per_image_miou=per_image_miou(confusions),
         boundary=boundary_score(outlines),
         views=tuple(view.name for view in scored),
-        learned_from=learned_from(labels, scored),
+        learned_from=learned_from(field.layer(layer), scored),
     )
 
 
 def evaluate_binary(
-    gaussians: Gaussians,
+    field: Renderable,
     views: Sequence[View],
-    layer: Labels | Selection,
+    layer: str,
     truth: LabelSource,
     *,
     id: int | None = None,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
     progress: Progress | None = None,
 ) -> BinaryReport:
     """Score a selection, or one id of a layer, as a mask in the views that have a truth.
 
     Args:
-        gaussians: The Gaussians of the scene.
+        field: What is scored.
         views: Where to look; those without a truth are left out.
-        layer: A selection, or labels.
+        layer: Name of the layer of the field, a selection or labels.
         truth: Label maps by view name.
         id: The id to score, of the truth and of a layer of labels; None takes every labelled
             pixel.
-        options: Switches of the blending model.
-        backend: Name of the rendering backend.
         progress: Called with the views done and their number.
 
     Raises:
@@ -149,14 +137,12 @@ def evaluate_binary(
         ShapeError: If a truth does not have its photograph's proportions.
     """
     scored = with_truth(views, truth)
-    labels = layer if isinstance(layer, Labels) else labels_of(layer)
-    wanted = id if isinstance(layer, Labels) else None
+    summary = field.layer(layer)
+    wanted = id if summary.kind == "labels" else None
     outlines: list[tuple[int, int]] = []
 
     def pairs() -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        for drawn, true in drawn_and_true(
-            gaussians, scored, labels, truth, options=options, backend=backend, progress=progress
-        ):
+        for drawn, true in drawn_and_true(field, scored, layer, truth, progress=progress):
             masks = _mask(drawn, wanted), _mask(true, id)
             outlines.append(boundary_overlap(*masks))
             yield masks
@@ -168,53 +154,49 @@ def evaluate_binary(
         boundary_mean=math.fsum(b / e if e else 1.0 for b, e in outlines) / len(outlines),
         boundary_pooled=both / max(either, 1),
         views=tuple(view.name for view in scored),
-        learned_from=learned_from(layer, scored),
+        learned_from=learned_from(summary, scored),
     )
 
 
-def labels_of(selection: Selection) -> Labels:
-    """A selection as labels, 1 inside and none outside, to be drawn as a mask."""
-    ids = torch.where(selection.mask, 1, UNLABELLED)
-    return Labels(ids=ids, confidence=selection.mask.float(), info=selection.info)
-
-
 def drawn_and_true(
-    gaussians: Gaussians,
+    field: Renderable,
     views: Sequence[View],
-    labels: Labels,
+    layer: str,
     truth: LabelSource,
     *,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
     progress: Progress | None = None,
 ) -> Iterator[tuple[LabelMap, LabelMap]]:
-    """A layer drawn in each view, and the truth there, one view at a time.
+    """A layer rendered in each view, and the truth there, one view at a time.
 
     Arguments are those of `evaluate_semantic`; all views must have a truth.
     """
     for done, view in enumerate(views, start=1):
         true = truth.label_map(view.name)
-        yield drawn_like(gaussians, view, labels, true, options=options, backend=backend), true
+        (drawn,) = drawn_like(field, view, (layer,), true)
+        yield drawn, true
         if progress is not None:
             progress(done, len(views))
 
 
 def drawn_like(
-    gaussians: Gaussians,
-    view: View,
-    labels: Labels,
-    truth: LabelMap,
-    *,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
-) -> LabelMap:
-    """A layer drawn in a view, in the pixels of its truth.
+    field: Renderable, view: View, layers: Sequence[str], truth: LabelMap
+) -> tuple[LabelMap, ...]:
+    """Layers rendered in a view, in the pixels of its truth.
 
     Raises:
-        ShapeError: If the truth does not have the photograph's proportions.
+        ShapeError: If the truth does not have the photograph's proportions, or what the field
+            gives has not the truth's pixels.
     """
     camera = camera_of_map(view, truth.height, truth.width)
-    return label_map(gaussians, camera, labels, options=options, backend=backend)
+    with field.view(camera) as looked_at:
+        drawn = tuple(looked_at.label_map(layer) for layer in layers)
+    for layer, label_map in zip(layers, drawn, strict=True):
+        if label_map.ids.shape != truth.ids.shape:
+            raise ShapeError(
+                f"view {view.name}: expected a label map of {layer!r} of {truth.width}x"
+                f"{truth.height} pixels, got {label_map.width}x{label_map.height}."
+            )
+    return drawn
 
 
 def _mask(ids: LabelMap, id: int | None) -> torch.Tensor:
@@ -234,7 +216,7 @@ def with_truth(views: Sequence[View], truth: LabelSource) -> list[View]:
     return scored
 
 
-def learned_from(layer: Labels | Selection, views: Sequence[View]) -> tuple[str, ...]:
+def learned_from(layer: RenderableLayer, views: Sequence[View]) -> tuple[str, ...]:
     """Names of those views that a layer says it was made from."""
     known = set(layer.info.views or ())
     return tuple(view.name for view in views if view.name in known)

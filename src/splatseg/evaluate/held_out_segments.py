@@ -15,10 +15,10 @@ from splatseg._check import check_shape
 from splatseg.core import (
     UNLABELLED,
     ClassTable,
-    Gaussians,
     LabelMap,
-    Labels,
     LabelSource,
+    Renderable,
+    RenderableLayer,
     View,
     map_ids,
 )
@@ -41,8 +41,6 @@ from splatseg.evaluate.panoptic import (
     panoptic_score,
     segment_keys,
 )
-from splatseg.evaluate.solid import MIN_OPACITY, NEIGHBOURS, PointRule, labels_of_points
-from splatseg.render import RenderOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,24 +82,20 @@ class PointReport:
 
 
 def evaluate_instances(
-    gaussians: Gaussians,
+    field: Renderable,
     views: Sequence[View],
-    labels: Labels,
+    layer: str,
     truth: LabelSource,
     *,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
     progress: Progress | None = None,
 ) -> InstanceReport:
     """Match the instances of a layer to the true ones over the whole scene, and score them.
 
     Args:
-        gaussians: The Gaussians of the scene.
+        field: What is scored.
         views: Where to look; those without a truth are left out.
-        labels: The layer; its ids need not be the truth's.
+        layer: Name of the layer; its ids need not be the truth's.
         truth: Instance maps by view name; -1 is void.
-        options: Switches of the blending model.
-        backend: Name of the rendering backend.
         progress: Called with the views done and their number.
 
     Raises:
@@ -110,29 +104,25 @@ def evaluate_instances(
     """
     scored = with_truth(views, truth)
     total = Overlaps.none()
-    for drawn, true in drawn_and_true(
-        gaussians, scored, labels, truth, options=options, backend=backend, progress=progress
-    ):
+    for drawn, true in drawn_and_true(field, scored, layer, truth, progress=progress):
         total = total + Overlaps.of(drawn.ids, true.ids)
     return InstanceReport(
         score=instance_score(total),
         views=tuple(view.name for view in scored),
-        learned_from=learned_from(labels, scored),
+        learned_from=learned_from(field.layer(layer), scored),
     )
 
 
 def evaluate_panoptic(
-    gaussians: Gaussians,
+    field: Renderable,
     views: Sequence[View],
     *,
-    classes: Labels | None,
-    instances: Labels,
+    classes: str | None,
+    instances: str,
     true_classes: LabelSource,
     true_instances: LabelSource,
     table: ClassTable,
     scores: Mapping[int, float] | None = None,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
     progress: Progress | None = None,
 ) -> PanopticReport:
     """Score a layer of classes and a layer of instances together.
@@ -140,17 +130,15 @@ def evaluate_panoptic(
     Views are gone through by name, so that AP50 without scores is that of other scorers.
 
     Args:
-        gaussians: The Gaussians of the scene.
+        field: What is scored.
         views: Where to look; those without a truth are left out.
-        classes: The layer of classes, in the ids of the truth. None takes the class that the
-            layer of instances says each of them has (`classes_of_instances`), pixel by pixel.
-        instances: The layer of instances; its ids need not be the truth's.
+        classes: Name of the layer of classes, in the ids of the truth. None takes the class that
+            the layer of instances says each of them has (`classes_of_instances`), pixel by pixel.
+        instances: Name of the layer of instances; its ids need not be the truth's.
         true_classes: Class maps by view name; -1 is void.
         true_instances: Instance maps by view name, of the same views.
         table: Which classes are things. A class that it does not know is stuff.
         scores: How sure each instance is, by its id, for AP50; 1 where there is none.
-        options: Switches of the blending model.
-        backend: Name of the rendering backend.
         progress: Called with the views done and their number.
 
     Raises:
@@ -160,16 +148,18 @@ def evaluate_panoptic(
     """
     things = frozenset(row.id for row in table.rows if row.isthing)
     scored = sorted(with_truth(views, true_classes), key=lambda view: view.name)
-    class_of = None if classes is not None else classes_of_instances(instances)
+    class_of = None if classes is not None else classes_of_instances(field.layer(instances))
+    layers = [layer for layer in (instances, classes) if layer is not None]
     _check_instances(scored, true_instances)
     total, detections, confusion = Overlaps.none(), Detections(), Confusion.none()
     for done, view in enumerate(scored, start=1):
         true, true_ids = _true_maps(view, true_classes, true_instances)
-        found = drawn_like(gaussians, view, instances, true, options=options, backend=backend).ids
-        if classes is not None:
-            drawn = drawn_like(gaussians, view, classes, true, options=options, backend=backend).ids
+        maps = drawn_like(field, view, layers, true)
+        found = maps[0].ids
+        if class_of is None:
+            drawn = maps[1].ids
         else:
-            drawn = map_ids(found, class_of or {}, default=UNLABELLED)
+            drawn = map_ids(found, class_of, default=UNLABELLED)
         one = Overlaps.of(
             segment_keys(drawn, found, things=things),
             segment_keys(true.ids, true_ids.ids, things=things),
@@ -179,8 +169,7 @@ def evaluate_panoptic(
         confusion = confusion + Confusion.of(drawn, true.ids)
         if progress is not None:
             progress(done, len(scored))
-    layers = [layer for layer in (classes, instances) if layer is not None]
-    both = {name for layer in layers for name in learned_from(layer, scored)}
+    both = {name for layer in layers for name in learned_from(field.layer(layer), scored)}
     return PanopticReport(
         score=panoptic_score(total, things=things),
         precision=average_precision(detections),
@@ -213,7 +202,7 @@ def _true_maps(
     return classes, instances
 
 
-def classes_of_instances(instances: Labels) -> dict[int, int]:
+def classes_of_instances(instances: RenderableLayer) -> dict[int, int]:
     """Class by instance id, -1 none, as the layer's info tells it.
 
     Raises:
@@ -231,41 +220,28 @@ def classes_of_instances(instances: Labels) -> dict[int, int]:
 
 
 def evaluate_points(
-    gaussians: Gaussians,
-    labels: Labels,
+    field: Renderable,
+    layer: str,
     *,
     points: Float[Tensor, "p 3"],
     truth: Int[Tensor, "p"],
     matched: bool = False,
-    rule: PointRule = "weighted",
-    neighbours: int = NEIGHBOURS,
-    min_opacity: float = MIN_OPACITY,
 ) -> PointReport:
     """Score the labels that a layer gives to labelled points of the scene.
 
     Args:
-        gaussians: The Gaussians of the scene.
-        labels: The layer; its ids, whether hard or soft.
-        points: Places in the world, scene units.
+        field: What is scored; it knows how points take labels.
+        layer: Name of the layer.
+        points: Positions in the world, scene units.
         truth: Their true ids, -1 void.
         matched: Ids of the layer are instances that mean something else than the truth's.
-        rule: How points take labels, see `labels_of_points`; so are the next two.
-        neighbours: Gaussians that vote at a point.
-        min_opacity: Fainter Gaussians are not there.
 
     Raises:
-        ShapeError: If there is not one true id a point, or one label a Gaussian.
+        ShapeError: If there is not one true id a point.
         InputError: If all points are void.
     """
     check_shape("truth", truth, (len(points),))
-    ids = labels_of_points(
-        gaussians,
-        labels.ids,
-        points,
-        rule=rule,
-        neighbours=neighbours,
-        min_opacity=min_opacity,
-    )
+    ids = field.labels_at(points, layer).ids
     return PointReport(
         semantic=None if matched else semantic_score(Confusion.of(ids, truth)),
         instances=instance_score(Overlaps.of(ids, truth)) if matched else None,

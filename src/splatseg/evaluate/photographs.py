@@ -10,12 +10,11 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from splatseg.core import Gaussians, View
+from splatseg.core import Renderable, View
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import Progress
 from splatseg.evaluate.metrics import SSIM_WINDOW, psnr, ssim
 from splatseg.io.images import load_alpha, load_image, load_mask
-from splatseg.render import RenderOptions, render
 
 MaskUse = Literal["off", "ignore", "alpha"]
 """What the masks of views mean, as in a fit."""
@@ -60,20 +59,18 @@ class PhotographReport:
 
 
 def evaluate_photographs(
-    gaussians: Gaussians,
+    field: Renderable,
     views: Sequence[View],
     *,
     masks: MaskUse = "off",
     lpips: Callable[[torch.Tensor, torch.Tensor], float] | None = None,
     seconds: float = math.inf,
-    options: RenderOptions | None = None,
-    backend: str = "auto",
     progress: Progress | None = None,
 ) -> PhotographReport:
     """Score the pictures against the photographs, as 8-bit files of both would score.
 
     Args:
-        gaussians: The Gaussians of the scene.
+        field: What is rendered.
         views: Views with photographs.
         masks: What masks mean. ``ignore``: only pixels that a view's mask keeps are scored, for a
             fit that ignored the others knows nothing of them; a view of which nothing is kept is
@@ -83,8 +80,6 @@ def evaluate_photographs(
         lpips: A network with weights (`splatseg.evaluate.lpips.load_lpips`); None leaves that
             score out.
         seconds: After so long no further view is begun; at least one is scored.
-        options: Switches of the blending model.
-        backend: Name of the rendering backend.
         progress: Called with the views done and their number.
 
     Raises:
@@ -96,9 +91,7 @@ def evaluate_photographs(
     scores: list[ViewScore] = []
     begin = time.monotonic()
     for done, view in enumerate(views, start=1):
-        score = _view_score(
-            gaussians, view, masks=masks, lpips=lpips, options=options, backend=backend
-        )
+        score = _view_score(field, view, masks=masks, lpips=lpips)
         if score is not None:
             scores.append(score)
         if progress is not None:
@@ -119,18 +112,14 @@ def evaluate_photographs(
 
 
 def _view_score(
-    gaussians: Gaussians,
+    field: Renderable,
     view: View,
     *,
     masks: MaskUse,
     lpips: Callable[[torch.Tensor, torch.Tensor], float] | None,
-    options: RenderOptions | None,
-    backend: str,
 ) -> ViewScore | None:
     """The scores of a view; None where its mask keeps nothing that could be scored."""
-    rendered, photograph = render_and_photograph(
-        gaussians, view, masks=masks, options=options, backend=backend
-    )
+    rendered, photograph = render_and_photograph(field, view, masks=masks)
     mask = load_mask(view) if masks == "ignore" else None
     keep = None if mask is None else mask > 0
     if keep is not None:
@@ -148,24 +137,24 @@ def _view_score(
 
 
 def render_and_photograph(
-    gaussians: Gaussians,
+    field: Renderable,
     view: View,
     *,
     masks: MaskUse = "off",
-    options: RenderOptions | None = None,
-    backend: str = "auto",
 ) -> tuple[UInt8[Tensor, "height width 3"], UInt8[Tensor, "height width 3"]]:
-    """What the Gaussians show in a view, and what the camera saw, both as 8-bit files hold them.
+    """What a field shows in a view, and what the camera saw, both as 8-bit files hold them.
 
     Arguments and errors are those of `evaluate_photographs`.
     """
     photograph = load_image(view)
-    with torch.no_grad():
-        drawn = render(gaussians, view.camera, options=options, backend=backend)
-    image = drawn.image.cpu().double()
+    with field.view(view.camera) as looked_at:
+        shown = looked_at.signals()
+    if shown.colour is None:
+        raise InputError("field: expected colours of a view, got none.")
+    image = shown.colour.double()
     opaque = load_alpha(view) if masks == "alpha" else None
     if opaque is not None:
-        image = image + (1 - drawn.alpha.cpu().double())[..., None]
+        image = image + (1 - shown.alpha.double())[..., None]
         photograph = _over_white(photograph, opaque, view)
     return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8), photograph
 

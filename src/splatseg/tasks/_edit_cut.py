@@ -15,7 +15,7 @@ from splatseg.edit import CutBy, Document, Where
 from splatseg.errors import InputError
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import find_evidence, open_evidence
-from splatseg.lift import CutOptions
+from splatseg.lift import CutOptions, GaussianField
 from splatseg.methods import keeps_ids
 from splatseg.render import BackendName, render
 from splatseg.tasks._observer import Observer
@@ -111,7 +111,8 @@ def measured_change(
     if all(view.image is not None and view.image.is_file() for view in spaced):
         for name, gaussians in zip(("photographs_before", "photographs_after"), pairs, strict=True):
             scores = [
-                psnr(*render_and_photograph(gaussians, view, backend=backend)) for view in spaced
+                psnr(*render_and_photograph(GaussianField(gaussians, backend=backend), view))
+                for view in spaced
             ]
             found[name] = math.fsum(scores) / len(scores)
     return {name: round(value, 3) for name, value in found.items()} | {"views": len(spaced)}

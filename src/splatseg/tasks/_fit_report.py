@@ -12,6 +12,7 @@ from splatseg.fit import FitOptions, FitResult
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import GAUSSIANS_FILE, POSES_FOLDER
+from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.fit_report import FitReportData, fit_record, fit_report
 from splatseg.report.html import report_html
@@ -43,7 +44,10 @@ def score_and_report(
     scores = None
     if views and scoring:
         scores = evaluate_photographs(
-            result.gaussians, views, masks=options.masks, seconds=_SCORING, backend=backend
+            GaussianField(result.gaussians, backend=backend),
+            views,
+            masks=options.masks,
+            seconds=_SCORING,
         )
     data = FitReportData(
         capture=replace(capture, views=result.views or capture.views),
@@ -86,7 +90,7 @@ def _pairs(
     for rank, label in ranks.items():
         score = ordered[rank]
         picture, photograph = render_and_photograph(
-            result.gaussians, names[score.name], masks=masks, backend=backend
+            GaussianField(result.gaussians, backend=backend), names[score.name], masks=masks
         )
         rows.append(
             (

@@ -31,6 +31,7 @@ from splatseg.io.evidence import Evidence, copy_evidence, find_evidence, open_ev
 from splatseg.lift import (
     ConfusionOptions,
     EvidenceSegments,
+    GaussianField,
     MatchedMaps,
     Sharpened,
     SharpenOptions,
@@ -293,7 +294,7 @@ def _psnr(
         return None
     masks = mask_use(scene)
     scores = [
-        psnr(*render_and_photograph(gaussians, view, masks=masks, backend=backend))
+        psnr(*render_and_photograph(GaussianField(gaussians, backend=backend), view, masks=masks))
         for view in views
     ]
     return sum(scores) / len(scores)
