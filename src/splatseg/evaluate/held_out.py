@@ -13,10 +13,12 @@ import torch
 
 from splatseg.core import (
     UNLABELLED,
+    Camera,
     LabelMap,
     LabelSource,
     Renderable,
     RenderableLayer,
+    RenderableView,
     View,
     camera_of_map,
 )
@@ -189,14 +191,22 @@ def drawn_like(
     """
     camera = camera_of_map(view, truth.height, truth.width)
     with field.view(camera) as looked_at:
-        drawn = tuple(looked_at.label_map(layer) for layer in layers)
-    for layer, label_map in zip(layers, drawn, strict=True):
-        if label_map.ids.shape != truth.ids.shape:
-            raise ShapeError(
-                f"view {view.name}: expected a label map of {layer!r} of {truth.width}x"
-                f"{truth.height} pixels, got {label_map.width}x{label_map.height}."
-            )
-    return drawn
+        return tuple(label_map_in(looked_at, layer, camera) for layer in layers)
+
+
+def label_map_in(looked_at: RenderableView, layer: str, camera: Camera) -> LabelMap:
+    """The label map of a view that a field opened for a camera.
+
+    Raises:
+        ShapeError: If it has not the camera's pixels: fields come from other packages too.
+    """
+    found = looked_at.label_map(layer)
+    if tuple(found.ids.shape) != (camera.height, camera.width):
+        raise ShapeError(
+            f"field: expected a label map of {layer!r} of {camera.width}x{camera.height} pixels, "
+            f"those of the camera, got {found.width}x{found.height}."
+        )
+    return found
 
 
 def _mask(ids: LabelMap, id: int | None) -> torch.Tensor:

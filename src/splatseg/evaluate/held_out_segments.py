@@ -156,10 +156,7 @@ def evaluate_panoptic(
         true, true_ids = _true_maps(view, true_classes, true_instances)
         maps = drawn_like(field, view, layers, true)
         found = maps[0].ids
-        if class_of is None:
-            drawn = maps[1].ids
-        else:
-            drawn = map_ids(found, class_of, default=UNLABELLED)
+        drawn = maps[1].ids if class_of is None else map_ids(found, class_of, default=UNLABELLED)
         one = Overlaps.of(
             segment_keys(drawn, found, things=things),
             segment_keys(true.ids, true_ids.ids, things=things),

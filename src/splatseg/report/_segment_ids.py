@@ -1,21 +1,21 @@
 """What the ids of a layer mean, and whether others mean the same by them."""
 
-from splatseg.core import ClassInfo, ClassTable, Labels, LabelSource
+from splatseg.core import ClassInfo, ClassTable, LabelSource, RenderableLayer
 from splatseg.io.evidence import Evidence
 from splatseg.report.legend import colour_of
 
 
-def ids_agree(labels: Labels, source: LabelSource, *, otherwise: bool) -> bool:
+def ids_agree(layer: RenderableLayer, source: LabelSource, *, otherwise: bool) -> bool:
     """Whether ids of a layer mean what a source of maps means by them.
 
     They do where every name that the layer has is the source's name of the same id. Where one
     of them has no names, `otherwise` says.
     """
-    named = labels.info.names
+    named = layer.info.names
     table = source.classes if isinstance(source, Evidence) else None
     if table is None or not table.rows or not named:
         return otherwise
-    present = set(labels.present.tolist())
+    present = set(layer.ids)
     theirs = {row.id: row.name for row in table.rows}
     return all(theirs.get(id) == name for id, name in named.items() if id in present)
 
@@ -26,19 +26,19 @@ def ids_are_classes(evidence: LabelSource | None) -> bool:
 
 
 def class_table(
-    labels: Labels, classes: ClassTable | None, *, unnamed_are_classes: bool
+    layer: RenderableLayer, classes: ClassTable | None, *, unnamed_are_classes: bool
 ) -> ClassTable:
     """Names and colours of the ids in use.
 
     Args:
-        labels: The layer. Its own names come first.
+        layer: The layer. Its own names come first.
         classes: Of the scene. Their colours are taken where id and name agree.
         unnamed_are_classes: A layer without names has the ids of these classes.
     """
-    named = labels.info.names
+    named = layer.info.names
     theirs = {row.id: row for row in classes.rows} if classes is not None else {}
     rows: list[ClassInfo] = []
-    for id in labels.present.tolist():
+    for id in layer.ids:
         row = theirs.get(id)
         name = named.get(id, f"id {id}")
         if not named and unnamed_are_classes and row is not None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, ClassTable, Labels
+from splatseg.core import UNLABELLED, ClassTable, Labels, RenderableLayer
 from splatseg.evaluate.metrics import SemanticScore
 from splatseg.evaluate.overlaps import InstanceScore
 from splatseg.report._common import count_text
@@ -18,8 +18,10 @@ from splatseg.report._segment_tables import (
     confidence_bars,
     conflict_tables,
     coverage_bars,
+    difference_tables,
     fact_rows,
     id_table,
+    seen_id_table,
     support_table,
 )
 from splatseg.report.html import Block, Commands, Figure, Legend, Report, Table
@@ -34,7 +36,12 @@ class SegmentationReportData:
     layer: str
     """Its name."""
 
-    labels: Labels
+    summary: RenderableLayer
+    """What the field says of it."""
+
+    labels: Labels | None
+    """Of Gaussians; None where the layer is not of Gaussians."""
+
     classes: ClassTable
     """Names and colours of the ids in use."""
 
@@ -97,21 +104,28 @@ def segmentation_page(data: SegmentationReportData, *, longest: int) -> Report:
         )
         blocks.append(_legend(data))
     blocks += data.tree
-    blocks += [support_table(labels), confidence_bars(labels)]
+    if labels is not None:
+        blocks += [support_table(labels), confidence_bars(labels)]
     if data.seen_of:
         blocks.append(coverage_bars(data.seen, views=data.seen_of))
-    blocks += conflict_tables(labels, data.compared, data.classes)
-    blocks += association_tables(labels.info)
+    if labels is not None:
+        blocks += conflict_tables(labels, data.classes)
+    blocks += difference_tables(data.compared)
+    blocks += association_tables(data.summary.info)
     scores = data.score.per_class if isinstance(data.score, SemanticScore) else {}
-    blocks.append(id_table(labels, data.classes, scores=scores, scored=data.scored))
+    blocks.append(
+        seen_id_table(data.panels, data.classes, scores=scores, scored=data.scored)
+        if labels is None
+        else id_table(labels, data.classes, scores=scores, scored=data.scored)
+    )
     blocks += _cost(data)
     if data.command:
         blocks.append(Commands(title="The same from the shell", lines=(data.command,)))
-    method = labels.info.method or "unknown"
+    method = data.summary.info.method or "unknown"
+    carriers = "" if labels is None else f" on {count_text(len(labels))} Gaussians"
     return Report(
         title=f"Segmentation {data.layer}",
-        summary=f"{len(data.classes.rows)} labels on {count_text(len(labels))} Gaussians, by "
-        f"{method} from {data.views} views. "
+        summary=f"{len(data.classes.rows)} labels{carriers}, by {method} from {data.views} views. "
         + (f"Scores are of {data.scored}." if data.scored else "There is no truth to score."),
         figures=_figures(data),
         blocks=tuple(blocks),
@@ -134,22 +148,10 @@ def _legend(data: SegmentationReportData) -> Legend:
 
 
 def _figures(data: SegmentationReportData) -> tuple[Figure, ...]:
-    labels, score = data.labels, data.score
-    labelled = labels.ids != UNLABELLED
-    share = float(labelled.double().mean()) if len(labels) else 0.0
-    figures = [
-        Figure(
-            label="Gaussians with a label",
-            value=f"{share:.1%}",
-            note=f"{count_text(int(labelled.sum()))} of {count_text(len(labels))}",
-        ),
-        Figure(label="Labels", value=str(len(data.classes.rows)), note="ids in use"),
-    ]
-    if bool(labelled.any()):
-        mean = float(labels.confidence[labelled].double().mean())
-        figures.append(
-            Figure(label="Confidence", value=f"{mean:.3f}", note="mean of those with a label")
-        )
+    score = data.score
+    figures = [] if data.labels is None else _label_figures(data.labels)
+    count = Figure(label="Labels", value=str(len(data.classes.rows)), note="ids in use")
+    figures.insert(min(1, len(figures)), count)
     if data.compared:
         pixels = sum(s.agreement.pixels for s in data.compared if s.agreement is not None)
         differ = sum(
@@ -179,6 +181,25 @@ def _figures(data: SegmentationReportData) -> tuple[Figure, ...]:
     return tuple(figures)
 
 
+def _label_figures(labels: Labels) -> list[Figure]:
+    """How many Gaussians have a label, and how sure it is."""
+    labelled = labels.ids != UNLABELLED
+    share = float(labelled.double().mean()) if len(labels) else 0.0
+    figures = [
+        Figure(
+            label="Gaussians with a label",
+            value=f"{share:.1%}",
+            note=f"{count_text(int(labelled.sum()))} of {count_text(len(labels))}",
+        )
+    ]
+    if bool(labelled.any()):
+        mean = float(labels.confidence[labelled].double().mean())
+        figures.append(
+            Figure(label="Confidence", value=f"{mean:.3f}", note="mean of those with a label")
+        )
+    return figures
+
+
 def _cost(data: SegmentationReportData) -> list[Table]:
     rows: list[tuple[str, str]] = [
         (step, f"{seconds:.1f} s") for step, seconds in data.timings.items()
@@ -188,7 +209,7 @@ def _cost(data: SegmentationReportData) -> list[Table]:
     if data.peak_bytes is not None:
         rows.append(("largest memory", f"{data.peak_bytes / 2**30:.2f} GiB resident"))
     tables = [Table(title="What it cost", columns=("what", "value"), rows=tuple(rows))]
-    options = fact_rows(data.labels.info.options)
+    options = fact_rows(data.summary.info.options)
     if options:
         tables.append(
             Table(title="Options of the method", columns=("option", "value"), rows=tuple(options))

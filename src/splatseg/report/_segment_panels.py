@@ -11,19 +11,18 @@ from splatseg.core import (
     UNLABELLED,
     ClassTable,
     LabelMap,
-    Labels,
     LabelSource,
-    Scene,
+    Renderable,
+    RenderableView,
     View,
     camera_of_map,
     map_ids,
 )
 from splatseg.evaluate.agreement import Agreement, agreement
+from splatseg.evaluate.held_out import label_map_in
 from splatseg.evaluate.overlaps import Overlaps, instance_score
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import image_camera, load_image, reduced_size
-from splatseg.lift import label_map
-from splatseg.render import prepare
 from splatseg.report.images import (
     Gallery,
     GalleryImage,
@@ -53,7 +52,7 @@ class ViewPanel:
     """The layer."""
 
     confidence: Float[Tensor, "height width"]
-    """Mean confidence of the Gaussians that a pixel shows, -1 where there are none."""
+    """How sure the labels of what a pixel shows are, -1 where there is nothing."""
 
     evidence: Int[Tensor, "height width"] | None
     truth: Int[Tensor, "height width"] | None
@@ -62,17 +61,16 @@ class ViewPanel:
 
 
 def view_panel(
-    scene: Scene,
-    labels: Labels,
+    field: Renderable,
+    layer: str,
     view: View,
     *,
     held_out: bool,
     evidence: LabelSource | None,
     truth: LabelSource | None,
     same_ids: bool,
-    backend: str,
 ) -> ViewPanel:
-    """Draw a view in the pixels of its truth, else of its photograph reduced.
+    """Render a view in the pixels of its truth, else of its photograph reduced.
 
     Raises:
         ShapeError: If the truth does not have the photograph's proportions.
@@ -83,17 +81,13 @@ def view_panel(
         true = truth.label_map(view.name).ids
     camera = image_camera(view, _LONGEST) if true is None else camera_of_map(view, *true.shape)
     size = (camera.height, camera.width)
-    shown = label_map(scene.gaussians, camera, labels, backend=backend).ids
-    sure = labels.confidence.to(scene.gaussians.means)[:, None]
-    with torch.no_grad(), prepare(scene.gaussians, camera, backend=backend) as prepared:
-        drawn = prepared.render(sure)
-        colours = prepared.render() if view.image is None else None
-    alpha = drawn.alpha.float().cpu()
-    mean = drawn.image[..., 0].float().cpu() / alpha.clamp_min(1e-6)
-    if colours is None:
-        image = _resized(load_image(view, longest=max(size)), size)
-    else:
-        image = (colours.image.float().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    with field.view(camera) as looked_at:
+        shown = label_map_in(looked_at, layer, camera).ids
+        confidence = looked_at.confidence(layer)
+        if view.image is None:
+            image = rendered_image(looked_at, size)
+        else:
+            image = _resized(load_image(view, longest=max(size)), size)
     seen = _evidence_ids(evidence, view.name)
     seen = None if seen is None else _nearest(seen, size)
     return ViewPanel(
@@ -101,11 +95,21 @@ def view_panel(
         held_out=held_out,
         image=image,
         drawn=shown,
-        confidence=torch.where(alpha > 0.02, mean.clamp(0, 1), -1.0),
+        confidence=confidence,
         evidence=seen,
         truth=true,
         agreement=None if seen is None else agreement(shown, seen, same_ids=same_ids),
     )
+
+
+def rendered_image(
+    looked_at: RenderableView, size: tuple[int, int]
+) -> UInt8[Tensor, "height width 3"]:
+    """What a view shows, in 8 bits; black where the field has no colours."""
+    colours = looked_at.signals().colour
+    if colours is None:
+        return torch.zeros(*size, 3, dtype=torch.uint8)
+    return (colours.float().cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
 
 
 def rename_truth(panels: Sequence[ViewPanel]) -> dict[int, int]:

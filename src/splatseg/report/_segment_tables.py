@@ -86,10 +86,8 @@ def coverage_bars(seen: Int[Tensor, "n"], *, views: int) -> Bars:
     )
 
 
-def conflict_tables(
-    labels: Labels, panels: Sequence[ViewPanel], classes: ClassTable
-) -> list[Block]:
-    """Where evidence disagrees with itself, Gaussian by Gaussian and view by view."""
+def conflict_tables(labels: Labels, classes: ClassTable) -> list[Block]:
+    """Where evidence disagrees with itself, Gaussian by Gaussian."""
     blocks: list[Block] = []
     if labels.candidates is not None and labels.candidates.shape[1] > 1 and len(labels):
         close = [(ratio, contested(labels, ratio=ratio)) for ratio in _CLOSE]
@@ -133,20 +131,25 @@ def conflict_tables(
                 "whom.",
             )
         )
-    compared = [(s.name, s.agreement) for s in panels if s.agreement is not None]
-    if compared:
-        compared.sort(key=lambda row: (-row[1].differ, row[0]))
-        blocks.append(
-            Table(
-                title="Evidence that differs from the layer",
-                columns=("view", "pixels compared", "differ"),
-                rows=tuple((name, one.pixels, f"{one.differ:.1%}") for name, one in compared),
-                note="Pixels where both have a label, the most contested view first. Evidence "
-                "with ids of its own: pixels that are not of the id that most of their segment "
-                "has.",
-            )
-        )
     return blocks
+
+
+def difference_tables(panels: Sequence[ViewPanel]) -> list[Table]:
+    """Where evidence disagrees with the layer, view by view."""
+    compared = [(s.name, s.agreement) for s in panels if s.agreement is not None]
+    if not compared:
+        return []
+    compared.sort(key=lambda row: (-row[1].differ, row[0]))
+    return [
+        Table(
+            title="Evidence that differs from the layer",
+            columns=("view", "pixels compared", "differ"),
+            rows=tuple((name, one.pixels, f"{one.differ:.1%}") for name, one in compared),
+            note="Pixels where both have a label, the most contested view first. Evidence "
+            "with ids of its own: pixels that are not of the id that most of their segment "
+            "has.",
+        )
+    ]
 
 
 def association_tables(info: LayerInfo) -> list[Block]:
@@ -193,13 +196,40 @@ def id_table(
         if scores:
             values.append(scores.get(row.id))
         rows.append(tuple(values))
+    columns = ("id", "name", "Gaussians", "confidence", *also)
+    return _largest_first(columns, rows, scored if scores else "")
+
+
+def seen_id_table(
+    panels: Sequence[ViewPanel], classes: ClassTable, *, scores: Mapping[int, float], scored: str
+) -> Table:
+    """One row an id: how many pixels of the views shown, how sure, how good where it is known."""
+    ids = torch.cat([torch.zeros(0), *(panel.drawn.reshape(-1) for panel in panels)]).long()
+    sure = torch.cat([torch.zeros(0), *(panel.confidence.reshape(-1) for panel in panels)]).double()
+    rows: list[tuple[Cell, ...]] = []
+    for row in classes.rows:
+        mask = ids == row.id
+        known = sure[mask & (sure >= 0)]
+        values: list[Cell] = [row.id, row.name, int(mask.sum())]
+        values.append(float(known.mean()) if len(known) else None)
+        if scores:
+            values.append(scores.get(row.id))
+        rows.append(tuple(values))
+    columns = ("id", "name", "pixels of the views shown", "confidence")
+    return _largest_first(columns, rows, scored if scores else "")
+
+
+def _largest_first(columns: Sequence[str], rows: list[tuple[Cell, ...]], scored: str) -> Table:
+    """Rows of ids by their third column; `scored` says of what the last one is the IoU."""
     rows.sort(key=lambda row: (-cast(int, row[2]), cast(int, row[0])))
     more = len(rows) - _ROWS
     notes = [f"The {_ROWS} largest; {more} more are left out."] if more > 0 else []
-    if scores:
+    if scored:
         notes.append(f"IoU is of {scored}; a dash where the truth has none of it.")
-    columns = ("id", "name", "Gaussians", "confidence", *also, *(("IoU",) if scores else ()))
-    return Table(title="Labels", columns=columns, rows=tuple(rows[:_ROWS]), note=" ".join(notes))
+        columns = (*columns, "IoU")
+    return Table(
+        title="Labels", columns=tuple(columns), rows=tuple(rows[:_ROWS]), note=" ".join(notes)
+    )
 
 
 def fact_rows(values: object) -> list[tuple[Cell, ...]]:

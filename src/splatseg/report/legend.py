@@ -8,7 +8,7 @@ from jaxtyping import Int, UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape
-from splatseg.core import UNLABELLED, ClassTable, Labels
+from splatseg.core import UNLABELLED, ClassTable, RenderableLayer
 
 Colour = tuple[int, int, int]
 
@@ -44,21 +44,21 @@ def colour_labels(
     return torch.tensor(colours, dtype=torch.uint8)[index]
 
 
-def names_of(labels: Labels, classes: ClassTable | None) -> dict[int, str]:
+def names_of(layer: RenderableLayer, classes: ClassTable | None) -> dict[int, str]:
     """Names of the ids in use: the layer's own, or the scene's where it has none."""
-    present = set(labels.present.tolist())
+    present = set(layer.ids)
     rows = () if classes is None else classes.rows
-    return dict(labels.info.names) or {row.id: row.name for row in rows if row.id in present}
+    return dict(layer.info.names) or {row.id: row.name for row in rows if row.id in present}
 
 
-def legend_of(labels: Labels, classes: ClassTable | None) -> dict[str, Any]:
+def legend_of(layer: RenderableLayer, classes: ClassTable | None) -> dict[str, Any]:
     """The content of legend.json for a layer."""
-    names = names_of(labels, classes)
-    sources = labels.info.source_ids or {}
+    names = names_of(layer, classes)
+    sources = layer.info.source_ids or {}
     rows: dict[str, dict[str, Any]] = {}
-    for id in labels.present.tolist():
+    for id in layer.ids:
         rows[str(id)] = {"name": names.get(id, ""), "colour": list(colour_of(id, classes))}
         if id in sources:
             rows[str(id)]["source_id"] = sources[id]
-    background = 0 if labels.background == UNLABELLED else labels.background
+    background = 0 if layer.background == UNLABELLED else layer.background
     return {"none": 0, "background": background, "ids": rows}

@@ -4,7 +4,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import InstanceTree, Labels, LabelSource, Scene, View
+from splatseg.core import (
+    InstanceTree,
+    Labels,
+    LabelSource,
+    Renderable,
+    RenderableLayer,
+    Scene,
+    View,
+)
 from splatseg.evaluate.agreement import SEEN_LONGEST, views_that_show
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
 from splatseg.evaluate.overlaps import InstanceScore, Overlaps, instance_score
@@ -14,7 +22,7 @@ from splatseg.report._common import environment, spread
 from splatseg.report._segment_ids import class_table, ids_agree, ids_are_classes
 from splatseg.report._segment_page import SegmentationReportData, segmentation_page
 from splatseg.report._segment_panels import ViewPanel, rename_truth, view_panel
-from splatseg.report.html import Block, report_html
+from splatseg.report.html import report_html
 from splatseg.report.tree_section import tree_section
 
 _LEARNED_ROWS = 4
@@ -33,7 +41,7 @@ def write_segmentation_report(
     path: Path,
     *,
     scene: Scene,
-    labels: Labels,
+    field: Renderable,
     layer: str,
     evidence: LabelSource | None,
     views: Sequence[View],
@@ -41,6 +49,7 @@ def write_segmentation_report(
     timings: Mapping[str, float],
     peak_bytes: int | None,
     command: str,
+    labels: Labels | None = None,
     tree: InstanceTree | None = None,
     backend: str = "auto",
 ) -> None:
@@ -52,8 +61,8 @@ def write_segmentation_report(
     Args:
         path: The file to write. Its folder must exist.
         scene: The scene.
-        labels: The layer.
-        layer: Its name.
+        field: What is rendered: its Gaussians, or another field of the same views.
+        layer: Name of the field's layer.
         evidence: What it was made from; None leaves that out.
         views: Those it was made from.
         truth: True maps of any views, of classes or of instances; ids that do not mean the same
@@ -61,26 +70,31 @@ def write_segmentation_report(
         timings: Seconds by step.
         peak_bytes: Largest resident memory of the process; None leaves it out.
         command: The words that started it; may be empty.
+        labels: The labels of Gaussians of the scene, of which tables tell; None leaves these out,
+            where the layer is not one of Gaussians.
         tree: The layer with all its levels, where it has levels; `labels` is a cut of it.
-        backend: Who renders.
+        backend: Who renders, said in the page and asked what views show of Gaussians.
 
     Raises:
         MissingFileError: If the folder, or a photograph that is shown, is not there.
         ShapeError: If a truth does not have its photograph's proportions.
     """
+    summary = field.layer(layer)
     same = evidence is not None and ids_agree(
-        labels, evidence, otherwise=keeps_ids(labels.info.method or "uplift")
+        summary, evidence, otherwise=keeps_ids(summary.info.method or "uplift")
     )
     panels, further = _panels(
-        scene, labels, views, evidence=evidence, truth=truth, same_ids=same, backend=backend
+        scene, field, layer, views, evidence=evidence, truth=truth, same_ids=same
     )
-    looked_at = spread(views, _COVERAGE_VIEWS)
+    looked_at = () if labels is None else spread(views, _COVERAGE_VIEWS)
     seen = views_that_show(scene.gaussians, looked_at, backend=backend)
-    truth_names, score, scored = _scores(labels, evidence, truth, panels)
+    truth_names, score, scored = _scores(summary, evidence, truth, panels)
+    shown = [scene.view(panel.name) for panel in panels[:_TREE_ROWS]]
     data = SegmentationReportData(
         layer=layer,
+        summary=summary,
         labels=labels,
-        classes=class_table(labels, scene.classes, unnamed_are_classes=ids_are_classes(evidence)),
+        classes=class_table(summary, scene.classes, unnamed_are_classes=ids_are_classes(evidence)),
         panels=panels,
         compared=tuple(s for s in (*panels, *further) if s.agreement is not None),
         seen=seen,
@@ -93,43 +107,35 @@ def write_segmentation_report(
         timings=timings,
         peak_bytes=peak_bytes,
         command=command,
-        tree=() if tree is None else _tree(scene, tree, panels, backend),
-        facts=_facts(labels, layer, backend),
+        tree=() if tree is None else tree_section(field, layer, tree, shown),
+        facts=_facts(summary, layer, backend),
     )
     page = _small_page(data)
     with atomic_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8", newline="\n")
 
 
-def _tree(
-    scene: Scene, tree: InstanceTree, panels: Sequence[ViewPanel], backend: str
-) -> tuple[Block, ...]:
-    views = [scene.view(panel.name) for panel in panels[:_TREE_ROWS]]
-    return tree_section(scene, tree, views, backend=backend)
-
-
 def _panels(
     scene: Scene,
-    labels: Labels,
+    field: Renderable,
+    layer: str,
     views: Sequence[View],
     *,
     evidence: LabelSource | None,
     truth: LabelSource | None,
     same_ids: bool,
-    backend: str,
 ) -> tuple[tuple[ViewPanel, ...], tuple[ViewPanel, ...]]:
     """Views to show, and further ones whose evidence is only compared with the layer."""
 
     def panel(view: View, *, held_out: bool, truth: LabelSource | None) -> ViewPanel:
         return view_panel(
-            scene,
-            labels,
+            field,
+            layer,
             view,
             held_out=held_out,
             evidence=evidence,
             truth=truth,
             same_ids=same_ids,
-            backend=backend,
         )
 
     learned = [view for view in views if _at_hand(view)]
@@ -162,7 +168,7 @@ def _small_page(data: SegmentationReportData) -> str:
 
 
 def _scores(
-    labels: Labels,
+    layer: RenderableLayer,
     evidence: LabelSource | None,
     truth: LabelSource | None,
     panels: Sequence[ViewPanel],
@@ -175,8 +181,8 @@ def _scores(
     scored = held_out or with_truth
     kind = "held-out view" if held_out else "view that the layer was made from"
     words = f"{len(scored)} {kind.replace('view', 'views', 1) if len(scored) > 1 else kind}"
-    otherwise = ids_are_classes(evidence) and keeps_ids(labels.info.method or "uplift")
-    if ids_agree(labels, truth, otherwise=otherwise):
+    otherwise = ids_are_classes(evidence) and keeps_ids(layer.info.method or "uplift")
+    if ids_agree(layer, truth, otherwise=otherwise):
         pooled = Confusion.none()
         for panel in scored:
             if panel.truth is not None:
@@ -189,8 +195,8 @@ def _scores(
     return rename_truth(with_truth), instance_score(total), words
 
 
-def _facts(labels: Labels, layer: str, backend: str) -> dict[str, Any]:
-    made = labels.info
+def _facts(summary: RenderableLayer, layer: str, backend: str) -> dict[str, Any]:
+    made = summary.info
     facts = {
         "layer": layer,
         "method": made.method,

@@ -2,13 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 
-import torch
-
-from splatseg.core import TREE_LEVELS, UNLABELLED, ClassInfo, ClassTable, InstanceTree, Scene, View
+from splatseg.core import (
+    TREE_LEVELS,
+    UNLABELLED,
+    ClassInfo,
+    ClassTable,
+    InstanceTree,
+    Renderable,
+    View,
+)
+from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.export import node_rows
 from splatseg.io.images import image_camera, load_image
-from splatseg.lift import label_map
-from splatseg.render import render
+from splatseg.report._segment_panels import rendered_image
 from splatseg.report.html import Block, Table
 from splatseg.report.images import Gallery, GalleryImage, overlay_labels
 from splatseg.report.legend import colour_of
@@ -18,21 +24,21 @@ _MAX_ROWS = 400
 
 
 def tree_section(
-    scene: Scene, tree: InstanceTree, views: Sequence[View], *, backend: str = "auto"
+    field: Renderable, layer: str, tree: InstanceTree, views: Sequence[View]
 ) -> tuple[Block, ...]:
     """The pictures of three cuts in some views, and a table of all nodes, children indented.
 
     Args:
-        scene: The scene.
+        field: What is rendered.
+        layer: Name of the layer of the field.
         tree: The layer.
-        views: Those that are drawn.
-        backend: Who renders.
+        views: Those that are rendered.
     """
-    pictures = (_cuts(scene, tree, views, backend),) if views else ()
+    pictures = (_cuts(field, layer, tree, views),) if views else ()
     return (*pictures, _nodes(tree))
 
 
-def _cuts(scene: Scene, tree: InstanceTree, views: Sequence[View], backend: str) -> Gallery:
+def _cuts(field: Renderable, layer: str, tree: InstanceTree, views: Sequence[View]) -> Gallery:
     table = ClassTable(
         rows=tuple(
             ClassInfo(id=node.id, name=node.name, colour=colour_of(node.id)) for node in tree.nodes
@@ -41,15 +47,15 @@ def _cuts(scene: Scene, tree: InstanceTree, views: Sequence[View], backend: str)
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for view in views:
         camera = image_camera(view, _LONGEST)
-        if view.image is None:
-            colours = render(scene.gaussians, camera, backend=backend).image.float().cpu()
-            photograph = (colours.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
-        else:
-            photograph = load_image(view, longest=_LONGEST)
-        drawn = [
-            label_map(scene.gaussians, camera, tree.cut(level), backend=backend).ids
-            for level in TREE_LEVELS
-        ]
+        size = (camera.height, camera.width)
+        with field.view(camera) as looked_at:
+            drawn = [
+                label_map_in(looked_at, f"{layer}@{level}", camera).ids for level in TREE_LEVELS
+            ]
+            if view.image is None:
+                photograph = rendered_image(looked_at, size)
+            else:
+                photograph = load_image(view, longest=_LONGEST)
         rows.append(
             (
                 view.name,

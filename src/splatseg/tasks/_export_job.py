@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Labels, Layer, LayerInfo, Scene, Selection
+from splatseg.core import UNLABELLED, Labels, Layer, LayerInfo, RenderableLayer, Scene, Selection
 from splatseg.errors import InputError
 from splatseg.io.export import (
     ObjectRow,
@@ -134,7 +134,7 @@ def with_only(job: ExportJob) -> ExportJob:
     if not job.options.only:
         return job
     objects = job.objects
-    names = names_of(objects, job.scene.classes)
+    names = names_of(RenderableLayer.of(objects), job.scene.classes)
     present = {id for id in torch.unique(objects.ids).tolist() if id != UNLABELLED}
     wanted: set[int] = set()
     for word in job.options.only:
@@ -198,7 +198,7 @@ def rows_of(job: ExportJob) -> tuple[ObjectRow, ...]:
     rows = objects_of(
         job.scene.gaussians,
         objects,
-        names=names_of(objects, job.scene.classes),
+        names=names_of(RenderableLayer.of(objects), job.scene.classes),
         classes=None if job.instances is None else job.classes,
         class_names=class_names(job.scene, job.classes),
         class_of=objects.info.class_of,
@@ -214,4 +214,4 @@ def class_names(scene: Scene, classes: Labels | None) -> dict[int, str]:
     """Names of class ids: the layer's own before the scene's."""
     rows = () if scene.classes is None else scene.classes.rows
     names = {row.id: row.name for row in rows}
-    return names | ({} if classes is None else names_of(classes, scene.classes))
+    return names | ({} if classes is None else names_of(RenderableLayer.of(classes), scene.classes))

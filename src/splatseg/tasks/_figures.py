@@ -76,14 +76,16 @@ def panoptic_figures(report: PanopticReport) -> dict[str, Any]:
     }
 
 
-def point_figures(report: PointReport, *, rule: str) -> dict[str, Any]:
-    """Labels of points, under names that begin with points_."""
+def point_figures(report: PointReport, *, rule: str | None) -> dict[str, Any]:
+    """Labels of points, under names that begin with points_; `rule` is that of Gaussians."""
     scores: dict[str, Any] = {}
     if report.semantic is not None:
         scores |= _classes(report.semantic)
     if report.instances is not None:
         scores |= _instances(report.instances)
-    scores |= {"unlabelled": report.unlabelled, "rule": rule}
+    scores["unlabelled"] = report.unlabelled
+    if rule is not None:
+        scores["rule"] = rule
     return {"points": report.points} | {f"points_{key}": value for key, value in scores.items()}
 
 

@@ -9,12 +9,11 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from splatseg.core import ClassTable, Labels, Scene, View
+from splatseg.core import ClassTable, Renderable, Scene, View
 from splatseg.errors import InputError, RangeError
 from splatseg.io.cameras import cameras_content
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.video import check_encoder, write_video
-from splatseg.render import BackendName, render
 from splatseg.render.paths import camera_path, is_forward_facing
 from splatseg.report.images import colour_depth
 from splatseg.report.legend import colour_labels
@@ -24,7 +23,7 @@ _NEAR, _FAR = 0.01, 0.99
 _FOCUS_PIXELS = 128
 
 
-def path_views(scene: Scene, *, frames: int, backend: BackendName) -> tuple[View, ...]:
+def path_views(scene: Scene, field: Renderable, *, frames: int) -> tuple[View, ...]:
     """Views ``path_0000`` and on, along `camera_path` of the training views, or of all.
 
     Raises:
@@ -35,7 +34,7 @@ def path_views(scene: Scene, *, frames: int, backend: BackendName) -> tuple[View
         raise InputError("split: a path goes along the scene's views, and this scene has none.")
     if frames < 1:
         raise RangeError(f"frames: expected at least 1, got {frames}.")
-    focus = _focus(scene, along, backend) if is_forward_facing(along) else None
+    focus = _focus(field, along) if is_forward_facing(along) else None
     cameras = camera_path(along, frames=frames, up=scene.up, focus=focus)
     digits = max(4, len(str(frames - 1)))
     return tuple(
@@ -44,7 +43,7 @@ def path_views(scene: Scene, *, frames: int, backend: BackendName) -> tuple[View
     )
 
 
-def _focus(scene: Scene, views: Sequence[View], backend: BackendName) -> float | None:
+def _focus(field: Renderable, views: Sequence[View]) -> float | None:
     """Median over some views of the median depth of what they show; None where that is nothing."""
     depths: list[float] = []
     for view in views[:: max(1, len(views) // 5)]:
@@ -53,11 +52,11 @@ def _focus(scene: Scene, views: Sequence[View], backend: BackendName) -> float |
         small = view.camera.resized(
             max(1, round(view.camera.width * share)), max(1, round(view.camera.height * share))
         )
-        nothing = scene.gaussians.means.new_zeros(len(scene.gaussians), 1)
-        with torch.no_grad():
-            drawn = render(scene.gaussians, small, nothing, backend=backend).median_depth
-        if bool((drawn > 0).any()):
-            depths.append(float(drawn[drawn > 0].median()))
+        with field.view(small) as looked_at:
+            shown = looked_at.signals(colour=False)
+        depth = shown.depth if shown.median_depth is None else shown.median_depth
+        if bool((depth > 0).any()):
+            depths.append(float(depth[depth > 0].median()))
     return sorted(depths)[len(depths) // 2] if depths else None
 
 
@@ -97,7 +96,7 @@ def write_film(
     views: Sequence[View],
     *,
     fps: float,
-    labels: Labels | None,
+    is_label_map: bool,
     classes: ClassTable | None,
 ) -> None:
     """A film beside a folder of pictures: ``rgb.mp4`` beside ``rgb/``.
@@ -106,7 +105,7 @@ def write_film(
     the colours of the legend.
     """
     files = [folder / f"{view.name}.png" for view in views]
-    if labels is not None:
+    if is_label_map:
         frames = (_coloured_ids(file, classes) for file in files)
     elif folder.name == "depth":
         frames = _depths(files, unit=float(read_json(folder / "depth.json")["unit"]))

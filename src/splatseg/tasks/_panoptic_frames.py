@@ -7,12 +7,13 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Labels, Scene, View
+from splatseg.core import UNLABELLED, Labels, Layer, RenderableLayer, RenderableView, Scene, View
 from splatseg.io.export import Category, Frame, SegmentInfo, classes_of
-from splatseg.lift import label_map
+from splatseg.lift import GaussianField
 from splatseg.report.legend import colour_of, names_of
 
 _OBJECT = "object"
+_OBJECTS, _STUFF = "objects", "stuff"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,7 +50,7 @@ def panoptic_segments(
         class_of: Class of an object, where its layer says.
         are_classes: The ids of `objects` are classes themselves: one category an id.
     """
-    own = names_of(objects, scene.classes)
+    own = names_of(RenderableLayer.of(objects), scene.classes)
     present = objects.present.tolist()
     if are_classes and not class_of:
         category_of = {id: id for id in present}
@@ -97,23 +98,23 @@ def panoptic_frames(
     progress: Callable[[int, int], None],
 ) -> Generator[Frame]:
     """Draw the segments of one view after another."""
+    layers: dict[str, Layer] = {_OBJECTS: segments.objects}
+    if segments.stuff is not None:
+        layers[_STUFF] = segments.stuff
+    field = GaussianField(scene.gaussians, layers, backend=backend)
     for done, view in enumerate(views, start=1):
         suffix = ".png" if view.image is None else view.image.suffix
-        yield Frame(
-            name=view.name,
-            image=f"{view.name}{suffix}",
-            ids=_draw(scene, view, segments, backend),
-        )
+        with field.view(view.camera) as looked_at:
+            ids = _draw(looked_at, segments)
+        yield Frame(name=view.name, image=f"{view.name}{suffix}", ids=ids)
         progress(done, len(views))
 
 
-def _draw(
-    scene: Scene, view: View, segments: PanopticSegments, backend: str
-) -> Int[Tensor, "height width"]:
-    ids = label_map(scene.gaussians, view.camera, segments.objects, backend=backend).ids
+def _draw(view: RenderableView, segments: PanopticSegments) -> Int[Tensor, "height width"]:
+    ids = view.label_map(_OBJECTS).ids
     if segments.stuff is None:
         return ids
-    stuff = label_map(scene.gaussians, view.camera, segments.stuff, backend=backend).ids
+    stuff = view.label_map(_STUFF).ids
     numbered = torch.where(stuff == UNLABELLED, UNLABELLED, stuff + segments.offset)
     return torch.where(ids == UNLABELLED, numbered, ids)
 

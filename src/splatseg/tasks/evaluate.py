@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from splatseg.core import ClassTable, Features, FlatLayer, Labels, Layer, Scene, View
+from splatseg.core import ClassTable, Layer, Renderable, Scene, View
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     SemanticReport,
@@ -17,10 +17,10 @@ from splatseg.evaluate import (
     evaluate_semantic,
 )
 from splatseg.evaluate.lpips import Lpips, load_lpips
-from splatseg.evaluate.solid import PointRule
 from splatseg.io.class_tables import class_table
 from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.io.json_files import read_json
+from splatseg.lift import GaussianField, PointLabelOptions, PointRule
 from splatseg.render import BackendName
 from splatseg.tasks._figures import (
     binary_figures,
@@ -32,7 +32,7 @@ from splatseg.tasks._figures import (
     semantic_figures,
 )
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.scene_parts import layer_of, mask_use, views_of_split
+from splatseg.tasks.scene_parts import gaussian_field, mask_use, views_of_split
 
 Metric = Literal["semantic", "instances", "panoptic", "binary"]
 
@@ -104,6 +104,7 @@ def evaluate(
     *,
     options: EvaluationOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
+    field: Renderable | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> dict[str, Any]:
@@ -118,7 +119,8 @@ def evaluate(
         scene: The scene.
         options: What to score.
         layers: Layers at hand; others are read from the scene's folder.
-        backend: Who renders.
+        field: What is scored, with layers of its own; None is the scene's Gaussians with theirs.
+        backend: Who renders the Gaussians.
         observer: Is told of the progress.
 
     Returns:
@@ -129,9 +131,17 @@ def evaluate(
     """
     options = options or EvaluationOptions()
     _check(options)
-    job = _Job(
-        scene=scene, options=options, layers=layers or {}, backend=backend, observer=observer
-    )
+    if field is None:
+        field = gaussian_field(
+            scene,
+            [name for name in (options.layer, options.instances) if name is not None],
+            layers,
+            backend=backend,
+            points=PointLabelOptions(rule=options.points_rule),
+        )
+    elif options.points_rule != EvaluationOptions().points_rule:
+        raise InputError("points_rule: goes with Gaussians; another field has a rule of its own.")
+    job = _Job(scene=scene, field=field, options=options, observer=observer)
     network = load_lpips(options.lpips) if options.lpips else None
     figures: dict[str, Any] = {"scene": str(scene.root), "split": options.split}
     if options.layer is not None:
@@ -144,16 +154,12 @@ def evaluate(
     return figures
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Job:
     scene: Scene
+    field: Renderable
     options: EvaluationOptions
-    layers: Mapping[str, Layer]
-    backend: BackendName
     observer: Observer
-
-    def layer(self, name: str) -> FlatLayer:
-        return layer_of(self.scene, name, self.layers)
 
 
 def _check(options: EvaluationOptions) -> None:
@@ -193,8 +199,7 @@ def _in_views(job: _Job, views: tuple[View, ...], network: Lpips | None) -> dict
         truth = open_evidence(
             job.options.truth, zero_is_class=job.options.zero_is_class, void=job.options.void
         )
-        layer = job.layer(job.options.layer)
-        figures |= _layer_figures(job, views, layer, truth)
+        figures |= _layer_figures(job, views, job.options.layer, truth)
     if network is not None or _wants_photographs(job, views):
         figures |= _photograph_figures(job, views, network)
     elif job.options.layer is None:
@@ -208,33 +213,28 @@ def _in_views(job: _Job, views: tuple[View, ...], network: Lpips | None) -> dict
 def _layer_figures(
     job: _Job,
     views: tuple[View, ...],
-    layer: FlatLayer,
+    layer: str,
     truth: Evidence,
 ) -> dict[str, Any]:
-    if isinstance(layer, Features):
-        raise InputError(f"layer: {job.options.layer} holds features, which have no score.")
+    kind = job.field.layer(layer).kind
+    if kind == "features":
+        raise InputError(
+            f"layer: {layer} holds features without a classifier, which have no score."
+        )
     if job.options.metric == "binary":
         with job.observer.stage("evaluate") as step:
             report = evaluate_binary(
-                job.scene.gaussians,
-                views,
-                layer,
-                truth,
-                id=job.options.id,
-                backend=job.backend,
-                progress=step,
+                job.field, views, layer, truth, id=job.options.id, progress=step
             )
         return binary_figures(report)
-    if not isinstance(layer, Labels):
+    if kind != "labels":
         raise InputError("metric: a selection has no classes, expected the metric binary.")
     if job.options.metric == "panoptic" and job.options.truth_instances is not None:
         true_instances = open_evidence(job.options.truth_instances)
         return _panoptic_figures(job, views, layer, truth=truth, true_instances=true_instances)
     method = evaluate_semantic if job.options.metric == "semantic" else evaluate_instances
     with job.observer.stage("evaluate") as step:
-        report = method(
-            job.scene.gaussians, views, layer, truth, backend=job.backend, progress=step
-        )
+        report = method(job.field, views, layer, truth, progress=step)
     if isinstance(report, SemanticReport):
         return semantic_figures(report)
     return instance_figures(report)
@@ -243,17 +243,17 @@ def _layer_figures(
 def _panoptic_figures(
     job: _Job,
     views: tuple[View, ...],
-    layer: Labels,
+    layer: str,
     *,
     truth: Evidence,
     true_instances: Evidence,
 ) -> dict[str, Any]:
-    other = None
-    if job.options.instances is not None:
-        other = _labels(job, job.options.instances, "instances")
+    other = job.options.instances
+    if other is not None:
+        _check_labels(job, other, "instances")
     with job.observer.stage("evaluate") as step:
         report = evaluate_panoptic(
-            job.scene.gaussians,
+            job.field,
             views,
             classes=None if other is None else layer,
             instances=layer if other is None else other,
@@ -261,7 +261,6 @@ def _panoptic_figures(
             true_instances=true_instances,
             table=_thing_table(job, truth),
             scores=None if job.options.scores is None else read_scores(job.options.scores),
-            backend=job.backend,
             progress=step,
         )
     return panoptic_figures(report)
@@ -288,24 +287,23 @@ def _thing_table(job: _Job, truth: Evidence) -> ClassTable:
 
 def _point_figures(job: _Job, path: Path) -> dict[str, Any]:
     """Scores of points, under names that begin with points_."""
-    labels = _labels(job, job.options.layer or "", "layer")
+    layer = job.options.layer or ""
+    _check_labels(job, layer, "layer")
     points, truth = read_points(path, _POINT_TRUTH[job.options.metric])
     report = evaluate_points(
-        job.scene.gaussians,
-        labels,
+        job.field,
+        layer,
         points=points,
         truth=truth,
         matched=job.options.metric == "instances",
-        rule=job.options.points_rule,
     )
-    return point_figures(report, rule=job.options.points_rule)
+    own = isinstance(job.field, GaussianField)
+    return point_figures(report, rule=job.options.points_rule if own else None)
 
 
-def _labels(job: _Job, name: str, option: str) -> Labels:
-    layer = job.layer(name)
-    if not isinstance(layer, Labels):
+def _check_labels(job: _Job, name: str, option: str) -> None:
+    if job.field.layer(name).kind != "labels":
         raise InputError(f"{option}: expected a layer of labels, {name} is none.")
-    return layer
 
 
 def _wants_photographs(job: _Job, views: tuple[View, ...]) -> bool:
@@ -318,11 +316,10 @@ def _photograph_figures(
 ) -> dict[str, Any]:
     with job.observer.stage("photographs") as step:
         report = evaluate_photographs(
-            job.scene.gaussians,
+            job.field,
             views,
             masks=mask_use(job.scene),
             lpips=network,
-            backend=job.backend,
             progress=step,
         )
     figures: dict[str, Any] = {

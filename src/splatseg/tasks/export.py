@@ -19,6 +19,7 @@ from splatseg.io.export import (
     write_points,
 )
 from splatseg.io.splats import SplatWarning
+from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.tasks._export_job import (
     ExportJob,
@@ -187,7 +188,8 @@ def _coco(job: ExportJob) -> Exported:
     options, scene = job.options, job.scene
     on_path = options.split == "path" and all(view.split != "path" for view in scene.views)
     if on_path:
-        views = path_views(scene, frames=options.frames, backend=job.backend)
+        field = GaussianField(scene.gaussians, backend=job.backend)
+        views = path_views(scene, field, frames=options.frames)
     else:
         views = views_of_split(scene, options.split)
     things = job.objects

@@ -4,7 +4,14 @@ from typing import Any, Literal
 
 import torch
 
-from splatseg.core import UNLABELLED, ClassTable, Labels, Selection, layer_info_to_json
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    Labels,
+    RenderableLayer,
+    Selection,
+    layer_info_to_json,
+)
 from splatseg.report.legend import colour_of, names_of
 
 _NONE = 0
@@ -34,7 +41,7 @@ def label_tables(
 
 
 def _rows(layer: Labels, classes: ClassTable | None) -> dict[str, Any]:
-    names = names_of(layer, classes)
+    names = names_of(RenderableLayer.of(layer), classes)
     ids, counts = torch.unique(layer.ids, return_counts=True)
     count_of = dict(zip(ids.tolist(), counts.tolist(), strict=True))
     return {

@@ -5,10 +5,11 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from splatseg.core import TREE_LEVELS, InstanceTree, Layer, Scene
+from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.io.export import write_node_table
+from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.segment_report import write_segmentation_report
 from splatseg.tasks._observer import SILENT, Observer
@@ -56,11 +57,18 @@ def export_layer(
 
     Objects as splat files, a table of them, all Gaussians with their labels as columns, and
     label maps of the held-out views (of all views where none is held out). Of a tree these are
-    its objects; with it come the table of all nodes, and label maps of its groups and parts.
+    its objects; with it come the table of all nodes, and label maps of its groups and parts. Of
+    features with a classifier, files have the labels of Gaussians (the hard readout), and label
+    maps are rendered ones.
+
+    Raises:
+        InputError: If the layer is of features without a classifier.
     """
+    field = GaussianField(scene.gaussians, {name: layer}, backend=backend)
+    of_files: Layer = field.labels(name) if isinstance(layer, Features) else layer
     folder = root / EXPORTS_FOLDER / name
     folder.mkdir(parents=True, exist_ok=True)
-    layers: Mapping[str, Layer] = {name: layer}
+    layers: Mapping[str, Layer] = {name: of_files}
     files = tuple(
         export(
             scene,
@@ -85,8 +93,7 @@ def export_layer(
         options=RenderingOptions(
             split="test" if scene.test_views else "all", what=_drawn(name, layer), coloured=True
         ),
-        layers=layers,
-        backend=backend,
+        field=field,
         observer=observer,
     )
     return files, maps
@@ -124,10 +131,12 @@ def report_layer(
     path.parent.mkdir(parents=True, exist_ok=True)
     # Linux counts in KiB, macOS in bytes.
     unit = 1 if sys.platform == "darwin" else 1024
+    field = GaussianField(scene.gaussians, {result.name: result.layer}, backend=backend)
     write_segmentation_report(
         path,
         scene=scene,
-        labels=result.labels,
+        field=field,
+        labels=field.labels(result.name),
         layer=result.name,
         evidence=None if result.evidence.kind == "masks" else result.evidence,
         views=result.views,

@@ -12,19 +12,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Labels, Layer, Scene, Selection, View, layer_address
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    Layer,
+    Renderable,
+    RenderableLayer,
+    RenderableView,
+    Scene,
+    View,
+    ViewSignals,
+)
 from splatseg.errors import InputError
-from splatseg.evaluate.held_out import labels_of
+from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.images import save_png
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import scene_layer_names
-from splatseg.lift import label_map
-from splatseg.render import BackendName, Rendered, render
+from splatseg.render import BackendName
 from splatseg.report.legend import colour_labels, legend_of
 from splatseg.tasks._film import check_film, path_views, write_film, write_path
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.scene_parts import layer_of, views_of_split
+from splatseg.tasks.scene_parts import gaussian_field, views_of_split
 
 _PICTURES = ("rgb", "depth", "alpha")
 _RECORD = "render.json"
@@ -69,11 +78,14 @@ class Rendering:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Layer:
-    """A layer to draw; a selection as the label 1."""
+    """A layer to draw."""
 
     name: str
-    labels: Labels
-    is_selection: bool
+    summary: RenderableLayer
+
+    @property
+    def is_selection(self) -> bool:
+        return self.summary.kind == "selection"
 
 
 def render_views(
@@ -82,6 +94,7 @@ def render_views(
     *,
     options: RenderingOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
+    field: Renderable | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> Rendering:
@@ -94,7 +107,9 @@ def render_views(
         output: Folder to write to.
         options: What to draw, of which views.
         layers: Layers at hand; others are read from the scene's folder.
-        backend: Who renders.
+        field: What is rendered, with layers of its own; None is the scene's Gaussians with
+            theirs.
+        backend: Who renders the Gaussians.
         observer: Is told of the progress.
 
     Raises:
@@ -102,12 +117,16 @@ def render_views(
     """
     options = options or RenderingOptions()
     on_path = options.split == "path" and all(view.split != "path" for view in scene.views)
+    wanted = _wanted(options.what)
+    names = [name for name in wanted if name not in _PICTURES]
+    _check_layers(scene, names, layers, field)
+    if field is None:
+        field = gaussian_field(scene, names, layers, backend=backend)
+    drawn = _layers(field, names)
     if on_path:
-        views = path_views(scene, frames=options.frames, backend=backend)
+        views = path_views(scene, field, frames=options.frames)
     else:
         views = views_of_split(scene, options.split)
-    wanted = _wanted(options.what)
-    drawn = _layers(scene, wanted, layers)
     folders = [*wanted]
     if options.coloured:
         folders += [f"{layer.name}_coloured" for layer in drawn if not layer.is_selection]
@@ -120,19 +139,19 @@ def render_views(
     record = _check_output(output, folders, files)
     output.mkdir(parents=True, exist_ok=True)
     try:
-        _render(scene, views, drawn, output, folders, backend=backend, observer=observer)
+        _render(scene, field, views, drawn, output, folders=folders, observer=observer)
         # Before the films, which take a while: what an interruption leaves can be replaced.
         entry = {"scene": str(scene.root), "split": options.split, "views": len(views)}
         write_json(output / _RECORD, record | dict.fromkeys([*folders, *files], entry))
         if on_path:
             write_path(output, views, pictures="rgb" in folders)
-        by_name = {layer.name: layer.labels for layer in drawn if not layer.is_selection}
+        label_maps = {layer.name for layer in drawn if not layer.is_selection}
         for name in films:
             write_film(
                 output / name,
                 views,
                 fps=options.fps,
-                labels=by_name.get(name),
+                is_label_map=name in label_maps,
                 classes=scene.classes,
             )
     finally:
@@ -144,12 +163,12 @@ def render_views(
 
 def _render(
     scene: Scene,
+    field: Renderable,
     views: Sequence[View],
     layers: Sequence[_Layer],
     output: Path,
-    folders: Sequence[str],
     *,
-    backend: BackendName,
+    folders: Sequence[str],
     observer: Observer,
 ) -> None:
     """Draw everything; each folder appears whole at the end or not at all."""
@@ -157,15 +176,16 @@ def _render(
         into = {name: stack.enter_context(atomic_folder(output / name)) for name in folders}
         with observer.stage("render") as step:
             for done, view in enumerate(views, start=1):
-                _draw_pictures(scene, view, into, backend)
-                for layer in layers:
-                    _draw_layer(scene, view, layer, into, backend)
+                with field.view(view.camera) as looked_at:
+                    _draw_pictures(looked_at, view, into)
+                    for layer in layers:
+                        _draw_layer(looked_at, view, layer, into, scene.classes)
                 step(done, len(views))
         if "depth" in into:
             _finish_depth(into["depth"], views, scene)
         for layer in layers:
             if not layer.is_selection:
-                legend = legend_of(layer.labels, scene.classes)
+                legend = legend_of(layer.summary, scene.classes)
                 write_json(into[layer.name] / "legend.json", legend)
 
 
@@ -175,26 +195,32 @@ def _wanted(what: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(what))
 
 
-def _layers(
-    scene: Scene, wanted: Sequence[str], at_hand: Mapping[str, Layer] | None
-) -> list[_Layer]:
-    layers: list[_Layer] = []
-    known = {*(at_hand or {}), *(() if scene.root is None else scene_layer_names(scene.root))}
-    for name in wanted:
-        if name in _PICTURES:
-            continue
-        if layer_address(name)[0] not in known:
+def _check_layers(
+    scene: Scene,
+    names: Sequence[str],
+    at_hand: Mapping[str, Layer] | None,
+    field: Renderable | None,
+) -> None:
+    """Refuse a name that no layer has."""
+    if field is not None:
+        known = {*field.layer_names}
+    else:
+        known = {*(at_hand or {}), *(() if scene.root is None else scene_layer_names(scene.root))}
+    for name in names:
+        if name.partition("@")[0] not in known:
             raise InputError(
                 f"what: expected {', '.join(_PICTURES)} or a layer of the scene "
                 f"({', '.join(sorted(known)) or 'it has none'}), got {name!r}."
             )
-        layer = layer_of(scene, name, at_hand)
-        if isinstance(layer, Labels):
-            layers.append(_Layer(name=name, labels=layer, is_selection=False))
-        elif isinstance(layer, Selection):
-            layers.append(_Layer(name=name, labels=labels_of(layer), is_selection=True))
-        else:
-            raise InputError(f"what: {name} holds features, which are no picture.")
+
+
+def _layers(field: Renderable, names: Sequence[str]) -> list[_Layer]:
+    layers = [_Layer(name=name, summary=field.layer(name)) for name in names]
+    for layer in layers:
+        if layer.summary.kind == "features":
+            raise InputError(
+                f"what: {layer.name} holds features without a classifier, which are no image."
+            )
     return layers
 
 
@@ -220,25 +246,23 @@ def _check_output(output: Path, folders: Sequence[str], files: Sequence[str]) ->
     return record
 
 
-def _draw_pictures(scene: Scene, view: View, into: Mapping[str, Path], backend: str) -> None:
+def _draw_pictures(looked_at: RenderableView, view: View, into: Mapping[str, Path]) -> None:
     if not any(name in into for name in _PICTURES):
         return
-    with torch.no_grad():
-        # Colour is drawn for nothing where only depth is asked for; a signal of one channel
-        # spares most of it.
-        signal = None if "rgb" in into else scene.gaussians.means.new_zeros(len(scene.gaussians), 1)
-        drawn = render(scene.gaussians, view.camera, signal, backend=backend)
+    shown = looked_at.signals(colour="rgb" in into)
     if "rgb" in into:
-        _save(drawn.image.clamp(0, 1), into["rgb"], view)
+        if shown.colour is None:
+            raise InputError("what: expected a field with colours for rgb, got one without.")
+        _save(shown.colour.clamp(0, 1), into["rgb"], view)
     if "alpha" in into:
-        _save(drawn.alpha.clamp(0, 1), into["alpha"], view)
+        _save(shown.alpha.clamp(0, 1), into["alpha"], view)
     if "depth" in into:
         path = _file(into["depth"] / ".float", view, ".npy")
-        np.save(path, _solid_depth(drawn).cpu().numpy().astype(np.float32), allow_pickle=False)
+        np.save(path, _solid_depth(shown).numpy().astype(np.float32), allow_pickle=False)
 
 
-def _solid_depth(drawn: Rendered) -> Tensor:
-    return torch.where(drawn.alpha >= _SOLID, drawn.depth, torch.zeros_like(drawn.depth))
+def _solid_depth(shown: ViewSignals) -> Tensor:
+    return torch.where(shown.alpha >= _SOLID, shown.depth, torch.zeros_like(shown.depth))
 
 
 def _finish_depth(folder: Path, views: Sequence[View], scene: Scene) -> None:
@@ -279,20 +303,20 @@ def depth_unit(deepest: float) -> float:
 
 
 def _draw_layer(
-    scene: Scene,
+    looked_at: RenderableView,
     view: View,
     layer: _Layer,
     into: Mapping[str, Path],
-    backend: str,
+    classes: ClassTable | None,
 ) -> None:
-    ids = label_map(scene.gaussians, view.camera, layer.labels, backend=backend).ids
+    ids = label_map_in(looked_at, layer.name, view.camera).ids
     if layer.is_selection:
         _save(ids != UNLABELLED, into[layer.name], view)
         return
     _save(torch.where(ids == UNLABELLED, 0, ids), into[layer.name], view)
     pictures = into.get(f"{layer.name}_coloured")
     if pictures is not None:
-        _save(colour_labels(ids, scene.classes), pictures, view)
+        _save(colour_labels(ids, classes), pictures, view)
 
 
 def _save(image: Tensor, folder: Path, view: View) -> None:

@@ -1,12 +1,14 @@
 """Parts of a scene by the names that people give them: views of a split, layers, evidence."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from splatseg.core import FlatLayer, Layer, LayerInfo, Scene, View, flat_layer, layer_address
 from splatseg.errors import InputError
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene_layer
+from splatseg.lift import GaussianField, PointLabelOptions
+from splatseg.render import BackendName
 
 
 def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
@@ -62,6 +64,35 @@ def whole_layer(scene: Scene, name: str, layers: Mapping[str, Layer] | None = No
     if scene.root is None:
         raise InputError(f"layer {name!r}: the scene has no folder to read it from.")
     return load_scene_layer(scene.root, name)
+
+
+def gaussian_field(
+    scene: Scene,
+    addresses: Iterable[str],
+    layers: Mapping[str, Layer] | None = None,
+    *,
+    backend: BackendName = "auto",
+    points: PointLabelOptions | None = None,
+) -> GaussianField:
+    """The Gaussians of a scene with some of its layers, each read once whatever is asked of it.
+
+    Args:
+        scene: The scene.
+        addresses: Of the layers: NAME, or NAME@part of one.
+        layers: Layers at hand; others are read from the scene's folder.
+        backend: Who renders.
+        points: How points take labels.
+
+    Raises:
+        InputError: If there is no such layer.
+    """
+    names = dict.fromkeys(address.partition("@")[0] for address in addresses)
+    return GaussianField(
+        scene.gaussians,
+        {name: whole_layer(scene, name, layers) for name in names},
+        backend=backend,
+        points=points,
+    )
 
 
 def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:
