@@ -15,8 +15,8 @@ from splatseg.core import (
     LayerInfo,
     Selection,
 )
-from splatseg.evaluate import labels_of_points
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
+from splatseg.lift import labels_of_points
 
 CPU = ("--backend", "cpu")
 CLASSES = [
@@ -148,7 +148,7 @@ def test_points_agree_with_the_scorer(labelled, both, rng, tmp_path) -> None:
     instance = np.where(xyz[:, 0] < 0, 21, 22).astype(np.uint16)
     np.savez(tmp_path / "points.npz", xyz=xyz, semantic=semantic, instance=instance)
     ids = load_scene_layer(labelled.scene, "classes").ids
-    given = labels_of_points(gaussians, ids, torch.from_numpy(xyz)).numpy()
+    given = labels_of_points(gaussians, ids, torch.from_numpy(xyz)).ids.numpy()
     np.savez(tmp_path / "pred.npz", semantic=given)
     ours, theirs = both(
         ("--layer", "classes", "--points", tmp_path / "points.npz"),

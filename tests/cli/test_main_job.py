@@ -192,8 +192,8 @@ def test_an_interrupted_render_leaves_nothing(small, splatseg, tmp_path, monkeyp
         calls.append(1)
         return original(*arguments, **options)
 
-    original = module.render
-    monkeypatch.setattr(module, "render", interrupted)
+    original = module._draw_pictures
+    monkeypatch.setattr(module, "_draw_pictures", interrupted)
     out = tmp_path / "out"
     status, _, err = splatseg(
         "render", small.scene, "--split", "all", "--what", "rgb,depth", "-o", out,

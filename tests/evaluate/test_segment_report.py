@@ -20,6 +20,7 @@ from splatseg.core import (
     Labels,
     LayerInfo,
     MaskSet,
+    RenderableLayer,
     Scene,
     View,
 )
@@ -32,6 +33,7 @@ from splatseg.io.evidence import (
     save_masks,
 )
 from splatseg.io.images import save_png
+from splatseg.lift import GaussianField
 from splatseg.report import _segment_ids, _segment_panels, _segment_tables, segment_report
 from splatseg.report.segment_report import write_segmentation_report
 
@@ -125,10 +127,12 @@ def write(tmp_path):
             "command": "splatseg segment SCENE --report",
         }
         given |= words
+        labels = layer_of(scene) if labels is None else labels
         write_segmentation_report(
             tmp_path / name,
             scene=scene,
-            labels=layer_of(scene) if labels is None else labels,
+            field=GaussianField(scene.gaussians, {"walls & sky": labels}, backend="cpu"),
+            labels=labels,
             layer="walls & sky",
             backend="cpu",
             **given,
@@ -310,24 +314,24 @@ def test_ids_agree_by_their_names(write) -> None:
     save_label_map(folder, "v0", LabelMap(ids=torch.ones(HEIGHT, WIDTH, dtype=torch.int32)))
     source = open_evidence(folder)
     named = layer_of(write.scene)
-    assert _segment_ids.ids_agree(named, source, otherwise=False)
+    assert _segment_ids.ids_agree(RenderableLayer.of(named), source, otherwise=False)
     other = layer_of(write.scene, info={"names": {2: "blue wall"}})
-    assert not _segment_ids.ids_agree(other, source, otherwise=True)
+    assert not _segment_ids.ids_agree(RenderableLayer.of(other), source, otherwise=True)
     # A name of an id that is not in use is no contradiction.
     unused = layer_of(write.scene, info={"names": {2: "red <wall>", 77: "pole"}})
-    assert _segment_ids.ids_agree(unused, source, otherwise=False)
+    assert _segment_ids.ids_agree(RenderableLayer.of(unused), source, otherwise=False)
     for otherwise in (True, False):
         bare = layer_of(write.scene, info={"names": {}})
-        assert _segment_ids.ids_agree(bare, source, otherwise=otherwise) == otherwise
-        assert _segment_ids.ids_agree(named, Maps({}), otherwise=otherwise) == otherwise
+        assert _segment_ids.ids_agree(RenderableLayer.of(bare), source, otherwise=otherwise) == otherwise
+        assert _segment_ids.ids_agree(RenderableLayer.of(named), Maps({}), otherwise=otherwise) == otherwise
 
 
 def test_names_and_colours(write) -> None:
     bare = layer_of(write.scene, info={"names": {}})
-    known = _segment_ids.class_table(bare, CLASSES, unnamed_are_classes=True)
+    known = _segment_ids.class_table(RenderableLayer.of(bare), CLASSES, unnamed_are_classes=True)
     assert known.rows[1].name == "red <wall>"
     assert known.rows[1].colour == (200, 0, 0)
-    tracks = _segment_ids.class_table(bare, CLASSES, unnamed_are_classes=False)
+    tracks = _segment_ids.class_table(RenderableLayer.of(bare), CLASSES, unnamed_are_classes=False)
     assert [row.name for row in tracks.rows] == ["id 1", "id 2", "id 3"]
     assert tracks.rows[1].colour != (200, 0, 0)
 

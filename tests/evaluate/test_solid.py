@@ -2,18 +2,16 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
 from splatseg.core import Gaussians
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.evaluate.metrics import Confusion, semantic_score
+from splatseg.evaluate.metrics import Confusion
 from splatseg.evaluate.solid import (
     gaussian_score,
     gaussian_weights,
     labels_from_points,
-    labels_of_points,
 )
 
 
@@ -64,61 +62,6 @@ def test_weighted_counts_add_to_plain_ones() -> None:
     assert total.counts.diagonal().tolist() == [0, 1.5, 0, 1.25]
 
 
-def test_points_equal_the_scorers(rng, score, tmp_path) -> None:
-    scene = gaussians_at(rng.normal(size=(60, 3)).tolist(), scales=0.3)
-    ids = torch.from_numpy(rng.integers(-1, 5, 60))
-    points = torch.from_numpy(rng.normal(size=(300, 3)))
-    given = labels_of_points(scene, torch.where(ids == 0, -1, ids), points)
-    truth = np.where(rng.random(300) < 0.7, given.numpy(), rng.integers(0, 5, 300))
-    truth = np.where(truth < 0, 0, truth)
-    np.savez(tmp_path / "p.npz", semantic=given.numpy())
-    np.savez(tmp_path / "t.npz", semantic=truth)
-    theirs = score("points", "--pred", tmp_path / "p.npz", "--truth", tmp_path / "t.npz")
-    memory = torch.from_numpy(np.where(truth == 0, -1, truth))
-    ours = semantic_score(Confusion.of(given, memory))
-    for key, value in (
-        ("mIoU", ours.miou), ("fwIoU", ours.fwiou), ("accuracy", ours.accuracy),
-        ("mAcc", ours.mean_accuracy),
-    ):  # fmt: skip
-        assert value == pytest.approx(theirs[key], abs=1e-12)
-
-
-def test_density_decides_where_the_centre_would_not() -> None:
-    """A long Gaussian covers the point; a small one, whose centre is nearer, does not."""
-    turn = torch.tensor([[1.0, 0, 0, 0], [math.sqrt(0.5), 0, 0, math.sqrt(0.5)]])
-    # The second is long along its x, which the quarter turn about z lays along the world's y.
-    scene = gaussians_at(
-        [[0.3, 0, 0], [0, 1, 0]], scales=[[0.05, 0.05, 0.05], [2, 0.1, 0.1]], rotations=turn
-    )
-    ids, point = torch.tensor([3, 8]), torch.tensor([[0.0, 0, 0]])
-    assert labels_of_points(scene, ids, point, rule="nearest").tolist() == [3]
-    assert labels_of_points(scene, ids, point).tolist() == [8]
-    assert labels_of_points(scene, ids, point, neighbours=1).tolist() == [3]
-
-
-def test_votes_add_up_and_ties_are_settled() -> None:
-    scene = gaussians_at([[0, 0, 0]] * 3, opacities=[0.5, 0.3, 0.3])
-    point = torch.zeros(1, 3)
-    assert labels_of_points(scene, torch.tensor([1, 2, 2]), point).tolist() == [2]
-    assert labels_of_points(scene, torch.tensor([1, -1, -1]), point).tolist() == [-1]
-    pair = scene[1:]
-    assert labels_of_points(pair, torch.tensor([9, 4]), point).tolist() == [4]
-    assert labels_of_points(pair, torch.tensor([-1, 4]), point).tolist() == [4]
-    # Nothing reaches a point this far: the nearest centre decides.
-    far = torch.tensor([[1e4, 0.0, 0.0]])
-    assert labels_of_points(gaussians_at([[0, 0, 0], [9, 0, 0]]), torch.tensor([1, 2]), far) == 2
-
-
-def test_faint_gaussians_are_not_there() -> None:
-    scene = gaussians_at([[0, 0, 0], [1, 0, 0]], opacities=[0.05, 0.9])
-    ids, point = torch.tensor([1, 2]), torch.zeros(1, 3)
-    for rule in ("nearest", "weighted"):
-        assert labels_of_points(scene, ids, point, rule=rule).tolist() == [2]
-    assert labels_of_points(scene, ids, point, rule="nearest", min_opacity=0).tolist() == [1]
-    with pytest.raises(InputError, match=r"opacity of 0\.95"):
-        labels_of_points(scene, ids, point, min_opacity=0.95)
-
-
 def test_truth_of_gaussians_from_points() -> None:
     scene = gaussians_at([[0, 0, 0], [1, 0, 0], [5, 0, 0]])
     points = torch.tensor([[0.1, 0, 0], [0.8, 0, 0]])
@@ -132,18 +75,3 @@ def test_truth_of_gaussians_from_points() -> None:
     ):  # fmt: skip
         with pytest.raises(error):
             labels_from_points(scene, bad, torch.arange(len(bad)), reach=reach)
-
-
-def test_bad_points_are_refused() -> None:
-    scene, ids = gaussians_at([[0, 0, 0]]), torch.tensor([1])
-    for words, error in (
-        ({"points": torch.full((1, 3), math.nan)}, RangeError),
-        ({"points": torch.zeros(1, 2)}, ShapeError),
-        ({"ids": torch.tensor([1, 2])}, ShapeError),
-        ({"neighbours": 0}, RangeError),
-        ({"min_opacity": 2}, RangeError),
-        ({"rule": "best"}, InputError),
-    ):
-        given = {"ids": ids, "points": torch.zeros(1, 3), **words}
-        with pytest.raises(error):
-            labels_of_points(scene, given.pop("ids"), given.pop("points"), **given)

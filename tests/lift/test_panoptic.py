@@ -11,6 +11,7 @@ from splatseg.core import (
     InstanceTree,
     Labels,
     LayerInfo,
+    RenderableLayer,
     TreeNode,
 )
 from splatseg.errors import InputError, ShapeError
@@ -61,7 +62,7 @@ def test_things_keep_their_ids_and_stuff_is_one_segment_a_class() -> None:
     assert found.ids.tolist() == [5, 5, 9, 9, 10, 6]
     assert found.info.class_of == {5: CUP, 6: CHAIR, 9: FLOOR, 10: WALL}
     assert found.info.names == {5: "cup 5", 6: "chair 6", 9: "floor", 10: "wall"}
-    assert classes_of_instances(found) == {5: CUP, 6: CHAIR, 9: FLOOR, 10: WALL}
+    assert classes_of_instances(RenderableLayer.of(found)) == {5: CUP, 6: CHAIR, 9: FLOOR, 10: WALL}
     assert found.info.edit("merge_panoptic") == {
         "things": 2,
         "stuff": 2,
