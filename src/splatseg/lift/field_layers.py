@@ -136,7 +136,7 @@ class _LabelLayer(FieldLayer):
 
     @override
     def label_map(self, view: ViewRenderer) -> LabelMap:
-        return view_label_map(view, self._labels)
+        return view_label_map(view.view, self._labels)
 
     @override
     def confidence(self, view: ViewRenderer, shown: LabelMap) -> tuple[Tensor, Tensor]:
