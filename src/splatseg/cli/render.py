@@ -18,8 +18,9 @@ class Command:
     """Draw views of a scene: DIR/<what>/<view>.png, in the photographs' own pixels.
 
     rgb and alpha have 8 bit. depth has 16 bit, z-depth with the unit in depth.json and 0 where
-    less than half of the light is stopped. A layer of labels becomes a 16-bit id map with 0 for
-    none and its meaning in legend.json; a selection becomes 0 and 255.
+    less than half of the light is stopped. A layer of labels, or of features with a classifier,
+    becomes a 16-bit id map with 0 for none and its meaning in legend.json; a selection becomes
+    0 and 255.
 
     --split path draws a smooth path near the captured cameras, and writes its cameras to
     DIR/transforms.json. --video makes a film of each folder, DIR/<what>.mp4.
@@ -41,7 +42,8 @@ class Command:
     split: SplitOrPath = "test"
 
     what: tuple[str, ...] = ("rgb",)
-    """What to draw: rgb, depth, alpha, and names of layers, by comma or by space."""
+    """What to draw: rgb, depth, alpha, and names of layers, by comma or by space. NAME@part is a
+    cut of a tree; NAME@hard reads features Gaussian by Gaussian and not view by view."""
 
     coloured: bool = False
     """Also write DIR/<layer>_coloured with images of label layers in the legend's colours."""
