@@ -57,7 +57,7 @@ def test_render_draws_the_layers_own_readout(trained, splatseg, tmp_path) -> Non
         }  # fmt: skip
     view = scene.views[0]
     layer = load_scene_layer(trained.scene, "identity")
-    hard = ClassifierHead.of(layer).labels(layer, metadata={})
+    hard = ClassifierHead.of(layer).labels(layer)
     expected = label_map(scene.gaussians, view.camera, hard, backend="cpu").ids
     written = ids_of(tmp_path / "out" / "identity@hard" / f"{view.name}.png")
     assert np.array_equal(written, expected.clamp_min(0).numpy())

@@ -322,8 +322,14 @@ def test_ids_agree_by_their_names(write) -> None:
     assert _segment_ids.ids_agree(RenderableLayer.of(unused), source, otherwise=False)
     for otherwise in (True, False):
         bare = layer_of(write.scene, info={"names": {}})
-        assert _segment_ids.ids_agree(RenderableLayer.of(bare), source, otherwise=otherwise) == otherwise
-        assert _segment_ids.ids_agree(RenderableLayer.of(named), Maps({}), otherwise=otherwise) == otherwise
+        assert (
+            _segment_ids.ids_agree(RenderableLayer.of(bare), source, otherwise=otherwise)
+            == otherwise
+        )
+        assert (
+            _segment_ids.ids_agree(RenderableLayer.of(named), Maps({}), otherwise=otherwise)
+            == otherwise
+        )
 
 
 def test_names_and_colours(write) -> None:

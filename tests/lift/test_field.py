@@ -1,5 +1,7 @@
 """Gaussians as a field: everything of a view is what it is on its own, from one projection."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,6 +11,7 @@ from splatseg.core import (
     Gaussians,
     InstanceTree,
     Labels,
+    LayerInfo,
     Renderable,
     Selection,
     TreeNode,
@@ -39,7 +42,7 @@ def layers_of(rng) -> dict:
     values = torch.from_numpy(rng.normal(size=(COUNT, 4))).float()
     weights = torch.from_numpy(rng.random(COUNT)).float() - 0.2
     confidence = torch.from_numpy(rng.random(COUNT)).float()
-    labels = Labels(ids=ids, confidence=confidence, background=9, metadata={"method": "vote"})
+    labels = Labels(ids=ids, confidence=confidence, background=9, info=LayerInfo(method="vote"))
     layers = {
         "labels": labels,
         "tree": InstanceTree(nodes=nodes, labels=Labels(ids=ids, confidence=confidence)),
@@ -47,8 +50,8 @@ def layers_of(rng) -> dict:
         "plain": Features(values=values),
     }
     for blend in ("features", "probabilities"):
-        metadata = {"head": head_of(blend).metadata(), "names": {"2": "two"}}
-        layers[blend] = Features(values=values, weights=weights.clamp_min(0), metadata=metadata)
+        info = LayerInfo(head=head_of(blend).to_json(), names={2: "two"})
+        layers[blend] = Features(values=values, weights=weights.clamp_min(0), info=info)
     return layers
 
 
@@ -74,7 +77,7 @@ def test_a_view_is_what_each_of_its_parts_is_alone(made, lens) -> None:
         head, layer = head_of(blend), layers[blend]
         expected[blend] = head.label_map(gaussians, camera, layer, backend=BACKEND)
         expected[f"{blend}@rendered"] = expected[blend]
-        hard = head.labels(layer, metadata={})
+        hard = head.labels(layer)
         expected[f"{blend}@hard"] = label_map(gaussians, camera, hard, backend=BACKEND)
     with field.view(camera) as view:
         shown = {name: view.label_map(name) for name in expected}
@@ -140,7 +143,7 @@ def test_what_there_is_to_know_of_layers(made) -> None:
     assert field.layer_names == tuple(layers)
     said = field.layer("labels")
     assert (said.kind, said.ids, said.background) == ("labels", (2, 4, 9), 9)
-    assert said.metadata["method"] == "vote"
+    assert said.info.method == "vote"
     assert field.layer("tree").ids == (2, 9)
     assert field.layer("tree@part").ids == (2, 4, 9)
     assert (field.layer("chosen").kind, field.layer("chosen").ids) == ("selection", (1,))
@@ -148,7 +151,7 @@ def test_what_there_is_to_know_of_layers(made) -> None:
     # Rendered features of nothing are zeros, to which the classifier says its largest bias.
     trained = field.layer("features")
     assert (trained.kind, trained.ids, trained.background) == ("labels", (2, 7, 12), 12)
-    assert trained.metadata["names"] == {"2": "two"}
+    assert trained.info.names == {2: "two"}
     assert field.layer("probabilities").background == -1
 
 
@@ -164,17 +167,15 @@ def test_nothing_is_labelled_as_the_layer_says(made) -> None:
 def test_the_hard_readout_heeds_the_recorded_min_share(made) -> None:
     gaussians, layers = made
     layer = layers["features"]
-    options = {"options": {"min_share": 0.7}}
-    strict = Features(
-        values=layer.values, weights=layer.weights, metadata={**layer.metadata, **options}
-    )
+    info = replace(layer.info, options={"min_share": 0.7})
+    strict = replace(layer, info=info)
     head = head_of("features")
     field = GaussianField(gaussians, {"a": layer, "b": strict})
-    assert torch.equal(field.labels("a").ids, head.labels(layer, metadata={}).ids)
-    expected = head.labels(layer, min_share=0.7, metadata={})
+    assert torch.equal(field.labels("a").ids, head.labels(layer).ids)
+    expected = head.labels(layer, min_share=0.7)
     assert torch.equal(field.labels("b").ids, expected.ids)
     assert int((expected.ids == -1).sum()) > int((field.labels("a").ids == -1).sum())
-    assert "head" not in field.labels("b").metadata
+    assert field.labels("b").info.head is None
 
 
 def test_points_take_labels_by_the_layers_own_readout(made) -> None:
@@ -191,7 +192,7 @@ def test_points_take_labels_by_the_layers_own_readout(made) -> None:
     assert at_centres.ids.tolist() == layers["labels"].ids.tolist()
     # At its centre, the nearest Gaussian's own features are classified.
     for blend in ("features", "probabilities"):
-        own = head_of(blend).labels(layers[blend], metadata={})
+        own = head_of(blend).labels(layers[blend])
         seen = layers[blend].weights > 0
         ids = hard.labels_at(gaussians.means, blend).ids
         assert ids[seen].tolist() == own.ids[seen].tolist()

@@ -133,12 +133,16 @@ def test_facts_of_the_instances_stay() -> None:
 
 def test_classes_come_from_all_that_a_record_tells() -> None:
     info = LayerInfo(class_of={1: CUP, 2: 0}, instances={2: SEEN, 5: SEEN})
-    assert classes_of_instances(labels([1], info=info)) == {1: CUP, 2: -1, 5: -1}
+    assert classes_of_instances(RenderableLayer.of(labels([1], info=info))) == {
+        1: CUP,
+        2: -1,
+        5: -1,
+    }
     nodes = (TreeNode(id=1, class_id=CUP), TreeNode(id=2, segments=3, views=2))
     tree = InstanceTree(nodes=nodes, labels=labels([1, 2]))
-    assert classes_of_instances(tree.cut()) == {1: CUP, 2: -1}
+    assert classes_of_instances(RenderableLayer.of(tree.cut())) == {1: CUP, 2: -1}
     with pytest.raises(InputError, match="expected a layer whose info tells the class"):
-        classes_of_instances(labels([1], info=LayerInfo(names={1: "cup"})))
+        classes_of_instances(RenderableLayer.of(labels([1], info=LayerInfo(names={1: "cup"}))))
 
 
 def test_bad_input_is_refused() -> None:

@@ -12,6 +12,7 @@ import torch
 from splatseg.core import (
     Camera,
     LabelMap,
+    LayerInfo,
     PointLabels,
     RenderableLayer,
     ViewSignals,
@@ -61,12 +62,12 @@ class BallOverFloor:
             raise InputError(f"layer: expected things, got {layer!r}.")
         return RenderableLayer(
             ids=(FLOOR, BALL),
-            metadata={
-                "method": "by hand",
-                "names": {str(FLOOR): "floor", str(BALL): "ball"},
-                "views": list(self.views),
-                "instances": [{"id": FLOOR, "class": 1}, {"id": BALL, "class": 2}],
-            },
+            info=LayerInfo(
+                method="by hand",
+                names={FLOOR: "floor", BALL: "ball"},
+                views=self.views,
+                class_of={FLOOR: 1, BALL: 2},
+            ),
         )
 
     def view(self, camera: Camera) -> "_View":

@@ -5,10 +5,10 @@ hit are others. Who renders, scores or reports asks a field through these protoc
 cameras, views and points, but no rows.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Literal, Protocol, Self
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,6 +16,7 @@ from torch import Tensor
 from splatseg._check import check_choice, check_shape
 from splatseg.core.camera import Camera
 from splatseg.core.evidence import UNLABELLED, LabelMap
+from splatseg.core.layer_info import LayerInfo
 from splatseg.core.layers import Labels, Selection
 from splatseg.errors import InputError
 
@@ -78,9 +79,8 @@ class RenderableLayer:
     background: int = UNLABELLED
     """Id of pixels that nothing covers; -1 is none."""
 
-    metadata: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """How it was made, in values that JSON holds, as of layers of Gaussians: views it learned
-    from, names of ids, method."""
+    info: LayerInfo = field(default_factory=LayerInfo)
+    """How it was made, as of layers of Gaussians: views it learned from, names of ids, method."""
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, _KINDS)
@@ -91,11 +91,11 @@ class RenderableLayer:
     def of(cls, layer: Labels | Selection) -> Self:
         """A layer of labels, or a selection."""
         if isinstance(layer, Selection):
-            return cls(kind="selection", ids=(1,), metadata=layer.metadata)
+            return cls(kind="selection", ids=(1,), info=layer.info)
         return cls(
             ids=tuple(layer.present.tolist()),
             background=layer.background,
-            metadata=layer.metadata,
+            info=layer.info,
         )
 
 

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, Literal, cast
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from splatseg.core import (
     LabelMap,
     Labels,
     Layer,
+    LayerInfo,
     PointLabels,
     RenderableLayer,
     Selection,
@@ -97,7 +98,7 @@ def field_layer(layers: Mapping[str, Layer], address: str) -> FieldLayer:
 def selection_labels(selection: Selection) -> Labels:
     """A selection as labels, 1 inside and none outside, to be rendered as a mask."""
     ids = torch.where(selection.mask, 1, UNLABELLED)
-    return Labels(ids=ids, confidence=selection.mask.float(), metadata=selection.metadata)
+    return Labels(ids=ids, confidence=selection.mask.float(), info=selection.info)
 
 
 def _of_features(name: str, layer: Features, readout: str) -> FieldLayer:
@@ -106,7 +107,7 @@ def _of_features(name: str, layer: Features, readout: str) -> FieldLayer:
             f"layer {name!r}: expected a readout of features after the @ "
             f"({', '.join(_READOUTS)}), got {readout!r}."
         )
-    if "head" not in layer.metadata:
+    if layer.info.head is None:
         return _PlainFeatures(name, layer)
     trained = _TrainedLayer(layer)
     return _LabelLayer(name, trained.labels) if readout == "hard" else trained
@@ -164,13 +165,12 @@ class _TrainedLayer(FieldLayer):
         return RenderableLayer(
             ids=tuple(sorted(set(self._head.ids.tolist()))),
             background=self._head.background,
-            metadata=self._features.metadata,
+            info=self._features.info,
         )
 
     @cached_property
     def _hard(self) -> Labels:
-        kept = {key: value for key, value in self._features.metadata.items() if key != "head"}
-        return self._head.labels(self._features, min_share=_min_share(kept), metadata=kept)
+        return self._head.labels(self._features, min_share=_min_share(self._features.info))
 
     @cached_property
     def _log_totals(self) -> Tensor:
@@ -212,7 +212,7 @@ class _PlainFeatures(FieldLayer):
     @property
     @override
     def summary(self) -> RenderableLayer:
-        return RenderableLayer(kind="features", metadata=self._features.metadata)
+        return RenderableLayer(kind="features", info=self._features.info)
 
     @property
     @override
@@ -244,9 +244,7 @@ class _PlainFeatures(FieldLayer):
         )
 
 
-def _min_share(metadata: Mapping[str, Any]) -> float:
+def _min_share(info: LayerInfo) -> float:
     """The least probability that the training's options ask of a hard label; 0 if they do not."""
-    options = metadata.get("options")
-    if not isinstance(options, Mapping):
-        return 0.0
-    return float(cast(Mapping[str, Any], options).get("min_share", 0.0))
+    recorded = info.options.get("min_share")
+    return float(recorded) if isinstance(recorded, int | float) else 0.0
