@@ -173,7 +173,7 @@ def test_points_and_photographs(scene, field, tmp_path) -> None:
     assert figures["points_accuracy"] == pytest.approx(3 / 4)
     assert figures["points_unlabelled"] == pytest.approx(1 / 4)
     assert "points_rule" not in figures
-    with pytest.raises(InputError, match="points_rule: goes with Gaussians"):
+    with pytest.raises(InputError, match="points_rule: goes with the scene's Gaussians"):
         evaluate(scene, options=replace(given, points_rule="nearest"), field=field)
     photographed = []
     for view in scene.views:

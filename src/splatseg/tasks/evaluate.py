@@ -20,7 +20,7 @@ from splatseg.evaluate.lpips import Lpips, load_lpips
 from splatseg.io.class_tables import class_table
 from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.io.json_files import read_json
-from splatseg.lift import GaussianField, PointLabelOptions, PointRule
+from splatseg.lift import PointLabelOptions, PointRule
 from splatseg.render import BackendName
 from splatseg.tasks._figures import (
     binary_figures,
@@ -131,6 +131,7 @@ def evaluate(
     """
     options = options or EvaluationOptions()
     _check(options)
+    rule = None if field is not None else options.points_rule
     if field is None:
         field = gaussian_field(
             scene,
@@ -140,8 +141,10 @@ def evaluate(
             points=PointLabelOptions(rule=options.points_rule),
         )
     elif options.points_rule != EvaluationOptions().points_rule:
-        raise InputError("points_rule: goes with Gaussians; another field has a rule of its own.")
-    job = _Job(scene=scene, field=field, options=options, observer=observer)
+        raise InputError(
+            "points_rule: goes with the scene's Gaussians; a field that is given has its own rule."
+        )
+    job = _Job(scene=scene, field=field, rule=rule, options=options, observer=observer)
     network = load_lpips(options.lpips) if options.lpips else None
     figures: dict[str, Any] = {"scene": str(scene.root), "split": options.split}
     if options.layer is not None:
@@ -158,6 +161,9 @@ def evaluate(
 class _Job:
     scene: Scene
     field: Renderable
+    rule: PointRule | None
+    """How points take labels, where that is for us to say."""
+
     options: EvaluationOptions
     observer: Observer
 
@@ -297,8 +303,7 @@ def _point_figures(job: _Job, path: Path) -> dict[str, Any]:
         truth=truth,
         matched=job.options.metric == "instances",
     )
-    own = isinstance(job.field, GaussianField)
-    return point_figures(report, rule=job.options.points_rule if own else None)
+    return point_figures(report, rule=job.rule)
 
 
 def _check_labels(job: _Job, name: str, option: str) -> None:
