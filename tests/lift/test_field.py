@@ -118,6 +118,19 @@ def test_one_projection_a_view(made, monkeypatch) -> None:
     assert len(prepared) == 1
 
 
+def test_options_of_the_blending_model_are_heeded(made) -> None:
+    gaussians, layers = made
+    camera = camera_at()
+    sharp = RenderOptions(near=1.9)
+    field = GaussianField(gaussians, layers, options=sharp, backend=BACKEND)
+    with field.view(camera) as view:
+        alpha, shown = view.signals().alpha, view.label_map("labels")
+    assert torch.equal(alpha, render(gaussians, camera, options=sharp, backend=BACKEND).alpha)
+    assert not torch.equal(alpha, render(gaussians, camera, backend=BACKEND).alpha)
+    expected = label_map(gaussians, camera, layers["labels"], options=sharp, backend=BACKEND)
+    assert torch.equal(shown.ids, expected.ids)
+
+
 def test_confidence_is_the_mean_of_what_a_pixel_shows(made) -> None:
     gaussians, layers = made
     camera = camera_at()
