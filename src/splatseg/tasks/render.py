@@ -127,11 +127,8 @@ def render_views(
         views = path_views(scene, field, frames=options.frames)
     else:
         views = views_of_split(scene, options.split)
-    folders = [*wanted]
-    if options.coloured:
-        folders += [f"{layer.name}_coloured" for layer in drawn if not layer.is_selection]
-    if len(set(folders)) != len(folders):
-        raise InputError("what: a layer has the name of another's coloured pictures.")
+    label_maps = [layer.name for layer in drawn if not layer.is_selection]
+    folders = _folders(wanted, label_maps if options.coloured else [])
     if options.video:
         check_film(views, fps=options.fps)
     films = [name for name in wanted if options.video]
@@ -145,7 +142,6 @@ def render_views(
         write_json(output / _RECORD, record | dict.fromkeys([*folders, *files], entry))
         if on_path:
             write_path(output, views, pictures="rgb" in folders)
-        label_maps = {layer.name for layer in drawn if not layer.is_selection}
         for name in films:
             write_film(
                 output / name,
@@ -193,6 +189,13 @@ def _wanted(what: Sequence[str]) -> list[str]:
     if not what:
         raise InputError("what: expected rgb, depth, alpha or names of layers, got nothing.")
     return list(dict.fromkeys(what))
+
+
+def _folders(wanted: Sequence[str], coloured: Sequence[str]) -> list[str]:
+    folders = [*wanted, *(f"{name}_coloured" for name in coloured)]
+    if len(set(folders)) != len(folders):
+        raise InputError("what: a layer has the name of another's coloured pictures.")
+    return folders
 
 
 def _check_layers(
