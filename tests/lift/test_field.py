@@ -222,17 +222,23 @@ def test_many_classes_are_read_a_few_at_a_time(made, blend) -> None:
     values = torch.randn(COUNT, 70, generator=torch.Generator().manual_seed(1))
     bias = torch.linspace(0, 1, 70)
     weight = torch.randn(70, 4, generator=torch.Generator().manual_seed(2))
+    weights = layers["features"].weights
+    assert bool((weights == 0).any()), "some Gaussians were never seen: they have no label"
     for features, matrix_of_head, shift in (
         (values, None, bias), (values, None, None), (layers["plain"].values, weight, bias),
     ):  # fmt: skip
         head = ClassifierHead(ids=torch.arange(70), weight=matrix_of_head, bias=shift, blend=blend)
         shown = head.label_map(
-            gaussians, camera, Features(values=features), options=RenderOptions(), backend=BACKEND
+            gaussians,
+            camera,
+            Features(values=features, weights=weights),
+            options=RenderOptions(),
+            backend=BACKEND,
         )
         if blend == "features":
             best, expected = head.probabilities(matrix @ features).max(dim=-1)
         else:
-            seen = matrix @ head.probabilities(features)
+            seen = matrix @ (head.probabilities(features) * (weights > 0)[:, None])
             best, expected = seen.max(dim=-1)
             nothing = 1 - seen.sum(dim=-1)
             expected = torch.where(best >= nothing, expected, -1)
