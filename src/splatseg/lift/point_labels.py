@@ -214,5 +214,5 @@ def _winners(
     winner = torch.where(totals >= largest, named, last).min(dim=1).values
     winner = torch.where(winner == last, UNLABELLED, winner)
     voted = votes.sum(dim=1)
-    share = torch.where(voted > 0, largest[:, 0] / torch.where(voted > 0, voted, 1.0), 0.0)
+    share = largest[:, 0] / torch.where(voted > 0, voted, 1.0)
     return torch.where(voted > 0, winner, ids[:, 0]).int(), share.float().clamp(0, 1)
