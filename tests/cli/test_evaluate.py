@@ -16,7 +16,7 @@ from splatseg.core import (
     Selection,
 )
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
-from splatseg.lift import labels_of_points
+from splatseg.lift import PointLabelOptions, labels_of_points
 
 CPU = ("--backend", "cpu")
 CLASSES = [
@@ -249,3 +249,26 @@ def test_true_instances_of_every_view_are_needed(labelled, splatseg) -> None:
     status, _, err = splatseg("evaluate", labelled.scene, *words, *CPU)
     assert status == 2
     assert "the first is test_2" in err
+
+
+def test_points_take_labels_by_the_rule_asked_for(labelled, splatseg, rng, tmp_path) -> None:
+    gaussians = load_scene(labelled.scene).gaussians
+    xyz = gaussians.means[rng.integers(0, len(gaussians), 900)].numpy()
+    xyz = (xyz + rng.normal(0, 0.3, xyz.shape)).astype(np.float32)
+    truth = np.where(xyz[:, 0] < 0.1, 2, 7)
+    np.savez(tmp_path / "points.npz", xyz=xyz, semantic=truth)
+    ids = load_scene_layer(labelled.scene, "classes").ids
+    right = {}
+    for rule in ("weighted", "nearest"):
+        status, text, err = splatseg(
+            "evaluate", labelled.scene, "--layer", "classes",
+            "--points", tmp_path / "points.npz", "--points-rule", rule, "--json",
+        )  # fmt: skip
+        assert status == 0, err
+        options = PointLabelOptions(rule=rule)
+        found = labels_of_points(gaussians, ids, torch.from_numpy(xyz), options=options)
+        right[rule] = float((found.ids.numpy() == truth).mean())
+        figures = json.loads(text)
+        assert figures["points_accuracy"] == pytest.approx(right[rule])
+        assert figures["points_rule"] == rule
+    assert right["weighted"] != right["nearest"], "the case must tell the rules apart"

@@ -107,6 +107,43 @@ def test_a_path_goes_through_the_field(scene, field, tmp_path) -> None:
     assert BALL in np.array(Image.open(tmp_path / "out" / "things" / "path_0001.png"))
 
 
+def test_paths_turn_about_the_median_depth_where_it_is_known(scene, tmp_path) -> None:
+    """Fields that differ in expected depth, and agree in the median, have one path."""
+
+    class Known(BallOverFloor):
+        factor = 1.0
+
+        def view(self, camera):
+            found = super().view(camera)
+            whole = found.signals
+
+            def signals(**words):
+                shown = whole(**words)
+                return replace(shown, depth=self.factor * shown.depth, median_depth=shown.depth)
+
+            found.signals = signals
+            return found
+
+    class Twice(Known):
+        factor = 2.0
+
+    class Alone(Twice):
+        def view(self, camera):
+            found = super().view(camera)
+            both = found.signals
+            found.signals = lambda **words: replace(both(**words), median_depth=None)
+            return found
+
+    beside = replace(scene, views=tuple(replace(view, split="train") for view in scene.views))
+    options = RenderingOptions(split="path", frames=3, what=("things",))
+    paths = []
+    for i, field in enumerate((Known(), Twice(), Alone())):
+        render_views(beside, tmp_path / str(i), options=options, field=field)
+        paths.append((tmp_path / str(i) / "transforms.json").read_text())
+    assert paths[0] == paths[1]
+    assert paths[0] != paths[2]
+
+
 @pytest.mark.parametrize("metric", ["semantic", "instances", "binary"])
 def test_scores_are_those_of_the_files(scene, field, truth, score, metric) -> None:
     layer = "selected" if metric == "binary" else "things"
