@@ -45,7 +45,8 @@ class EvaluationOptions:
     """What is scored against what."""
 
     layer: str | None = None
-    """Name of the layer to score. None scores renders only."""
+    """Name of the layer to score. NAME@part is a cut of a tree; NAME@hard reads features Gaussian
+    by Gaussian and not view by view. None scores renders only."""
 
     truth: Path | None = None
     """Folder of the true id maps, one PNG a view; 0 is void. Of classes, or of instances where
