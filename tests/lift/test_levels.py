@@ -18,6 +18,7 @@ def tree(parents: list[int], support: list[float] | None = None) -> SegmentTree:
         size=np.ones(count),
         support=np.ones(count) if support is None else np.array(support),
         views=np.full(count, 5),
+        alone=np.zeros(count, bool),
     )
 
 

@@ -15,7 +15,8 @@ that sees a cup where there is only table, and the votes themselves tell how oft
 Where masks overlap, segments of one view that lie inside each other are of different levels and
 never one instance (`splatseg.lift.segments.nesting`); nor are those to which a model itself gave
 different levels. Groups of segments then become a tree
-(`splatseg.lift.segments.tree`), whose levels say which nodes are objects
+(`splatseg.lift.segments.tree`), in which nodes that are two things are divided
+(`splatseg.lift.segments.separate`) and whose levels say which nodes are objects
 (`splatseg.lift.segments.levels`); masks of objects and of their parts vote for the objects, and
 within each object for its parts. With ``overlapping="flat"`` there are no levels: groups of masks
 are taken one after another, those that most of the views that could have seen them did see
@@ -48,9 +49,9 @@ from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, co
 from splatseg.lift.segments.ballots import by_mass, majority
 from splatseg.lift.segments.clustering import Agreement, cluster
 from splatseg.lift.segments.flatten import chosen_groups
-from splatseg.lift.segments.levels import node_levels
 from splatseg.lift.segments.nesting import nesting
 from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.lift.segments.separate import separated_levels
 from splatseg.lift.segments.table import SegmentTable, segment_table
 from splatseg.lift.segments.tree import segment_tree
 from splatseg.lift.segments.tree_labels import category_of, instance_tree, tree_votes
@@ -221,7 +222,12 @@ def _tree(
         min_views=min(options.least_views, len(table.views)),
         overlap=options.overlap,
     )
-    level = node_levels(found)
+    found, level = separated_levels(
+        found,
+        nested,
+        min_support=options.min_support,
+        min_views=min(options.least_views, len(table.views)),
+    )
     votes = tree_votes(
         table, found, level, _say(table, found.node, options.small_things), confusion=confusion
     )

@@ -42,7 +42,9 @@ def node_levels(tree: SegmentTree) -> NDArray[np.int64]:
         inner = children[row]
         if not inner:
             continue
-        as_object[row] = below[inner].sum()
+        # An object without some of its parts is not a part: what it holds are parts.
+        parts = [j for i in inner for j in (children[i] if tree.alone[i] else [i])]
+        as_object[row] = below[parts].sum()
         lone = np.array([0.0 if children[i] else _LONE_COST * tree.support[i] for i in inner])
         best = np.minimum(as_object[inner] + lone, as_group[inner])
         if len(inner) > 1:

@@ -20,9 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.lift.segments.clustering import Agreement
+from splatseg.lift.segments.shared import MIN_COSINE
 
 MIN_CONTAINMENT = 0.7
 """C(a, b) from which on a lies inside b: less than that is a seam they share."""
+
+MIN_KNOWN_SIZE = (MIN_COSINE / MIN_CONTAINMENT) ** 2
+"""A mask that lies inside one that is larger still shares too little with it to be counted: one
+of less than a 196th of its mass."""
 
 _SAME = 0.8
 """Intersection over union from which on two segments of one view are the same thing twice."""

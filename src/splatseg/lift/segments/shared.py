@@ -6,7 +6,7 @@ import numpy as np
 
 from splatseg.lift.mass.products import entries_of, sparse_product
 
-_MIN_COSINE = 0.05
+MIN_COSINE = 0.05
 """Least cosine of two segments' masses: of two sets one a 400th of the other's size reaches it."""
 
 _BLOCK = 512
@@ -33,7 +33,7 @@ def shared_masses(masses: Any) -> Any:
         rows = masses[start : start + _BLOCK]
         block = sparse_product(rows, entries, count, begin=begin).tocoo()
         row, column = block.row + start, block.col
-        kept = block.data > _MIN_COSINE * length[row] * length[column]
+        kept = block.data > MIN_COSINE * length[row] * length[column]
         kept &= column >= row
         blocks.append((row[kept], column[kept], block.data[kept].astype(np.float32)))
         # What is before a block was multiplied with it before.

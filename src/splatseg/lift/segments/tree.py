@@ -56,6 +56,10 @@ class SegmentTree:
     views: NDArray[np.int64]
     """(nodes,): views with a segment of the node."""
 
+    alone: NDArray[np.bool_]
+    """(nodes,): whether the node is its parent without some of what lies in it
+    (`lift.segments.separate`)."""
+
     @property
     def children(self) -> list[list[int]]:
         """Rows of the children of each node, ascending."""
@@ -113,6 +117,7 @@ def segment_tree(
         size=both.diagonal().copy(),
         support=support,
         views=views,
+        alone=np.zeros(len(both), bool),
     )
 
 
