@@ -131,6 +131,18 @@ def test_neither_the_order_of_views_nor_that_of_masks_matters() -> None:
     assert torch.equal(one.labels.confidence, other.labels.confidence)
 
 
+def test_the_largest_part_of_what_leaves_a_part_out_is_a_part() -> None:
+    # A frame in the first strip, the pane in the others, and the window: nearly the same as the
+    # pane, so that the masks of both are one node at first.
+    window = {view.name: ((0,), (1, 2, 3, 4), (0, 1, 2, 3, 4)) for view in VIEWS}
+    tree = tree_of(nested(window))
+    frame, pane = frozenset({0, 2}), frozenset(range(12)) - {0, 2}
+    assert sets(tree.cut()) == {frame | pane}
+    assert sets(tree.cut("part")) == {frame, pane}
+    assert [node.level for node in tree.nodes] == ["object", "part", "part"]
+    assert {node.support for node in tree.nodes} == {1.0}
+
+
 def test_a_cut_can_be_asked_for_instead_of_the_tree() -> None:
     parts = run(nested(), level="part")
     assert isinstance(parts, Labels)

@@ -147,7 +147,7 @@ class _SegmentPairs:
         return together, self._inside[own][:, masks].toarray().astype(bool) & together
 
     def held(self, child: int, parent: int) -> float:
-        """h of a child; 1 if no view has masks of both."""
+        """Share h of a child; 1 if no view has masks of both."""
         together, inside = self._pairs(child, self._members[parent])
         return float(inside.sum() / together.sum()) if together.any() else 1.0
 
