@@ -1,6 +1,6 @@
 """Nested masks of the train views as a tree, scored on the test views by the independent scorer.
 
-    python benchmarks/nested.py SCENE ../shared/data/office [--rows tree cues ...] [--work DIR]
+    python benchmarks/nested.py SCENE ../shared/data/office [--rows tree flat ...] [--work DIR]
 
 Rows:
 
@@ -9,11 +9,10 @@ Rows:
 - `parts`, `objects`: association of the masks of one level alone, which the recorded truth of the
   masks (`../masks_nested_truth`) tells: what a tree must not fall short of.
 - `flat`: association without levels.
-- `cues`: how often each cue of a node's level is right, and all of them together; the level of a
-  node is that of most of its masks, without the fragments of textures.
 - `sam`: `masks_sam`, whose levels are drawn at random, as a tree and flat.
 
-The truth of the masks is looked at for references and for counting only.
+The truth of the masks is looked at for references only. How often each cue of a node's level is
+right says `benchmarks/nested_cues.py`.
 """
 
 import json
@@ -31,15 +30,9 @@ from scored import ScoredScene, run_rows
 from splatseg.core import InstanceTree, Labels, MaskSet
 from splatseg.io.evidence import open_evidence
 from splatseg.lift.completion.complete import complete
-from splatseg.lift.segments.clustering import cluster
-from splatseg.lift.segments.levels import node_levels
-from splatseg.lift.segments.nesting import nesting
 from splatseg.lift.segments.recorded import EvidenceSegments
-from splatseg.lift.segments.table import segment_table
-from splatseg.lift.segments.tree import SegmentTree, segment_tree
 from splatseg.methods.associate import AssociateOptions, associate
 
-_LEVELS = ("part", "object", "group")
 _CUTS = ("group", "object", "part", 0.75)
 
 
@@ -170,91 +163,8 @@ def sam(bench: Bench) -> None:
         line("masks_sam, flat", bench.score("instances", [folder], "instance"), seconds)
 
 
-def cues(bench: Bench) -> None:
-    """How often each cue of a node's level is right."""
-    options = AssociateOptions()
-    source = EvidenceSegments(evidence=open_evidence(bench.data / "masks_nested"))
-    table = segment_table(
-        bench.scene.gaussians,
-        bench.scene.train_views,
-        source,
-        most_views=options.most_views,
-        longest_side=options.longest_side,
-    )
-    agreement = table.agreement()
-    nested = nesting(agreement, table.level)
-    group = cluster(nested.agreement, options.agreement, conflicts=nested.conflicts)
-    found = segment_tree(
-        table,
-        agreement,
-        nested,
-        group,
-        min_support=options.min_support,
-        min_views=options.least_views,
-        overlap=options.overlap,
-    )
-    folder = bench.data.parent / "masks_nested_truth" / bench.data.name
-    rows = {view: true_levels(folder, view) for view in table.views}
-    level_of = [
-        str(rows[table.views[view]][name]["level"])
-        for view, name in zip(table.view.tolist(), table.name.tolist(), strict=True)
-    ]
-    truth: list[str] = []
-    for node in range(len(found.parent)):
-        counts = Counter(level_of[i] for i in np.flatnonzero(found.node == node).tolist())
-        del counts["texture"]
-        truth.append(counts.most_common(1)[0][0] if counts else "texture")
-    score = np.array([table.score[found.node == node].mean() for node in range(len(truth))])
-    for name, answer in answers(found, score).items():
-        tell(name, truth, answer)
-
-
-def answers(found: SegmentTree, score: np.ndarray) -> dict[str, list[str]]:
-    """The level of each node by each cue alone, and by the rule."""
-    children, count = found.children, len(found.parent)
-    height, depth = np.zeros(count, int), np.zeros(count, int)
-    for node in reversed(found.top_down()):
-        height[node] = 1 + max((height[i] for i in children[node]), default=-1)
-    for node in found.top_down():
-        if found.parent[node] >= 0:
-            depth[node] = depth[found.parent[node]] + 1
-    tiled = np.array(
-        [found.size[c].sum() / found.size[i] if c else 0.0 for i, c in enumerate(children)]
-    )
-    thirds = lambda values: [_LEVELS[int(3 * r)] for r in _rank(values)]  # noqa: E731
-    return {
-        "levels below (0 part, 1 object, 2 group)": [_LEVELS[min(h, 2)] for h in height],
-        "levels above (0 object, 1 part)": ["object" if d == 0 else "part" for d in depth],
-        "children tile it (object if 0.7 or more)": [
-            "object" if t >= 0.7 else "part" for t in tiled
-        ],
-        "size, by thirds": thirds(found.size),
-        "support over views, by thirds": thirds(found.support),
-        "predicted IoU, by thirds": thirds(score),
-        "fewest exceptions (the rule)": [_LEVELS[level] for level in node_levels(found)],
-    }
-
-
-def _rank(values: np.ndarray) -> np.ndarray:
-    order = np.empty(len(values))
-    order[np.argsort(values, kind="stable")] = np.arange(len(values)) / max(len(values), 1)
-    return order
-
-
-def tell(name: str, truth: Sequence[str], answer: Sequence[str]) -> None:
-    """Print how often a cue is right, over all nodes and by true level."""
-    right: dict[str, list[bool]] = {}
-    for true, said in zip(truth, answer, strict=True):
-        if true != "texture":
-            right.setdefault(true, []).append(true == said)
-    all_of = [value for values in right.values() for value in values]
-    parts = "  ".join(f"{level} {np.mean(right.get(level, [False])):.2f}" for level in _LEVELS)
-    print(f"{name:48s} {np.mean(all_of):.3f} of {len(all_of)} nodes;  {parts}", flush=True)
-
-
 ROWS: dict[str, Callable[[Bench], None]] = {
     "tree": tree,
-    "cues": cues,
     "parts": one_level("part", "part"),
     "objects": one_level("object", "instance"),
     "flat": flat,
