@@ -343,6 +343,20 @@ def test_confusion_is_corrected_unless_told_otherwise(monkeypatch) -> None:
     assert (told.candidates, plain.candidates) == (None, None)
 
 
+def test_relabelling_counts_no_more_views_than_saw_a_gaussian(monkeypatch) -> None:
+    """The number of views that see each Gaussian goes along with its votes."""
+    module = importlib.import_module("splatseg.methods.associate")
+    asked = []
+    monkeypatch.setattr(
+        module, "correct_confusion", lambda labels, options: asked.append(labels) or labels
+    )
+    # In v3 nothing is said of the right square, so that three views tell something of it.
+    labels = run(clean({**NAMES, "v3": [70000, 5, -1]}))
+    for found in (asked[0].effective_views, labels.effective_views):
+        assert found is not None
+        assert found.tolist() == [4.0] * 8 + [3.0] * 4 + [0.0]
+
+
 def test_accidents_are_left_out() -> None:
     source = clean(NAMES)
     # Only v1 sees a fourth thing in the upper half of the middle one.

@@ -67,6 +67,20 @@ def test_a_lone_thing_in_a_group_is_half_an_exception() -> None:
     assert levels([-1, 0, 1, 1, 1, 0, 0])[0] == OBJECT
 
 
+def test_a_lone_thing_counts_by_its_support() -> None:
+    # Three sub-parts against two, and halves of what two lone things are supported by.
+    parents = [-1, 0, 1, 1, 1, 0, 0]
+    assert levels(parents, [1, 1, 1, 1, 1, 1, 1])[0] == OBJECT
+    assert levels(parents, [1, 1, 1, 1, 1, 0.9, 0.9])[0] == GROUP
+
+
+def test_a_group_in_a_group_costs_what_a_group_does() -> None:
+    # A room with a cup, and a desk of two lamps of three parts: taken for an object the desk would
+    # be six exceptions, and the room no group.
+    room = [-1, 0, 1, 1, 2, 2, 2, 3, 3, 3, 0]
+    assert levels(room) == [GROUP, GROUP, OBJECT, OBJECT, *[PART] * 6, OBJECT]
+
+
 def agreement(share: np.ndarray, view: list[int]) -> Agreement:
     """Of segments that hold shares of Gaussians which all views see alike."""
     seen = scipy.sparse.csr_matrix(np.repeat(share.sum(axis=1)[:, None], max(view) + 1, axis=1))

@@ -46,7 +46,7 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
-from splatseg.lift.segments.ballots import by_mass, majority
+from splatseg.lift.segments.ballots import by_mass, majority, view_counts
 from splatseg.lift.segments.clustering import Agreement, cluster
 from splatseg.lift.segments.flatten import chosen_groups
 from splatseg.lift.segments.nesting import nesting
@@ -180,7 +180,7 @@ def associate(
         group = chosen_groups(table, agreement, group, overlap=options.overlap)
     votes = table.votes(group, _say(table, group, options.small_things))
     group, votes = by_mass(group, votes)
-    labels = majority(votes)
+    labels = majority(votes, view_counts(table))
     if confusion is not None:
         labels = correct_confusion(labels, options=confusion)
     return replace(

@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatseg.core import UNLABELLED, Labels
+from splatseg.lift.segments.table import SegmentTable
 
 CANDIDATES = 8
 """Ids of a Gaussian that are kept, those with most votes."""
@@ -22,11 +24,18 @@ def by_mass(group: NDArray[np.int64], votes: Any) -> tuple[NDArray[np.int64], An
     return rank[group], votes.tocsc()[:, order].tocsr()
 
 
-def majority(votes: Any) -> Labels:
+def view_counts(table: SegmentTable) -> Tensor:
+    """(Gaussians,): how many of the views that were compared see each."""
+    seen = np.bincount(table.sights().indices, minlength=table.gaussians)
+    return torch.from_numpy(seen.astype(np.float32))
+
+
+def majority(votes: Any, effective_views: Tensor | None = None) -> Labels:
     """The strongest ids of each Gaussian (the smaller among equals), their shares, all votes.
 
     Args:
         votes: Sparse (Gaussians, groups); group 0 gets the id 1.
+        effective_views: How many views see each Gaussian, where that is known.
     """
     count = votes.shape[0]
     votes.sort_indices()
@@ -50,4 +59,5 @@ def majority(votes: Any) -> Labels:
         candidates=torch.from_numpy(ids),
         shares=torch.from_numpy(shares),
         evidence=torch.from_numpy(total.astype(np.float32)),
+        effective_views=effective_views,
     )

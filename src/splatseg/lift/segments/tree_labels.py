@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatseg.core import UNLABELLED, ClassTable, InstanceTree, Labels, TreeLevel, TreeNode
 from splatseg.lift.mass.confusion import ConfusionOptions, correct_confusion
-from splatseg.lift.segments.ballots import majority
+from splatseg.lift.segments.ballots import majority, view_counts
 from splatseg.lift.segments.levels import GROUP, OBJECT, PART
 from splatseg.lift.segments.table import SegmentTable
 from splatseg.lift.segments.tree import SegmentTree
@@ -49,10 +50,12 @@ class _Ballot:
     level: NDArray[np.int64]
     weight: NDArray[np.float64]
     confusion: ConfusionOptions | None
+    views: Tensor
+    """(Gaussians,): how many views see each."""
 
     def decided(self, group: NDArray[np.int64]) -> Labels:
         """The labels by the votes of groups of segments, with all candidates."""
-        labels = majority(self.table.votes(group, self.weight))
+        labels = majority(self.table.votes(group, self.weight), self.views)
         return (
             labels if self.confusion is None else correct_confusion(labels, options=self.confusion)
         )
@@ -93,7 +96,14 @@ def tree_votes(
         weight: (segments,): factor of each segment's votes.
         confusion: How segments err, see `correct_confusion`; None takes the majority.
     """
-    ballot = _Ballot(table=table, tree=tree, level=level, weight=weight, confusion=confusion)
+    ballot = _Ballot(
+        table=table,
+        tree=tree,
+        level=level,
+        weight=weight,
+        confusion=confusion,
+        views=view_counts(table),
+    )
     object_of, top_part = _above(tree, level)
     objects, group = _compact(object_of[tree.node])
     total = np.asarray(table.votes(group, weight).sum(axis=0)).ravel()
