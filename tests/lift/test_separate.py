@@ -1,5 +1,6 @@
 """Nodes that are two things, by hand: a shelf with two books, a pane with its frame."""
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -157,14 +158,39 @@ def test_a_pane_that_is_one_node_with_its_window_is_a_part_of_it() -> None:
     assert tree.node.tolist() == [0, 3, 1, 2] * 4
 
 
-@pytest.mark.parametrize(("inside", "divided"), [(3, False), (2, True)])
-def test_children_in_three_of_four_masks_are_parts(inside: int, divided: bool) -> None:
-    # A view has four masks of the shelf, of which some hold the books.
+@pytest.mark.parametrize(("inside", "of", "divided"), [(3, 4, False), (5, 7, True)])
+def test_children_in_three_of_four_masks_are_parts(inside: int, of: int, divided: bool) -> None:
+    # A view has several masks of the shelf, of which some hold the books.
     masks: Masks = []
     for view in range(4):
-        masks += [(view, 0, EVERYTHING)] * inside + [(view, 0, SHELF)] * (4 - inside)
+        masks += [(view, 0, EVERYTHING)] * inside + [(view, 0, SHELF)] * (of - inside)
         masks += [(view, row + 1, member) for row, member in enumerate(MEMBERS)]
     assert (len(separated(masks)[0].parent) == 10) == divided
+
+
+def test_what_two_divisions_leave_out_ends_beside_the_larger_thing() -> None:
+    module = importlib.import_module("splatseg.lift.segments.separate")
+    # 0 holds 1, a fragment, and 2; 1 holds 3 and 4; 4 holds 5. Neither the smaller thing of 1 nor
+    # that of 0 holds 5.
+    parents = [-1, 0, 0, 1, 1, 4]
+    members = [(1, (*range(12), *range(20, 24))), (1, range(12)), (2, (19,)), (3, (20, 21))]
+    members += [(4, (*range(9), 22, 23)), (5, (22, 23)), (0, EVERYTHING), (0, range(19))]
+    masks = [(view, node, held) for view in range(3) for node, held in members]
+    share = np.zeros((len(masks), GAUSSIANS))
+    for row, (_, _, held) in enumerate(masks):
+        share[row, list(held)] = 1
+    node, view = (np.array([mask[column] for mask in masks]) for column in (1, 0))
+    tree = SegmentTree(
+        node=node,
+        parent=np.array(parents),
+        size=np.array([24.0, 16, 1, 2, 11, 2]),
+        support=np.ones(6),
+        views=np.full(6, 3),
+        alone=np.zeros(6, bool),
+    )
+    found = module._divisions(tree, nested_of(share, view), min_support=0.3, min_views=2)
+    assert [division.row for division in found] == [1, 0]
+    assert module._divided(tree, found).parent.tolist() == [-1, 7, 0, 0, 6, 0, 1, 0]
 
 
 def test_masks_too_small_to_be_compared_say_nothing() -> None:
