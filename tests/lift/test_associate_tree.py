@@ -82,7 +82,7 @@ def test_halves_wholes_group_and_neighbour_are_four_levels_of_one_tree() -> None
     assert int(tree.labels.ids[12]) == -1
     assert sorted(node.level for node in tree.nodes) == [*["group"], *["object"] * 3, *["part"] * 4]
     assert all(node.views == 4 and node.support == 1 for node in tree.nodes)
-    assert tree.metadata["associate"] == {
+    assert tree.info.details["associate"] == {
         "segments": 32,
         "instances": 3,
         "left_out": 0,
@@ -162,7 +162,7 @@ def test_a_cut_can_be_asked_for_instead_of_the_tree() -> None:
     parts = run(nested(), level="part")
     assert isinstance(parts, Labels)
     assert sets(parts) == {*HALVES, RIGHT}
-    assert parts.metadata["cut"] == "part"
+    assert parts.info.cut == "part"
     coarse = run(nested(), level="0")
     assert isinstance(coarse, Labels)
     assert sets(coarse) == {LEFT | MIDDLE, RIGHT}
@@ -248,7 +248,7 @@ def test_same_bits_at_one_two_and_three_threads() -> None:
     for other in found[1:]:
         assert other.nodes == found[0].nodes
         assert bits(other) == bits(found[0])
-        assert other.metadata == found[0].metadata
+        assert other.info == found[0].info
 
 
 def ragged(seed: int, views: Sequence[View] = VIEWS) -> Segments:
@@ -280,17 +280,17 @@ def test_the_whole_tree_follows_neither_order_nor_names(seed: int) -> None:
     other = tree_of(shuffled(source, rng), [VIEWS[i] for i in rng.permutation(len(VIEWS))])
     assert one.nodes == other.nodes
     assert bits(one) == bits(other)
-    assert one.metadata == other.metadata
+    assert one.info == other.info
 
 
-def test_names_of_views_are_in_the_metadata_alone() -> None:
+def test_names_of_views_are_in_the_info_alone() -> None:
     source, names = ragged(3), {"v0": "z", "v1": "c", "v2": "m", "v3": "a"}
     renamed = [replace(view, name=names[view.name]) for view in VIEWS]
     other = tree_of(
         replace(source, of={names[name]: found for name, found in source.of.items()}), renamed
     )
     one = tree_of(source)
-    assert one.metadata["views"] != other.metadata["views"]
+    assert one.info.views != other.info.views
     for level in TREE_LEVELS:
         assert sets(one.cut(level)) == sets(other.cut(level))
     kinds = [
