@@ -133,6 +133,8 @@ def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
     independent = ConfusionOptions(max_correlation=1.0, correlated_views=1.5)
     found = correct_confusion(labels, options=independent, view_correlation=1.0)
     assert found.ids[18:].tolist() == [2, 2]
+    found = correct_confusion(labels, view_correlation=0.9)
+    assert found.info.edit("correct_confusion")["effective_views"] == 3.0
     # Never more than there are at most.
     few = ConfusionOptions(effective_views=2.0)
     found = correct_confusion(labels, options=few, view_correlation=0.9)
