@@ -1,7 +1,7 @@
 """Labels decided under how often ids are taken for one another."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -100,6 +100,18 @@ def desk_and_mouse(*, evidence=20.0) -> Labels:
     shares = [[1.0, 0.0]] * 18 + [[0.55, 0.45], [0.65, 0.35]]
     candidates = [[1, -1]] * 18 + [[2, 1], [1, 2]]
     return soft(candidates, shares, evidence=[evidence] * 20)
+
+
+def test_defaults_are_those_that_the_figures_were_measured_with() -> None:
+    """Decision 0013; other numbers need other figures."""
+    assert asdict(ConfusionOptions()) == {
+        "effective_views": 10.0,
+        "max_correlation": 0.27,
+        "correlated_views": 3.0,
+        "min_confusion": 3e-3,
+        "diagonal_prior": 5.0,
+        "max_evidence": 20.0,
+    }
 
 
 def test_what_is_often_missed_needs_fewer_votes() -> None:
