@@ -158,6 +158,38 @@ def test_relabelling_of_a_tree_counts_no_more_views_than_saw_a_gaussian(monkeypa
         assert labels.effective_views.tolist() == expected
 
 
+def test_the_rest_of_an_object_has_no_part() -> None:
+    # One half of the left square has masks; a twentieth of the other half's light falls in them.
+    half = {view.name: ((0,), (0, 1), (2, 3), (4,)) for view in VIEWS}
+    tree = tree_of(nested(half))
+    assert sets(tree.cut()) == {LEFT, MIDDLE, RIGHT}
+    assert sets(tree.cut("part")) == {HALVES[0], HALVES[1], MIDDLE, RIGHT}
+    assert [node.level for node in tree.nodes] == ["object"] * 3 + ["part"]
+
+
+def test_votes_for_the_own_node_count_as_the_others_do() -> None:
+    module = importlib.import_module("splatseg.lift.segments.tree_labels")
+    table = table_of(nested())
+    count = len(table.view)
+    node = np.arange(count) % 8
+    node[node == 7] = -1
+    own = np.resize([4, 5, -1], table.gaussians)
+    found = []
+    for weight in (np.ones(count), np.where(node == 4, 3.0, 1.0)):
+        ballot = module._Ballot(
+            table=table, tree=None, level=None, weight=weight, confusion=None, views=None
+        )
+        found.append(ballot.own(node, own))
+        of = node[table.segment]
+        mine = (of == own[table.gaussian]) & (of >= 0)
+        votes = (weight[table.segment] * table.mass)[mine]
+        expected = np.bincount(table.gaussian[mine], votes, minlength=table.gaussians)
+        assert found[-1] == pytest.approx(expected)
+    assert found[0][own == 4].max() > 0
+    assert found[1][own == 4] == pytest.approx(3 * found[0][own == 4])
+    assert found[1][own == 5] == pytest.approx(found[0][own == 5])
+
+
 def test_a_cut_can_be_asked_for_instead_of_the_tree() -> None:
     parts = run(nested(), level="part")
     assert isinstance(parts, Labels)
