@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from splatseg.core import TREE_LEVELS, InstanceTree, Labels, MaskSet, Rle, View
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.segments.clustering import Agreement, cluster
+from splatseg.lift.segments.levels import GROUP, OBJECT, PART
+from splatseg.lift.segments.tree import SegmentTree
 from splatseg.methods.associate import DEFAULT_CONFUSION, AssociateOptions, associate
 from splatseg.render.cpu import set_threads, threads
 
@@ -188,6 +190,37 @@ def test_votes_for_the_own_node_count_as_the_others_do() -> None:
     assert found[0][own == 4].max() > 0
     assert found[1][own == 4] == pytest.approx(3 * found[0][own == 4])
     assert found[1][own == 5] == pytest.approx(found[0][own == 5])
+
+
+def test_ids_follow_what_is_seen_and_not_where_masks_begin() -> None:
+    # Two, six and four Gaussians from left to right.
+    tree = tree_of(nested({view.name: ((0,), (1, 2, 3), (4,)) for view in VIEWS}))
+    assert tree.cut().ids.tolist() == [3, 1, 3, *[1] * 5, *[2] * 4, -1]
+
+
+def test_parts_of_parts_are_of_the_part_next_to_the_object() -> None:
+    module = importlib.import_module("splatseg.lift.segments.tree_labels")
+    table = table_of(nested())
+    found = SegmentTree(
+        node=np.zeros(len(table.view), int),
+        parent=np.array([-1, 0, 1, 2, -1, 4]),
+        size=np.ones(6),
+        support=np.ones(6),
+        views=np.ones(6, int),
+        alone=np.zeros(6, bool),
+    )
+    level = np.array([GROUP, OBJECT, PART, PART, OBJECT, PART])
+    object_of, top_part = module._above(found, level)
+    assert object_of.tolist() == [-1, 1, 1, 1, 4, 4, -1]
+    assert top_part.tolist() == [-1, -1, 2, 2, -1, 5, -1]
+
+
+def test_parts_of_parts_are_nodes_of_their_own() -> None:
+    strips = ((0,), (1,), (0, 1), (2, 3), (0, 1, 2, 3), (4,))
+    tree = tree_of(nested({view.name: strips for view in VIEWS}))
+    assert sets(tree.cut()) == {LEFT | MIDDLE, RIGHT}
+    assert sets(tree.cut("part")) == {HALVES[0], HALVES[1], MIDDLE, RIGHT}
+    assert tree.depth == 3
 
 
 def test_a_cut_can_be_asked_for_instead_of_the_tree() -> None:

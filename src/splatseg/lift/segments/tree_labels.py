@@ -170,8 +170,7 @@ def _parts(
     chosen = np.where(ids == UNLABELLED, -1, np.append(parts, -1)[ids - 1])
     inside = (chosen >= 0) & (object_of[chosen] == node[:, None])
     first = chosen[np.arange(len(node)), inside.argmax(axis=1)]
-    is_object = np.append(ballot.level == OBJECT, False)
-    whole = ballot.own(np.where(is_object[ballot.tree.node], ballot.tree.node, -1), node)
+    whole = ballot.own(ballot.tree.node, node)
     pieces = ballot.own(np.where(part >= 0, object_of[part], -1), node)
     there = inside.any(axis=1) & (pieces >= _MIN_PART_VOTES * whole)
     return np.where(there, first, node)
