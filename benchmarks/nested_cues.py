@@ -254,7 +254,7 @@ def main() -> None:
         scene.gaussians,
         scene.train_views,
         EvidenceSegments(evidence=open_evidence(arguments.data / arguments.evidence)),
-        most_views=options.most_views,
+        max_views=options.max_views,
         longest_side=options.longest_side,
     )
     agreement = table.agreement()
@@ -265,7 +265,7 @@ def main() -> None:
         nested,
         cluster(nested.agreement, options.agreement, conflicts=nested.conflicts),
         min_support=options.min_support,
-        min_views=options.least_views,
+        min_views=options.min_views,
         overlap=options.overlap,
     )
     truth = node_truth(arguments.data, arguments.evidence, table, tree)

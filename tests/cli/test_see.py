@@ -174,16 +174,16 @@ def test_other_settings_are_refused_and_named(small, splatseg) -> None:
     assert splatseg("see", small.scene, *CLASSICAL)[0] == 0
     folder = small.scene / "evidence" / "masks"
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    sentence = refused(splatseg("see", small.scene, *CLASSICAL, "--least-area", "0.1"))
-    assert "made in another way (least_area 0.0005 there, 0.1 now)" in sentence
+    sentence = refused(splatseg("see", small.scene, *CLASSICAL, "--min-area", "0.1"))
+    assert "made in another way (min_area 0.0005 there, 0.1 now)" in sentence
     sentence = refused(splatseg("see", small.scene, *CLASSICAL, "--what", "features"))
     assert "made in another way" in sentence
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
-    words = (*CLASSICAL, "--least-area", "0.1", "--overwrite")
+    words = (*CLASSICAL, "--min-area", "0.1", "--overwrite")
     status, out, _ = splatseg("see", small.scene, *words)
     assert status == 0
     assert "were there" not in out
-    assert header(folder)["metadata"]["settings"]["regions"]["least_area"] == 0.1
+    assert header(folder)["metadata"]["settings"]["regions"]["min_area"] == 0.1
 
 
 def recorded_otherwise(folder, change) -> None:
@@ -201,11 +201,11 @@ def test_settings_that_came_later_count_as_their_defaults(small, splatseg) -> No
 
     def before_least_area(metadata) -> None:
         for key in ("settings", "default_settings"):
-            del metadata[key]["regions"]["least_area"]
+            del metadata[key]["regions"]["min_area"]
 
     recorded_otherwise(folder, before_least_area)
-    sentence = refused(splatseg(*words, "--least-area", "0.1"))
-    assert "made in another way (least_area 0.0005 there, 0.1 now)" in sentence
+    sentence = refused(splatseg(*words, "--min-area", "0.1"))
+    assert "made in another way (min_area 0.0005 there, 0.1 now)" in sentence
     status, out, _ = splatseg(*words)
     assert status == 0
     assert "3 of them were there" in out
@@ -506,7 +506,7 @@ def test_other_words_that_cannot_be_used(small, splatseg, recorded) -> None:
     assert "expected evidence of labels, got masks" in refused(
         see(splatseg, small, recorded, "--what", "labels")
     )
-    sentence = refused(see(splatseg, small, recorded, "--least-area", "0.2"))
+    sentence = refused(see(splatseg, small, recorded, "--min-area", "0.2"))
     assert "settings of regions with model classical" in sentence
     sentence = refused(splatseg("see", small.scene, *CLASSICAL, "--void", "3"))
     assert "--void" in sentence

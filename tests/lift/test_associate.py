@@ -225,7 +225,7 @@ def test_large_segments_are_read_on_a_coarser_grid(overlapping) -> None:
 
 
 def table_of(source: Segments, views=VIEWS) -> SegmentTable:
-    return segment_table(GAUSSIANS, views, source, most_views=100, backend=BACKEND)
+    return segment_table(GAUSSIANS, views, source, max_views=100, backend=BACKEND)
 
 
 def test_pairs_that_share_next_to_nothing_are_left_out() -> None:
@@ -363,9 +363,9 @@ def test_accidents_are_left_out() -> None:
     ids = source.of["v1"].ids.clone()
     ids[:16][ids[:16] == 7] = 4
     source = Segments({**source.of, "v1": LabelMap(ids=ids)})
-    assert run(source, least_views=2).info.details["associate"]["instances"] == 3
-    assert run(source, least_views=5).info.details["associate"]["instances"] == 3, "4 views are all"
-    alone = run(source, VIEWS[1:2], least_views=2)
+    assert run(source, min_views=2).info.details["associate"]["instances"] == 3
+    assert run(source, min_views=5).info.details["associate"]["instances"] == 3, "4 views are all"
+    alone = run(source, VIEWS[1:2], min_views=2)
     assert alone.info.details["associate"]["instances"] == 4, "one view is all there is"
 
 
@@ -420,18 +420,18 @@ def test_of_flat_nested_masks_those_that_most_views_have_are_taken() -> None:
 
 
 def test_memory_is_bounded_by_the_views_that_see_most() -> None:
-    table = segment_table(GAUSSIANS, VIEWS, clean(NAMES), most_views=2, backend=BACKEND)
-    whole = segment_table(GAUSSIANS, VIEWS, clean(NAMES), most_views=4, backend=BACKEND)
+    table = segment_table(GAUSSIANS, VIEWS, clean(NAMES), max_views=2, backend=BACKEND)
+    whole = segment_table(GAUSSIANS, VIEWS, clean(NAMES), max_views=4, backend=BACKEND)
     pairs = np.unique(np.stack((table.gaussian, table.view[table.segment])), axis=1)
     assert np.bincount(pairs[0]).max() == 2
     for i in range(12):
         best = np.sort(np.unique(whole.seen[whole.gaussian == i]))[-2:]
         assert set(table.seen[table.gaussian == i]) <= set(best)
-    assert groups(run(clean(NAMES), most_views=3).ids) == THINGS
+    assert groups(run(clean(NAMES), max_views=3).ids) == THINGS
 
 
 def test_masses_are_those_of_the_masks() -> None:
-    table = segment_table(GAUSSIANS, VIEWS, clean(NAMES), most_views=9, backend=BACKEND)
+    table = segment_table(GAUSSIANS, VIEWS, clean(NAMES), max_views=9, backend=BACKEND)
     assert table.views == ("v0", "v1", "v2", "v3")
     assert len(table.view) == 12
     assert table.view.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
@@ -464,8 +464,8 @@ def test_hostile_input() -> None:
         AssociateOptions(agreement=1.5)
     with pytest.raises(RangeError, match="small_things"):
         AssociateOptions(small_things=-1.0)
-    with pytest.raises(RangeError, match="least_views"):
-        AssociateOptions(least_views=0)
+    with pytest.raises(RangeError, match="min_views"):
+        AssociateOptions(min_views=0)
     # Segments where no Gaussian is: no instance, no error.
     corner = torch.full((32, 64), -1, dtype=torch.int32)
     corner[0, 0] = 1

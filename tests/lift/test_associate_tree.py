@@ -120,7 +120,7 @@ def test_masks_of_few_views_are_no_nodes_where_more_support_is_asked_for() -> No
     whole = {LEFT, *HALVES[2:], RIGHT}
     assert sets(tree_of(nested(rare), min_support=0.4).cut("part")) == {*HALVES, RIGHT}
     assert sets(tree_of(nested(rare), min_support=0.6).cut("part")) == whole
-    assert sets(tree_of(nested(rare), least_views=3).cut("part")) == whole
+    assert sets(tree_of(nested(rare), min_views=3).cut("part")) == whole
 
 
 def test_neither_the_order_of_views_nor_that_of_masks_matters() -> None:

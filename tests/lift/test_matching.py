@@ -74,14 +74,14 @@ def test_what_fits_nothing_well_enough_says_nothing(drawn) -> None:
     """One segment over the whole image: its overlap with A is A's share of the image."""
     everything = LabelMap(ids=torch.zeros(drawn.shape, dtype=torch.int32))
     share = float((drawn == A).float().mean())
-    assert bool((matched(everything, least_overlap=share + 1e-6) == -1).all())
+    assert bool((matched(everything, min_overlap=share + 1e-6) == -1).all())
     # A and B are as large as each other: the smaller id wins.
-    assert bool((matched(everything, least_overlap=share - 1e-6) == A).all())
+    assert bool((matched(everything, min_overlap=share - 1e-6) == A).all())
 
 
 def test_a_segment_of_nothing_but_gaps_has_no_id(drawn) -> None:
     gaps = LabelMap(ids=torch.where(drawn == -1, 3, -1).int())
-    assert bool((matched(gaps, least_overlap=0.0) == -1).all())
+    assert bool((matched(gaps, min_overlap=0.0) == -1).all())
 
 
 def test_of_masks_that_overlap_the_better_one_tells(drawn) -> None:
@@ -91,14 +91,14 @@ def test_of_masks_that_overlap_the_better_one_tells(drawn) -> None:
     both = a | b
     # Half of A by itself (1/2) and A with B (1/2) are worse than A: wherever A is, it tells.
     masks = MaskSet.from_dense(torch.stack((part, both, a)))
-    found = matched(masks, least_overlap=0.4)
+    found = matched(masks, min_overlap=0.4)
     assert bool((found[a] == A).all())
     assert bool((found[b] == A).all()), "of A and B with equal overlap the smaller id"
     assert bool((found[~both] == -1).all())
     # Order does not matter, and what overlaps too little is left out.
     turned = MaskSet.from_dense(torch.stack((a, both, part)))
-    assert torch.equal(found, matched(turned, least_overlap=0.4))
-    alone = matched(turned, least_overlap=0.6)
+    assert torch.equal(found, matched(turned, min_overlap=0.4))
+    alone = matched(turned, min_overlap=0.6)
     assert torch.equal(alone, torch.where(a, A, -1).int())
 
 
@@ -159,8 +159,8 @@ def test_views_without_segments_are_not_named_and_not_there() -> None:
 
 def test_refused() -> None:
     source = Segments({})
-    with pytest.raises(RangeError, match="least_overlap"):
-        MatchedMaps(gaussians=SCENE, views=[], source=source, labels=LAYER, least_overlap=1.5)
+    with pytest.raises(RangeError, match="min_overlap"):
+        MatchedMaps(gaussians=SCENE, views=[], source=source, labels=LAYER, min_overlap=1.5)
     short = Labels(ids=LAYER.ids[:1], confidence=LAYER.confidence[:1])
     with pytest.raises(ShapeError, match="labels: expected 2 rows"):
         MatchedMaps(gaussians=SCENE, views=[], source=source, labels=short)

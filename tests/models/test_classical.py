@@ -91,7 +91,7 @@ def test_a_level_merges_what_is_alike_before_what_is_not(squares) -> None:
 
 
 def test_masks_are_nested_and_levels_come_back_as_partitions(squares) -> None:
-    masks = region_masks(squares, RegionOptions(least_area=0.0, cuts=(0.03, 0.1, 0.3)))
+    masks = region_masks(squares, RegionOptions(min_area=0.0, cuts=(0.03, 0.1, 0.3)))
     dense = [masks.dense(i) for i in range(len(masks))]
     for i, a in enumerate(dense):
         for b in dense[i + 1 :]:
@@ -132,9 +132,9 @@ def test_enlarged_borders_are_straight_and_labels_stay_labels() -> None:
 
 
 def test_small_masks_are_dropped(squares) -> None:
-    everything = region_masks(squares, RegionOptions(least_area=0.0))
+    everything = region_masks(squares, RegionOptions(min_area=0.0))
     share = 0.05
-    kept = region_masks(squares, RegionOptions(least_area=share))
+    kept = region_masks(squares, RegionOptions(min_area=share))
     areas = [m.area for m in everything.masks]
     assert min(m.area for m in kept.masks) >= share * 96 * 128
     assert len(kept) == sum(a >= share * 96 * 128 for a in areas) < len(everything)
@@ -240,8 +240,8 @@ def test_the_cost_of_two_regions_is_the_formula_of_the_docstring() -> None:
         {"cuts": ()},
         {"cuts": (0.3, 0.2)},
         {"cuts": (0.0, 0.2)},
-        {"least_area": 1.5},
-        {"least_area": float("nan")},
+        {"min_area": 1.5},
+        {"min_area": float("nan")},
     ],
 )
 def test_settings_of_regions_that_make_no_sense(wrong) -> None:
@@ -398,6 +398,6 @@ def test_the_model_of_the_name_classical_says_what_it_is() -> None:
 
 def test_settings_change_with_every_option() -> None:
     settings = Classical().settings
-    assert Classical(regions=RegionOptions(least_area=0.01)).settings != settings
+    assert Classical(regions=RegionOptions(min_area=0.01)).settings != settings
     assert Classical(cut=GrabCutOptions(cut_rounds=2)).settings != settings
     assert Classical(descriptor=DescriptorOptions(cell_size=4)).settings != settings

@@ -78,7 +78,7 @@ class AssociateOptions:
     """Exponent with which small instances outweigh large ones where views contradict each other;
     0 treats all alike. 0.25 does most of what correcting confusion does, without it."""
 
-    least_views: int = 2
+    min_views: int = 2
     """An instance needs segments in so many views, or in all there are if they are fewer."""
 
     overlapping: Overlapping = "tree"
@@ -98,7 +98,7 @@ class AssociateOptions:
     [0, 1]; with flat, a group is left out if more than this share of it is covered by groups
     that were taken before."""
 
-    most_views: int = 50
+    max_views: int = 50
     """Views of each Gaussian that are compared, those that see most of it; bounds memory and
     time."""
 
@@ -116,7 +116,7 @@ class AssociateOptions:
             raise InputError(f"overlapping: expected tree or flat, got {self.overlapping!r}.")
         if self.level != "tree":
             tree_level(self.level)
-        for name in ("least_views", "most_views", "longest_side"):
+        for name in ("min_views", "max_views", "longest_side"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
 
@@ -164,7 +164,7 @@ def associate(
         gaussians,
         views,
         source,
-        most_views=options.most_views,
+        max_views=options.max_views,
         longest_side=options.longest_side,
         render_options=render_options,
         backend=backend,
@@ -175,7 +175,7 @@ def associate(
         tree = _tree(table, agreement, options, confusion, classes)
         return tree if options.level == "tree" else tree.cut(tree_level(options.level))
     group = cluster(agreement, options.agreement)
-    group = _seen_often(table, group, min(options.least_views, len(table.views)))
+    group = _seen_often(table, group, min(options.min_views, len(table.views)))
     if source.overlapping:
         group = chosen_groups(table, agreement, group, overlap=options.overlap)
     votes = table.votes(group, _say(table, group, options.small_things))
@@ -219,14 +219,14 @@ def _tree(
         nested,
         group,
         min_support=options.min_support,
-        min_views=min(options.least_views, len(table.views)),
+        min_views=min(options.min_views, len(table.views)),
         overlap=options.overlap,
     )
     found, level = separated_levels(
         found,
         nested,
         min_support=options.min_support,
-        min_views=min(options.least_views, len(table.views)),
+        min_views=min(options.min_views, len(table.views)),
     )
     votes = tree_votes(
         table, found, level, _say(table, found.node, options.small_things), confusion=confusion

@@ -10,7 +10,7 @@ from splatseg.lift.segments.table import SegmentTable
 
 _MOST = 0.5
 
-_LEAST_SIGHT = 0.3
+_MIN_VISIBILITY = 0.3
 """A view could have seen a group if it sees this share of what the group's best view does."""
 
 
@@ -82,7 +82,7 @@ def _support(
     count = joined.shape[0]
     members = np.bincount(group[group >= 0], minlength=count)
     sight = (joined @ agreement.seen).toarray() / np.maximum(members, 1)[:, None]
-    could = sight >= _LEAST_SIGHT * sight.max(axis=1, keepdims=True)
+    could = sight >= _MIN_VISIBILITY * sight.max(axis=1, keepdims=True)
     did = np.zeros_like(could)
     there = group >= 0
     did[group[there], table.view[there]] = True

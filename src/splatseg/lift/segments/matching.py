@@ -6,7 +6,7 @@ the layer tells which of its ids each segment shows: the one with which it has t
 
 .. math:: \mathrm{IoU}(s, k) = \frac{|s \cap k|}{|s \cup k|}
 
-over the view's pixels. A segment that fits none by at least `least_overlap` says nothing, so
+over the view's pixels. A segment that fits none by at least `min_overlap` says nothing, so
 what the model got wrong in this view, or what the layer does not have, is left out.
 """
 
@@ -53,7 +53,7 @@ class MatchedMaps:
     labels: Labels
     """The layer whose ids the segments take."""
 
-    least_overlap: float = 0.2
+    min_overlap: float = 0.2
     """Intersection over union, in [0, 1], that a segment must have with what the layer shows,
     the same that joins segments (`AssociateOptions.agreement`)."""
 
@@ -64,7 +64,7 @@ class MatchedMaps:
     backend: str = "auto"
 
     def __post_init__(self) -> None:
-        check_range("least_overlap", self.least_overlap, 0.0, 1.0)
+        check_range("min_overlap", self.min_overlap, 0.0, 1.0)
         if len(self.labels) != len(self.gaussians):
             raise ShapeError(
                 f"labels: expected {len(self.gaussians)} rows, one a Gaussian, "
@@ -96,8 +96,8 @@ class MatchedMaps:
         )
         drawn = label_map(self.gaussians, camera, hard, backend=self.backend).ids.long()
         if isinstance(segments, LabelMap):
-            return _of_map(segments, drawn, self.least_overlap)
-        return _of_masks(segments, drawn, self.least_overlap)
+            return _of_map(segments, drawn, self.min_overlap)
+        return _of_masks(segments, drawn, self.min_overlap)
 
 
 def _of_map(segments: LabelMap, drawn: Int64[Tensor, "height width"], least: float) -> LabelMap:

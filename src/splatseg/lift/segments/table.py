@@ -32,13 +32,13 @@ from splatseg.lift.segments.entries import SegmentEntries
 from splatseg.lift.segments.shared import shared_masses
 from splatseg.render import RenderOptions
 
-_LEAST_WEIGHT = 0.05
+_MIN_WEIGHT = 0.05
 """A view that sees less of a Gaussian than so many pixels says nothing about it."""
 
-_LEAST_SHARE = 0.1
+_MIN_SHARE = 0.1
 """A segment that holds less than this share of what a view sees of a Gaussian only touches it."""
 
-_LEAST_MASS = 1e-3
+_MIN_MASS = 1e-3
 
 
 _PAIRS = 4e9
@@ -113,7 +113,7 @@ class SegmentTable:
             # Segments of one view repeat what that view sees of a Gaussian; it is wanted once.
             seen[:] = 0
             seen[self.gaussian[start:stop]] = self.seen[start:stop]
-            known = np.flatnonzero(seen > _LEAST_WEIGHT).astype(np.int32)
+            known = np.flatnonzero(seen > _MIN_WEIGHT).astype(np.int32)
             found.append((known, np.sqrt(seen[known])))
         return scipy.sparse.csc_matrix(
             (
@@ -178,9 +178,9 @@ class SegmentTable:
     def _shares(self, entries: slice) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """Which entries are more than a touch, and each one's share of what its view sees."""
         seen = self.seen[entries]
-        least = np.maximum(seen, _LEAST_MASS)
+        least = np.maximum(seen, _MIN_MASS)
         share: NDArray[np.float32] = np.divide(self.mass[entries], least, dtype=np.float32)
-        return (seen > _LEAST_WEIGHT) & (share > _LEAST_SHARE), share
+        return (seen > _MIN_WEIGHT) & (share > _MIN_SHARE), share
 
     def slices(self) -> Iterator[slice]:
         """All entries, a few at a time."""
@@ -226,7 +226,7 @@ def segment_table(
     views: Sequence[View],
     source: SegmentSource,
     *,
-    most_views: int,
+    max_views: int,
     longest_side: int | None = None,
     render_options: RenderOptions | None = None,
     backend: str = "auto",
@@ -238,7 +238,7 @@ def segment_table(
         gaussians: The Gaussians of the scene.
         views: Those whose segments count.
         source: Their segments.
-        most_views: Views kept of each Gaussian, those that see most of it: this bounds memory.
+        max_views: Views kept of each Gaussian, those that see most of it: this bounds memory.
         longest_side: Larger segments are read at so many pixels along their longest side; None
             reads all pixels. Masses stay in pixels of the segments as they came.
         render_options: Switches of the blending model.
@@ -254,7 +254,7 @@ def segment_table(
         if view.name not in known:
             raise InputError(f"evidence: there are no segments of view {view.name!r}.")
     ordered = sorted(views, key=lambda view: view.name)
-    entries = SegmentEntries(len(gaussians), most_views)
+    entries = SegmentEntries(len(gaussians), max_views)
     rows: list[tuple[int, int, int, float, int]] = []
     for place, view in enumerate(ordered):
         segments = source.segments_of(view.name)
@@ -339,7 +339,7 @@ def _add(
     """
     count = len(found.visible)
     segment, gaussian = found.segment.numpy(), found.gaussian.numpy()
-    kept = found.weight.numpy() > _LEAST_MASS
+    kept = found.weight.numpy() > _MIN_MASS
     segment, gaussian = segment[kept], gaussian[kept].astype(np.int32)
     mass = (pixel * found.weight.numpy()[kept]).astype(np.float32)
     sight = pixel * found.visible.numpy() if outside else np.bincount(gaussian, mass, count)

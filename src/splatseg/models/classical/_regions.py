@@ -33,7 +33,7 @@ class RegionOptions:
     """Costs of merging at which the hierarchy is cut, rising: one level of masks each, 0 the
     finest. A cost is about 1 where two large regions have nothing in common."""
 
-    least_area: float = 0.0005
+    min_area: float = 0.0005
     """Masks smaller than this share of the image are dropped."""
 
     def __post_init__(self) -> None:
@@ -44,7 +44,7 @@ class RegionOptions:
         rising = all(a < b for a, b in zip(self.cuts, self.cuts[1:], strict=False))
         if not self.cuts or self.cuts[0] <= 0 or not rising:
             raise InputError(f"cuts: expected positive, rising costs, got {self.cuts}.")
-        check_range("least_area", self.least_area, 0.0, 1.0)
+        check_range("min_area", self.min_area, 0.0, 1.0)
 
 
 def region_masks(image: Image, options: RegionOptions | None = None) -> MaskSet:
@@ -84,7 +84,7 @@ def region_masks(image: Image, options: RegionOptions | None = None) -> MaskSet:
     kept = [
         i
         for i in sorted(range(len(nodes)), key=lambda i: (levels[i], -tree.area[nodes[i]], i))
-        if masks[i].area >= max(1, options.least_area * height * width)
+        if masks[i].area >= max(1, options.min_area * height * width)
         and masks[i].area < height * width
     ]
     return MaskSet(
