@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatseg.core import LabelMap, Labels, Scene, View
+from splatseg.core import InstanceTree, LabelMap, Labels, Scene, View
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import (
@@ -116,6 +116,8 @@ def replica(job: Job) -> None:
     """Masks that need no weights, and the layer of them, against the reference's instances."""
     found = open_evidence(job.scene.root / "evidence" / job.masks if job.scene.root else Path())
     labels = load_scene_layer(job.scene.root or Path(), job.masks)
+    if isinstance(labels, InstanceTree):
+        labels = labels.cut()
     if not isinstance(labels, Labels):
         raise SystemExit(f"{job.masks}: expected a layer of labels")
     known = set(found.view_names)
