@@ -19,12 +19,12 @@ from splatseg.fit import (
     FitOptions,
     FitProgress,
     checkpoint_summary,
-    discard_checkpoint,
     fit,
 )
 from splatseg.fit._checkpoint import read_checkpoint, write_checkpoint
 from splatseg.fit._resume import CheckpointClock
 from splatseg.fit._run import FitRun
+from splatseg.io.npz_writing import discard_checkpoint_file
 
 OPTIONS = FitOptions(
     minutes=None,
@@ -402,7 +402,7 @@ def test_the_old_one_stays_until_the_new_one_is_whole(
             write_checkpoint(path, read_checkpoint(path))
     assert path.read_bytes() == good
     assert fit(capture, options=OPTIONS, checkpoints=checkpoints).steps == 60
-    discard_checkpoint(path)
+    discard_checkpoint_file(path)
     assert not path.parent.exists()
 
 

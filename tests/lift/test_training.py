@@ -15,6 +15,7 @@ from splatseg import _native
 from splatseg.core import LabelMap, View
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, SplatsegError
+from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.lift.training import (
     Batch,
     LabelTargets,
@@ -26,7 +27,6 @@ from splatseg.lift.training import (
     TrainingSummary,
     Values,
     _file,
-    discard_training,
     train,
     training_summary,
 )
@@ -270,7 +270,7 @@ def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
     assert (whole.losses, whole.scores) == (again.losses, again.scores)
     assert (whole.best_step, whole.stopped) == (again.best_step, again.stopped)
     assert training_summary(path) == TrainingSummary(step=stop, steps=25)
-    discard_training(path)
+    discard_checkpoint_file(path)
     assert not tmp_path.exists()
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from splatseg.core import Scene
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
+from splatseg.io.atomic import is_vacant
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.render import BackendName
@@ -273,7 +274,7 @@ def _prepare(folder: Path, observer: Observer) -> None:
         raise InputError(f"{folder}: expected a folder to write to, got a file.")
     check_parent(folder)
     record = folder / _RECORD
-    if folder.is_dir() and any(folder.iterdir()):
+    if folder.is_dir() and not is_vacant(folder):
         if not record.is_file() or read_json(record).get("made_by") != _MADE_BY:
             raise InputError(
                 f"{folder}: expected a new or empty folder or one that an earlier demo made, got "
