@@ -69,12 +69,17 @@ def clean_view_names(names: Sequence[str]) -> list[str]:
     cleaned = [_cleaned(name) for name in names]
     found = list(cleaned)
     taken = {_folded(name) for name in _TABLES}
-    # Names that need no change come first, so that no other one takes theirs.
+    others: list[int] = []
+    # Names that can stay come first, so that no other one takes theirs.
     for i in sorted(range(len(names)), key=lambda i: (cleaned[i] != names[i], names[i])):
-        number = 1
+        if _folded(found[i]) in taken:
+            others.append(i)
+        taken.add(_folded(found[i]))
+    for i in others:
+        number = 2
         while _folded(found[i]) in taken:
-            number += 1
             found[i] = f"{cleaned[i]}_{number}"
+            number += 1
         taken.add(_folded(found[i]))
     return found
 
