@@ -83,6 +83,20 @@ def test_without_locks_of_the_system_the_process_counts(
         pass
 
 
+def test_a_lock_file_of_another_kind_bars_nobody_and_leads_nowhere(tmp_path: Path) -> None:
+    """What a scene from elsewhere may hold."""
+    os.mkfifo(tmp_path / LOCK_FILE)
+    assert lock_owner(tmp_path) is None
+    (tmp_path / LOCK_FILE).unlink()
+    precious = tmp_path / "precious"
+    precious.write_text("content")
+    (tmp_path / LOCK_FILE).symlink_to(precious)
+    assert lock_owner(tmp_path) is None
+    with pytest.raises(OutputError, match="cannot be written"), scene_lock(tmp_path, "see"):
+        pass
+    assert precious.read_text() == "content"
+
+
 def _ended() -> int:
     """Number of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])

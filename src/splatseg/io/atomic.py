@@ -8,7 +8,6 @@ another one is writing, and `sweep` removes it.
 
 import contextlib
 import errno
-import fcntl
 import os
 import shutil
 import tempfile
@@ -18,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.file_locks import try_lock
 from splatseg.io.write_errors import write_failures_named
 
 TEMPORARY = ".splatseg-"
@@ -115,8 +115,7 @@ def hidden_folder(target: Path) -> Generator[Path]:
         yield holder
     finally:
         shutil.rmtree(holder, ignore_errors=True)
-        if handle is not None:
-            os.close(handle)
+        os.close(handle)
 
 
 def sweep(folder: Path) -> None:
@@ -205,14 +204,10 @@ def _finish_replacing(holder: Path, folder: Path) -> None:
             (holder / name).replace(folder / name)
 
 
-def _locked(holder: Path) -> int | None:
-    """A handle of the folder with a lock on it, which the system gives back when we end."""
+def _locked(holder: Path) -> int:
+    """A handle of the folder, with a lock on it where there are locks."""
     handle = os.open(holder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # a file system without locks: the number of the process has to do
-        os.close(handle)
-        return None
+    try_lock(handle)
     return handle
 
 
@@ -223,11 +218,8 @@ def _is_abandoned(holder: Path) -> bool:
     except OSError:
         return False
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass  # a file system without locks
+        if try_lock(handle) == "held":
+            return False
     finally:
         os.close(handle)
     number = holder.name.removeprefix(TEMPORARY).partition("-")[0]

@@ -6,7 +6,6 @@ of a process that was killed bars nobody. Reading a scene needs no lock.
 """
 
 import contextlib
-import fcntl
 import json
 import os
 import socket
@@ -19,6 +18,7 @@ from typing import Any, cast
 
 from splatseg.errors import InputError
 from splatseg.io.atomic import TEMPORARY, is_running
+from splatseg.io.file_locks import try_lock
 from splatseg.io.write_errors import write_failures_named
 
 LOCK_FILE = f"{TEMPORARY}lock"
@@ -106,20 +106,18 @@ def check_unlocked(root: Path) -> None:
 def lock_owner(root: Path) -> LockOwner | None:
     """Who works on a scene now; None if nobody does."""
     try:
-        handle = os.open(root / LOCK_FILE, os.O_RDONLY)
+        # Whatever a scene from elsewhere has of this name: nothing is waited for.
+        handle = os.open(root / LOCK_FILE, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
         return None
     try:
         owner = _read(handle)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return owner or LockOwner(work="splatseg", process=0, host="", since=0.0)
-        except OSError:  # a file system without locks
-            return owner if _seems_to_run(owner) else None
+        lock = try_lock(handle, shared=True)
     finally:
         os.close(handle)
-    return None
+    if lock == "held":
+        return owner or LockOwner(work="splatseg", process=0, host="", since=0.0)
+    return owner if lock == "unknown" and _seems_to_run(owner) else None
 
 
 def _taken(path: Path) -> int:
@@ -130,23 +128,15 @@ def _taken(path: Path) -> int:
     """
     for attempt in range(_TRIES):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = _read(handle)
-            os.close(handle)
-            if attempt == _TRIES - 1:
-                raise InputError(_refusal(path.parent, owner)) from None
-            time.sleep(_PAUSE)
-            continue
-        except OSError:  # a file system without locks: the number of the process has to do
-            owner = _read(handle)
-            if _seems_to_run(owner):
-                os.close(handle)
-                raise InputError(_refusal(path.parent, owner)) from None
-        if _is_current(handle, path):
+        lock, owner = try_lock(handle), _read(handle)
+        # On a file system without locks the number of the process has to do.
+        free = lock == "taken" or (lock == "unknown" and not _seems_to_run(owner))
+        if free and _is_current(handle, path):
             return handle
-        os.close(handle)  # its owner has just removed it
+        os.close(handle)
+        if not free and attempt == _TRIES - 1:
+            raise InputError(_refusal(path.parent, owner))
+        time.sleep(_PAUSE)  # or its owner has just removed it
     raise InputError(_refusal(path.parent, None))
 
 
@@ -181,5 +171,5 @@ def _read(handle: int) -> LockOwner | None:
             host=str(entry["host"])[:80],
             since=float(entry["since"]),
         )
-    except (ValueError, KeyError, TypeError, OverflowError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
