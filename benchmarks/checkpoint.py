@@ -15,11 +15,11 @@ import torch
 
 from splatseg.fit._checkpoint import (
     Checkpoint,
-    discard_checkpoint,
     read_checkpoint,
     write_checkpoint,
 )
 from splatseg.fit._state import FitState
+from splatseg.io.npz_writing import discard_checkpoint_file
 
 _WIDTHS = {"means": 3, "log_scales": 3, "rotations": 4, "logits": 1, "sh": 48}
 
@@ -49,7 +49,7 @@ def main() -> None:
     wall = time.monotonic()
     read_checkpoint(path)
     print(f"read: {time.monotonic() - wall:.2f} s")
-    discard_checkpoint(path)
+    discard_checkpoint_file(path)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@
     │   ├── RangeError                        a value is outside its range, NaN or infinite
     │   ├── FileFormatError                   a file is not what it should be
     │   └── MissingFileError (FileNotFoundError)
+    ├── OutputError (OSError)                 a file or folder cannot be written
     ├── MissingPackageError (ImportError)     an optional package is not installed
     └── BackendError (RuntimeError)           a backend cannot run here
 
@@ -36,6 +37,10 @@ class FileFormatError(InputError):
 
 class MissingFileError(InputError, FileNotFoundError):
     """A file or folder that was named does not exist."""
+
+
+class OutputError(SplatsegError, OSError):
+    """A file or folder cannot be written: the message names it and says what to do."""
 
 
 class MissingPackageError(SplatsegError, ImportError):

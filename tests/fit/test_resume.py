@@ -12,19 +12,20 @@ import torch
 
 from splatseg import _native
 from splatseg.core import Capture, Gaussians, PointCloud
-from splatseg.errors import FileFormatError, InputError, SplatsegError
+from splatseg.core.checkpoints import CheckpointWarning
+from splatseg.errors import FileFormatError, InputError
 from splatseg.fit import (
     Checkpoints,
     CheckpointVersionError,
     FitOptions,
     FitProgress,
     checkpoint_summary,
-    discard_checkpoint,
     fit,
 )
 from splatseg.fit._checkpoint import read_checkpoint, write_checkpoint
 from splatseg.fit._resume import CheckpointClock
 from splatseg.fit._run import FitRun
+from splatseg.io.npz_writing import discard_checkpoint_file
 
 OPTIONS = FitOptions(
     minutes=None,
@@ -378,11 +379,23 @@ def test_states_that_do_not_fit_are_refused(capture: Capture, path: Path) -> Non
     assert "the state of a fit" in refused(stages=None)
 
 
-def test_a_checkpoint_that_cannot_be_written_is_an_error(capture: Capture, path: Path) -> None:
+def test_a_checkpoint_that_cannot_be_written_is_told_of_and_the_fit_goes_on(
+    capture: Capture, path: Path
+) -> None:
     path.parent.parent.mkdir()
     path.parent.write_text("a file where the folder should be")
-    with pytest.raises(SplatsegError, match="the checkpoint cannot be written"):
-        fit(capture, options=OPTIONS, checkpoints=Checkpoints(path=path, steps=2))
+    told: list[str] = []
+    with_failures = fit(
+        capture,
+        options=OPTIONS,
+        checkpoints=Checkpoints(path=path, steps=25, at_end=True, failed=told.append),
+    )
+    assert _same(with_failures.gaussians, fit(capture, options=OPTIONS).gaussians)
+    assert len(told) == 3
+    assert all("checkpoint.npz: cannot be written" in line for line in told)
+    assert all(line.endswith("the work goes on, but has no checkpoint of now") for line in told)
+    with pytest.warns(CheckpointWarning, match="cannot be written"):
+        fit(capture, options=OPTIONS, checkpoints=Checkpoints(path=path, steps=50))
 
 
 def test_the_old_one_stays_until_the_new_one_is_whole(
@@ -402,7 +415,7 @@ def test_the_old_one_stays_until_the_new_one_is_whole(
             write_checkpoint(path, read_checkpoint(path))
     assert path.read_bytes() == good
     assert fit(capture, options=OPTIONS, checkpoints=checkpoints).steps == 60
-    discard_checkpoint(path)
+    discard_checkpoint_file(path)
     assert not path.parent.exists()
 
 

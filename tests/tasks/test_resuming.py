@@ -14,10 +14,19 @@ import pytest
 from splatseg.cli import main
 from splatseg.core import Labels
 from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.fit import FitOptions
 from splatseg.io.scene import load_scene, training_file
 from splatseg.lift.training import _train, training_summary
 from splatseg.methods import find_method
-from splatseg.tasks import CheckpointOptions, SegmentOptions, describe, save_segmentation, segment
+from splatseg.tasks import (
+    CheckpointOptions,
+    MakeSceneOptions,
+    SegmentOptions,
+    describe,
+    make_scene,
+    save_segmentation,
+    segment,
+)
 from splatseg.tasks import segment as segment_task
 from support.observers import Cancelled, Stopping
 
@@ -288,3 +297,28 @@ def test_a_signal_ends_the_command_with_one_sentence(
     assert not (made / "layers" / f"{LAYER}.npz").exists()
     assert main(["segment", str(made), *WORDS, "--resume"]) == 0
     assert (made / "layers" / f"{LAYER}.npz").read_bytes() == straight["identity"]
+
+
+def test_what_is_refused_is_not_said_to_go_on(scene, small_room, tmp_path) -> None:
+    stop(scene)
+    hearing = Stopping("segment", after=1000)
+    with pytest.raises(InputError, match="got one with batch 200 instead of 100"):
+        run(scene, checkpoints=GOING_ON, observer=hearing, batch=100)
+    assert not any("going on" in line for line in hearing.heard)
+    fit_options = FitOptions(minutes=None, steps=40, max_gaussians=500)
+    often = MakeSceneOptions(checkpoint_steps=5)
+    stopping = Stopping("fit", after=8)
+    with pytest.raises(Cancelled):
+        make_scene(
+            small_room, tmp_path / "new", fit_options=fit_options, options=often, observer=stopping
+        )
+    hearing = Stopping()
+    with pytest.raises(InputError, match="seed 0 instead of 1"):
+        make_scene(
+            small_room,
+            tmp_path / "new",
+            fit_options=replace(fit_options, seed=1),
+            options=replace(often, resume=True),
+            observer=hearing,
+        )
+    assert not any("going on" in line for line in hearing.heard)

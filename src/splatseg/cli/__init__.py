@@ -9,13 +9,14 @@ Exit status: 0 done, 2 bad input or usage, 1 everything else, Ctrl-C included.
 
 import difflib
 import importlib
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from splatseg.cli._pages import kept_page
+from splatseg.cli._signals import interrupted_by_signals
+from splatseg.cli._streams import prepare_streams, silence, tell
 from splatseg.cli._words import field_names, option_names, with_flags
 from splatseg.errors import InputError, SplatsegError
 
@@ -125,22 +126,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     if debug:
         words = [word for word in words if word != "--debug"]
+    prepare_streams()
     try:
-        status = _dispatch(words)
+        with interrupted_by_signals():
+            status = _dispatch(words)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of our output went away (`splatseg info X | head -1`). The interpreter
-        # flushes once more at exit; give it somewhere to write so that it stays silent.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader of our output went away (`splatseg info X | head -1`).
+        silence(sys.stdout)
         return EXIT_FAILED
     except KeyboardInterrupt as error:
         how = f": {error}" if error.args else ""
-        print(f"interrupted{how}", file=sys.stderr)
+        tell(sys.stderr, f"interrupted{how}\n")
         return EXIT_FAILED
     except InputError as error:
         return _report(error, str(error), status=EXIT_USAGE, debug=debug)
     except SplatsegError as error:
         return _report(error, str(error), status=EXIT_FAILED, debug=debug)
+    except OSError as error:
+        return _report_system(error, debug=debug)
     except Exception as error:  # noqa: BLE001  (the last resort: one line, not a traceback)
         sentence = f"{type(error).__name__}: {error} (add --debug for the traceback)"
         return _report(error, sentence, status=EXIT_FAILED, debug=debug)
@@ -236,10 +240,22 @@ def _unknown(name: str) -> str:
     return f"unknown {kind} {name!r}; {hint}"
 
 
+def _report_system(error: OSError, *, debug: bool) -> int:
+    """An error of the system: one of writing says what to do."""
+    from splatseg.io.write_errors import is_write_failure, write_failure
+
+    sentence = f"{type(error).__name__}: {error} (add --debug for the traceback)"
+    if is_write_failure(error):
+        sentence = write_failure(error.filename or "the standard output", error)
+    if error.filename is None:
+        silence(sys.stdout)
+    return _report(error, sentence, status=EXIT_FAILED, debug=debug)
+
+
 def _report(error: Exception, sentence: str, *, status: int, debug: bool) -> int:
     if debug:
         import traceback
 
         traceback.print_exception(error, file=sys.stderr)
-    print(f"error: {sentence}", file=sys.stderr)
+    tell(sys.stderr, f"error: {sentence}\n")
     return status

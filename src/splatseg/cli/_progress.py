@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from splatseg.cli._streams import tell
+
 SECONDS_BETWEEN_LINES = 10.0
 """At most one line in this time: enough to see that something goes on, few enough for a log."""
 
@@ -85,11 +87,7 @@ def lines_on_stderr(what: str) -> ProgressLines | None:
     if Console(stderr=True).is_terminal:
         return None
 
-    def write(line: str) -> None:
-        sys.stderr.write(line)
-        sys.stderr.flush()
-
-    return ProgressLines(what, write=write)
+    return ProgressLines(what, write=lambda line: tell(sys.stderr, line))
 
 
 @contextmanager

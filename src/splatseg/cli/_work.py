@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from splatseg.cli._fit_progress import fit_progress, pose_progress
 from splatseg.cli._progress import progress
+from splatseg.cli._streams import tell
 from splatseg.core import Scene
 from splatseg.fit import FitProgress
 from splatseg.io.scene import load_scene
@@ -96,16 +97,13 @@ class ConsoleObserver(Observer):
     def note(self, message: str) -> None:
         """A line of its own on stderr."""
         if not self._quiet:
-            sys.stderr.write(f"note: {message}\n")
-            sys.stderr.flush()
+            tell(sys.stderr, f"note: {message}\n")
 
     @override
     def info(self, message: str) -> None:
         """A line of its own."""
         if not self._quiet:
-            stream = sys.stderr if self._json else sys.stdout
-            stream.write(f"{message}\n")
-            stream.flush()
+            tell(sys.stderr if self._json else sys.stdout, f"{message}\n")
 
 
 def _nothing(now: object) -> None:

@@ -14,6 +14,7 @@ from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Scene
 from splatseg.io.json_files import write_json
 from splatseg.tasks import EvaluationOptions, evaluate
+from splatseg.tasks.new_scene import check_parent
 
 _PER_CLASS = {
     "per_class": "classes",
@@ -62,6 +63,8 @@ class Command:
 
 def run(command: Command) -> None:
     """Evaluate a scene."""
+    if command.json_file is not None:
+        check_parent(command.json_file)
     scene = open_scene(command.scene, command.data)
     figures = evaluate(
         scene,

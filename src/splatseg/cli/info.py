@@ -91,13 +91,19 @@ def _photographs_sentence(facts: dict[str, Any]) -> str:
     return f"{facts['photographs']} photographs, {', '.join(facts['sizes'])}; no poses"
 
 
+_NO_CHECKPOINT = "fit that was stopped before its first checkpoint"
+
+
 def _unfinished_sentence(facts: dict[str, Any]) -> str:
+    running = facts["running"]
+    how = f"running, process {running['process']}; " if running else ""
     if not facts["steps"]:
-        return "fit that was stopped before its first checkpoint"
+        return f"fit, {how}no checkpoint yet" if running else _NO_CHECKPOINT
     return (
-        f"unfinished fit, {100 * facts['progress']:.0f} % done: {facts['gaussians']} Gaussians "
-        f"after {facts['steps']} steps and {facts['seconds'] / 60:.1f} minutes; "
-        "fit --resume continues it"
+        f"unfinished fit, {how}{100 * facts['progress']:.0f} % done"
+        f"{' at its last checkpoint' if running else ''}: {facts['gaussians']} Gaussians "
+        f"after {facts['steps']} steps and {facts['seconds'] / 60:.1f} minutes"
+        f"{'' if running else '; fit --resume continues it'}"
     )
 
 

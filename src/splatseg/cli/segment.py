@@ -13,9 +13,10 @@ import tyro
 from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder, Seed
 from splatseg.cli._words import option_value
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
-from splatseg.core import UNLABELLED, Features, Labels
+from splatseg.core import UNLABELLED, Features, Labels, Scene
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
+from splatseg.io.scene_folder import work_on_scene
 from splatseg.lift import CompletionOptions
 from splatseg.methods import Method, find_method, methods
 from splatseg.tasks import (
@@ -156,52 +157,69 @@ def run(command: Command) -> None:
         _check_outputs(command, method)
     if command.export and command.shared.layer is not None:
         check_layer_exports(scene, command.scene, command.shared.layer)
-    result = segment(
-        scene,
-        method,
-        options=command.shared,
-        method_options=command.options,
-        completion=command.completion,
-        checkpoints=command.checkpoint,
-        backend=command.backend,
-        observer=observer,
-    )
-    if command.export:
-        check_layer_exports(scene, command.scene, result.name)
-    path = save_segmentation(command.scene, result)
-    lines = [_summary(result, time.monotonic() - started), str(path)]
-    made = _facts(result, path)
-    timings = {"load": opened}
-    if command.export:
-        began = time.monotonic()
-        files, maps = export_layer(
+    # Until all of it is written, no other process may change the scene.
+    writes = ["layers", *(["reports"] if command.report else [])]
+    with work_on_scene(command.scene, "segment", writes=writes):
+        result = segment(
             scene,
-            command.scene,
-            result.name,
-            result.layer,
+            method,
+            options=command.shared,
+            method_options=command.options,
+            completion=command.completion,
+            checkpoints=command.checkpoint,
             backend=command.backend,
             observer=observer,
         )
-        timings["export"] = time.monotonic() - began
-        lines += [f"{file.summary} in {file.output}" for file in files]
-        made["exports"] = [file.output for file in files]
-        if maps is not None:
-            lines.append(f"{maps.views} views in {maps.folder}")
-            made["exports"].append(maps.folder)
-    if command.report:
-        where = report_layer(
-            scene,
-            command.scene,
-            result,
-            truth=truth,
-            timings=timings,
-            command=typed(sys.argv),
-            backend=command.backend,
-        )
-        lines.append(f"report: {where}")
-        made["report"] = where
+        if command.export:
+            check_layer_exports(scene, command.scene, result.name)
+        path = save_segmentation(command.scene, result)
+        lines = [_summary(result, time.monotonic() - started), str(path)]
+        made = _facts(result, path)
+        timings = {"load": opened}
+        if command.export:
+            _export(command, scene, result, observer, lines=lines, made=made, timings=timings)
+        if command.report:
+            where = report_layer(
+                scene,
+                command.scene,
+                result,
+                truth=truth,
+                timings=timings,
+                command=typed(sys.argv),
+                backend=command.backend,
+            )
+            lines.append(f"report: {where}")
+            made["report"] = where
     made["seconds"] = round(time.monotonic() - started, 3)
     print_result(made, lines, json=command.json)
+
+
+def _export(
+    command: Command,
+    scene: Scene,
+    result: Segmentation,
+    observer: ConsoleObserver,
+    *,
+    lines: list[str],
+    made: dict[str, Any],
+    timings: dict[str, float],
+) -> None:
+    """Write the exports, and add what they are to what is printed."""
+    began = time.monotonic()
+    files, maps = export_layer(
+        scene,
+        command.scene,
+        result.name,
+        result.layer,
+        backend=command.backend,
+        observer=observer,
+    )
+    timings["export"] = time.monotonic() - began
+    lines += [f"{file.summary} in {file.output}" for file in files]
+    made["exports"] = [file.output for file in files]
+    if maps is not None:
+        lines.append(f"{maps.views} views in {maps.folder}")
+        made["exports"].append(maps.folder)
 
 
 def _facts(result: Segmentation, path: Path) -> dict[str, Any]:

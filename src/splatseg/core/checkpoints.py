@@ -2,6 +2,8 @@
 
 import math
 import time
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +11,18 @@ from splatseg.errors import RangeError
 
 # The pause is at least this many times the time that writing a checkpoint took.
 _MIN_PAUSE_RATIO = 60.0
+
+
+class CheckpointWarning(UserWarning):
+    """A checkpoint could not be written; the work goes on without it."""
+
+
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, CheckpointWarning, stacklevel=2)
+
+
+def _nothing() -> None:
+    """Where nobody wants to know."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +50,13 @@ class Checkpoints:
     """Write one at the end too: from it a fit can be made longer, and what follows a training
     can be done again."""
 
+    resumed: Callable[[], None] = _nothing
+    """Called when the work goes on from the file, after it was found to be of this work."""
+
+    failed: Callable[[str], None] = _warn
+    """Told in a sentence that a checkpoint could not be written; the one before is still there,
+    and the work goes on. The default is a `CheckpointWarning`."""
+
     def __post_init__(self) -> None:
         if not (math.isfinite(self.seconds) and self.seconds > 0):
             raise RangeError(
@@ -43,6 +64,11 @@ class Checkpoints:
             )
         if self.steps is not None and self.steps < 1:
             raise RangeError(f"checkpoints.steps: expected at least 1, got {self.steps}.")
+
+
+def without_checkpoint(error: Exception) -> str:
+    """The sentence about a checkpoint that could not be written."""
+    return f"{str(error).rstrip('.')}; the work goes on, but has no checkpoint of now"
 
 
 class CheckpointSchedule:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM are deferred until long work is between two steps."""
+"""Ctrl-C, SIGTERM and SIGHUP are deferred until long work is between two steps."""
 
 import signal
 import threading
@@ -6,7 +6,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from types import FrameType
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 # This signal interrupts at once: the step in progress may never end.
 _MAX_REQUESTS = 3
 
@@ -39,10 +39,11 @@ _active: list[Interrupts] = []
 
 @contextmanager
 def deferred_interrupts() -> Generator[Interrupts]:
-    """Record SIGINT and SIGTERM while the block runs; the third raises `KeyboardInterrupt`.
+    """Record these signals while the block runs; the third raises `KeyboardInterrupt`.
 
-    A nested block shares the requests of the outer one. Outside the main thread, which alone
-    receives signals, nothing is recorded. The block itself decides how to stop.
+    A SIGTERM or SIGHUP that is ignored, as by ``nohup``, stays so. A nested block shares the
+    requests of the outer one. Outside the main thread, which alone receives signals, nothing is
+    recorded. The block itself decides how to stop.
     """
     if _active:
         yield _active[-1]
@@ -52,9 +53,12 @@ def deferred_interrupts() -> Generator[Interrupts]:
         yield interrupts
         return
     before = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number in _SIGNALS[1:]:
+        if before[number] == signal.SIG_IGN:
+            del before[number]
     _active.append(interrupts)
     try:
-        for number in _SIGNALS:
+        for number in before:
             signal.signal(number, interrupts.receive)
         yield interrupts
     finally:

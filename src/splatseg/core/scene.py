@@ -12,6 +12,7 @@ from torch import Tensor
 from splatseg._check import check_shape
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
+from splatseg.core.view_names import check_view_name
 from splatseg.errors import InputError, ShapeError
 
 
@@ -20,7 +21,8 @@ class View:
     """One photograph with its camera. The pixels stay on disk until somebody asks."""
 
     name: str
-    """The file's stem, or its relative path without suffix where stems clash."""
+    """The file's stem, or its relative path without suffix where stems clash. Files of the view
+    are called so, below their folders: see `view_names`."""
 
     camera: Camera
     """In the photograph's own pixels, after its EXIF orientation was applied."""
@@ -39,6 +41,9 @@ class View:
 
     depth_unit: float | None = None
     """Scene units of one step of the depth map."""
+
+    def __post_init__(self) -> None:
+        check_view_name(self.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,6 +7,7 @@ from typing import Any
 
 from splatseg.core import Edited, Layer, Scene, apply_rows
 from splatseg.errors import InputError, ShapeError
+from splatseg.io.atomic import is_vacant
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene, scene_layer_names
 
 HISTORY = "edits"
@@ -63,7 +64,7 @@ def save_document(document: Document, root: Path | str) -> Document:
         InputError: If something is there already: edits write new scenes.
     """
     root = Path(root)
-    if root.exists() and not (root.is_dir() and not any(root.iterdir())):
+    if root.exists() and not (root.is_dir() and is_vacant(root)):
         raise InputError(
             f"{root}: expected a new folder, got one that is there; an edit never overwrites."
         )

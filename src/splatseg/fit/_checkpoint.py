@@ -18,9 +18,10 @@ import torch
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
-from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
+from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.fit._state import FitState
-from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.json_files import parse_object
+from splatseg.io.npz_writing import write_checkpoint_file
 
 FORMAT = "splatseg-fit"
 VERSION = 1
@@ -47,7 +48,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint; the previous one stays until the new one is complete.
 
     Raises:
-        SplatsegError: If it cannot be written; the previous one is kept.
+        OutputError: If it cannot be written; the previous one is kept.
     """
     header = {
         "format": FORMAT,
@@ -55,17 +56,9 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "identity": dict(checkpoint.identity),
         "content": dict(checkpoint.state.content),
     }
-    text = json_text(str(path), header)
-    arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text.encode(), np.uint8)}
-    arrays |= {name: tensor.numpy() for name, tensor in checkpoint.state.tensors.items()}
-    unfinished = _unfinished(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with unfinished.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        unfinished.replace(path)
-    except OSError as error:
-        raise SplatsegError(f"{path}: the checkpoint cannot be written ({error}).") from error
+    tensors = checkpoint.state.tensors
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+    write_checkpoint_file(path, header, arrays)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -115,18 +108,6 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
         seconds=state.number("seconds"),
         gaussians=int(state.number("gaussians")),
     )
-
-
-def discard_checkpoint(path: Path) -> None:
-    """Remove a checkpoint, and its folder if nothing else is in it."""
-    for file in (path, _unfinished(path)):
-        file.unlink(missing_ok=True)
-    if path.parent.is_dir() and not any(path.parent.iterdir()):
-        path.parent.rmdir()
-
-
-def _unfinished(path: Path) -> Path:
-    return path.with_name(f"{path.name}.new")
 
 
 @contextmanager

@@ -46,7 +46,7 @@ def fit(
             checkpoint to resume from has other data or options.
         MissingFileError: If a photograph is missing.
         FileFormatError: If the checkpoint to resume from is damaged.
-        SplatsegError: If the loss is no longer a number, or a checkpoint cannot be written.
+        SplatsegError: If the loss is no longer a number.
     """
     renderer = get_backend(backend)
     views = tuple(view for view in capture.train_views if view.image is not None)

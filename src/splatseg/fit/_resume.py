@@ -4,7 +4,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from splatseg.core.checkpoints import Checkpoints, CheckpointSchedule
+from splatseg.core.checkpoints import Checkpoints, CheckpointSchedule, without_checkpoint
+from splatseg.errors import OutputError
 from splatseg.fit._checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from splatseg.fit._identity import check_identity
 from splatseg.fit._state import FitState
@@ -35,6 +36,7 @@ class CheckpointClock:
             return None
         found = read_checkpoint(path)
         check_identity(path, found.identity, self._identity)
+        self._checkpoints.resumed()
         return found.state
 
     def due(self, steps: int) -> bool:
@@ -42,9 +44,13 @@ class CheckpointClock:
         return self._schedule.due(steps)
 
     def write(self, state: FitState) -> float:
-        """Write a checkpoint. Returns the seconds it took."""
+        """Write a checkpoint, or tell that it cannot be. Returns the seconds it took."""
         begin = time.monotonic()
-        write_checkpoint(self._checkpoints.path, Checkpoint(state=state, identity=self._identity))
+        checkpoint = Checkpoint(state=state, identity=self._identity)
+        try:
+            write_checkpoint(self._checkpoints.path, checkpoint)
+        except OutputError as error:
+            self._checkpoints.failed(without_checkpoint(error))
         seconds = time.monotonic() - begin
         self._schedule.written(seconds)
         return seconds

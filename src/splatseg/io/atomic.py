@@ -1,24 +1,35 @@
 """Writing files and folders so that nothing half-written is ever seen under the target's name.
 
-Everything is written under a temporary name beside the target (same file system, so that the
-rename is one step) and renamed only when the block ended well.
+Everything is written in a hidden folder beside the target (same file system, so that the rename
+is one step) and renamed only when the block ended well. The hidden folder's name has the number
+of the process, and the process holds a lock on it: what a killed process left is told from what
+another one is writing, and `sweep` removes it.
 """
 
+import contextlib
+import errno
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.file_locks import try_lock
+from splatseg.io.write_errors import write_failures_named
 
 TEMPORARY = ".splatseg-"
-"""How the names of folders begin that hold what is being written."""
+"""How the names of files and folders begin that are ours and not the user's."""
+
+_PREVIOUS = ("previous", "previous.old")
+# A process of this number that runs may be another one, of another container or later.
+_CERTAINLY_ABANDONED = 3600.0
 
 
 @contextmanager
-def atomic_file(path: str | os.PathLike[str]) -> Generator[Path]:
+def atomic_file(path: str | os.PathLike[str], *, durable: bool = False) -> Generator[Path]:
     """Give a temporary path to write a file to; it becomes `path` when the block ends well.
 
     The temporary name ends with the target's whole name, so writers that look at the suffix
@@ -27,10 +38,13 @@ def atomic_file(path: str | os.PathLike[str]) -> Generator[Path]:
 
     Args:
         path: The file to write. Its folder must exist.
+        durable: Wait until the disk has the file before it replaces the old one, so that a
+            power cut leaves one of the two.
 
     Raises:
         MissingFileError: If the folder of `path` does not exist.
         InputError: If `path` is a folder, or if the block ended without writing the file.
+        OutputError: If the disk is full, or there is no permission.
 
     Example:
         >>> import tempfile
@@ -43,52 +57,133 @@ def atomic_file(path: str | os.PathLike[str]) -> Generator[Path]:
     target = _checked_target(path)
     if target.is_dir():
         raise InputError(f"{target}: expected a file to write, got a folder.")
-    holder = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=target.parent))
-    try:
+    with hidden_folder(target) as holder, write_failures_named(target, within=holder):
         temporary = holder / target.name
         yield temporary
         if not temporary.is_file():
             raise InputError(f"{target}: expected the file to be written, but nothing was.")
+        if durable:
+            sync(temporary)
         temporary.replace(target)
-    finally:
-        shutil.rmtree(holder, ignore_errors=True)
+        if durable:
+            sync(target.parent)
 
 
 @contextmanager
-def atomic_folder(path: str | os.PathLike[str]) -> Generator[Path]:
+def atomic_folder(path: str | os.PathLike[str], *, durable: bool = False) -> Generator[Path]:
     """Give an empty temporary folder to fill; it becomes `path` when the block ends well.
 
     An existing folder is replaced as a whole: what the block did not write is gone afterwards.
     Between two renames the target is missing for an instant, but both the old and the new
-    folder are complete at every moment, and the old one comes back if the second rename fails.
+    folder are complete at every moment; the old one comes back if the second rename fails, and
+    `sweep` brings the new one into place if the process was killed between the two.
 
     Args:
         path: The folder to write. Its parent must exist.
+        durable: Wait until the disk has everything before the folder takes its name.
 
     Raises:
         MissingFileError: If the parent of `path` does not exist.
         InputError: If `path` is a file.
+        OutputError: If the disk is full, or there is no permission.
     """
     target = _checked_target(path)
     if target.exists() and not target.is_dir():
         raise InputError(f"{target}: expected a folder to write, got a file.")
-    holder = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=target.parent))
-    try:
+    with hidden_folder(target) as holder, write_failures_named(target, within=holder):
         temporary = holder / target.name
         temporary.mkdir()
         yield temporary
-        _replace_folder(temporary, target, holder / "previous")
+        if durable:
+            sync_tree(temporary)
+        replace_folder(temporary, target, holder / _PREVIOUS[0])
+        if durable:
+            sync(target.parent)
+
+
+@contextmanager
+def hidden_folder(target: Path) -> Generator[Path]:
+    """A hidden folder beside `target` while the block runs, which `sweep` lets alone.
+
+    Raises:
+        OutputError: If none can be made there.
+    """
+    with write_failures_named(target):
+        holder = Path(tempfile.mkdtemp(prefix=f"{TEMPORARY}{os.getpid()}-", dir=target.parent))
+    handle = _locked(holder)
+    try:
+        yield holder
     finally:
         shutil.rmtree(holder, ignore_errors=True)
+        os.close(handle)
 
 
-def _replace_folder(new: Path, target: Path, aside: Path) -> None:
+def sweep(folder: Path) -> None:
+    """Clear a folder of what killed processes were writing in it.
+
+    A folder that one was about to replace gets its new content. What a process that runs is
+    writing stays, and so does what may not be removed.
+    """
+    if not folder.is_dir():
+        return
+    for holder in folder.glob(f"{TEMPORARY}[0-9]*-*"):
+        if holder.is_dir() and not holder.is_symlink() and _is_abandoned(holder):
+            with contextlib.suppress(OSError):
+                _finish_replacing(holder, folder)
+            shutil.rmtree(holder, ignore_errors=True)
+
+
+def is_vacant(folder: Path) -> bool:
+    """Whether a folder holds nothing of the user's."""
+    return all(entry.name.startswith(TEMPORARY) for entry in folder.iterdir())
+
+
+def check_writable(folder: Path) -> None:
+    """Find out before long work whether something can be written in a folder that is there.
+
+    Raises:
+        InputError: If it cannot; the message says why and what to do.
+    """
+    try:
+        with hidden_folder(folder / TEMPORARY):
+            pass
+    except OSError as error:
+        reason = str(error).partition(": ")[2] or str(error)
+        raise InputError(f"{folder}: {reason}") from error
+
+
+def sync(path: Path) -> None:
+    """Wait until the disk has a file, or the names in a folder.
+
+    Raises:
+        OSError: If the disk does not take it.
+    """
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        # Some file systems know no such thing for folders.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
+            raise
+    finally:
+        os.close(handle)
+
+
+def sync_tree(folder: Path) -> None:
+    """Wait until the disk has a folder with everything in it."""
+    for parent, _, files in os.walk(folder):
+        for name in files:
+            sync(Path(parent) / name)
+        sync(Path(parent))
+
+
+def replace_folder(new: Path, target: Path, aside: Path) -> None:
     """Rename `new` to `target`; what was there before goes to `aside`."""
     if not target.exists():
         new.replace(target)
         return
     if aside == new:  # the target itself is called "previous"
-        aside = aside.with_name("previous.old")
+        aside = aside.with_name(_PREVIOUS[1])
     try:
         target.replace(aside)
         new.replace(target)
@@ -96,6 +191,52 @@ def _replace_folder(new: Path, target: Path, aside: Path) -> None:
         if aside.exists() and not target.exists():
             aside.replace(target)
         raise
+
+
+def _finish_replacing(holder: Path, folder: Path) -> None:
+    """Do the second rename of `replace_folder`, if its process was killed before it."""
+    names = {entry.name for entry in holder.iterdir()}
+    aside = _PREVIOUS[1] if _PREVIOUS[1] in names else _PREVIOUS[0]
+    new = names - {aside}
+    if aside in names and len(new) == 1:
+        name = new.pop()
+        if not (folder / name).exists():
+            (holder / name).replace(folder / name)
+
+
+def _locked(holder: Path) -> int:
+    """A handle of the folder, with a lock on it where there are locks."""
+    handle = os.open(holder, os.O_RDONLY)
+    try_lock(handle)
+    return handle
+
+
+def _is_abandoned(holder: Path) -> bool:
+    """Whether the process that made a hidden folder has ended."""
+    try:
+        handle = os.open(holder, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        if try_lock(handle) == "held":
+            return False
+    finally:
+        os.close(handle)
+    number = holder.name.removeprefix(TEMPORARY).partition("-")[0]
+    if not (number.isdecimal() and is_running(int(number))):
+        return True
+    return time.time() - holder.stat().st_mtime > _CERTAINLY_ABANDONED
+
+
+def is_running(process: int) -> bool:
+    """Whether a process of this number runs on this machine."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def _checked_target(path: str | os.PathLike[str]) -> Path:

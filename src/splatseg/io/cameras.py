@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from splatseg.core import Camera, View
+from splatseg.core.view_names import view_name_fault
 from splatseg.errors import FileFormatError
 from splatseg.io.captures.build import checked_pose, opencv_from_opengl
 from splatseg.io.captures.nerfstudio import MILLIMETRE, frame_matrix, lens_of, number
@@ -134,6 +135,9 @@ def _view(
     name, split = entry.get("name"), entry.get("split")
     if not isinstance(name, str) or not isinstance(split, str):
         raise FileFormatError(f"{where}: expected a name and a split, got {name!r} and {split!r}.")
+    fault = view_name_fault(name)
+    if fault is not None:
+        raise FileFormatError(f"{where}: {fault}.")
     files = {
         field: _resolve(entry, key, folder=folder, source=source) for field, key in _FILES.items()
     }

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core.json_values import plain_json
-from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.atomic import atomic_file
 
 
@@ -49,10 +49,16 @@ def json_text(name: str, value: Mapping[str, Any], *, indent: int | None = None)
     Numbers are written with the fewest digits that give the same float64.
 
     Raises:
-        InputError: If it holds a key that is no string, NaN, infinity, or an object that JSON
-            has no word for; `name` starts the message.
+        InputError: If it holds a key that is no string, NaN, infinity, an object that JSON has no
+            word for, or bytes of a file name that are no UTF-8; `name` starts the message.
     """
-    return json.dumps(plain_json(name, value), indent=indent, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(plain_json(name, value), indent=indent, ensure_ascii=False, allow_nan=False)
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        around = text[max(error.start - 20, 0) : error.end + 20]
+        raise InputError(f"{name}: expected text that UTF-8 can hold, got {around!r}.") from error
+    return text
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -60,6 +66,7 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 
     Raises:
         InputError: If a value has no place in JSON.
+        OutputError: If the disk is full, or there is no permission.
     """
     text = json_text(path.name, value, indent=1)
     with atomic_file(path) as temporary:

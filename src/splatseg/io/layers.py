@@ -29,7 +29,8 @@ from splatseg.core import (
 )
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.atomic import atomic_file
-from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.json_files import parse_object
+from splatseg.io.npz_writing import save_arrays
 
 FORMAT = "splatseg-layer"
 VERSION = 3
@@ -90,10 +91,8 @@ def save_layer(path: Path, layer: Layer) -> None:
             header |= {"kind": "selection"}
             arrays = {"mask": layer.mask.cpu().numpy()}
     header["info"] = layer_info_to_json(layer.info)
-    text = json_text(f"{path}: header", header)
-    arrays = {_HEADER: np.frombuffer(text.encode(), np.uint8)} | arrays
-    with atomic_file(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    with atomic_file(path, durable=True) as temporary:
+        save_arrays(temporary, header, arrays, name=path)
 
 
 def load_layer(path: Path) -> Layer:

@@ -10,6 +10,8 @@
       fit/checkpoint.npz        state of a fit that was stopped
       training/<layer>.npz      state of a training of this layer that was stopped
       capture/                  poses that were found for bare photographs
+      .splatseg-lock            who works on the scene now, see `scene_lock`
+      .splatseg-pending/        files of the scene that are about to take their places
 
 Photographs stay where they are: a scene knows its capture by a path relative to itself and an
 absolute one, and opens without it.
@@ -24,7 +26,14 @@ from typing import Any, cast
 
 from splatseg.core import Layer, Scene, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.atomic import TEMPORARY, atomic_folder
+from splatseg.io.atomic import (
+    TEMPORARY,
+    atomic_folder,
+    hidden_folder,
+    is_vacant,
+    sync,
+    sync_tree,
+)
 from splatseg.io.cameras import (
     cameras_content,
     relative_path,
@@ -34,30 +43,38 @@ from splatseg.io.cameras import (
 from splatseg.io.class_tables import class_rows, class_table
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
+from splatseg.io.lock import scene_lock
+from splatseg.io.paths import path_inside
+from splatseg.io.scene_folder import (
+    CAMERAS_FILE,
+    FOLDERS,
+    GAUSSIANS_FILE,
+    PENDING,
+    SCENE_FILE,
+    TRAINING_FOLDER,
+    current_file,
+    finish_pending,
+    scene_path,
+)
 from splatseg.io.splats import read_splats, write_splats
+from splatseg.io.write_errors import write_failures_named
 
 FORMAT = "splatseg-scene"
 VERSION = 1
 """Version of the folders written; all versions up to it are read."""
 
-SCENE_FILE = "scene.json"
-GAUSSIANS_FILE = "gaussians.ply"
-CAMERAS_FILE = "cameras/transforms.json"
 CHECKPOINT_FILE = "fit/checkpoint.npz"
-TRAINING_FOLDER = "training"
-"""Where methods that train keep their state until the layer is written."""
 
 POSES_FOLDER = "capture"
 """Where `fit` keeps the poses that it found for bare photographs."""
 
 _POSES_ENTRIES = ("poses.json", "sparse", "frames", "frames.txt", "work")
-FOLDERS = ("cameras", "evidence", "layers", "reports")
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 
 
 def is_scene(path: Path) -> bool:
     """Whether a folder is a scene folder."""
-    return (path / SCENE_FILE).is_file()
+    return current_file(path, SCENE_FILE).is_file()
 
 
 def is_unfinished(path: Path) -> bool:
@@ -74,8 +91,12 @@ def is_unfinished(path: Path) -> bool:
 
 
 def training_file(root: Path, layer: str) -> Path:
-    """Where the training of a layer keeps its state."""
-    return root / TRAINING_FOLDER / f"{layer}.npz"
+    """Where the training of a layer keeps its state.
+
+    Raises:
+        InputError: If a link leads out of the scene.
+    """
+    return path_inside(root, TRAINING_FOLDER, f"{layer}.npz", make=False)
 
 
 def training_files(root: Path) -> tuple[Path, ...]:
@@ -97,8 +118,8 @@ def save_scene(
     """Write a scene folder; layers, evidence and reports that are there stay.
 
     A new folder appears whole or not at all, with its `layers`. In one that is there, be it a
-    scene or the checkpoint of one that was being fitted, each file is replaced whole,
-    scene.json last.
+    scene or the checkpoint of one that was being fitted, the new files take the places of the
+    old ones together: a process that is killed leaves the old scene or the new one.
 
     Returns:
         The scene with `root` set.
@@ -107,17 +128,19 @@ def save_scene(
         InputError: If `root` is a folder of something else, a value has no place in JSON, or a
             layer has not one row a Gaussian.
         MissingFileError: If the parent of `root` does not exist.
+        OutputError: If the disk is full, or there is no permission.
     """
     root = Path(root)
     for name, layer in (layers or {}).items():
         _check_layer(name, layer, len(scene.gaussians))
     there = is_scene(root) or is_unfinished(root)
-    if root.is_dir() and not there and any(root.iterdir()):
+    if root.is_dir() and not there and not is_vacant(root):
         raise InputError(f"{root}: expected an empty folder or a scene to write to, got neither.")
     if there:
-        _write(scene, root, layers or {}, final=root)
+        with scene_lock(root, "saving"):
+            _replace(scene, root, layers or {})
     else:
-        with atomic_folder(root) as temporary:
+        with atomic_folder(root, durable=True) as temporary:
             _write(scene, temporary, layers or {}, final=root)
     return replace(scene, root=root)
 
@@ -137,12 +160,12 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
     """
     root = Path(root)
     content = _scene_content(root)
-    cameras = read_json(root / CAMERAS_FILE)
+    cameras = read_json(current_file(root, CAMERAS_FILE))
     source = _source(root, content, cameras, None if data is None else Path(data))
     views = views_from_content(
         cameras, folder=root / "cameras", source=source, path=root / CAMERAS_FILE
     )
-    gaussians = read_splats(root / GAUSSIANS_FILE)
+    gaussians = read_splats(current_file(root, GAUSSIANS_FILE))
     if len(gaussians) != content["gaussians"]:
         raise FileFormatError(
             f"{root / GAUSSIANS_FILE}: expected {content['gaussians']} Gaussians as {SCENE_FILE} "
@@ -162,8 +185,9 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
 
 
 def scene_layer_names(root: Path | str) -> tuple[str, ...]:
-    """Names of the layers of a scene folder, sorted."""
-    return tuple(sorted(path.stem for path in (Path(root) / "layers").glob("*.npz")))
+    """Names of the layers of a scene folder, sorted. Other files in their folder are none."""
+    names = (path.stem for path in (Path(root) / "layers").glob("*.npz"))
+    return tuple(sorted(name for name in names if _NAME.fullmatch(name)))
 
 
 def load_scene_layer(root: Path | str, name: str) -> Layer:
@@ -191,15 +215,17 @@ def save_scene_layer(root: Path | str, name: str, layer: Layer) -> Path:
     """Write a layer into a scene folder; gives the file.
 
     Raises:
-        InputError: If the name cannot be a file's, or the layer has not one row a Gaussian.
+        InputError: If the name cannot be a file's, the layer has not one row a Gaussian, a link
+            leads out of the scene, or another process works on it.
         MissingFileError: If there is no scene.
+        OutputError: If the disk is full, or there is no permission.
     """
     root = Path(root)
     _check_layer(name, layer, _scene_content(root)["gaussians"])
-    folder = root / "layers"
-    folder.mkdir(exist_ok=True)
-    save_layer(folder / f"{name}.npz", layer)
-    return folder / f"{name}.npz"
+    with scene_lock(root, "saving"):
+        path = scene_path(root, "layers", f"{name}.npz")
+        save_layer(path, layer)
+    return path
 
 
 def check_name(what: str, name: str) -> None:
@@ -217,6 +243,20 @@ def _check_layer(name: str, layer: Layer, count: int) -> None:
         raise InputError(
             f"layer {name!r}: expected {count} rows as the scene has Gaussians, got {len(layer)}."
         )
+
+
+def _replace(scene: Scene, root: Path, layers: Mapping[str, Layer]) -> None:
+    """Write over a scene: from one rename on, the new files count."""
+    finish_pending(root)
+    with hidden_folder(root / PENDING) as holder, write_failures_named(root, within=holder):
+        new = holder / "scene"
+        new.mkdir()
+        _write(scene, new, layers, final=root)
+        sync_tree(new)
+        new.replace(root / PENDING)
+        sync(root)
+    with write_failures_named(root):
+        finish_pending(root)
 
 
 def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Path) -> None:
@@ -265,7 +305,7 @@ def _absolute(view: View) -> View:
 
 
 def _scene_content(root: Path) -> dict[str, Any]:
-    path = root / SCENE_FILE
+    path = current_file(root, SCENE_FILE)
     if not path.is_file():
         raise MissingFileError(f"{root}: expected a scene folder, got none (no {SCENE_FILE}).")
     content = read_json(path)

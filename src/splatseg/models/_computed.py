@@ -30,6 +30,7 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.images import load_image
 from splatseg.io.json_files import read_json, write_json
+from splatseg.io.paths import path_inside
 from splatseg.models._cache import ModelCache
 from splatseg.models._sources import SEGMENT_PARTS, Source, What, some, without_empty
 
@@ -91,6 +92,11 @@ class _Computed(Source):
     def what(self) -> str:
         return self.asked
 
+    @property
+    @override
+    def is_costly(self) -> bool:
+        return True
+
     @override
     def available(self, views: Sequence[View]) -> frozenset[str]:
         return frozenset(view.name for view in views)
@@ -148,7 +154,7 @@ class _Computed(Source):
         table = read_json(path) if path.is_file() else {}
         for part in sorted(parts.rglob(SEGMENTS_FILE)):
             table |= read_json(part)
-        write_json(path, table)
+        write_json(path_inside(folder, SEGMENTS_FILE), table)
         shutil.rmtree(parts, ignore_errors=True)
 
     @override
@@ -176,8 +182,8 @@ class _Computed(Source):
     def _write_panoptic(self, folder: Path, view: View, image: Image) -> None:
         found = self._ask(ModelCache.panoptic, self.model.panoptic, image)
         self._check_size(view, found.ids.height, found.ids.width)
-        part = folder / SEGMENT_PARTS / view.name
-        part.mkdir(parents=True, exist_ok=True)
+        part = path_inside(folder, SEGMENT_PARTS, view.name)
+        part.mkdir(exist_ok=True)
         # Before the label map, which is what tells that the view is done.
         save_segments(part, {view.name: found.segments})
         save_label_map(folder, view.name, LabelMap(ids=found.ids.ids))

@@ -28,6 +28,7 @@ from splatseg.io.evidence import (
     save_tracks,
     view_files,
 )
+from splatseg.io.paths import path_inside
 from splatseg.models._recorded_features import check_grid
 from splatseg.models._recording import check_size
 from splatseg.models._sources import Source, some, without_empty
@@ -99,6 +100,11 @@ class _Copied(Source):
     def what(self) -> str:
         return self.evidence.kind
 
+    @property
+    @override
+    def is_costly(self) -> bool:
+        return False
+
     @override
     def available(self, views: Sequence[View]) -> frozenset[str]:
         return frozenset(self.evidence.view_names)
@@ -142,11 +148,11 @@ class _Copied(Source):
             save_tracks(folder, evidence.tracks, order=evidence.order)
         elif isinstance(evidence, FeatureEvidence):
             for name in _SHARED:
-                _copy(evidence.folder / name, folder / name)
+                _copy(evidence.folder / name, path_inside(folder, name))
             words = evidence.folder / TEXT_FILE
             beside = evidence.folder.absolute().parent / TEXT_FILE
             if evidence.basis is not None or words.is_file():
-                _copy(words if words.is_file() else beside, folder / TEXT_FILE)
+                _copy(words if words.is_file() else beside, path_inside(folder, TEXT_FILE))
 
     @override
     def write(self, folder: Path, view: View) -> int:
@@ -214,9 +220,7 @@ class _Copied(Source):
             save_features(folder, view.name, features)
             return
         # Quantised features stay as they are: all depths, at their size.
-        target = folder / f"{view.name}.npz"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _copy(evidence.files[view.name], target)
+        _copy(evidence.files[view.name], path_inside(folder, f"{view.name}.npz"))
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -3,7 +3,8 @@
 import importlib.metadata
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -12,8 +13,10 @@ from splatseg.core import View
 from splatseg.core.models import Model, ModelWithDefaults
 from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
 from splatseg.errors import InputError
-from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header
+from splatseg.io.atomic import TEMPORARY, hidden_folder, is_vacant, replace_folder, sweep
+from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header, view_files
 from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.write_errors import write_failures_named
 from splatseg.models._cache import ModelCache
 from splatseg.models._computed import computed
 from splatseg.models._copied import copied
@@ -69,7 +72,8 @@ def record_evidence(
 ) -> SeenEvidence:
     """Write what a model sees in views, one view at a time; a second call does what is left.
 
-    A recorded model's evidence is checked and copied; no photograph is read for it.
+    A recorded model's evidence is checked and copied; no photograph is read for it. If it fails,
+    or before the first view is there, no folder is left.
 
     Args:
         model: The model, or a recorded one.
@@ -79,7 +83,7 @@ def record_evidence(
             before the others.
         asked: How the views were asked for; recorded, so that it can be seen later what the
             evidence may be used for.
-        overwrite: Whether evidence of the same name is deleted first.
+        overwrite: Whether evidence of the same name is replaced, once the new one is complete.
         missing: Whether it is an error that recorded evidence lacks a view.
         cache: Where to look before the model is run.
         progress: Called with the number of views done and of all.
@@ -88,8 +92,9 @@ def record_evidence(
         InputError: If the model has no such thing, the folder holds something else or was made
             with other settings, or recorded evidence lacks views.
         FileFormatError: If recorded evidence is broken or has not the photograph's size.
+        OutputError: If the disk is full, or there is no permission.
     """
-    folder = Path(folder)
+    target = Path(folder)
     if not views:
         raise InputError("views: expected at least one view, got none.")
     source = (
@@ -97,33 +102,34 @@ def record_evidence(
         if isinstance(model, AnyRecorded)
         else computed(model, what=what, cache=cache)
     )
-    source.check_target(folder)
+    source.check_target(target)
     available = source.available(views)
     wanted = [view for view in views if view.name in available]
     metadata = _metadata(model, source, asked)
-    done = _begin(folder, source, wanted, metadata, overwrite=overwrite)
-    todo = [view for view in wanted if view.name not in done]
-    source.start(folder, wanted)
     started = time.monotonic()
     masks = 0
-    for i, view in enumerate(todo):
+    with _work_folder(target, source, overwrite=overwrite) as folder:
+        done = _begin(folder, source, wanted, metadata)
+        todo = [view for view in wanted if view.name not in done]
+        source.start(folder, wanted)
+        for i, view in enumerate(todo):
+            if progress is not None:
+                progress(len(done) + i, len(wanted))
+            masks += source.write(folder, view)
         if progress is not None:
-            progress(len(done) + i, len(wanted))
-        masks += source.write(folder, view)
-    if progress is not None:
-        progress(len(wanted), len(wanted))
-    seconds = time.monotonic() - started
-    source.finish(folder)
-    _write_header(folder, source, metadata | {"complete": True})
+            progress(len(wanted), len(wanted))
+        seconds = time.monotonic() - started
+        source.finish(folder)
+        _write_header(folder, source, metadata | {"complete": True})
     return SeenEvidence(
-        folder=folder,
+        folder=target,
         model=model.name,
         kind=source.kind,
         views=len(wanted),
         kept=len(done),
         masks=masks if source.kind == "masks" else None,
         seconds=seconds,
-        bytes=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
+        bytes=sum(path.stat().st_size for path in target.rglob("*") if path.is_file()),
         notes=source.notes(),
     )
 
@@ -144,29 +150,53 @@ def _metadata(model: Model, source: Source, asked: str) -> dict[str, Any]:
     return parse_object(json_text("metadata", metadata), where="metadata")
 
 
+@contextmanager
+def _work_folder(target: Path, source: Source, *, overwrite: bool) -> Generator[Path]:
+    """Where views are written: the folder itself, or one beside evidence that is replaced.
+
+    The one beside stays if the block is interrupted, and the next call goes on in it. What holds
+    nothing worth going on with is removed.
+    """
+    if target.exists() and not target.is_dir():
+        raise InputError(f"{target}: expected a folder to write evidence to, got a file.")
+    if not target.parent.is_dir():
+        raise InputError(f"{target}: expected a folder of evidence in a folder that is there.")
+    header = evidence_header(target) if target.is_dir() else None
+    if target.is_dir() and header is None and not is_vacant(target):
+        raise InputError(
+            f"{target}: expected a new folder or evidence that splatseg wrote, got other files."
+        )
+    sweep(target)
+    beside = target.with_name(f"{TEMPORARY}see-{target.name}")
+    folder = beside if header is not None and overwrite else target
+    had_views = folder.is_dir() and _holds_views(folder)
+    try:
+        yield folder
+    except BaseException as error:
+        worthless = not (had_views or source.is_costly) and isinstance(error, Exception)
+        if folder.is_dir() and (worthless or not _holds_views(folder)):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    if folder == beside:
+        with hidden_folder(target) as holder, write_failures_named(target):
+            beside.replace(holder / target.name)
+            replace_folder(holder / target.name, target, holder / "previous")
+    shutil.rmtree(beside, ignore_errors=True)
+
+
+def _holds_views(folder: Path) -> bool:
+    return any(view_files(folder, suffix) for suffix in (".png", ".json", ".npz"))
+
+
 def _begin(
-    folder: Path,
-    source: Source,
-    wanted: Sequence[View],
-    metadata: Mapping[str, Any],
-    *,
-    overwrite: bool,
+    folder: Path, source: Source, wanted: Sequence[View], metadata: Mapping[str, Any]
 ) -> frozenset[str]:
     """Make the folder, or see what of the work is done there; gives the views to skip."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder to write evidence to, got a file.")
-    if not folder.parent.is_dir():
-        raise InputError(f"{folder}: expected a folder of evidence in a folder that is there.")
     header = evidence_header(folder) if folder.is_dir() else None
-    if folder.is_dir() and header is None and any(folder.iterdir()):
-        raise InputError(
-            f"{folder}: expected a new folder or evidence that splatseg wrote, got other files."
-        )
-    if header is not None and overwrite:
+    if header is not None and _may_be_lost(folder, header, source, metadata):
         shutil.rmtree(folder)
         header = None
     if header is None:
-        folder.mkdir(exist_ok=True)
         _write_header(folder, source, metadata)
         return frozenset()
     _check_same(folder, header, source, metadata)
@@ -179,6 +209,22 @@ def _begin(
         )
     _write_header(folder, source, metadata)
     return there
+
+
+def _may_be_lost(
+    folder: Path, header: Mapping[str, Any], source: Source, metadata: Mapping[str, Any]
+) -> bool:
+    """Whether a folder holds nothing to go on with: no view, or new evidence of other settings."""
+    if not _holds_views(folder):
+        recorded = header.get("metadata")
+        return isinstance(recorded, Mapping) and recorded.get("complete") is False  # pyright: ignore[reportUnknownMemberType]
+    if not folder.name.startswith(TEMPORARY):
+        return False
+    try:
+        _check_same(folder, header, source, metadata)
+    except InputError:
+        return True
+    return False
 
 
 def _check_same(

@@ -29,6 +29,11 @@ class Source(ABC):
     def what(self) -> str:
         """What was asked for; for recorded evidence its kind."""
 
+    @property
+    @abstractmethod
+    def is_costly(self) -> bool:
+        """Whether views that are written are worth keeping if a later one fails."""
+
     @abstractmethod
     def available(self, views: Sequence[View]) -> frozenset[str]:
         """Names of the views that there can be evidence of."""

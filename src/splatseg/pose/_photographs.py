@@ -14,6 +14,7 @@ from splatseg.core import Camera, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import bare_photographs
 from splatseg.io.images import image_size, load_image, open_image, reduced_size
+from splatseg.io.paths import check_utf8
 from splatseg.pose._exif import LensFacts, lens_facts
 from splatseg.pose._options import PoseOptions
 from splatseg.pose._report import LeftOut
@@ -78,11 +79,13 @@ def find_photographs(folder: Path) -> tuple[Path, ...]:
     Raises:
         MissingFileError: If there is no such folder.
         InputError: If there are fewer than three, or HEIC or RAW files without a JPEG of the
-            same name.
+            same name, or names that are not UTF-8.
     """
     if not folder.is_dir():
         raise MissingFileError(f"{folder}: there is no such folder of photographs.")
     found = bare_photographs(folder)
+    for path in found:
+        check_utf8(path)
     _refuse_undecodable(folder, found)
     if len(found) < MIN_PHOTOGRAPHS:
         raise InputError(

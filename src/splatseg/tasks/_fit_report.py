@@ -12,6 +12,7 @@ from splatseg.fit import FitOptions, FitResult
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.scene import GAUSSIANS_FILE, POSES_FOLDER
+from splatseg.io.scene_folder import scene_path
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.fit_report import FitReportData, fit_record, fit_report
@@ -63,13 +64,12 @@ def score_and_report(
     pairs = None
     if scores is not None:
         pairs = _pairs(result, views, scores, masks=options.masks, backend=backend)
-    folder = root / "reports"
-    folder.mkdir(exist_ok=True)
-    with atomic_file(folder / "fit.html") as path:
+    where = scene_path(root, "reports", "fit.html")
+    with atomic_file(where) as path:
         page = report_html(fit_report(data, pairs=pairs))
         path.write_text(page, encoding="utf-8", newline="\n")
-    write_json(folder / "fit.json", fit_record(data))
-    return scores, folder / "fit.html"
+    write_json(scene_path(root, "reports", "fit.json"), fit_record(data))
+    return scores, where
 
 
 def _pairs(

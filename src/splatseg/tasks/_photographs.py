@@ -6,6 +6,7 @@ from typing import Literal
 from splatseg.core import Capture
 from splatseg.errors import InputError
 from splatseg.io.captures import find_formats, read_capture
+from splatseg.io.paths import check_utf8
 from splatseg.io.scene import POSES_FOLDER
 from splatseg.pose import (
     PoseOptions,
@@ -51,6 +52,7 @@ def capture_of(
     """
     if not _without_poses(data, format, poses):
         return read_capture(data, format=format), None
+    check_utf8(data)
     options = PoseOptions(seed=seed, frames=frames)
     with observer.pose_stage() as step:
         result = recover_poses(data, folder=scene / POSES_FOLDER, options=options, progress=step)

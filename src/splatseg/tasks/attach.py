@@ -19,12 +19,15 @@ from splatseg.core import (
     with_info,
 )
 from splatseg.errors import InputError, RangeError
+from splatseg.io.atomic import is_vacant
 from splatseg.io.export import column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import is_scene, load_scene, save_scene, save_scene_layer, scene_layer_names
+from splatseg.io.scene_folder import work_on_scene
 from splatseg.lift import Attached, AttachOptions, attach
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.import_scene import read_with_notes
 from splatseg.tasks.label_columns import label_tables
+from splatseg.tasks.new_scene import check_parent
 from splatseg.tasks.scene_parts import layer_of, whole_layer
 
 _LABEL_COLUMNS = ("class_id", "confidence", "instance_id", "instance_confidence", "selected")
@@ -155,9 +158,8 @@ def _check_output(output: Path, read: set[Path]) -> None:
     to_file = output.suffix.lower() == ".ply"
     if output.name.lower().endswith(".compressed.ply") or output.suffix.lower() in _NO_COLUMNS:
         raise InputError(f"{output}: expected a scene folder or a .ply file, which has columns.")
-    if not output.absolute().parent.is_dir():
-        raise InputError(f"{output}: expected an existing folder to write in.")
-    if not to_file and output.exists() and (not output.is_dir() or any(output.iterdir())):
+    check_parent(output)
+    if not to_file and output.exists() and not (output.is_dir() and is_vacant(output)):
         raise InputError(f"{output}: expected a new folder, got one that is there.")
     if to_file and output.resolve() in read:
         raise InputError(f"{output}: is what is read; choose another name.")
@@ -255,10 +257,11 @@ def _layers_to_scene(work: _Work) -> AttachedLayers:
         raise InputError(
             f"{work.file}: has the layers {', '.join(clash)} already; `overwrite` replaces them."
         )
-    edited = _edited(work)
-    found = _attached(work, scene.gaussians, edited)
-    for name, layer in layers.items():
-        save_scene_layer(work.file, name, _carried(work, found, layer))
+    with work_on_scene(work.file, "attach", writes=("layers",)):
+        edited = _edited(work)
+        found = _attached(work, scene.gaussians, edited)
+        for name, layer in layers.items():
+            save_scene_layer(work.file, name, _carried(work, found, layer))
     return AttachedLayers(
         output=work.file, gaussians=len(edited), names=tuple(layers), table=None, attached=found
     )

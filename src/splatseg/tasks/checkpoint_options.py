@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
+from splatseg.tasks._observer import Observer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,17 +43,24 @@ class CheckpointOptions:
         if self.resume and self.overwrite:
             raise InputError("resume, overwrite: expected one of the two, got both.")
 
-    def checkpoints(self, path: Path, *, at_end: bool) -> Checkpoints:
+    def checkpoints(
+        self, path: Path, *, at_end: bool, observer: Observer, onwards: str | None = None
+    ) -> Checkpoints:
         """The same for the work itself.
 
         Args:
             path: Where checkpoints are written.
             at_end: Whether the finished work leaves one, too.
+            observer: Is told of a checkpoint that cannot be written.
+            onwards: What the observer is told when the work goes on from one.
         """
+        told = {} if onwards is None else {"resumed": partial(observer.info, onwards)}
         return Checkpoints(
             path=path,
             seconds=self.checkpoint_every,
             steps=self.checkpoint_steps,
             resume=self.resume,
             at_end=at_end,
+            failed=observer.note,
+            **told,
         )

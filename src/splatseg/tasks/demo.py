@@ -11,8 +11,11 @@ from typing import Any
 from splatseg.core import Scene
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
+from splatseg.io.atomic import is_vacant
 from splatseg.io.json_files import read_json, write_json
+from splatseg.io.lock import check_unlocked
 from splatseg.io.scene import load_scene, save_scene_layer
+from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
 from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.synthetic import cameras, room, write_capture
@@ -98,6 +101,15 @@ def make_demo(
     """
     started = time.monotonic()
     options = options or DemoOptions()
+    _check_folder(folder)
+    folder.mkdir(exist_ok=True)
+    with work_on_scene(folder, "demo"):
+        return _made(folder, options, started, backend, observer)
+
+
+def _made(
+    folder: Path, options: DemoOptions, started: float, backend: BackendName, observer: Observer
+) -> Demo:
     _prepare(folder, observer)
     steps: list[tuple[str, float]] = []
     observer.info("Generating a room with photographs, truth and machine labels")
@@ -263,24 +275,31 @@ def _fitted(made: MadeScene) -> str:
     return f"{len(made.result.gaussians)} Gaussians in {made.result.steps} steps{scores}"
 
 
-def _prepare(folder: Path, observer: Observer) -> None:
-    """Leave an empty folder with the record of an unfinished demo in it.
-
-    The record comes first and goes last, so that whatever an interrupted run leaves is known
-    to be a demo's and may be replaced by the next.
-    """
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder of anything but an earlier demo, or one that another process works on."""
+    check_unlocked(folder)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: expected a folder to write to, got a file.")
     check_parent(folder)
     record = folder / _RECORD
-    if folder.is_dir() and any(folder.iterdir()):
-        if not record.is_file() or read_json(record).get("made_by") != _MADE_BY:
-            raise InputError(
-                f"{folder}: expected a new or empty folder or one that an earlier demo made, got "
-                "one with other files; choose another."
-            )
+    if not folder.is_dir() or is_vacant(folder):
+        return
+    if not record.is_file() or read_json(record).get("made_by") != _MADE_BY:
+        raise InputError(
+            f"{folder}: expected a new or empty folder or one that an earlier demo made, got one "
+            "with other files; choose another."
+        )
+
+
+def _prepare(folder: Path, observer: Observer) -> None:
+    """Leave a folder with the record of an unfinished demo in it.
+
+    The record comes first and goes last, so that whatever an interrupted run leaves is known
+    to be a demo's and may be replaced by the next.
+    """
+    record = folder / _RECORD
+    if record.is_file():
         observer.info(f"Replacing the earlier demo in {folder}")
-    folder.mkdir(exist_ok=True)
     write_json(record, {"made_by": _MADE_BY, "finished": False})
     for name in _FOLDERS:
         if (folder / name).is_dir():

@@ -24,6 +24,7 @@ from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_c
 from splatseg.io.evidence import Evidence, evidence_names, open_evidence
 from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import load_layer
+from splatseg.io.lock import lock_owner
 from splatseg.io.scene import (
     CHECKPOINT_FILE,
     is_scene,
@@ -115,11 +116,17 @@ def _describe_folder(path: Path, format: str) -> dict[str, Any]:
 def _unfinished_facts(path: Path) -> dict[str, Any]:
     """Facts of a folder that a fit was to make a scene of."""
     checkpoint = path / CHECKPOINT_FILE
-    facts: dict[str, Any] = {"path": str(path), "kind": "unfinished fit"}
+    facts: dict[str, Any] = {"path": str(path), "kind": "unfinished fit", "running": _running(path)}
     summary = CheckpointSummary(steps=0, progress=0.0, seconds=0.0, gaussians=0)
     if checkpoint.is_file():
         summary = checkpoint_summary(checkpoint)
     return facts | asdict(summary)
+
+
+def _running(root: Path) -> dict[str, Any] | None:
+    """Which process works on a scene folder now."""
+    owner = lock_owner(root)
+    return None if owner is None else asdict(owner)
 
 
 def _captures_inside(path: Path) -> list[str]:
@@ -178,16 +185,10 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
     facts: dict[str, Any] = {"path": str(root), "kind": "scene"}
     facts |= _gaussian_facts(scene.gaussians) | _view_facts(scene.views)
     notes = [f"{len(lost)} photographs are not where they were (see --data)"] if lost else []
-    if (root / CHECKPOINT_FILE).is_file():
-        stopped = where_it_stopped(root / CHECKPOINT_FILE)
-        if stopped is not None:
-            notes.append(f"its fit {stopped}; fit --resume continues it")
-    notes += [
-        f"the training of layer {file.stem} {where_training_stopped(file)}; segment --resume "
-        "continues it"
-        for file in training_files(root)
-    ]
+    owner = lock_owner(root)
+    notes += [f"a process works on it ({owner})"] if owner is not None else _stopped_notes(root)
     facts |= {
+        "running": _running(root),
         "classes": None if scene.classes is None else len(scene.classes.rows),
         "up": None if scene.up is None else list(scene.up),
         "metres_per_unit": scene.metres_per_unit,
@@ -199,6 +200,20 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
         "notes": notes,
     }
     return facts
+
+
+def _stopped_notes(root: Path) -> list[str]:
+    """What was stopped in a scene folder and can go on."""
+    notes: list[str] = []
+    if (root / CHECKPOINT_FILE).is_file():
+        stopped = where_it_stopped(root / CHECKPOINT_FILE)
+        if stopped is not None:
+            notes.append(f"its fit {stopped}; fit --resume continues it")
+    return notes + [
+        f"the training of layer {file.stem} {where_training_stopped(file)}; segment --resume "
+        "continues it"
+        for file in training_files(root)
+    ]
 
 
 def _layer_kind(layer: Layer) -> str:

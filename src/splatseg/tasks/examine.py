@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatseg.errors import InputError
+from splatseg.io.atomic import is_vacant
 from splatseg.pose.doctor import (
     Diagnosis,
     DoctorOptions,
@@ -45,7 +46,7 @@ def examine_capture(
     if options.max_views < 2:
         raise InputError(f"max_views: expected at least 2, got {options.max_views}.")
     if fix is not None:
-        if fix.exists() and (not fix.is_dir() or any(fix.iterdir())):
+        if fix.exists() and not (fix.is_dir() and is_vacant(fix)):
             raise InputError(f"{fix}: expected a new or empty folder to write to.")
         check_parent(fix)
     read = read_for_doctor(data, format=format)

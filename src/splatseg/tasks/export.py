@@ -10,6 +10,7 @@ from splatseg.core import Gaussians, Layer, Scene
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import (
     check_beside,
+    check_parent,
     check_replaceable,
     write_coco_panoptic,
     write_column_table,
@@ -115,8 +116,7 @@ def _check(scene: Scene, output: Path, what: What, options: ExportOptions) -> No
     ):
         if given and what not in kinds:
             raise InputError(f"{name}: goes with an export of {' or '.join(kinds)}, not of {what}.")
-    if not output.absolute().parent.is_dir():
-        raise InputError(f"{output}: expected an existing folder to write in.")
+    check_parent(output)
     _check_place(scene, output, what)
 
 

@@ -10,6 +10,7 @@ from splatseg.core import Capture, Gaussians, Scene
 from splatseg.errors import InputError
 from splatseg.importing import Alignment, VirtualViews, align, place_cameras
 from splatseg.io.captures import read_capture
+from splatseg.io.paths import check_utf8
 from splatseg.io.scene import save_scene
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
 from splatseg.render import BackendName
@@ -101,6 +102,7 @@ def import_scene(
     """
     options = options or ImportOptions()
     check_replaceable_scene(folder)
+    check_utf8(file)
     gaussians = read_with_notes(file, observer)
     if not len(gaussians):
         raise InputError(f"{file}: expected Gaussians, got a file of none.")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture, Scene
+from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.interrupts import deferred_interrupts
 from splatseg.errors import InputError
 from splatseg.evaluate import PhotographReport
@@ -13,12 +14,12 @@ from splatseg.fit import (
     EXPOSURES,
     FitOptions,
     FitResult,
-    discard_checkpoint,
     exposures_record,
     fit,
     random_point_count,
     reduction_note,
 )
+from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scene import CHECKPOINT_FILE, save_scene
 from splatseg.pose import PoseReport
 from splatseg.render import BackendName
@@ -26,7 +27,7 @@ from splatseg.tasks._fit_report import score_and_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._photographs import Poses, capture_of
 from splatseg.tasks.checkpoint_options import CheckpointOptions
-from splatseg.tasks.stopped_fit import check_fit_output
+from splatseg.tasks.stopped_fit import check_fit_output, fit_folder
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,27 +109,35 @@ def make_scene(
         observer: Is told of the progress.
 
     Raises:
-        InputError: If the folder holds what would be lost, or the capture cannot be used.
+        InputError: If the folder holds what would be lost, the capture cannot be used, or
+            another process works on the folder.
         FileFormatError: If a file of the capture or a checkpoint is damaged.
     """
     options = options or MakeSceneOptions()
     fit_options = fit_options or FitOptions()
-    resumed = check_fit_output(folder, options)
-    capture, poses = _capture(data, folder, options, fit_options, observer)
-    if resumed is not None:
-        observer.info(resumed)
-    result, stopped = _fitted(
-        capture, folder, options, fit_options, backend=backend, observer=observer
-    )
-    scores, report = score_and_report(
-        folder,
-        capture,
-        result,
-        options=fit_options,
-        backend=backend,
-        scoring=not stopped,
-        command=command,
-    )
+    onwards = check_fit_output(folder, options)
+    with fit_folder(folder):
+        capture, poses = _capture(data, folder, options, fit_options, observer)
+        checkpoints = options.checkpoints(
+            folder / CHECKPOINT_FILE,
+            at_end=options.keep_checkpoint,
+            observer=observer,
+            onwards=onwards,
+        )
+        if options.resume and onwards is None:
+            observer.info(f"{folder}: nothing to go on from, beginning")
+        result, stopped = _fitted(
+            capture, folder, options, fit_options, checkpoints, backend=backend, observer=observer
+        )
+        scores, report = score_and_report(
+            folder,
+            capture,
+            result,
+            options=fit_options,
+            backend=backend,
+            scoring=not stopped,
+            command=command,
+        )
     return MadeScene(
         folder=folder,
         capture=capture,
@@ -170,12 +179,12 @@ def _fitted(
     folder: Path,
     options: MakeSceneOptions,
     fit_options: FitOptions,
+    checkpoints: Checkpoints,
     *,
     backend: BackendName,
     observer: Observer,
 ) -> tuple[FitResult, bool]:
     """Fit and write the scene. Tells whether it was asked to stop, while it wrote too."""
-    checkpoints = options.checkpoints(folder / CHECKPOINT_FILE, at_end=options.keep_checkpoint)
     with deferred_interrupts() as interrupts:
         with observer.fit_stage() as step:
             result = fit(
@@ -205,7 +214,7 @@ def _save(
     )
     save_scene(scene, folder)
     if not (result.interrupted or keep):
-        discard_checkpoint(folder / CHECKPOINT_FILE)
+        discard_checkpoint_file(folder / CHECKPOINT_FILE)
 
 
 def _beginning(capture: Capture, options: FitOptions) -> str:

@@ -9,6 +9,8 @@ from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.io.export import write_node_table
+from splatseg.io.scene_folder import scene_path
+from splatseg.io.write_errors import write_failures_named
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.segment_report import write_segmentation_report
@@ -66,8 +68,9 @@ def export_layer(
     """
     field = GaussianField(scene.gaussians, {name: layer}, backend=backend)
     of_files: Layer = field.labels(name) if isinstance(layer, Features) else layer
-    folder = root / EXPORTS_FOLDER / name
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = scene_path(root, EXPORTS_FOLDER, name)
+    with write_failures_named(folder):
+        folder.mkdir(exist_ok=True)
     layers: Mapping[str, Layer] = {name: of_files}
     files = tuple(
         export(
@@ -127,8 +130,7 @@ def report_layer(
         command: The words that started it; may be empty.
         backend: Who renders.
     """
-    path = root / REPORTS_FOLDER / f"{result.name}.html"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = scene_path(root, REPORTS_FOLDER, f"{result.name}.html")
     # Linux counts in KiB, macOS in bytes.
     unit = 1 if sys.platform == "darwin" else 1024
     field = GaussianField(scene.gaussians, {result.name: result.layer}, backend=backend)

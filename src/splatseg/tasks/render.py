@@ -25,14 +25,16 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import label_map_in
-from splatseg.io.atomic import atomic_folder
+from splatseg.io.atomic import atomic_folder, sweep
 from splatseg.io.images import save_png
 from splatseg.io.json_files import read_json, write_json
+from splatseg.io.paths import path_inside
 from splatseg.io.scene import scene_layer_names
 from splatseg.render import BackendName
 from splatseg.report.legend import colour_labels, legend_of
 from splatseg.tasks._film import check_film, path_views, write_film, write_path
 from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.new_scene import check_parent_writable
 from splatseg.tasks.scene_parts import gaussian_field, views_of_split
 
 _PICTURES = ("rgb", "depth", "alpha")
@@ -139,7 +141,7 @@ def render_views(
         _render(scene, field, views, drawn, output, folders=folders, observer=observer)
         # Before the films, which take a while: what an interruption leaves can be replaced.
         entry = {"scene": str(scene.root), "split": options.split, "views": len(views)}
-        write_json(output / _RECORD, record | dict.fromkeys([*folders, *files], entry))
+        write_json(path_inside(output, _RECORD), record | dict.fromkeys([*folders, *files], entry))
         if on_path:
             write_path(output, views, pictures="rgb" in folders)
         for name in films:
@@ -169,7 +171,9 @@ def _render(
 ) -> None:
     """Draw everything; each folder appears whole at the end or not at all."""
     with ExitStack() as stack:
-        into = {name: stack.enter_context(atomic_folder(output / name)) for name in folders}
+        into = {
+            name: stack.enter_context(atomic_folder(path_inside(output, name))) for name in folders
+        }
         with observer.stage("render") as step:
             for done, view in enumerate(views, start=1):
                 with field.view(view.camera) as looked_at:
@@ -193,7 +197,7 @@ def _wanted(what: Sequence[str]) -> list[str]:
 
 def _folders(wanted: Sequence[str], coloured: Sequence[str]) -> list[str]:
     folders = [*wanted, *(f"{name}_coloured" for name in coloured)]
-    if len(set(folders)) != len(folders):
+    if len({name.casefold() for name in folders}) != len(folders):
         raise InputError("what: a layer has the name of another's coloured pictures.")
     return folders
 
@@ -231,10 +235,12 @@ def _check_output(output: Path, folders: Sequence[str], files: Sequence[str]) ->
     """What earlier renders wrote here; what is somebody else's is not replaced."""
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: expected a folder to write to, got a file.")
+    check_parent_writable(output)
+    sweep(output)
     path = output / _RECORD
     record = read_json(path) if path.is_file() else {}
     for name in folders:
-        folder = output / name
+        folder = path_inside(output, name, make=False)
         if name not in record and folder.is_dir() and any(folder.iterdir()):
             raise InputError(
                 f"{folder}: expected no folder or one that render wrote, got one with other "
@@ -328,6 +334,4 @@ def _save(image: Tensor, folder: Path, view: View) -> None:
 
 def _file(folder: Path, view: View, suffix: str) -> Path:
     """Where a view's file goes; names with a slash go into subfolders."""
-    path = folder / f"{view.name}{suffix}"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+    return path_inside(folder, f"{view.name}{suffix}")

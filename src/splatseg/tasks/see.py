@@ -7,6 +7,7 @@ from typing import Literal
 from splatseg.core import Model, Scene
 from splatseg.errors import InputError
 from splatseg.io.scene import check_name
+from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import ModelCache, SeenEvidence, find_model, record_evidence
 from splatseg.models.classical import Classical, RegionOptions
 from splatseg.models.recorded import AnyRecorded, recorded_model
@@ -46,7 +47,7 @@ class SeeOptions:
     """How features are kept in the cache."""
 
     overwrite: bool = False
-    """Delete evidence of this name first."""
+    """Replace evidence of this name, once the new one is complete."""
 
 
 def see(
@@ -73,7 +74,7 @@ def see(
 
     Raises:
         InputError: If there is no such model, it cannot be asked this, the scene has no such
-            views, or other evidence of this name is there.
+            views, other evidence of this name is there, or another process works on the scene.
         FileFormatError: If recorded evidence is broken or has not the photograph's size.
     """
     options = options or SeeOptions()
@@ -87,13 +88,11 @@ def see(
         cache = ModelCache(folder=options.cache, precision=options.precision, report=observer.note)
     if found.note:
         observer.note(f"{found.name}: {found.note}")
-    folder = scene.root / EVIDENCE_FOLDER / evidence
-    folder.parent.mkdir(exist_ok=True)
-    with observer.stage("see") as step:
+    with work_on_scene(scene.root, "see"), observer.stage("see") as step:
         seen = record_evidence(
             found,
             views,
-            folder,
+            scene_path(scene.root, EVIDENCE_FOLDER, evidence),
             what=options.what,
             asked=views_recorded(options.views),
             overwrite=options.overwrite,

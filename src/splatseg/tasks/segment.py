@@ -28,10 +28,10 @@ from splatseg.io.evidence import (
     find_evidence,
     open_evidence,
 )
+from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.lift.completion.complete import CompletionOptions, complete
 from splatseg.lift.segments.panoptic import merge_panoptic
-from splatseg.lift.training import discard_training
 from splatseg.methods import Method, MethodInputs, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
@@ -177,7 +177,7 @@ def save_segmentation(root: Path, made: Segmentation) -> Path:
     """
     path = save_scene_layer(root, made.name, made.layer)
     if made.checkpoint is not None:
-        discard_training(made.checkpoint)
+        discard_checkpoint_file(made.checkpoint)
     return path
 
 

@@ -1,10 +1,14 @@
 """Fits that were stopped: where, and whether they can go on."""
 
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
 from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
 from splatseg.io.scene import CHECKPOINT_FILE, is_scene
+from splatseg.io.scene_folder import work_on_scene
+from splatseg.io.write_errors import write_failures_named
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.new_scene import check_replaceable_scene
 
@@ -17,7 +21,7 @@ def check_fit_output(root: Path, options: CheckpointOptions) -> str | None:
         options: Whether a fit that was stopped there is to go on, or may be lost.
 
     Returns:
-        A sentence on where the fit goes on, None where nothing is to be said.
+        A sentence on where the fit goes on, None where it begins.
 
     Raises:
         InputError: If the folder holds what would be lost, or nothing can be resumed.
@@ -39,6 +43,29 @@ def check_fit_output(root: Path, options: CheckpointOptions) -> str | None:
     return None
 
 
+@contextmanager
+def fit_folder(root: Path) -> Generator[None]:
+    """Make the folder of a fit and work on it alone; what the block leaves empty is removed.
+
+    Raises:
+        InputError: If another process works on it.
+        OutputError: If it cannot be made.
+    """
+    checkpoints = (root / CHECKPOINT_FILE).parent
+    with write_failures_named(root):
+        root.mkdir(exist_ok=True)
+    try:
+        with work_on_scene(root, "fit", writes=("reports",) if is_scene(root) else ()):
+            with write_failures_named(checkpoints):
+                # It says that the folder is that of a fit, should this process be killed.
+                checkpoints.mkdir(exist_ok=True)
+            yield
+    finally:
+        for folder in (checkpoints, root):
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
+
+
 def where_it_stopped(checkpoint: Path) -> str | None:
     """Where the fit of a checkpoint was stopped, in words; None if it was finished."""
     try:
@@ -58,7 +85,7 @@ def _resumable(checkpoint: Path) -> bool:
     return True
 
 
-def _resumed(root: Path, checkpoint: Path) -> str:
+def _resumed(root: Path, checkpoint: Path) -> str | None:
     if checkpoint.is_file():
         return f"{root}: going on from {_where(checkpoint_summary(checkpoint))}"
     if is_scene(root):
@@ -66,7 +93,7 @@ def _resumed(root: Path, checkpoint: Path) -> str:
             f"{root}: expected a fit that can be resumed, got a scene without a checkpoint; "
             "`keep_checkpoint` keeps that of a finished fit."
         )
-    return f"{root}: nothing to go on from, beginning"
+    return None
 
 
 def _where(summary: CheckpointSummary) -> str:

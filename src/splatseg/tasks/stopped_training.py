@@ -51,15 +51,18 @@ def training_checkpoints(
         raise InputError("checkpoints: expected a scene with a folder to keep them in, got none.")
     options.check_not_both()
     path = training_file(scene.root, layer)
-    if options.resume:
-        observer.info(f"{path}: {_onwards(path)}")
+    onwards = None
+    if options.resume and path.is_file():
+        onwards = f"{path}: going on from {_where(path)}"
+    elif options.resume:
+        observer.info(f"{path}: nothing to go on from, beginning")
     elif path.is_file() and not options.overwrite:
-        onwards = "`resume` continues it, " if _resumable(path) else ""
+        hint = "`resume` continues it, " if _resumable(path) else ""
         raise InputError(
             f"{path}: expected no training of this layer, got one that "
-            f"{where_training_stopped(path)}; {onwards}`overwrite` begins again."
+            f"{where_training_stopped(path)}; {hint}`overwrite` begins again."
         )
-    return options.checkpoints(path, at_end=True)
+    return options.checkpoints(path, at_end=True, observer=observer, onwards=onwards)
 
 
 def where_training_stopped(path: Path) -> str:
@@ -107,12 +110,6 @@ def _refuse_for(method: Method, options: CheckpointOptions) -> None:
             f"{', '.join(asked)}: expected a method that trains, got {method.name}, which is not "
             "stopped and resumed."
         )
-
-
-def _onwards(path: Path) -> str:
-    if path.is_file():
-        return f"going on from {_where(path)}"
-    return "nothing to go on from, beginning"
 
 
 def _where(path: Path) -> str:

@@ -16,9 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
+from splatseg.core.view_names import clean_view_names
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import read_metadata
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
+from splatseg.io.paths import check_utf8
 
 TEST_EVERY = 8
 """Without a split of its own, views 0, 8, 16 ... of a capture by sorted name are test views."""
@@ -88,6 +90,7 @@ def build_capture(
     names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
     raw, names = [raw[i] for i in order], [names[i] for i in order]
+    _check_paths(path, raw)
     _check_files(path, raw)
     splits, split_note = _splits(raw)
     scaled: Counter[str] = Counter()
@@ -128,7 +131,8 @@ def view_names(relatives: Sequence[str]) -> list[str]:
     """Names of views: the file's stem, or its relative path where stems clash.
 
     Relative paths start below the folder that all photographs share, and lose their suffix
-    unless only the suffix tells two photographs apart.
+    unless only the suffix tells two photographs apart. What climbs in them is left out, and names
+    that differ only in case get a number: files are called so, see `clean_view_names`.
 
     Raises:
         InputError: If a photograph is listed twice.
@@ -150,12 +154,14 @@ def view_names(relatives: Sequence[str]) -> list[str]:
     below = [PurePosixPath(*path.parts[shared:]) for path in paths]
     stems = Counter(path.stem for path in below)
     bare = Counter(path.with_suffix("") for path in below)
-    return [
-        path.stem
-        if stems[path.stem] == 1
-        else str(path if bare[path.with_suffix("")] > 1 else path.with_suffix(""))
-        for path in below
-    ]
+    return clean_view_names(
+        [
+            path.stem
+            if stems[path.stem] == 1
+            else str(path if bare[path.with_suffix("")] > 1 else path.with_suffix(""))
+            for path in below
+        ]
+    )
 
 
 def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Intrinsics:
@@ -251,6 +257,15 @@ def _camera(
         model=intrinsics.model if distorted else "pinhole",
         distortion=intrinsics.distortion if distorted else (),
     )
+
+
+def _check_paths(path: Path, raw: Sequence[RawView]) -> None:
+    """Refuse names that no scene can hold, before there is one to lose."""
+    check_utf8(path)
+    for view in raw:
+        for file in (view.image, view.mask, view.depth):
+            if file is not None:
+                check_utf8(file)
 
 
 def _check_files(path: Path, raw: Sequence[RawView]) -> None:

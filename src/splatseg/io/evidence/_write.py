@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from splatseg._check import check_choice, check_finite, check_values
 from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Segment, Track
+from splatseg.core.view_names import check_view_name
 from splatseg.errors import InputError, RangeError
 from splatseg.io.atomic import atomic_file, atomic_folder
 from splatseg.io.class_tables import class_rows
@@ -21,6 +22,8 @@ from splatseg.io.evidence._open import FORMAT, VERSION
 from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE
 from splatseg.io.images import write_png
 from splatseg.io.json_files import json_text, write_json
+from splatseg.io.paths import path_inside
+from splatseg.io.write_errors import write_failures_named
 
 _WRITTEN = ("labels", "panoptic", "tracked", "masks", "features")
 _MAX_ID = 65535
@@ -60,8 +63,9 @@ def create_evidence(
         "metadata": dict(metadata or {}),
     }
     json_text("metadata", header)
-    folder.mkdir(exist_ok=True)
-    write_json(folder / HEADER_FILE, header)
+    with write_failures_named(folder):
+        folder.mkdir(exist_ok=True)
+    write_json(path_inside(folder, HEADER_FILE), header)
     return folder
 
 
@@ -88,9 +92,10 @@ def save_label_map(folder: Path | str, name: str, label_map: LabelMap) -> None:
         check_values(f"{name}: confidence", label_map.confidence, 0.0, 1.0)
         steps = label_map.confidence.double().cpu().numpy() * CONFIDENCE_STEPS
         confidence = np.floor(steps + 0.5).astype(np.uint16)
-    beside = _view_path(Path(folder) / CONFIDENCE_FOLDER, name, ".png", make=False)
+    beside = path_inside(Path(folder), CONFIDENCE_FOLDER, f"{name}.png", make=False)
     if confidence is not None:
-        write_png(confidence, _view_path(Path(folder) / CONFIDENCE_FOLDER, name, ".png"))
+        beside.parent.mkdir(parents=True, exist_ok=True)
+        write_png(confidence, beside)
     elif beside.is_file():
         # It belongs to the label map that is about to be replaced.
         beside.unlink()
@@ -133,7 +138,7 @@ def save_segments(folder: Path | str, segments: Mapping[str, Sequence[Segment]])
                 for segment in rows
             ]
         }
-    write_json(Path(folder) / SEGMENTS_FILE, content)
+    write_json(path_inside(Path(folder), SEGMENTS_FILE), content)
 
 
 def save_tracks(folder: Path | str, tracks: Sequence[Track], *, order: Sequence[str]) -> None:
@@ -142,7 +147,7 @@ def save_tracks(folder: Path | str, tracks: Sequence[Track], *, order: Sequence[
         "order": list(order),
         "tracks": {str(track.id): {"category_votes": dict(track.votes)} for track in tracks},
     }
-    write_json(Path(folder) / TRACKS_FILE, content)
+    write_json(path_inside(Path(folder), TRACKS_FILE), content)
 
 
 def save_features(folder: Path | str, name: str, features: FeatureMap) -> None:
@@ -166,13 +171,10 @@ def save_features(folder: Path | str, name: str, features: FeatureMap) -> None:
 
 
 def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Path:
-    parts = name.split("/")
-    if not name or any(part in ("", ".", "..") or part.startswith(".") for part in parts):
-        raise InputError(f"view: expected a name that can be a file's, got {name!r}.")
+    check_view_name(name)
     path = folder / f"{name}{suffix}"
-    if make:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+    with write_failures_named(path):
+        return path_inside(folder, f"{name}{suffix}", make=make)
 
 
 def copy_evidence(folder: Path | str, scene: Path | str) -> Path:
@@ -189,7 +191,7 @@ def copy_evidence(folder: Path | str, scene: Path | str) -> Path:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of evidence, got none.")
-    target = Path(scene) / "evidence" / folder.name
+    target = path_inside(Path(scene), "evidence", folder.name, make=False)
     with atomic_folder(target) as temporary:
         shutil.copytree(folder, temporary, dirs_exist_ok=True)
     return target

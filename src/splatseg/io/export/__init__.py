@@ -12,6 +12,7 @@ from splatseg.io.export._columns import column_table_of as column_table_of
 from splatseg.io.export._columns import label_columns as label_columns
 from splatseg.io.export._columns import write_column_table as write_column_table
 from splatseg.io.export._columns import write_labelled_splats as write_labelled_splats
+from splatseg.io.export._folders import check_parent as check_parent
 from splatseg.io.export._folders import check_replaceable as check_replaceable
 from splatseg.io.export._objects import ObjectRow as ObjectRow
 from splatseg.io.export._objects import classes_of as classes_of

@@ -21,6 +21,7 @@ from splatseg.io.export._folders import check_replaceable
 from splatseg.io.export._tables import MADE_BY
 from splatseg.io.images import write_png
 from splatseg.io.json_files import write_json
+from splatseg.io.paths import path_inside
 
 PANOPTIC_FILE = "panoptic.json"
 PANOPTIC_FOLDER = "panoptic"
@@ -104,9 +105,7 @@ def write_coco_panoptic(
             names.add(frame.name)
             ids = frame.ids.detach().cpu().numpy().astype(np.int64)
             file = f"{frame.name}.png"
-            path = temporary / PANOPTIC_FOLDER / file
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(_encoded(ids), path)
+            write_png(_encoded(ids), path_inside(temporary, PANOPTIC_FOLDER, file))
             height, width = ids.shape
             images.append(
                 {"id": number, "file_name": frame.image, "width": width, "height": height}

@@ -3,8 +3,10 @@
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
+from splatseg.io.atomic import check_writable, is_vacant, sweep
 from splatseg.io.export._tables import MADE_BY
 from splatseg.io.json_files import read_json
+from splatseg.io.paths import check_utf8
 
 
 def check_replaceable(path: Path, record: str) -> None:
@@ -20,7 +22,7 @@ def check_replaceable(path: Path, record: str) -> None:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: expected a folder to write to, got a file.")
     check_parent(path)
-    if path.is_dir() and any(path.iterdir()) and not is_ours(path / record):
+    if path.is_dir() and not is_vacant(path) and not is_ours(path / record):
         raise InputError(
             f"{path}: expected a new or empty folder or one that an earlier export made, got one "
             "with other files; choose another."
@@ -28,9 +30,16 @@ def check_replaceable(path: Path, record: str) -> None:
 
 
 def check_parent(path: Path) -> None:
-    """Raise `InputError` unless the folder that `path` is to be in exists."""
-    if not path.absolute().parent.is_dir():
+    """Raise `InputError` unless `path` can be written: its folder is there, and lets us.
+
+    What processes that were killed were writing there is cleared.
+    """
+    check_utf8(path)
+    parent = path.absolute().parent
+    if not parent.is_dir():
         raise InputError(f"{path}: expected an existing folder to write in.")
+    check_writable(parent)
+    sweep(parent)
 
 
 def is_ours(path: Path) -> bool:

@@ -19,7 +19,6 @@ from splatseg.lift.training._sampler import RowSampler as RowSampler
 from splatseg.lift.training._sampler import SamplingOptions as SamplingOptions
 from splatseg.lift.training._sampler import held_out_views as held_out_views
 from splatseg.lift.training._state import TrainingSummary as TrainingSummary
-from splatseg.lift.training._state import discard_training as discard_training
 from splatseg.lift.training._state import training_summary as training_summary
 from splatseg.lift.training._targets import LabelTargets as LabelTargets
 from splatseg.lift.training._targets import MaskTargets as MaskTargets

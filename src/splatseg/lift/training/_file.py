@@ -5,7 +5,8 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from splatseg.core.checkpoints import Checkpoints, CheckpointSchedule
+from splatseg.core.checkpoints import Checkpoints, CheckpointSchedule, without_checkpoint
+from splatseg.errors import OutputError
 from splatseg.lift.training._state import TrainingState, read_state, write_state
 
 
@@ -42,6 +43,7 @@ class TrainingFile:
         if not (self._checkpoints.resume and path.is_file()):
             return start
         state = read_state(path, start, self._identity)
+        self._checkpoints.resumed()
         self._written = state.step
         return state
 
@@ -50,12 +52,15 @@ class TrainingFile:
         return self._schedule.due(state.step)
 
     def write(self, state: TrainingState) -> None:
-        """Write a checkpoint, unless the file has this step already."""
+        """Write a checkpoint, unless the file has this step already, or tell that it cannot be."""
         if self._written == state.step:
             return
         begin = time.monotonic()
-        write_state(self._checkpoints.path, state, self._identity)
-        self._written = state.step
+        try:
+            write_state(self._checkpoints.path, state, self._identity)
+            self._written = state.step
+        except OutputError as error:
+            self._checkpoints.failed(without_checkpoint(error))
         self._schedule.written(time.monotonic() - begin)
 
     @contextmanager

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core.recorded_options import differing_names, option_differences
-from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.npz_writing import write_checkpoint_file
 from splatseg.lift.training._adam import RowMoments
 
 FORMAT = "splatseg-training"
@@ -102,7 +103,7 @@ def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -
         identity: What the training is of, see `read_state`; values that JSON holds.
 
     Raises:
-        SplatsegError: If it cannot be written; the one before is still there.
+        OutputError: If it cannot be written; the one before is still there.
     """
     header = {
         "format": FORMAT,
@@ -115,26 +116,8 @@ def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -
         "scores": state.scores,
         "best": bool(state.best_rows or state.best_shared),
     }
-    arrays: dict[str, NDArray[Any]] = {
-        _HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)
-    }
-    arrays |= {name: tensor.cpu().numpy() for name, tensor in state.arrays().items()}
-    unfinished = path.with_name(f"{path.name}.new")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with unfinished.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        unfinished.replace(path)
-    except OSError as error:
-        raise SplatsegError(f"{path}: the checkpoint cannot be written ({error}).") from error
-
-
-def discard_training(path: Path) -> None:
-    """Remove a training's checkpoint, and its folder if nothing else is in it."""
-    for file in (path, path.with_name(f"{path.name}.new")):
-        file.unlink(missing_ok=True)
-    if path.parent.is_dir() and not any(path.parent.iterdir()):
-        path.parent.rmdir()
+    arrays = {name: tensor.cpu().numpy() for name, tensor in state.arrays().items()}
+    write_checkpoint_file(path, header, arrays)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

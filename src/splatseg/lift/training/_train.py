@@ -101,8 +101,8 @@ def train(
         seed: Of drawn pixels, the order of batches and the model's random choices.
         checkpoints: Where and how often the state is written. With them, Ctrl-C and SIGTERM are
             answered between two steps, by a checkpoint and then a `KeyboardInterrupt`; the third
-            signal interrupts at once. The last checkpoint stays until `discard_training` removes
-            it. None writes none.
+            signal interrupts at once. The last checkpoint stays until the caller removes it.
+            None writes none.
         settings: What else must be the same to resume, in values that JSON holds: the model's
             own options.
         defaults: Their defaults: what counts where a checkpoint does not name one.
@@ -113,7 +113,6 @@ def train(
         KeyboardInterrupt: If it was interrupted.
         InputError: If the checkpoint to resume from is of another training.
         FileFormatError: If it is damaged.
-        SplatsegError: If a checkpoint cannot be written.
     """
     options = options or TrainingOptions()
     run = _Run(model, sampler, options, seed)

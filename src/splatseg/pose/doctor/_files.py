@@ -11,7 +11,7 @@ import numpy as np
 
 from splatseg.core import Capture, PointCloud
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.atomic import atomic_folder
+from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.cameras import cameras_content
 from splatseg.io.captures import find_formats, read_capture
 from splatseg.io.images import image_size
@@ -133,7 +133,7 @@ def write_corrected(diagnosis: Diagnosis, folder: Path) -> None:
     capture = diagnosis.corrected
     if capture is None:
         raise InputError("diagnosis: expected one with a correction, got none.")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and not (folder.is_dir() and is_vacant(folder)):
         raise InputError(f"{folder}: expected a new or empty folder to write to.")
     views = [
         replace(

@@ -1,0 +1,78 @@
+"""Archives of NumPy arrays with a header, written: layers, and checkpoints of long work.
+
+Entries are stored uncompressed and without time stamps, so that the same values give the same
+bytes; nothing is pickled.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.io.atomic import sync
+from splatseg.io.json_files import json_text
+from splatseg.io.write_errors import write_failures_named
+
+HEADER = "header"
+"""Name of the entry that holds the header, JSON as bytes of UTF-8."""
+
+
+def save_arrays(
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, name: Path
+) -> None:
+    """Write a header and arrays to a file as they come.
+
+    Args:
+        path: The file.
+        header: Values that JSON holds.
+        arrays: By name.
+        name: What the file is to be called, for messages.
+
+    Raises:
+        InputError: If the header holds a value that JSON has no word for.
+        OSError: If it cannot be written.
+    """
+    text = json_text(f"{name}: header", header)
+    with path.open("wb") as file:
+        np.savez(
+            file, allow_pickle=False, **{HEADER: np.frombuffer(text.encode(), np.uint8)}, **arrays
+        )
+
+
+def write_checkpoint_file(
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> None:
+    """Write a checkpoint; the one before stays until the disk has the new one.
+
+    It is written under a fixed second name, so that a process that is killed at any moment
+    leaves a complete one, and an unfinished file that the next one overwrites.
+
+    Raises:
+        OutputError: If it cannot be written; the one before is still there.
+    """
+    new = unfinished(path)
+    with write_failures_named(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            save_arrays(new, header, arrays, name=path)
+            sync(new)
+            new.replace(path)
+            sync(path.parent)
+        except OSError:
+            new.unlink(missing_ok=True)  # a full disk needs the space
+            raise
+
+
+def discard_checkpoint_file(path: Path) -> None:
+    """Remove a checkpoint, and its folder if nothing else is in it."""
+    for file in (path, unfinished(path)):
+        file.unlink(missing_ok=True)
+    if path.parent.is_dir() and not any(path.parent.iterdir()):
+        path.parent.rmdir()
+
+
+def unfinished(path: Path) -> Path:
+    """Where a checkpoint is while it is being written."""
+    return path.with_name(f"{path.name}.new")

@@ -1,0 +1,93 @@
+"""The folder of a scene while it is written: its files, who works on it, what a kill left of it."""
+
+import os
+import shutil
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from splatseg.io.atomic import TEMPORARY, check_writable, sweep
+from splatseg.io.lock import scene_lock
+from splatseg.io.paths import path_inside
+from splatseg.io.write_errors import write_failures_named
+
+SCENE_FILE = "scene.json"
+GAUSSIANS_FILE = "gaussians.ply"
+CAMERAS_FILE = "cameras/transforms.json"
+TRAINING_FOLDER = "training"
+"""Where methods that train keep their state until the layer is written."""
+
+FOLDERS = ("cameras", "evidence", "layers", "reports")
+"""Folders that every scene has."""
+
+PENDING = f"{TEMPORARY}pending"
+"""Folder of files of a new scene that count already, but are not in their places yet."""
+
+_WORK_FOLDERS = (*FOLDERS, "exports", "fit", TRAINING_FOLDER)
+
+
+def scene_path(root: Path, *names: str) -> Path:
+    """Where something of a scene is to be written; the folders that it needs are made.
+
+    Raises:
+        InputError: If a link leads out of the scene.
+        OutputError: If there is no permission.
+    """
+    with write_failures_named(root.joinpath(*names)):
+        return path_inside(root, *names)
+
+
+@contextmanager
+def work_on_scene(root: Path, work: str, *, writes: Sequence[str] = ()) -> Generator[None]:
+    """Work on a scene folder as the only process that does, after what others left is cleared.
+
+    What a process that was killed had as good as finished is finished.
+
+    Args:
+        root: The scene folder, or that of a fit.
+        work: What is done, for the message to others.
+        writes: Folders of the scene that will be written to.
+
+    Raises:
+        InputError: If another process works on it, or it may not be written to.
+        OutputError: If the folder cannot be written to.
+    """
+    with scene_lock(root, work):
+        with write_failures_named(root):
+            _clear(root)
+        for name in writes:
+            check_writable(scene_path(root, name, "file").parent)
+        yield
+
+
+def finish_pending(root: Path) -> None:
+    """Move the files of a new scene to their places, the last of them scene.json."""
+    pending = root / PENDING
+    if not pending.is_dir():
+        return
+    files = [path.relative_to(pending) for path in pending.rglob("*") if path.is_file()]
+    for file in sorted(files, key=lambda file: (file.as_posix() == SCENE_FILE, file)):
+        target = path_inside(root, file.as_posix())
+        (pending / file).replace(target)
+    for name in FOLDERS:
+        (root / name).mkdir(exist_ok=True)
+    shutil.rmtree(pending)
+
+
+def current_file(root: Path, name: str) -> Path:
+    """Where a file of the scene is: among those about to take their places, or in its own."""
+    pending = root / PENDING / name
+    return pending if pending.is_file() else root / name
+
+
+def _clear(root: Path) -> None:
+    """Finish or remove what processes that were killed left in a scene."""
+    finish_pending(root)
+    sweep(root)
+    for name in _WORK_FOLDERS:
+        for folder, _, files in os.walk(root / name):
+            sweep(Path(folder))
+            if name in ("fit", TRAINING_FOLDER):
+                for file in files:
+                    if file.endswith(".npz.new"):  # half a checkpoint
+                        (Path(folder) / file).unlink(missing_ok=True)
