@@ -4,7 +4,6 @@ Which layout a file has is told by its first bytes, and by its name only where t
 nothing (``.splat`` has no header). Each format's bytes are described in docs/formats/splats.md.
 """
 
-import json
 import zlib
 from pathlib import Path
 from typing import Literal
@@ -13,6 +12,7 @@ from splatseg._check import check_choice
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.json_files import read_json
 from splatseg.io.splats._common import Losses, StrPath, check_file
 from splatseg.io.splats._common import SplatWarning as SplatWarning
 
@@ -204,8 +204,8 @@ def _format_of_json(path: Path) -> SplatFormat | None:
     if path.name == "meta.json":
         return "sog"
     try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, RecursionError):
+        document = read_json(path)
+    except FileFormatError:
         return None
     if "means" in document and "quats" in document:
         return "sog"
