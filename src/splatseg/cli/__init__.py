@@ -10,14 +10,18 @@ Exit status: 0 done, 2 bad input or usage, 1 everything else, Ctrl-C included.
 import difflib
 import importlib
 import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
 from splatseg.cli._pages import kept_page
 from splatseg.cli._words import field_names, option_names, with_flags
 from splatseg.errors import InputError, SplatsegError
+
+_MAX_UNPACKED = re.compile("--max-unpacked(=.*)?")
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
@@ -114,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 when the command was carried out; 2 when the words or the input cannot be used; 1 for
         everything else. Errors are one line on the standard error stream; ``--debug`` anywhere
-        among the words adds the traceback.
+        among the words adds the traceback, ``--max-unpacked SIZE`` raises `io.limits`.
 
     Example:
         >>> main(["--version"])
@@ -126,7 +130,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if debug:
         words = [word for word in words if word != "--debug"]
     try:
-        status = _dispatch(words)
+        with _unpacking(words) as words:
+            status = _dispatch(words)
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader of our output went away (`splatseg info X | head -1`). The interpreter
@@ -147,6 +152,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
+@contextmanager
+def _unpacking(words: list[str]) -> Generator[list[str]]:
+    """The words without ``--max-unpacked SIZE``, which holds for every file that is read inside."""
+    at = next((i for i, word in enumerate(words) if _MAX_UNPACKED.fullmatch(word)), None)
+    if at is None:
+        yield words
+        return
+    from splatseg.io.limits import parse_size, unpacking  # here: most command lines need neither
+
+    _, joined, size = words[at].partition("=")
+    end = at + 1 if joined else at + 2
+    if not joined:
+        size = " ".join(words[at + 1 : end])
+    with unpacking(parse_size(size)):
+        yield [*words[:at], *words[end:]]
+
+
 def entry_point() -> int:
     """What the installed `splatseg` script calls; it exits with the status returned."""
     return main()
@@ -164,7 +186,9 @@ def overview() -> str:
         "splatseg COMMAND --help   the flags of one command, with their units and defaults\n"
         "splatseg help COMMAND     the same\n"
         "splatseg --version        the version\n"
-        "--debug                   with any command: the traceback of an error\n\n"
+        "--debug                   with any command: the traceback of an error\n"
+        "--max-unpacked SIZE       with any command: how much a small file may unpack to, such as\n"
+        "                          4GB (256MiB; always 64 times its own size)\n\n"
         "exit status: 0 done, 2 bad input or usage, 1 everything else"
     )
 

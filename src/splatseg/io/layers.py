@@ -26,8 +26,10 @@ from splatseg.core import (
     layer_info_to_json,
     node_row,
 )
-from splatseg.errors import FileFormatError, InputError
+from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.io.npz import open_npz
 
@@ -46,6 +48,7 @@ _ARRAYS = (
 """All that some kind of layer has; nothing else of a file is unpacked."""
 
 _VOID = 0
+_MAX_ID = 2**31 - 1
 
 
 def save_layer(path: Path, layer: Layer) -> None:
@@ -111,7 +114,16 @@ def load_layer(path: Path) -> Layer:
     """
     arrays = _arrays(path)
     header = _header(path, arrays)
-    count, info = int(header["count"]), _info(path, header)
+    info = _info(path, header)
+    with made_from(path):
+        return _layer(path, header, arrays, info)
+
+
+def _layer(
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
+) -> Layer:
+    """The layer that checked arrays make."""
+    count = int(header["count"])
     match header.get("kind"):
         case "labels":
             pair = "candidates" in arrays or "shares" in arrays
@@ -154,7 +166,7 @@ def load_layer(path: Path) -> Layer:
         case kind:
             raise FileFormatError(
                 f"{path}: expected a layer of labels, features, a tree or a selection, "
-                f"got {kind!r}."
+                f"got {quoted(kind)}."
             )
 
 
@@ -183,21 +195,28 @@ def _tree(
     try:
         nodes = tuple(_node(row) for row in cast("list[Any]", rows))
         return InstanceTree(nodes=nodes, labels=labels)
-    except (InputError, KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected nodes of a tree, got others ({error}).") from error
+    except (InputError, KeyError, TypeError) as error:
+        raise FileFormatError(
+            f"{path}: expected nodes of a tree, got others ({reason(error)})."
+        ) from error
 
 
 def _node(row: Mapping[str, Any]) -> TreeNode:
-    parent = int(row["parent"])
+    whole = {
+        key: json_integer(row[key], where=key, low=-1, high=_MAX_ID)
+        for key in ("id", "parent", "class", "segments", "views")
+    }
+    if not isinstance(row["name"], str):
+        raise InputError(f"name: expected a string, got {quoted(row['name'])}.")
     return TreeNode(
-        id=int(row["id"]),
-        parent=UNLABELLED if parent == _VOID else parent,
+        id=whole["id"],
+        parent=UNLABELLED if whole["parent"] == _VOID else whole["parent"],
         level=row["level"],
-        name=str(row["name"]),
-        class_id=int(row["class"]),
-        support=float(row["support"]),
-        segments=int(row["segments"]),
-        views=int(row["views"]),
+        name=row["name"],
+        class_id=whole["class"],
+        support=json_number(row["support"], where="support"),
+        segments=whole["segments"],
+        views=whole["views"],
     )
 
 
@@ -234,14 +253,13 @@ def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     header = parse_object(raw.tobytes(), where=str(path))
     version, count = header.get("version"), header.get("count")
     if header.get("format") != FORMAT or not isinstance(version, int):
-        raise FileFormatError(f"{path}: expected a layer, got {header.get('format')!r}.")
+        raise FileFormatError(f"{path}: expected a layer, got {quoted(header.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
             f"{path}: expected a layer of version {VERSION} or less, got version {version}; "
             "a later splatseg wrote it."
         )
-    if not isinstance(count, int) or count < 0:
-        raise FileFormatError(f"{path}: expected a header with a count of 0 or more.")
+    header["count"] = json_integer(count, where=f"{path}: count")
     return header
 
 
@@ -258,9 +276,7 @@ def _info(path: Path, header: Mapping[str, Any]) -> LayerInfo:
 
 
 def _background(path: Path, header: Mapping[str, Any]) -> int:
-    value = header.get("background")
-    if not isinstance(value, int) or value < 0:
-        raise FileFormatError(f"{path}: expected a background id of 0 or more, got {value!r}.")
+    value = json_integer(header.get("background"), where=f"{path}: background", high=_MAX_ID)
     return UNLABELLED if value == _VOID else value
 
 

@@ -16,12 +16,20 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
+from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import read_metadata
+from splatseg.io.foreign import is_file
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
 
 TEST_EVERY = 8
 """Without a split of its own, views 0, 8, 16 ... of a capture by sorted name are test views."""
+
+MAX_SIDE = 1 << 24
+"""Pixels a side of a picture that a layout may speak of."""
+
+_LONGEST = 100
+"""Characters of a path in a message; its end is kept."""
 
 _ROTATION_TOLERANCE = 1e-3
 # A matrix this close to a rotation is kept to the last bit; others are made exact.
@@ -169,6 +177,11 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
     """
     if intrinsics.width is None or intrinsics.height is None:
         return replace(intrinsics, width=size[0], height=size[1])
+    if not (1 <= intrinsics.width <= MAX_SIDE and 1 <= intrinsics.height <= MAX_SIDE):
+        raise InputError(
+            f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got "
+            f"{intrinsics.width}x{intrinsics.height}."
+        )
     if (intrinsics.width, intrinsics.height) == size:
         return intrinsics
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
@@ -204,6 +217,8 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
     bad = int((~np.isfinite(pose)).sum())
     if bad:
         raise InputError(f"{where}: expected a finite pose, got {bad} values of 16 that are not.")
+    if np.abs(pose).max() > MAX_NUMBER:
+        raise InputError(f"{where}: expected a pose of numbers up to {MAX_NUMBER:g}, got more.")
     rotation = pose[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
@@ -223,9 +238,15 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
 
 
 def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back)."""
+    """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back).
+
+    NaN where it is singular, which `checked_pose` refuses in its own words.
+    """
     world_from_opencv = world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
-    return np.linalg.inv(world_from_opencv).astype(np.float64)
+    try:
+        return np.linalg.inv(world_from_opencv).astype(np.float64)
+    except np.linalg.LinAlgError:
+        return np.full((4, 4), np.nan)
 
 
 def _camera(
@@ -259,7 +280,7 @@ def _check_files(path: Path, raw: Sequence[RawView]) -> None:
         ("masks", [view.mask for view in raw if view.mask is not None]),
         ("depth maps", [view.depth for view in raw if view.depth is not None]),
     ):
-        missing = [str(file) for file in files if not file.is_file()]
+        missing = [str(file) for file in files if not is_file(file)]
         if missing:
             raise MissingFileError(
                 f"{path}: {len(missing)} of {len(files)} {what} are missing ({_first(missing)})."
@@ -267,7 +288,8 @@ def _check_files(path: Path, raw: Sequence[RawView]) -> None:
 
 
 def _first(names: Sequence[str], count: int = 5) -> str:
-    return ", ".join(names[:count]) + (", ..." if len(names) > count else "")
+    shown = [name if len(name) <= _LONGEST else f"...{name[-_LONGEST:]}" for name in names[:count]]
+    return ", ".join(shown) + (", ..." if len(names) > count else "")
 
 
 def _splits(raw: Sequence[RawView]) -> tuple[list[str], str | None]:

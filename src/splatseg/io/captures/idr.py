@@ -20,6 +20,9 @@ _SCALES = (1.0, 0.5, 0.25, 0.125, 2.0)
 # A principal point this far from the middle, as a share of the image, is no match.
 _OFF_CENTRE = 0.15
 
+_MAX_ENTRY = 1e15
+"""Of a projection; pixels times scene units are far below."""
+
 
 def find_idr(folder: Path) -> Path | None:
     """The file of projection matrices of an IDR capture, or None."""
@@ -91,7 +94,7 @@ def decompose(
         InputError: If it is singular, not finite, or skewed by more than a pixel in a thousand.
     """
     left = projection[:3, :3]
-    if not np.isfinite(projection).all() or abs(np.linalg.det(left)) < 1e-12:
+    if not np.abs(projection).max() < _MAX_ENTRY or abs(np.linalg.det(left)) < 1e-12:
         raise InputError(f"{where}: expected a projection matrix, got a singular or infinite one.")
     sign = np.sign(np.linalg.det(left))
     flip = np.eye(3)[::-1]
@@ -99,6 +102,8 @@ def decompose(
     k, rotation = flip @ r.T @ flip, flip @ q.T
     signs = np.diag(np.sign(np.diag(k)))
     k, rotation = k @ signs, signs @ rotation
+    if not k[2, 2] > 0 or not np.linalg.matrix_rank(k) == 3:
+        raise InputError(f"{where}: expected a projection matrix, got a singular one.")
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = np.linalg.solve(k, sign * projection[:3, 3])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.captures._points_beside import points_beside
-from splatseg.io.captures.build import Intrinsics, RawView, build_capture
+from splatseg.io.captures.build import MAX_SIDE, Intrinsics, RawView, build_capture
 from splatseg.io.images import find_images
 from splatseg.io.npy import read_npy
 
@@ -66,7 +66,7 @@ def _cam_from_world(row: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _intrinsics(row: NDArray[np.float64], *, where: str) -> Intrinsics:
     height, width, focal = (float(v) for v in row[:15].reshape(3, 5)[:, 4])
-    if not (height >= 1 and width >= 1 and np.isfinite([height, width]).all()):
+    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
         raise InputError(f"{where}: expected a height and width, got {height:g} and {width:g}.")
     return Intrinsics(
         fx=focal,

@@ -12,6 +12,7 @@ from splatseg._check import check_choice
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import is_folder
 from splatseg.io.json_files import read_json
 from splatseg.io.splats._common import Losses, StrPath, check_file
 from splatseg.io.splats._common import SplatWarning as SplatWarning
@@ -149,7 +150,7 @@ def splat_format(path: StrPath) -> SplatFormat:
         MissingFileError: If there is no such file.
     """
     source = Path(path)
-    if source.is_dir():
+    if is_folder(source):
         if (source / "meta.json").is_file():
             return "sog"
         raise FileFormatError(
