@@ -230,7 +230,11 @@ def open_image(path: Path) -> Image.Image:
             f"{path}: expected a picture of at most {2 * most} pixels, got more; if you trust it, "
             f"{OPTION} with a larger size than {FREE} bytes reads it."
         ) from error
-    check_pixels(path, image, packed=size)
+    try:
+        check_pixels(path, image, packed=size)
+    except FileFormatError:
+        image.close()
+        raise
     return image
 
 

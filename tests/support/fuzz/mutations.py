@@ -107,9 +107,12 @@ def json_values(random: Random, data: bytes) -> bytes | None:
         root = json.loads(data)
     except ValueError:
         return None
-    for _ in range(random.choice((1, 1, 1, 2, 4))):
-        _change(random, root)
-    text = json.dumps(root)
+    try:
+        for _ in range(random.choice((1, 1, 1, 2, 4))):
+            _change(random, root)
+        text = json.dumps(root)
+    except RecursionError:  # lists in lists, more than Python writes
+        return None
     return (text + " " * (-len(text) % 4)).encode()
 
 

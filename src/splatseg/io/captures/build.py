@@ -19,7 +19,7 @@ from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
 from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import read_metadata
-from splatseg.io.foreign import is_file
+from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
 
 TEST_EVERY = 8
@@ -93,7 +93,8 @@ def build_capture(
         raise InputError(
             f"{path}: expected photographs with poses, got a {format} capture of none."
         )
-    names = view_names([view.relative for view in raw])
+    with made_from(path):
+        names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
     raw, names = [raw[i] for i in order], [names[i] for i in order]
     _check_files(path, raw)
@@ -289,7 +290,8 @@ def _check_files(path: Path, raw: Sequence[RawView]) -> None:
 
 def _first(names: Sequence[str], count: int = 5) -> str:
     shown = [name if len(name) <= _LONGEST else f"...{name[-_LONGEST:]}" for name in names[:count]]
-    return ", ".join(shown) + (", ..." if len(names) > count else "")
+    listed = ", ".join(shown) + (", ..." if len(names) > count else "")
+    return "".join(c if c.isprintable() else "?" for c in listed)
 
 
 def _splits(raw: Sequence[RawView]) -> tuple[list[str], str | None]:

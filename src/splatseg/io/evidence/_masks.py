@@ -121,17 +121,20 @@ def read_mask_images(folder: Path) -> MaskSet:
     if not files:
         raise FileFormatError(f"{folder}: expected PNG pictures of masks, got none.")
     scores = _image_scores(folder / MASK_TABLE)
-    arrays = [read_id_map(path) for path in files]
-    for path, array in zip(files, arrays, strict=True):
-        if array.shape != arrays[0].shape:
+    masks: list[Rle] = []
+    for path in files:  # one at a time: all together may take far more than their files
+        array = read_id_map(path)
+        first = masks[0] if masks else None
+        if first is not None and array.shape != (first.height, first.width):
             raise FileFormatError(
-                f"{path}: expected {arrays[0].shape[1]}x{arrays[0].shape[0]} pixels as "
+                f"{path}: expected {first.width}x{first.height} pixels as "
                 f"{files[0].name} has, got {array.shape[1]}x{array.shape[0]}."
             )
+        masks.append(Rle.encode(torch.from_numpy(array != 0)))
     return MaskSet(
-        height=int(arrays[0].shape[0]),
-        width=int(arrays[0].shape[1]),
-        masks=tuple(Rle.encode(torch.from_numpy(array != 0)) for array in arrays),
+        height=masks[0].height,
+        width=masks[0].width,
+        masks=tuple(masks),
         scores=torch.tensor([scores.get(path.stem, 1.0) for path in files]).clamp(0, 1),
         levels=torch.zeros(len(files), dtype=torch.int32),
     )
