@@ -9,8 +9,10 @@ Exit status: 0 done, 2 bad input or usage, 1 everything else, Ctrl-C included.
 
 import difflib
 import importlib
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -19,6 +21,8 @@ from splatseg.cli._signals import interrupted_by_signals
 from splatseg.cli._streams import prepare_streams, silence, tell
 from splatseg.cli._words import field_names, option_names, with_flags
 from splatseg.errors import InputError, SplatsegError
+
+_MAX_UNPACKED = re.compile("--max-unpacked(=.*)?")
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
@@ -115,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 when the command was carried out; 2 when the words or the input cannot be used; 1 for
         everything else. Errors are one line on the standard error stream; ``--debug`` anywhere
-        among the words adds the traceback.
+        among the words adds the traceback, ``--max-unpacked SIZE`` raises `io.limits`.
 
     Example:
         >>> main(["--version"])
@@ -128,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         words = [word for word in words if word != "--debug"]
     prepare_streams()
     try:
-        with interrupted_by_signals():
+        with interrupted_by_signals(), _unpacking(words) as words:
             status = _dispatch(words)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -151,6 +155,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
+@contextmanager
+def _unpacking(words: list[str]) -> Generator[list[str]]:
+    """The words without ``--max-unpacked SIZE``, which holds for every file that is read inside."""
+    at = next((i for i, word in enumerate(words) if _MAX_UNPACKED.fullmatch(word)), None)
+    if at is None:
+        yield words
+        return
+    from splatseg.io.limits import parse_size, unpacking  # here: most command lines need neither
+
+    _, joined, size = words[at].partition("=")
+    end = at + 1 if joined else at + 2
+    if not joined:
+        size = " ".join(words[at + 1 : end])
+    with unpacking(parse_size(size)):
+        yield [*words[:at], *words[end:]]
+
+
 def entry_point() -> int:
     """What the installed `splatseg` script calls; it exits with the status returned."""
     return main()
@@ -168,7 +189,9 @@ def overview() -> str:
         "splatseg COMMAND --help   the flags of one command, with their units and defaults\n"
         "splatseg help COMMAND     the same\n"
         "splatseg --version        the version\n"
-        "--debug                   with any command: the traceback of an error\n\n"
+        "--debug                   with any command: the traceback of an error\n"
+        "--max-unpacked SIZE       with any command: how much a small file may unpack to, such as\n"
+        "                          4GB (256MiB; always 64 times its own size)\n\n"
         "exit status: 0 done, 2 bad input or usage, 1 everything else"
     )
 

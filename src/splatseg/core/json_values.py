@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias, cast
 
-from splatseg.errors import InputError
+from splatseg.errors import InputError, quoted
 
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
 """What JSON has a word for; numbers are finite, keys are strings."""
@@ -62,7 +62,7 @@ def _plain(name: str, value: object, depth: int, max_depth: int) -> JSON:
         entries: dict[str, JSON] = {}
         for key, entry in cast("Mapping[object, object]", value).items():
             if not isinstance(key, str):
-                raise InputError(f"{name}: expected keys that are strings, got {key!r}.")
+                raise InputError(f"{name}: expected keys that are strings, got {quoted(key)}.")
             # Names are made where they may be needed: layers hold tables of many numbers.
             entries[key] = (
                 cast("JSON", entry)

@@ -6,7 +6,7 @@ from typing import Literal, TypeVar, cast
 
 from splatseg.core.json_values import JSON, MAX_DEPTH, plain_object
 from splatseg.core.tree_levels import TREE_LEVELS, TreeLevel
-from splatseg.errors import InputError, RangeError
+from splatseg.errors import InputError, RangeError, quoted
 
 _MAX_DEPTH = MAX_DEPTH - 10
 """Files hold a record within other groups."""
@@ -201,7 +201,9 @@ def _check_cut(value: object) -> None:
     if value is None or (isinstance(value, str) and value in TREE_LEVELS):
         return
     if isinstance(value, str):
-        raise InputError(f"cut: expected {', '.join(TREE_LEVELS)} or a number, got {value!r}.")
+        raise InputError(
+            f"cut: expected {', '.join(TREE_LEVELS)} or a number, got {quoted(value)}."
+        )
     _check_number("cut", value)
     if not 0 <= cast("float", value) <= 1:
         raise RangeError(f"cut: expected a granularity from 0 to 1, got {value}.")
@@ -209,12 +211,12 @@ def _check_cut(value: object) -> None:
 
 def _check_word(name: str, key: object) -> None:
     if not isinstance(key, str):
-        raise InputError(f"{name}: expected keys that are strings, got {key!r}.")
+        raise InputError(f"{name}: expected keys that are strings, got {quoted(key)}.")
 
 
 def _check_id(name: str, key: object) -> None:
     if isinstance(key, bool) or not isinstance(key, int) or key < 0:
-        raise InputError(f"{name}: expected ids of 0 or more as keys, got {key!r}.")
+        raise InputError(f"{name}: expected ids of 0 or more as keys, got {quoted(key)}.")
 
 
 def _tuple(name: str, values: object, kind: type[_Value]) -> tuple[_Value, ...]:

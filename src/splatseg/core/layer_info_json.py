@@ -10,7 +10,7 @@ from typing import Any, cast
 from splatseg.core.json_values import JSON, id_of_key, plain_object
 from splatseg.core.layer_info import InstanceFacts, LayerEdit, LayerInfo
 from splatseg.core.layer_info_version_0 import layer_info_from_metadata
-from splatseg.errors import FileFormatError, InputError
+from splatseg.errors import FileFormatError, InputError, quoted
 
 LAYER_INFO_VERSION = 1
 """Version of the records that are written; those up to it are read."""
@@ -68,7 +68,7 @@ def layer_info_from_json(record: Mapping[str, Any], *, where: str) -> LayerInfo:
         return layer_info_from_metadata(record, where=where)
     version: object = record["version"]
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
-        raise FileFormatError(f"{where}: expected a version of 1 or more, got {version!r}.")
+        raise FileFormatError(f"{where}: expected a version of 1 or more, got {quoted(version)}.")
     if version > LAYER_INFO_VERSION:
         raise FileFormatError(
             f"{where}: expected a record of version {LAYER_INFO_VERSION} or less, got version "
@@ -120,7 +120,7 @@ def _by_id(name: str, value: object) -> dict[int, Any]:
     for key, entry in cast("Mapping[object, object]", value).items():
         id = id_of_key(key)
         if id is None:
-            raise InputError(f"{name}: expected ids of 0 or more as keys, got {key!r}.")
+            raise InputError(f"{name}: expected ids of 0 or more as keys, got {quoted(key)}.")
         table[id] = entry
     return table
 
@@ -131,7 +131,7 @@ def _record(name: str, value: object, known: Sequence[str]) -> dict[str, Any]:
     record = dict(cast("Mapping[str, Any]", value))
     unknown = sorted(set(record) - set(known))
     if unknown:
-        raise InputError(f"{name}: expected {', '.join(known)}, got {unknown[0]!r}.")
+        raise InputError(f"{name}: expected {', '.join(known)}, got {quoted(unknown[0])}.")
     return record
 
 

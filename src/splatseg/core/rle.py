@@ -11,6 +11,9 @@ from torch import Tensor
 from splatseg._check import check_shape
 from splatseg.errors import InputError, RangeError
 
+_MAX_BITS = 35
+"""Of a number in compressed counts: 7 characters, which hold any run and any difference of two."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rle:
@@ -90,6 +93,8 @@ class Rle:
             value |= (code & 31) << shift
             shift += 5
             if code & 32:
+                if shift >= _MAX_BITS:
+                    raise InputError("counts: expected runs of 32 bits, got a longer number.")
                 continue
             if code & 16:
                 value -= 1 << shift
@@ -97,6 +102,12 @@ class Rle:
             value = shift = 0
         if any(count < 0 for count in counts):
             raise InputError("counts: the compressed mask holds a negative run.")
+        total = sum(counts)
+        if total != height * width:  # before they are forced into 32 bits
+            raise InputError(
+                f"counts: expected runs that add up to {height} x {width} = {height * width} "
+                f"pixels, got {total}."
+            )
         return cls(height=height, width=width, counts=np.array(counts, np.uint32))
 
     def to_coco(self) -> str:

@@ -15,9 +15,10 @@ import torch
 
 from splatseg.core import Camera, View
 from splatseg.core.view_names import view_name_fault
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures.build import checked_pose, opencv_from_opengl
-from splatseg.io.captures.nerfstudio import MILLIMETRE, frame_matrix, lens_of, number
+from splatseg.io.captures.nerfstudio import MILLIMETRE, frame_matrix, lens_of, number, size_of
+from splatseg.io.foreign import made_from
 
 _MODEL_NAMES = {"pinhole": "PINHOLE", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 _DISTORTION = {
@@ -134,7 +135,9 @@ def _view(
     merged = {**content, **entry}
     name, split = entry.get("name"), entry.get("split")
     if not isinstance(name, str) or not isinstance(split, str):
-        raise FileFormatError(f"{where}: expected a name and a split, got {name!r} and {split!r}.")
+        raise FileFormatError(
+            f"{where}: expected a name and a split, got {quoted(name)} and {quoted(split)}."
+        )
     fault = view_name_fault(name)
     if fault is not None:
         raise FileFormatError(f"{where}: {fault}.")
@@ -169,18 +172,17 @@ def _camera(merged: Mapping[str, Any], frame: Mapping[str, Any], *, where: str) 
     model, distortion = lens_of(merged, where=where)
     pinhole = merged.get("camera_model") == _MODEL_NAMES["pinhole"]
     matrix = frame_matrix(frame, where=where)
-    pose = checked_pose(
-        matrix if not np.isfinite(matrix).all() else opencv_from_opengl(matrix),
-        where=where,
-    )
-    return Camera(
-        width=int(number(merged, "w", None, where=where)),
-        height=int(number(merged, "h", None, where=where)),
-        fx=number(merged, "fl_x", None, where=where),
-        fy=number(merged, "fl_y", None, where=where),
-        cx=number(merged, "cx", None, where=where),
-        cy=number(merged, "cy", None, where=where),
-        cam_from_world=torch.from_numpy(pose),
-        model="pinhole" if pinhole else model,
-        distortion=() if pinhole else distortion,
-    )
+    pose = checked_pose(opencv_from_opengl(matrix), where=where)
+    width, height = size_of(merged, where=where)
+    with made_from(where):
+        return Camera(
+            width=width,
+            height=height,
+            fx=number(merged, "fl_x", None, where=where),
+            fy=number(merged, "fl_y", None, where=where),
+            cx=number(merged, "cx", None, where=where),
+            cy=number(merged, "cy", None, where=where),
+            cam_from_world=torch.from_numpy(pose),
+            model="pinhole" if pinhole else model,
+            distortion=() if pinhole else distortion,
+        )

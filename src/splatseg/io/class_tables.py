@@ -3,7 +3,7 @@
 from typing import Any, cast
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 
 _MAX_ID = 2**31 - 1
 """Ids are int32."""
@@ -48,12 +48,14 @@ def _class_info(row: object, *, where: str) -> ClassInfo:
     entry = cast(dict[str, Any], row)
     id, name, colour = entry.get("id"), entry.get("name"), entry.get("colour")
     if isinstance(id, bool) or not isinstance(id, int) or id < 0 or not isinstance(name, str):
-        raise FileFormatError(f"{where}: expected an integer id and a name, got {entry!r:.80}.")
+        raise FileFormatError(f"{where}: expected an integer id and a name, got {quoted(entry)}.")
     if id > _MAX_ID:
-        raise FileFormatError(f"{where}: expected an id up to {_MAX_ID}, got {id}.")
+        raise FileFormatError(f"{where}: expected an id up to {_MAX_ID}, got {quoted(id)}.")
     if colour is not None:
         values = cast(list[object], colour) if isinstance(colour, list) else []
         if len(values) != 3 or not all(isinstance(v, int) and 0 <= v <= 255 for v in values):
-            raise FileFormatError(f"{where}: expected a colour of three bytes, got {colour!r:.80}.")
+            raise FileFormatError(
+                f"{where}: expected a colour of three bytes, got {quoted(colour)}."
+            )
         colour = cast(tuple[int, int, int], tuple(values))
     return ClassInfo(id=id, name=name, isthing=bool(entry.get("isthing", True)), colour=colour)

@@ -8,8 +8,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from splatseg.core import View
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError
+from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
+from splatseg.io.npy import read_npy
 
 
 def load_depth(view: View) -> Float[torch.Tensor, "rows columns"]:
@@ -33,23 +35,19 @@ def load_depth(view: View) -> Float[torch.Tensor, "rows columns"]:
         raise FileFormatError(
             f"{view.depth}: expected a depth map of one channel, got shape {values.shape}."
         )
-    depth = values.astype(np.float32) * np.float32(view.depth_unit or 1.0)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite becomes 0
+        depth = values.astype(np.float32) * np.float32(view.depth_unit or 1.0)
     depth[~(np.isfinite(depth) & (depth > 0))] = 0
     return torch.from_numpy(depth)
 
 
 def _npy(path: Path) -> NDArray[np.generic]:
-    try:
-        return np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: there is no such depth map.") from error
-    except (OSError, ValueError, EOFError) as error:
-        raise FileFormatError(f"{path}: cannot be read as an array ({error}).") from error
+    array = read_npy(path)
+    if array.dtype.kind not in "biuf":
+        raise FileFormatError(f"{path}: expected a depth map of numbers, got text.")
+    return array
 
 
 def _image(path: Path) -> NDArray[np.generic]:
-    with open_image(path) as image:
-        try:
-            return np.array(image)
-        except (OSError, SyntaxError, ValueError) as error:
-            raise FileFormatError(f"{path}: cannot be decoded ({error}).") from error
+    with open_image(path) as image, reading(path, "an image of depths"):
+        return np.array(image)

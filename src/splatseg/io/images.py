@@ -6,17 +6,20 @@ to the pixels after that (see ``docs/conventions.md``).
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from splatseg.core import Camera, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError, ShapeError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import is_file, reading
+from splatseg.io.limits import FREE, OPTION, check_unpacked
 
 DEFAULT_LONGEST = 1600
 """Longest side, in pixels, that commands which read photographs work at unless told otherwise."""
@@ -25,6 +28,9 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", "
 """Suffixes, in lower case, of the files that are taken for photographs."""
 
 _EXIF_ORIENTATION = 0x0112
+_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2}
+"""Bytes that Pillow takes for a pixel, by mode; all others take 4."""
+
 # Of the eight EXIF orientations, these four exchange rows and columns.
 _TURNED = frozenset({5, 6, 7, 8})
 
@@ -50,7 +56,7 @@ def image_size(path: Path) -> tuple[int, int]:
             # Some versions of Pillow turn TIFF files by themselves, others do not.
             return _upright(image, path).size
         width, height = image.size
-        return (height, width) if _orientation(image) in _TURNED else (width, height)
+        return (height, width) if _orientation(image, path) in _TURNED else (width, height)
 
 
 def reduced_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
@@ -114,7 +120,7 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
     camera = view.camera
     with open_image(view.mask) as image:
         upright = _upright(image, view.mask)
-    grey = np.asarray(upright)
+    grey = _array(upright, view.mask)
     if upright.mode in ("RGBA", "LA"):
         grey = grey[..., -1]
     grey = grey.max(axis=2) if grey.ndim == 3 else grey
@@ -148,9 +154,10 @@ def load_alpha(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heig
     if view.mask is None:
         if not (upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info):
             return None
-        grey = np.asarray(upright.convert("RGBA"))[..., -1]
+        with reading(path, "an image"):
+            grey = np.asarray(upright.convert("RGBA"))[..., -1]
     else:
-        grey = np.asarray(upright)
+        grey = _array(upright, path)
         if upright.mode in ("RGBA", "LA"):
             grey = grey[..., -1]
         grey = grey.max(axis=2) if grey.ndim == 3 else grey
@@ -205,28 +212,56 @@ def write_png(array: NDArray[np.uint8] | NDArray[np.uint16], path: Path) -> None
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open an image for reading; the caller closes it.
+    """Open an image for reading, its pixels undecoded; the caller closes it.
 
     Raises:
         MissingFileError: If there is no such file.
-        FileFormatError: If it is not an image that Pillow reads.
+        FileFormatError: If it is not an image that Pillow reads, or far too large for its file.
     """
     try:
-        return Image.open(path)
-    except FileNotFoundError as error:
+        with reading(path, "an image"):
+            image = Image.open(path)
+            size = path.stat().st_size
+    except MissingFileError as error:
         raise MissingFileError(f"{path}: there is no such image.") from error
-    except IsADirectoryError as error:
-        raise FileFormatError(f"{path}: expected an image, got a folder.") from error
-    except UnidentifiedImageError as error:
-        raise FileFormatError(f"{path}: expected an image, got something else.") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FileFormatError(f"{path}: cannot be read as an image ({error}).") from error
+    except Image.DecompressionBombError as error:
+        most = Image.MAX_IMAGE_PIXELS or 0
+        raise FileFormatError(
+            f"{path}: expected a picture of at most {2 * most} pixels, got more; if you trust it, "
+            f"{OPTION} with a larger size than {FREE} bytes reads it."
+        ) from error
+    try:
+        check_pixels(path, image, packed=size)
+    except FileFormatError:
+        image.close()
+        raise
+    return image
+
+
+def check_pixels(where: object, image: Image.Image, *, packed: int) -> None:
+    """Refuse a picture whose pixels would take more than a file of its size may unpack to.
+
+    Args:
+        where: The file; starts the message.
+        image: The picture, not decoded yet.
+        packed: Bytes of the file.
+
+    Raises:
+        FileFormatError: If there are too many.
+    """
+    width, height = image.size
+    check_unpacked(
+        where,
+        width * height * _BYTES.get(image.mode, 4),
+        packed=packed,
+        what=f"a picture of {width}x{height} pixels",
+    )
 
 
 def _photograph(view: View) -> Path:
     if view.image is None:
         raise InputError(f"view {view.name!r}: expected a view with a photograph, got one without.")
-    if not view.image.is_file():
+    if not is_file(view.image):
         raise MissingFileError(
             f"{view.image}: the photograph of view {view.name!r} is not there; if the photographs "
             "moved, name their new folder with --data (data= in Python)."
@@ -234,31 +269,37 @@ def _photograph(view: View) -> Path:
     return view.image
 
 
-def _orientation(image: Image.Image) -> int:
+def _orientation(image: Image.Image, path: Path) -> int:
     # Image.getexif of a PNG decodes the whole picture unless the tag came before the pixels.
     if image.format == "PNG" and "exif" not in image.info:
         return 1
-    return int(image.getexif().get(_EXIF_ORIENTATION, 1))
+    with reading(path, "an image"):
+        turned: object = image.getexif().get(_EXIF_ORIENTATION, 1)
+    return turned if isinstance(turned, int) else 1
 
 
 def _upright(image: Image.Image, path: Path) -> Image.Image:
-    try:
+    with reading(path, "an image"):
         return ImageOps.exif_transpose(image)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise FileFormatError(f"{path}: cannot be decoded ({error}).") from error
+
+
+def _array(image: Image.Image, path: Path) -> NDArray[Any]:
+    with reading(path, "an image"):
+        return np.asarray(image)
 
 
 def _decode(image: Image.Image, path: Path) -> Image.Image:
     upright = _upright(image, path)
-    if upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info:
-        upright = upright.convert("RGBA")
-        white = Image.new("RGBA", upright.size, (255, 255, 255, 255))
-        return Image.alpha_composite(white, upright).convert("RGB")
     if upright.mode.startswith(("I", "F")):
         raise FileFormatError(
             f"{path}: expected a photograph of 8 bits a channel, got mode {upright.mode}."
         )
-    return upright.convert("RGB")
+    with reading(path, "an image"):
+        if upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info:
+            upright = upright.convert("RGBA")
+            white = Image.new("RGBA", upright.size, (255, 255, 255, 255))
+            return Image.alpha_composite(white, upright).convert("RGB")
+        return upright.convert("RGB")
 
 
 def _to_integers(array: NDArray[np.generic]) -> NDArray[np.uint8] | NDArray[np.uint16]:

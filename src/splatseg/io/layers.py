@@ -4,7 +4,6 @@ An npz is a ZIP archive of NumPy arrays. Entries are stored uncompressed and wit
 stamps, so that the same layer gives the same bytes.
 """
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -27,9 +26,12 @@ from splatseg.core import (
     layer_info_to_json,
     node_row,
 )
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import made_from
 from splatseg.io.json_files import parse_object
+from splatseg.io.npz import open_npz
 from splatseg.io.npz_writing import save_arrays
 
 FORMAT = "splatseg-layer"
@@ -40,7 +42,14 @@ _INFO_VERSION = 3
 """Files before it have a flat object of any keys instead, under ``metadata``."""
 
 _HEADER = "header"
+_ARRAYS = (
+    _HEADER, "ids", "confidence", "candidates", "shares", "evidence", "effective_views",
+    "inferred", "values", "weights", "mask",
+)  # fmt: skip
+"""All that some kind of layer has; nothing else of a file is unpacked."""
+
 _VOID = 0
+_MAX_ID = 2**31 - 1
 
 
 def save_layer(path: Path, layer: Layer) -> None:
@@ -104,7 +113,16 @@ def load_layer(path: Path) -> Layer:
     """
     arrays = _arrays(path)
     header = _header(path, arrays)
-    count, info = int(header["count"]), _info(path, header)
+    info = _info(path, header)
+    with made_from(path):
+        return _layer(path, header, arrays, info)
+
+
+def _layer(
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
+) -> Layer:
+    """The layer that checked arrays make."""
+    count = int(header["count"])
     match header.get("kind"):
         case "labels":
             pair = "candidates" in arrays or "shares" in arrays
@@ -147,7 +165,7 @@ def load_layer(path: Path) -> Layer:
         case kind:
             raise FileFormatError(
                 f"{path}: expected a layer of labels, features, a tree or a selection, "
-                f"got {kind!r}."
+                f"got {quoted(kind)}."
             )
 
 
@@ -176,21 +194,28 @@ def _tree(
     try:
         nodes = tuple(_node(row) for row in cast("list[Any]", rows))
         return InstanceTree(nodes=nodes, labels=labels)
-    except (InputError, KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected nodes of a tree, got others ({error}).") from error
+    except (InputError, KeyError, TypeError) as error:
+        raise FileFormatError(
+            f"{path}: expected nodes of a tree, got others ({reason(error)})."
+        ) from error
 
 
 def _node(row: Mapping[str, Any]) -> TreeNode:
-    parent = int(row["parent"])
+    whole = {
+        key: json_integer(row[key], where=key, low=-1, high=_MAX_ID)
+        for key in ("id", "parent", "class", "segments", "views")
+    }
+    if not isinstance(row["name"], str):
+        raise InputError(f"name: expected a string, got {quoted(row['name'])}.")
     return TreeNode(
-        id=int(row["id"]),
-        parent=UNLABELLED if parent == _VOID else parent,
+        id=whole["id"],
+        parent=UNLABELLED if whole["parent"] == _VOID else whole["parent"],
         level=row["level"],
-        name=str(row["name"]),
-        class_id=int(row["class"]),
-        support=float(row["support"]),
-        segments=int(row["segments"]),
-        views=int(row["views"]),
+        name=row["name"],
+        class_id=whole["class"],
+        support=json_number(row["support"], where="support"),
+        segments=whole["segments"],
+        views=whole["views"],
     )
 
 
@@ -216,18 +241,8 @@ def _from_file(ids: NDArray[Any]) -> torch.Tensor:
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    if not path.is_file():
-        raise MissingFileError(f"{path}: there is no such layer.")
-    try:
-        # NumPy takes a file that is no archive for a single array, or for a pickle.
-        with zipfile.ZipFile(path):
-            pass
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise FileFormatError(
-            f"{path}: expected a layer, but it cannot be read as one ({error})."
-        ) from error
+    with open_npz(path, expected="a layer") as archive:
+        return {name: archive.array(name) for name in _ARRAYS if name in archive}
 
 
 def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
@@ -237,14 +252,13 @@ def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     header = parse_object(raw.tobytes(), where=str(path))
     version, count = header.get("version"), header.get("count")
     if header.get("format") != FORMAT or not isinstance(version, int):
-        raise FileFormatError(f"{path}: expected a layer, got {header.get('format')!r}.")
+        raise FileFormatError(f"{path}: expected a layer, got {quoted(header.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
             f"{path}: expected a layer of version {VERSION} or less, got version {version}; "
             "a later splatseg wrote it."
         )
-    if not isinstance(count, int) or count < 0:
-        raise FileFormatError(f"{path}: expected a header with a count of 0 or more.")
+    header["count"] = json_integer(count, where=f"{path}: count")
     return header
 
 
@@ -261,9 +275,7 @@ def _info(path: Path, header: Mapping[str, Any]) -> LayerInfo:
 
 
 def _background(path: Path, header: Mapping[str, Any]) -> int:
-    value = header.get("background")
-    if not isinstance(value, int) or value < 0:
-        raise FileFormatError(f"{path}: expected a background id of 0 or more, got {value!r}.")
+    value = json_integer(header.get("background"), where=f"{path}: background", high=_MAX_ID)
     return UNLABELLED if value == _VOID else value
 
 

@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core import Layer, Scene, View
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.atomic import (
     TEMPORARY,
     atomic_folder,
@@ -41,6 +42,7 @@ from splatseg.io.cameras import (
     views_from_content,
 )
 from splatseg.io.class_tables import class_rows, class_table
+from splatseg.io.foreign import is_file, is_folder, made_from
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.lock import scene_lock
@@ -172,16 +174,19 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
             f"says, got {len(gaussians)}."
         )
     classes, metres = content.get("classes"), content.get("metres_per_unit")
-    return Scene(
-        gaussians=gaussians,
-        views=_with_splits(root, content, views),
-        classes=None if classes is None else class_table(classes, where=str(root / SCENE_FILE)),
-        up=_up(root, content),
-        metres_per_unit=None if metres is None else float(metres),
-        source=source,
-        root=root,
-        provenance=cast(dict[str, Any], content.get("provenance") or {}),
-    )
+    with made_from(root / SCENE_FILE):
+        return Scene(
+            gaussians=gaussians,
+            views=_with_splits(root, content, views),
+            classes=None if classes is None else class_table(classes, where=str(root / SCENE_FILE)),
+            up=_up(root, content),
+            metres_per_unit=None
+            if metres is None
+            else json_number(metres, where=f"{root / SCENE_FILE}: metres_per_unit"),
+            source=source,
+            root=root,
+            provenance=_provenance(root, content),
+        )
 
 
 def scene_layer_names(root: Path | str) -> tuple[str, ...]:
@@ -311,14 +316,13 @@ def _scene_content(root: Path) -> dict[str, Any]:
     content = read_json(path)
     version = content.get("version")
     if content.get("format") != FORMAT or not isinstance(version, int):
-        raise FileFormatError(f"{path}: expected a scene, got {content.get('format')!r}.")
+        raise FileFormatError(f"{path}: expected a scene, got {quoted(content.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
             f"{path}: expected a scene of version {VERSION} or less, got version {version}; "
             "a later splatseg wrote it."
         )
-    if not isinstance(content.get("gaussians"), int):
-        raise FileFormatError(f"{path}: expected the number of Gaussians, got none.")
+    json_integer(content.get("gaussians"), where=f"{path}: gaussians")
     return content
 
 
@@ -332,7 +336,7 @@ def _source(
     if data is not None:
         if not data.is_dir():
             raise MissingFileError(f"{data}: there is no such folder of photographs.")
-        missing = [name for name in photographs if not (data / name).is_file()]
+        missing = [name for name in photographs if not is_file(data / name)]
         if missing:
             raise MissingFileError(
                 f"{data}: {len(missing)} of {len(photographs)} photographs of the scene are not "
@@ -347,8 +351,8 @@ def _source(
         Path(os.path.normpath(root / str(entry.get("relative")))),
         Path(str(entry.get("absolute"))),
     ]
-    there = [candidate for candidate in candidates if candidate.is_dir()]
-    with_photographs = [p for p in there if not photographs or (p / photographs[0]).is_file()]
+    there = [candidate for candidate in candidates if is_folder(candidate)]
+    with_photographs = [p for p in there if not photographs or is_file(p / photographs[0])]
     return next(iter([*with_photographs, *there, candidates[1]]))
 
 
@@ -359,6 +363,9 @@ def _with_splits(
     split = content.get("split")
     if not isinstance(split, dict) or not all(isinstance(v, list) for v in split.values()):  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]
         raise FileFormatError(f"{root / SCENE_FILE}: expected a split of lists of view names.")
+    entries = cast(dict[str, list[object]], split)
+    if not all(isinstance(name, str) for names in entries.values() for name in names):
+        raise FileFormatError(f"{root / SCENE_FILE}: expected a split of names, got others.")
     lists = cast(dict[str, list[str]], split)
     of_view = {name: key for key, names in lists.items() for name in names}
     names = {view.name for view in views}
@@ -372,12 +379,23 @@ def _with_splits(
     )
 
 
+def _provenance(root: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    provenance = content.get("provenance") or {}
+    if not isinstance(provenance, dict):
+        raise FileFormatError(
+            f"{root / SCENE_FILE}: expected an object as provenance, got {quoted(provenance)}."
+        )
+    return cast(dict[str, Any], provenance)
+
+
 def _up(root: Path, content: Mapping[str, Any]) -> tuple[float, float, float] | None:
     up = content.get("up")
     if up is None:
         return None
     values = cast(list[object], up) if isinstance(up, list) else []
-    if len(values) != 3 or not all(isinstance(v, (int, float)) for v in values):
-        raise FileFormatError(f"{root / SCENE_FILE}: expected up as three numbers, got {up!r:.60}.")
-    x, y, z = (float(cast(float, v)) for v in values)
+    if len(values) != 3:
+        raise FileFormatError(
+            f"{root / SCENE_FILE}: expected up as three numbers, got {quoted(up)}."
+        )
+    x, y, z = (json_number(v, where=f"{root / SCENE_FILE}: up") for v in values)
     return (x, y, z)

@@ -20,6 +20,7 @@ from splatseg.io.evidence import (
     LabelEvidence,
     PanopticEvidence,
     TrackedEvidence,
+    check_map_sizes,
     read_id_map,
     save_features,
     save_label_map,
@@ -139,6 +140,7 @@ class _Copied(Source):
     @override
     def start(self, folder: Path, views: Sequence[View]) -> None:
         evidence = self.evidence
+        check_map_sizes(evidence, views)
         if evidence.source_ids is not None:
             there = view_files(folder, ".png").values()
             self.highest.extend(int(read_id_map(path).max(initial=0)) for path in there)

@@ -13,6 +13,7 @@ from PIL import Image
 from splatseg.core import Camera, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import bare_photographs
+from splatseg.io.foreign import reading
 from splatseg.io.images import image_size, load_image, open_image, reduced_size
 from splatseg.io.paths import check_utf8
 from splatseg.pose._exif import LensFacts, lens_facts
@@ -112,7 +113,7 @@ def read_headers(paths: Sequence[Path]) -> tuple[list[Photograph], list[LeftOut]
     for path in paths:
         try:
             width, height = image_size(path)
-            with open_image(path) as image:
+            with open_image(path) as image, reading(path, "a photograph"):
                 facts = lens_facts(image)
         except FileFormatError as error:
             bad.append(LeftOut(name=path.name, why=_reason(error, path)))

@@ -18,7 +18,7 @@ from splatseg.evaluate import (
 )
 from splatseg.evaluate.lpips import Lpips, load_lpips
 from splatseg.io.class_tables import class_table
-from splatseg.io.evidence import Evidence, open_evidence
+from splatseg.io.evidence import Evidence, check_map_sizes, open_evidence
 from splatseg.io.json_files import read_json
 from splatseg.lift import PointLabelOptions, PointRule
 from splatseg.render import BackendName
@@ -206,6 +206,7 @@ def _in_views(job: _Job, views: tuple[View, ...], network: Lpips | None) -> dict
         truth = open_evidence(
             job.options.truth, zero_is_class=job.options.zero_is_class, void=job.options.void
         )
+        check_map_sizes(truth, views)
         figures |= _layer_figures(job, views, job.options.layer, truth)
     if network is not None or _wants_photographs(job, views):
         figures |= _photograph_figures(job, views, network)
@@ -238,6 +239,7 @@ def _layer_figures(
         raise InputError("metric: a selection has no classes, expected the metric binary.")
     if job.options.metric == "panoptic" and job.options.truth_instances is not None:
         true_instances = open_evidence(job.options.truth_instances)
+        check_map_sizes(true_instances, views)
         return _panoptic_figures(job, views, layer, truth=truth, true_instances=true_instances)
     method = evaluate_semantic if job.options.metric == "semantic" else evaluate_instances
     with job.observer.stage("evaluate") as step:

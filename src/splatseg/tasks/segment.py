@@ -24,6 +24,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import (
     Evidence,
     TrackedEvidence,
+    check_map_sizes,
     evidence_names,
     find_evidence,
     open_evidence,
@@ -323,6 +324,7 @@ def _views(
 ) -> tuple[View, ...]:
     """The views asked for that have evidence; named ones must have it."""
     allowed = views_asked(scene, asked)
+    check_map_sizes(evidence, allowed)
     if asked[0] not in ("train", "all"):
         return allowed
     known = set(evidence.view_names)

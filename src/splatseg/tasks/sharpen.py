@@ -27,7 +27,13 @@ from splatseg.fit import (
     recorded_exposures,
     refinement_options,
 )
-from splatseg.io.evidence import Evidence, copy_evidence, find_evidence, open_evidence
+from splatseg.io.evidence import (
+    Evidence,
+    check_map_sizes,
+    copy_evidence,
+    find_evidence,
+    open_evidence,
+)
 from splatseg.lift import (
     ConfusionOptions,
     EvidenceSegments,
@@ -260,6 +266,7 @@ def _source(
     zero = own and layer.info.source_ids is not None
     evidence = open_evidence(find_evidence(folders, name), zero_is_class=zero)
     views = views_to_learn_from(scene, layer, evidence)
+    check_map_sizes(evidence, views)
     same = own and keeps_ids(layer.info.method)
     if same and evidence.kind in ("labels", "tracked"):
         return evidence, evidence, views

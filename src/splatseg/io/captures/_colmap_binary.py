@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from splatseg.core import PointCloud
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures._points import point_cloud
 from splatseg.io.captures.colmap_model import (
     MODELS,
@@ -30,6 +30,7 @@ from splatseg.io.captures.colmap_model import (
     ColmapRig,
     rigid_matrix,
 )
+from splatseg.io.foreign import read_bytes
 
 _CAMERA_SENSOR = 0
 _MAX_NAME = 4096
@@ -40,10 +41,7 @@ class _Cursor:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        try:
-            self._data = path.read_bytes()
-        except OSError as error:
-            raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from error
+        self._data = read_bytes(path, "a file of COLMAP")
         self._offset = 0
 
     def read(self, layout: struct.Struct) -> tuple[float, ...]:
@@ -86,7 +84,7 @@ class _Cursor:
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise FileFormatError(f"{self._path}: the name {raw!r:.80} is not UTF-8.") from error
+            raise FileFormatError(f"{self._path}: the name {quoted(raw)} is not UTF-8.") from error
 
     def finish(self) -> None:
         """Refuse bytes after the last record."""

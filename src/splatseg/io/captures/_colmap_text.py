@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from splatseg.core import PointCloud
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures._points import point_cloud
 from splatseg.io.captures.colmap_model import (
     ColmapCamera,
@@ -24,6 +24,7 @@ from splatseg.io.captures.colmap_model import (
     ColmapRig,
     rigid_matrix,
 )
+from splatseg.io.foreign import reading
 
 _T = TypeVar("_T")
 
@@ -118,12 +119,8 @@ def read_frames(path: Path) -> tuple[ColmapFrame, ...]:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
+    with reading(path, "a text file in UTF-8"):
         return path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected a text file in UTF-8 ({error}).") from error
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
 def _rows(path: Path) -> list[tuple[int, str]]:
@@ -138,8 +135,8 @@ def _parsed(
     for number, line in rows:
         try:
             found.append(parse(line))
-        except (ValueError, IndexError) as error:
+        except (ValueError, IndexError, OverflowError) as error:
             raise FileFormatError(
-                f"{path}: line {number}: expected {columns}, got {line[:80]!r}."
+                f"{path}: line {number}: expected {columns}, got {quoted(line)}."
             ) from error
     return found

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from splatseg.core import ClassTable
 from splatseg.io.class_tables import class_table
@@ -56,6 +57,11 @@ def read_metadata(folder: Path) -> Metadata:
             if isinstance(content.get(name), list)
         },
         classes=class_table(content["classes"], where=str(path)) if "classes" in content else None,
-        up=_UP_AXES.get(str(content.get("up_axis", ""))),
-        metres_per_unit=_METRES.get(str(content.get("units", ""))),
+        up=_UP_AXES.get(_word(content, "up_axis")),
+        metres_per_unit=_METRES.get(_word(content, "units")),
     )
+
+
+def _word(content: Mapping[str, Any], key: str) -> str:
+    value: object = content.get(key)
+    return value if isinstance(value, str) else ""

@@ -43,7 +43,8 @@ def splits_beside(folder: Path) -> dict[Path, str]:
     if not path.is_file():
         return {}
     content = read_json(path)
-    frames = [f for f in content.get("frames", []) if isinstance(f, dict)]
+    listed = content.get("frames")
+    frames = [f for f in listed if isinstance(f, dict)] if isinstance(listed, list) else []  # pyright: ignore[reportUnknownVariableType]
     splits = frame_splits(content, frames)
     return {
         folder / str(frame.get("file_path")): split

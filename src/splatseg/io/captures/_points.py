@@ -1,5 +1,6 @@
 """Start points from PLY files: x y z and, where they are there, colours."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 
 from splatseg.core import PointCloud
 from splatseg.core.sh import SH_C0
-from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.errors import FileFormatError, quoted, reason
+from splatseg.io.foreign import read_bytes, reading
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -19,6 +21,7 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _HEADER_LIMIT = 65536
+_COUNT = re.compile("[0-9]{1,15}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +59,9 @@ def read_ply_points(path: Path) -> PointCloud:
     vertex = elements[0]
     names = [name for name, _ in vertex.fields]
     if not {"x", "y", "z"} <= set(names) or len(set(names)) != len(names):
-        raise FileFormatError(f"{path}: expected vertices with x, y and z, got {', '.join(names)}.")
+        raise FileFormatError(
+            f"{path}: expected vertices with x, y and z, got {quoted(', '.join(names))}."
+        )
     rows = _rows(path, order, vertex, offset)
     points = np.stack([rows[axis] for axis in "xyz"], axis=1)
     if not np.isfinite(points).all():
@@ -66,11 +71,8 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 def _header(path: Path) -> tuple[str, list[_Element], int]:
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEADER_LIMIT)
-    except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: there is no such file.") from error
+    with reading(path, "a PLY file"), path.open("rb") as file:
+        head = file.read(_HEADER_LIMIT)
     end = head.find(b"end_header")
     newline = head.find(b"\n", end)
     if not head.startswith(b"ply") or end < 0 or newline < 0:
@@ -82,7 +84,12 @@ def _header(path: Path) -> tuple[str, list[_Element], int]:
             continue
         if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
             order = words[1]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal():
+        elif (
+            words[0] == "element"
+            and len(words) == 3
+            and words[2].isdecimal()
+            and len(words[2]) < 16
+        ):
             elements.append(_Element(name=words[1], count=int(words[2]), fields=()))
         elif words[0] == "property" and elements:
             last = elements[-1]
@@ -90,9 +97,9 @@ def _header(path: Path) -> tuple[str, list[_Element], int]:
                 fields = (*last.fields, (words[2], _TYPES[words[1]]))
                 elements[-1] = _Element(name=last.name, count=last.count, fields=fields)
             elif last.name == "vertex" or len(words) != 5:
-                raise FileFormatError(f"{path}: PLY property {line.strip()!r} is not understood.")
+                raise FileFormatError(f"{path}: PLY property {quoted(line)} is not understood.")
         else:
-            raise FileFormatError(f"{path}: PLY header line {line.strip()!r} is not understood.")
+            raise FileFormatError(f"{path}: PLY header line {quoted(line)} is not understood.")
     if not order:
         raise FileFormatError(f"{path}: expected a PLY file that names its format.")
     return order, elements, newline + 1
@@ -108,12 +115,15 @@ def _rows(path: Path, order: str, vertex: _Element, offset: int) -> NDArray[np.v
             f"{path}: expected {vertex.count} points of {dtype.itemsize} bytes, "
             f"got {have} bytes: the file ends early."
         )
-    return np.fromfile(path, dtype, vertex.count, offset=offset)
+    with reading(path, "a PLY file"):
+        return np.fromfile(path, dtype, vertex.count, offset=offset)
 
 
 def _ascii_rows(path: Path, vertex: _Element, offset: int) -> NDArray[np.void]:
     dtype = np.dtype([(name, "f8" if code[0] == "f" else code) for name, code in vertex.fields])
-    lines = path.read_bytes()[offset:].split(b"\n")[: vertex.count]
+    lines = read_bytes(path, "a PLY file")[offset:].split(b"\n")[: vertex.count]
+    if len(lines) < vertex.count:
+        raise FileFormatError(f"{path}: expected {vertex.count} rows, got {len(lines)}.")
     rows = np.empty(vertex.count, dtype)
     try:
         values = [tuple(float(word) for word in line.split()) for line in lines]
@@ -122,7 +132,8 @@ def _ascii_rows(path: Path, vertex: _Element, offset: int) -> NDArray[np.void]:
         rows[:] = values
     except (ValueError, OverflowError) as error:
         raise FileFormatError(
-            f"{path}: expected {vertex.count} rows of {len(vertex.fields)} numbers ({error})."
+            f"{path}: expected {vertex.count} rows of {len(vertex.fields)} numbers "
+            f"({reason(error)})."
         ) from error
     return rows
 

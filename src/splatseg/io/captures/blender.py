@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import Intrinsics, RawView, build_capture
 from splatseg.io.captures.nerfstudio import cam_from_world_of, focal_of, number
+from splatseg.io.foreign import is_file
 from splatseg.io.images import IMAGE_SUFFIXES, image_size
 from splatseg.io.json_files import read_json
 
@@ -46,17 +47,19 @@ def read_blender(folder: Path) -> Capture:
 
 def _raw_view(content: Mapping[str, Any], frame: object, split: str, *, path: Path) -> RawView:
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):  # pyright: ignore[reportUnknownMemberType]
-        raise FileFormatError(f"{path}: expected frames with a file_path, got {frame!r:.60}.")
+        raise FileFormatError(f"{path}: expected frames with a file_path, got {quoted(frame)}.")
     entry: dict[str, Any] = frame  # pyright: ignore[reportUnknownVariableType]
     relative = entry["file_path"].replace("\\", "/").removeprefix("./")
-    where = f"{path}: frame {relative!r}"
+    where = f"{path}: frame {quoted(relative)}"
     image = path.parent / relative
+    if not image.name:
+        raise FileFormatError(f"{where}: expected a file_path that names a file, got none.")
     if image.suffix.lower() not in IMAGE_SUFFIXES:
         tried = [image.parent / f"{image.name}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
-        image = next((file for file in tried if file.is_file()), tried[0])
+        image = next((file for file in tried if is_file(file)), tried[0])
         relative += image.suffix
     # The layout does not tell the size; a photograph that is missing is reported later.
-    width, height = image_size(image) if image.is_file() else (1, 1)
+    width, height = image_size(image) if is_file(image) else (1, 1)
     focal = focal_of(number({**content, **entry}, "camera_angle_x", None, where=where), width)
     return RawView(
         image=image,

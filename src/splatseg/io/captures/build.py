@@ -16,14 +16,22 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
+from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.core.view_names import clean_view_names
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import read_metadata
+from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
 from splatseg.io.paths import check_utf8
 
 TEST_EVERY = 8
 """Without a split of its own, views 0, 8, 16 ... of a capture by sorted name are test views."""
+
+MAX_SIDE = 1 << 24
+"""Pixels a side of a picture that a layout may speak of."""
+
+_LONGEST = 100
+"""Characters of a path in a message; its end is kept."""
 
 _ROTATION_TOLERANCE = 1e-3
 # A matrix this close to a rotation is kept to the last bit; others are made exact.
@@ -87,7 +95,8 @@ def build_capture(
         raise InputError(
             f"{path}: expected photographs with poses, got a {format} capture of none."
         )
-    names = view_names([view.relative for view in raw])
+    with made_from(path):
+        names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
     raw, names = [raw[i] for i in order], [names[i] for i in order]
     _check_paths(path, raw)
@@ -175,6 +184,11 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
     """
     if intrinsics.width is None or intrinsics.height is None:
         return replace(intrinsics, width=size[0], height=size[1])
+    if not (1 <= intrinsics.width <= MAX_SIDE and 1 <= intrinsics.height <= MAX_SIDE):
+        raise InputError(
+            f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got "
+            f"{intrinsics.width}x{intrinsics.height}."
+        )
     if (intrinsics.width, intrinsics.height) == size:
         return intrinsics
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
@@ -210,6 +224,8 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
     bad = int((~np.isfinite(pose)).sum())
     if bad:
         raise InputError(f"{where}: expected a finite pose, got {bad} values of 16 that are not.")
+    if np.abs(pose).max() > MAX_NUMBER:
+        raise InputError(f"{where}: expected a pose of numbers up to {MAX_NUMBER:g}, got more.")
     rotation = pose[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
@@ -229,9 +245,15 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
 
 
 def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back)."""
+    """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back).
+
+    NaN where it is singular, which `checked_pose` refuses in its own words.
+    """
     world_from_opencv = world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
-    return np.linalg.inv(world_from_opencv).astype(np.float64)
+    try:
+        return np.linalg.inv(world_from_opencv).astype(np.float64)
+    except np.linalg.LinAlgError:
+        return np.full((4, 4), np.nan)
 
 
 def _camera(
@@ -274,7 +296,7 @@ def _check_files(path: Path, raw: Sequence[RawView]) -> None:
         ("masks", [view.mask for view in raw if view.mask is not None]),
         ("depth maps", [view.depth for view in raw if view.depth is not None]),
     ):
-        missing = [str(file) for file in files if not file.is_file()]
+        missing = [str(file) for file in files if not is_file(file)]
         if missing:
             raise MissingFileError(
                 f"{path}: {len(missing)} of {len(files)} {what} are missing ({_first(missing)})."
@@ -282,7 +304,9 @@ def _check_files(path: Path, raw: Sequence[RawView]) -> None:
 
 
 def _first(names: Sequence[str], count: int = 5) -> str:
-    return ", ".join(names[:count]) + (", ..." if len(names) > count else "")
+    shown = [name if len(name) <= _LONGEST else f"...{name[-_LONGEST:]}" for name in names[:count]]
+    listed = ", ".join(shown) + (", ..." if len(names) > count else "")
+    return "".join(c if c.isprintable() else "?" for c in listed)
 
 
 def _splits(raw: Sequence[RawView]) -> tuple[list[str], str | None]:

@@ -4,11 +4,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from splatseg.core import Capture
-from splatseg.errors import InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures import _colmap_binary, _colmap_text
 from splatseg.io.captures._nerfstudio_split import splits_beside
 from splatseg.io.captures.build import RawView, build_capture
 from splatseg.io.captures.colmap_model import ColmapModel, intrinsics_of, poses_of
+from splatseg.io.foreign import is_file
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".", "0")
 _IMAGE_FOLDERS = ("images", "input", "rgb", "images_2", "images_4", "images_8", ".")
@@ -53,7 +54,7 @@ def read_colmap(folder: Path) -> Capture:
     for id, image in model.images.items():
         if image.camera_id not in model.cameras:
             raise InputError(
-                f"{model_folder}: image {image.name!r} names camera {image.camera_id}, "
+                f"{model_folder}: image {quoted(image.name)} names camera {image.camera_id}, "
                 "which is not there."
             )
         relative = image.name.replace("\\", "/")
@@ -104,7 +105,7 @@ def _image_folder(folder: Path, names: Iterable[str]) -> tuple[Path, Path]:
     roots = [folder, *list(folder.resolve().parents)[:_LEVELS_UP]]
     for root in roots:
         for name in _IMAGE_FOLDERS:
-            if any((root / name / image).is_file() for image in first):
+            if any(is_file(root / name / image) for image in first):
                 return root, root / name
     # None is there: the complaint about missing photographs names where they belong.
     return folder, folder / _IMAGE_FOLDERS[0]

@@ -4,13 +4,14 @@ Camera models and their parameter order are those of COLMAP's ``sensor/models.h`
 the binary files hold.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, PointCloud
-from splatseg.errors import InputError
+from splatseg.errors import InputError, quoted
 from splatseg.io.captures.build import Intrinsics
 
 MODELS: dict[int, tuple[str, int]] = {
@@ -115,7 +116,7 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
     if camera.model not in _LENSES:
         raise InputError(
             f"{where}: expected a camera model that can be undistorted ({', '.join(_LENSES)}), "
-            f"got {camera.model}; undistort the photographs with COLMAP first."
+            f"got {quoted(camera.model)}; undistort the photographs with COLMAP first."
         )
     expected, values = PARAMETER_COUNTS[camera.model], camera.parameters
     if len(values) != expected:
@@ -140,8 +141,8 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
 def rigid_matrix(values: tuple[float, ...]) -> NDArray[np.float64]:
     """4 x 4 transform of qw qx qy qz tx ty tz; a zero quaternion gives NaN, found later."""
     w, x, y, z = values[:4]
-    length = float(np.sqrt(w * w + x * x + y * y + z * z))
-    w, x, y, z = (v / length if length > 0 else float("nan") for v in (w, x, y, z))
+    length = math.hypot(w, x, y, z)
+    w, x, y, z = (v / length if 0 < length < math.inf else float("nan") for v in (w, x, y, z))
     matrix = np.eye(4)
     matrix[:3, :3] = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

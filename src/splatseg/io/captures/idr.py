@@ -1,7 +1,6 @@
 """Reads IDR captures: cameras_sphere.npz, photographs and object masks (DTU as IDR ships it)."""
 
 import re
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import Intrinsics, RawView, build_capture
 from splatseg.io.images import find_images, image_size
+from splatseg.io.npz import open_npz
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
 _IMAGE_FOLDERS = ("images", "image")
@@ -19,6 +19,9 @@ _MASK_FOLDERS = ("masks", "mask")
 _SCALES = (1.0, 0.5, 0.25, 0.125, 2.0)
 # A principal point this far from the middle, as a share of the image, is no match.
 _OFF_CENTRE = 0.15
+
+_MAX_ENTRY = 1e15
+"""Of a projection; pixels times scene units are far below."""
 
 
 def find_idr(folder: Path) -> Path | None:
@@ -91,7 +94,7 @@ def decompose(
         InputError: If it is singular, not finite, or skewed by more than a pixel in a thousand.
     """
     left = projection[:3, :3]
-    if not np.isfinite(projection).all() or abs(np.linalg.det(left)) < 1e-12:
+    if not np.abs(projection).max() < _MAX_ENTRY or abs(np.linalg.det(left)) < 1e-12:
         raise InputError(f"{where}: expected a projection matrix, got a singular or infinite one.")
     sign = np.sign(np.linalg.det(left))
     flip = np.eye(3)[::-1]
@@ -99,6 +102,8 @@ def decompose(
     k, rotation = flip @ r.T @ flip, flip @ q.T
     signs = np.diag(np.sign(np.diag(k)))
     k, rotation = k @ signs, signs @ rotation
+    if not k[2, 2] > 0 or not np.linalg.matrix_rank(k) == 3:
+        raise InputError(f"{where}: expected a projection matrix, got a singular one.")
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = np.linalg.solve(k, sign * projection[:3, 3])
@@ -109,22 +114,19 @@ def decompose(
 
 
 def _matrices(path: Path) -> list[NDArray[np.float64]]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            indices = sorted(
-                int(found[1])
-                for key in archive.files
-                if (found := re.fullmatch(r"world_mat_(\d+)", key))
-            )
-            matrices = [archive[f"world_mat_{i}"].astype(np.float64) for i in indices]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{path}: expected a NumPy archive, it cannot be read.") from error
-    for index, matrix in zip(indices, matrices, strict=True):
-        if matrix.shape not in ((4, 4), (3, 4)):
+    with open_npz(path) as archive:
+        names = sorted(
+            (int(found[1]), key)
+            for key in archive.names
+            if (found := re.fullmatch(r"world_mat_([0-9]{1,9})", key))
+        )
+        matrices = [archive.array(key) for _, key in names]
+    for (index, _), matrix in zip(names, matrices, strict=True):
+        if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "iuf":
             raise FileFormatError(
-                f"{path}: expected world_mat_{index} of 4 x 4, got shape {matrix.shape}."
+                f"{path}: expected world_mat_{index} of 4 x 4 numbers, got shape {matrix.shape}."
             )
-    return matrices
+    return [matrix.astype(np.float64) for matrix in matrices]
 
 
 def _scale(ks: list[NDArray[np.float64]], sizes: list[tuple[int, int]], path: Path) -> float:

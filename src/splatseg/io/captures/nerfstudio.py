@@ -9,16 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, Capture, PointCloud
-from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.core.json_numbers import json_matrix, json_number
+from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures._nerfstudio_split import frame_splits
 from splatseg.io.captures._points import ply_holds_splats, read_ply_points
 from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import (
+    MAX_SIDE,
     Intrinsics,
     RawView,
     build_capture,
     opencv_from_opengl,
 )
+from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json
 
 FILE = "transforms.json"
@@ -71,26 +74,15 @@ def frame_matrix(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]
     Raises:
         FileFormatError: If it is no matrix of numbers of 4 x 4 or 3 x 4.
     """
-    try:
-        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{where}: expected a transform_matrix of 4 x 4 numbers.") from error
-    if matrix.shape == (3, 4):
-        matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
-    if matrix.shape != (4, 4):
-        raise FileFormatError(
-            f"{where}: expected a transform_matrix of 4 x 4 numbers, got shape {matrix.shape}."
-        )
-    return matrix
+    matrix = json_matrix(
+        frame.get("transform_matrix"), where=f"{where}: transform_matrix", shapes=((4, 4), (3, 4))
+    )
+    return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
 
 
 def cam_from_world_of(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]:
-    """cam_from_world with OpenCV axes of a frame; NaN where the matrix cannot be inverted."""
-    matrix = frame_matrix(frame, where=where)
-    if not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
-        # `checked_pose` refuses it in its own words: nothing is lost here.
-        return matrix
-    return opencv_from_opengl(matrix)
+    """cam_from_world with OpenCV axes of a frame; NaN where its matrix is singular."""
+    return opencv_from_opengl(frame_matrix(frame, where=where))
 
 
 def number(source: Mapping[str, Any], key: str, default: float | None, *, where: str) -> float:
@@ -99,10 +91,7 @@ def number(source: Mapping[str, Any], key: str, default: float | None, *, where:
     Raises:
         FileFormatError: If it lacks and has no default, or is something else.
     """
-    value = source.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise FileFormatError(f"{where}: expected a number for {key}, got {value!r:.40}.")
-    return float(value)
+    return json_number(source.get(key, default), where=f"{where}: {key}")
 
 
 def lens_of(source: Mapping[str, Any], *, where: str) -> tuple[CameraModel, tuple[float, ...]]:
@@ -113,9 +102,9 @@ def lens_of(source: Mapping[str, Any], *, where: str) -> tuple[CameraModel, tupl
     """
     default = "OPENCV_FISHEYE" if source.get("is_fisheye") is True else "OPENCV"
     name = source.get("camera_model", default)
-    if name not in _MODELS:
+    if not isinstance(name, str) or name not in _MODELS:
         known = ", ".join(sorted(_MODELS))
-        raise FileFormatError(f"{where}: expected a camera_model of {known}, got {name!r}.")
+        raise FileFormatError(f"{where}: expected a camera_model of {known}, got {quoted(name)}.")
     model = _MODELS[name]
     keys = _FISHEYE if model == "fisheye" else _OPENCV
     return model, tuple(number(source, key, 0.0, where=where) for key in keys)
@@ -142,7 +131,7 @@ def _raw_view(
     index: int,
 ) -> RawView:
     relative = str(frame["file_path"]).replace("\\", "/")
-    where = f"{path}: frame {relative!r}"
+    where = f"{path}: frame {quoted(relative)}"
     merged = {**content, **frame}
     return RawView(
         image=path.parent / relative,
@@ -166,10 +155,7 @@ def _intrinsics(source: Mapping[str, Any], *, where: str) -> Intrinsics:
     model, distortion = lens_of(source, where=where)
     if "w" not in source or "h" not in source:
         raise FileFormatError(f"{where}: expected the image size as w and h, got none.")
-    width, height = (
-        number(source, "w", None, where=where),
-        number(source, "h", None, where=where),
-    )
+    width, height = size_of(source, where=where)
     if "fl_x" in source:
         fx = number(source, "fl_x", None, where=where)
     else:
@@ -188,9 +174,22 @@ def _intrinsics(source: Mapping[str, Any], *, where: str) -> Intrinsics:
         cx=number(source, "cx", width / 2, where=where),
         cy=number(source, "cy", height / 2, where=where),
         distortion=distortion,
-        width=int(width),
-        height=int(height),
+        width=width,
+        height=height,
     )
+
+
+def size_of(source: Mapping[str, Any], *, where: str) -> tuple[int, int]:
+    """Width and height in pixels, ``w`` and ``h``; parts of pixels are left out.
+
+    Raises:
+        FileFormatError: If they lack, or no picture can have them.
+    """
+    width, height = (
+        int(json_number(source.get(key), where=f"{where}: {key}", low=1, high=MAX_SIDE))
+        for key in ("w", "h")
+    )
+    return width, height
 
 
 def focal_of(angle: float, size: float) -> float:
@@ -208,7 +207,7 @@ def _points(content: Mapping[str, Any], folder: Path) -> tuple[PointCloud | None
     name = content.get("ply_file_path")
     if isinstance(name, str) and name:
         path = folder / name.replace("\\", "/")
-        if not path.is_file():
+        if not is_file(path):
             raise MissingFileError(f"{path}: the start points that {FILE} names are not there.")
         return read_ply_points(path), path if ply_holds_splats(path) else None
     return points_beside(folder), None

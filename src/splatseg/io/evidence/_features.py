@@ -5,7 +5,6 @@ in quant.npz or basis.npz. Text features are principal components on top of that
 vector is ``normalise((q * scale + offset) @ basis + mean)``.
 """
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +21,12 @@ from splatseg._check import check_shape
 from splatseg.core import FeatureMap, MaskSet
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
-from splatseg.io.npz import read_npz
+from splatseg.io.npz import npz_names, read_npz
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"
+_MAX_PIXELS = 1 << 24
+
 TEXT_FILE = "text_embeddings.npz"
 
 
@@ -77,6 +78,8 @@ class FeatureEvidence(IdFreeEvidence):
         if self.scale is None or self.offset is None:
             return _own_features(path)
         codes = read_npz(path, ["f"])["f"]
+        if codes.dtype.kind not in "iu":
+            raise FileFormatError(f"{path}: expected quantised features, got {codes.dtype}.")
         if codes.ndim != self.scale.ndim + 2 or codes.shape[-1] != self.scale.shape[-1]:
             raise FileFormatError(
                 f"{path}: expected features of {self.scale.shape} blocks and channels, "
@@ -147,8 +150,9 @@ def load_text_embeddings(path: Path) -> TextEmbeddings:
     path = path / TEXT_FILE if path.is_dir() else path
     arrays = read_npz(path, ["labels", "vectors", "kind", "target_id"])
     _check_finite(path, "vectors", arrays["vectors"])
-    count = len(arrays["labels"])
-    if arrays["vectors"].ndim != 2 or any(len(array) != count for array in arrays.values()):
+    count = arrays["vectors"].shape[0] if arrays["vectors"].ndim == 2 else -1
+    columns = [arrays[name] for name in ("labels", "kind", "target_id")]
+    if any(column.shape != (count,) for column in columns) or columns[2].dtype.kind not in "iu":
         raise FileFormatError(f"{path}: expected one vector, kind and target_id a label.")
     return TextEmbeddings(
         labels=tuple(str(label) for label in arrays["labels"]),
@@ -165,12 +169,16 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
         shared = read_npz(path, ["scale", "offset", "stride", "basis", "mean"])
         for name in ("scale", "offset", "basis", "mean"):
             _check_finite(path, name, shared[name])
+        _check_tables(path, shared)
+        basis, mean = shared["basis"], shared["mean"]
+        if basis.ndim != 2 or mean.shape != basis.shape[1:]:
+            raise FileFormatError(f"{path}: expected a basis and a mean of its width.")
         return FeatureEvidence(
             root=folder,
             files=files,
             scale=shared["scale"],
             offset=shared["offset"],
-            stride=int(shared["stride"]),
+            stride=_whole(path, "stride", shared["stride"]),
             basis=shared["basis"].astype(np.float32),
             mean=shared["mean"].astype(np.float32),
         )
@@ -179,18 +187,42 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
         shared = read_npz(path, ["scale", "offset", "stride", "blocks"])
         for name in ("scale", "offset"):
             _check_finite(path, name, shared[name])
+        _check_tables(path, shared)
+        if shared["blocks"].ndim != 1 or shared["blocks"].dtype.kind != "U":
+            raise FileFormatError(f"{path}: expected the names of blocks, got others.")
         return FeatureEvidence(
             root=folder,
             files=files,
             scale=shared["scale"],
             offset=shared["offset"],
-            stride=int(shared["stride"]),
+            stride=_whole(path, "stride", shared["stride"]),
             blocks=tuple(str(block) for block in shared["blocks"]),
         )
     return FeatureEvidence(root=folder, files=files)
 
 
+def _check_tables(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse scales and offsets that are not one a channel, or one a block and channel."""
+    scale, offset = arrays["scale"], arrays["offset"]
+    if scale.ndim not in (1, 2) or scale.shape != offset.shape:
+        raise FileFormatError(
+            f"{path}: expected a scale and an offset of each channel, got shapes {scale.shape} "
+            f"and {offset.shape}."
+        )
+
+
+def _whole(path: Path, name: str, value: NDArray[Any]) -> int:
+    """A positive number of pixels that an array of one holds."""
+    whole = value.size == 1 and value.dtype.kind in "iu"
+    number = int(value.reshape(-1)[0]) if whole else 0
+    if not 0 < number <= _MAX_PIXELS:
+        raise FileFormatError(f"{path}: expected {name} as one whole number of pixels.")
+    return number
+
+
 def _check_finite(path: Path, name: str, values: NDArray[Any]) -> None:
+    if values.dtype.kind not in "fiu":
+        raise FileFormatError(f"{path}: expected {name} as numbers, got {values.dtype}.")
     bad = values.size - int(np.isfinite(values).sum()) if values.dtype.kind == "f" else 0
     if bad:
         raise FileFormatError(
@@ -201,34 +233,31 @@ def _check_finite(path: Path, name: str, values: NDArray[Any]) -> None:
 
 def holds_masks(path: Path) -> bool:
     """Whether a file is an npz with masks."""
-    return _holds(path, "masks.npy")
+    return "masks" in npz_names(path)
 
 
 def holds_features(path: Path) -> bool:
     """Whether a file is an npz with features in our own layout."""
-    return _holds(path, "features.npy")
-
-
-def _holds(path: Path, entry: str) -> bool:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return entry in archive.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
+    return "features" in npz_names(path)
 
 
 def _own_features(path: Path) -> FeatureMap:
     arrays = read_npz(path, ["features", "stride", "size"])
     features, size = arrays["features"], arrays["size"]
     _check_finite(path, "features", features)
-    if features.ndim != 3 or features.dtype.kind != "f" or size.shape != (2,):
+    if (
+        features.ndim != 3
+        or features.dtype.kind != "f"
+        or size.shape != (2,)
+        or 0 in features.shape
+    ):
         raise FileFormatError(
             f"{path}: expected features of shape (rows, columns, channels) and a size, "
             f"got {features.dtype} of {features.shape}."
         )
     return FeatureMap(
         features=torch.from_numpy(features.astype(np.float32)),
-        stride=int(arrays["stride"]),
-        height=int(size[0]),
-        width=int(size[1]),
+        stride=_whole(path, "stride", arrays["stride"]),
+        height=_whole(path, "height", size[:1]),
+        width=_whole(path, "width", size[1:]),
     )

@@ -19,7 +19,12 @@ from splatseg.io.evidence._base import (
     FileEvidence,
     refuse,
 )
+from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
+from splatseg.io.limits import check_unpacked
+
+_BYTES_OF_PIXEL = 5
+"""A byte as it is decoded and an int32."""
 
 CONFIDENCE_STEPS = 65535
 """A confidence of 1 in a file of confidences, 16 bit."""
@@ -73,11 +78,15 @@ def read_id_map(path: Path) -> NDArray[np.int32]:
                 f"{path}: expected one channel of ids, got {image.mode}; a coloured picture of "
                 "labels is no label map."
             )
-        try:
-            array = np.asarray(image)
-        except (OSError, SyntaxError, ValueError) as error:
-            raise FileFormatError(f"{path}: cannot be decoded ({error}).") from error
-    ids = array.astype(np.int64)
+        width, height = image.size
+        check_unpacked(
+            path,
+            width * height * _BYTES_OF_PIXEL,
+            packed=path.stat().st_size,
+            what=f"a label map of {width}x{height} pixels",
+        )
+        with reading(path, "a label map"):
+            ids = np.asarray(image)
     if ids.size and (ids.min() < 0 or ids.max() > MAX_FILE_ID):
         raise FileFormatError(
             f"{path}: expected ids in [0, {MAX_FILE_ID}], got [{ids.min()}, {ids.max()}]."

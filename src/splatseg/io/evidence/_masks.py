@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from splatseg.core import FeatureMap, MaskSet, Rle
-from splatseg.errors import FileFormatError, InputError
+from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._labels import read_id_map
 from splatseg.io.json_files import read_json
+from splatseg.io.limits import check_unpacked
 from splatseg.io.npz import read_npz
 
 MASK_TABLE = "metadata.csv"
@@ -26,6 +28,7 @@ MASK_TABLE = "metadata.csv"
 
 _SCORES = ("score", "predicted_iou")
 _INT32 = np.iinfo(np.int32)
+_MAX_SIDE = 1 << 24
 _MAX_RUN = int(np.iinfo(np.uint32).max)
 
 
@@ -118,17 +121,20 @@ def read_mask_images(folder: Path) -> MaskSet:
     if not files:
         raise FileFormatError(f"{folder}: expected PNG pictures of masks, got none.")
     scores = _image_scores(folder / MASK_TABLE)
-    arrays = [read_id_map(path) for path in files]
-    for path, array in zip(files, arrays, strict=True):
-        if array.shape != arrays[0].shape:
+    masks: list[Rle] = []
+    for path in files:  # one at a time: all together may take far more than their files
+        array = read_id_map(path)
+        first = masks[0] if masks else None
+        if first is not None and array.shape != (first.height, first.width):
             raise FileFormatError(
-                f"{path}: expected {arrays[0].shape[1]}x{arrays[0].shape[0]} pixels as "
+                f"{path}: expected {first.width}x{first.height} pixels as "
                 f"{files[0].name} has, got {array.shape[1]}x{array.shape[0]}."
             )
+        masks.append(Rle.encode(torch.from_numpy(array != 0)))
     return MaskSet(
-        height=int(arrays[0].shape[0]),
-        width=int(arrays[0].shape[1]),
-        masks=tuple(Rle.encode(torch.from_numpy(array != 0)) for array in arrays),
+        height=masks[0].height,
+        width=masks[0].width,
+        masks=tuple(masks),
         scores=torch.tensor([scores.get(path.stem, 1.0) for path in files]).clamp(0, 1),
         levels=torch.zeros(len(files), dtype=torch.int32),
     )
@@ -153,7 +159,8 @@ def _image_scores(path: Path) -> dict[str, float]:
         scores = {row["id"]: float(row["predicted_iou"]) for row in rows}
     except (KeyError, TypeError, ValueError, csv.Error, OSError) as error:
         raise FileFormatError(
-            f"{path}: expected the columns id and predicted_iou, as SAM's tool writes ({error})."
+            f"{path}: expected the columns id and predicted_iou, as SAM's tool writes "
+            f"({reason(error)})."
         ) from error
     if not all(math.isfinite(score) for score in scores.values()):
         raise FileFormatError(f"{path}: expected finite scores, got others.")
@@ -175,9 +182,15 @@ def read_masks(path: Path) -> MaskSet:
     height, width = content.get("height"), content.get("width")
     if not isinstance(rows, list) or not _is_side(height) or not _is_side(width):
         raise FileFormatError(
-            f"{path}: expected masks with their height and width, got {height!r:.40} and "
-            f"{width!r:.40}."
+            f"{path}: expected masks with their height and width, got {quoted(height)} and "
+            f"{quoted(width)}."
         )
+    check_unpacked(
+        path,
+        height * width,
+        packed=path.stat().st_size,
+        what=f"masks of {width}x{height} pixels",
+    )
     masks: list[Rle] = []
     scores: list[float] = []
     levels: list[int] = []
@@ -187,15 +200,11 @@ def read_masks(path: Path) -> MaskSet:
         masks.append(_rle(fields.get("segmentation"), height, width, where=where))
         score = next((fields[key] for key in _SCORES if key in fields), 1.0)
         level = fields.get("level", 0)
-        if not isinstance(score, (int, float)) or _is_infinite(score):
-            raise FileFormatError(f"{where}: expected a finite score, got {score!r:.40}.")
-        if not isinstance(level, int) or not _INT32.min <= level <= _INT32.max:
-            raise FileFormatError(
-                f"{where}: expected a whole number from {_INT32.min} to {_INT32.max} as level, "
-                f"got {level!r:.40}."
-            )
-        scores.append(float(min(1, max(0, score))))
-        levels.append(level)
+        number = json_number(score, where=f"{where}: score")
+        scores.append(min(1.0, max(0.0, number)))
+        levels.append(
+            json_integer(level, where=f"{where}: level", low=int(_INT32.min), high=int(_INT32.max))
+        )
     return MaskSet(
         height=height,
         width=width,
@@ -231,7 +240,7 @@ def _rle(segmentation: object, height: int, width: int, *, where: str) -> Rle:
     if fields.get("size") != [height, width] or not isinstance(counts, (str, list)):
         raise FileFormatError(
             f"{where}: expected a run-length mask of {height} x {width}, "
-            f"got size {fields.get('size')}."
+            f"got size {quoted(fields.get('size'))}."
         )
     try:
         if isinstance(counts, str):
@@ -240,17 +249,12 @@ def _rle(segmentation: object, height: int, width: int, *, where: str) -> Rle:
         wrong = [run for run in runs if type(run) is not int or not 0 <= run <= _MAX_RUN]
         if wrong:
             raise InputError(
-                f"counts: expected whole numbers from 0 to {_MAX_RUN}, got {wrong[0]!r:.40}."
+                f"counts: expected whole numbers from 0 to {_MAX_RUN}, got {quoted(wrong[0])}."
             )
         return Rle(height=height, width=width, counts=np.array(runs, np.uint32))
     except (InputError, OverflowError) as error:
         raise FileFormatError(f"{where}: {error}") from error
 
 
-def _is_infinite(value: float) -> bool:
-    # A whole number may be too large for a float; it is finite.
-    return isinstance(value, float) and not math.isfinite(value)
-
-
 def _is_side(value: object) -> TypeGuard[int]:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+    return isinstance(value, int) and not isinstance(value, bool) and 0 < value <= _MAX_SIDE

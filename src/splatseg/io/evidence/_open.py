@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from splatseg.core import ClassTable
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.core.json_values import id_of_key
+from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.captures import read_metadata
 from splatseg.io.class_tables import class_table
 from splatseg.io.evidence._base import HEADER_FILE, Evidence, EvidenceKind, view_files
@@ -157,7 +158,7 @@ def _header(folder: Path) -> dict[str, Any]:
     header = read_json(path)
     version = header.get("version")
     if header.get("format") != FORMAT or not isinstance(version, int):
-        raise FileFormatError(f"{path}: expected evidence, got {header.get('format')!r}.")
+        raise FileFormatError(f"{path}: expected evidence, got {quoted(header.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
             f"{path}: expected evidence of version {VERSION} or less, got version {version}; "
@@ -213,9 +214,10 @@ def _recorded_ids(folder: Path, header: dict[str, Any]) -> dict[int, int] | None
     if recorded is None:
         return None
     entries = cast(dict[str, object], recorded) if isinstance(recorded, dict) else {"": None}
-    if not all(key.isdecimal() and isinstance(id, int) for key, id in entries.items()):
+    ids = {id_of_key(key): id for key, id in entries.items()}
+    if None in ids or not all(isinstance(id, int) for id in ids.values()):
         raise FileFormatError(
             f"{folder / HEADER_FILE}: expected source_ids of integers by integer, "
-            f"got {recorded!r:.60}."
+            f"got {quoted(recorded)}."
         )
-    return {int(key): cast(int, id) for key, id in entries.items()}
+    return {cast(int, key): cast(int, id) for key, id in ids.items()}

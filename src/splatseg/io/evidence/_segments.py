@@ -1,6 +1,5 @@
 """Panoptic and tracked evidence: label maps whose ids have a table beside them."""
 
-import math
 from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +20,8 @@ from splatseg.core import (
     Track,
     map_ids,
 )
-from splatseg.errors import FileFormatError
+from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.evidence._base import MAX_FILE_ID, Evidence, EvidenceKind, is_id, refuse
 from splatseg.io.evidence._labels import LabelEvidence, masks_of_ids
 from splatseg.io.json_files import read_json
@@ -108,24 +108,18 @@ class PanopticEvidence(TableEvidence):
             fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
             id, category = fields.get("id"), fields.get("category_id")
             score = fields.get("score", 1.0)
-            if not is_id(id) or not isinstance(category, int) or category > MAX_FILE_ID:
+            if not is_id(id) or not isinstance(category, int) or not -1 <= category <= MAX_FILE_ID:
                 raise FileFormatError(
                     f"{path}: view {name!r}: expected segments with id and category_id up to "
-                    f"{MAX_FILE_ID}, got {row!r:.60}."
+                    f"{MAX_FILE_ID}, got {quoted(row)}."
                 )
-            if not isinstance(score, (int, float)) or (
-                isinstance(score, float) and math.isnan(score)
-            ):
-                raise FileFormatError(
-                    f"{path}: view {name!r}: expected a number as score of segment {id}, "
-                    f"got {score!r:.40}."
-                )
+            number = json_number(score, where=f"{path}: view {quoted(name)}: score of segment {id}")
             segments.append(
                 Segment(
                     id=id,
                     category=category if category > 0 else UNLABELLED,
                     isthing=bool(fields.get("isthing", True)),
-                    score=float(min(1, max(0, score))),
+                    score=min(1.0, max(0.0, number)),
                 )
             )
         return tuple(sorted(segments, key=lambda segment: segment.id))
@@ -166,17 +160,14 @@ class TrackedEvidence(TableEvidence):
             if not _is_key(key) or not isinstance(votes, dict):
                 raise FileFormatError(
                     f"{path}: expected tracks by id up to {MAX_FILE_ID}, got "
-                    f"{key!r:.40}: {row!r:.60}."
+                    f"{quoted(key)}: {quoted(row)}."
                 )
             counts = cast(dict[str, object], votes)
-            wrong = [v for v in counts.values() if not isinstance(v, (int, float)) or v != v // 1]
-            if wrong:
-                raise FileFormatError(
-                    f"{path}: expected whole numbers as category_votes of track {key}, "
-                    f"got {wrong[0]!r:.40}."
-                )
+            where = f"{path}: category_votes of track {key}"
             found.append(
-                Track(id=int(key), votes={n: int(cast(int, v)) for n, v in counts.items()})
+                Track(
+                    id=int(key), votes={n: json_integer(v, where=where) for n, v in counts.items()}
+                )
             )
         return tuple(sorted(found, key=lambda track: track.id))
 

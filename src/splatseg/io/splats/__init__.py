@@ -4,7 +4,6 @@ Which layout a file has is told by its first bytes, and by its name only where t
 nothing (``.splat`` has no header). Each format's bytes are described in docs/formats/splats.md.
 """
 
-import json
 import zlib
 from pathlib import Path
 from typing import Literal
@@ -13,6 +12,8 @@ from splatseg._check import check_choice
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import is_folder
+from splatseg.io.json_files import read_json
 from splatseg.io.splats._common import Losses, StrPath, check_file
 from splatseg.io.splats._common import SplatWarning as SplatWarning
 
@@ -149,7 +150,7 @@ def splat_format(path: StrPath) -> SplatFormat:
         MissingFileError: If there is no such file.
     """
     source = Path(path)
-    if source.is_dir():
+    if is_folder(source):
         if (source / "meta.json").is_file():
             return "sog"
         raise FileFormatError(
@@ -204,8 +205,8 @@ def _format_of_json(path: Path) -> SplatFormat | None:
     if path.name == "meta.json":
         return "sog"
     try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, RecursionError):
+        document = read_json(path)
+    except FileFormatError:
         return None
     if "means" in document and "quats" in document:
         return "sog"

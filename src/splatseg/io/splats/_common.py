@@ -23,7 +23,9 @@ from torch import Tensor
 from splatseg.core import Gaussians
 from splatseg.core.activations import exponential, sigmoid
 from splatseg.core.gaussians import LOW_PASS
-from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.errors import FileFormatError, MissingFileError, quoted
+from splatseg.io.foreign import is_file, is_folder, read_bytes
+from splatseg.io.limits import check_unpacked
 
 StrPath: TypeAlias = str | PathLike[str]
 Array: TypeAlias = NDArray[np.float32]
@@ -60,10 +62,30 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
         yield slice(start, min(start + size, count))
 
 
+def check_size(path: Path, count: int, degree: int, *, packed: int) -> None:
+    """Refuse a file that stands for more Gaussians than one of its size may, before they are made.
+
+    Args:
+        path: The file.
+        count: How many it says that there are.
+        degree: Degree of their harmonics.
+        packed: Bytes of the file, and of those that belong to it.
+
+    Raises:
+        FileFormatError: If these are too many, see `io.limits`.
+    """
+    check_unpacked(path, count * bytes_in_memory(degree), packed=packed, what=f"{count} Gaussians")
+
+
+def bytes_in_memory(degree: int) -> int:
+    """Bytes that a Gaussian takes in memory."""
+    return 4 * (3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2)
+
+
 def read_file(path: Path) -> bytes:
     """All bytes of a file that must exist, be a file and not be empty."""
     check_file(path)
-    return path.read_bytes()
+    return read_bytes(path, "a splat file")
 
 
 def check_file(path: Path) -> int:
@@ -73,9 +95,9 @@ def check_file(path: Path) -> int:
         MissingFileError: If it does not exist.
         FileFormatError: If it is a folder or empty.
     """
-    if path.is_dir():
+    if is_folder(path):
         raise FileFormatError(f"{path}: expected a splat file, got a folder.")
-    if not path.is_file():
+    if not is_file(path):
         raise MissingFileError(f"{path}: no such file.")
     size = path.stat().st_size
     if size == 0:
@@ -164,7 +186,7 @@ def _variance(path: Path, text: str) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0):
-        raise FileFormatError(f"{path}: expected 'low_pass' to be 0 or more, got {text!r}.")
+        raise FileFormatError(f"{path}: expected 'low_pass' to be 0 or more, got {quoted(text)}.")
     return value
 
 

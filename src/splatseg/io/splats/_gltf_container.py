@@ -1,7 +1,6 @@
 """The container that is glTF 2.0: JSON, buffers, accessors and the tree of nodes."""
 
 import base64
-import binascii
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +9,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.errors import FileFormatError, MissingFileError, quoted
+from splatseg.io.foreign import is_file, read_bytes
 from splatseg.io.splats._common import read_file
 from splatseg.io.splats._json import Json
 
@@ -48,6 +48,7 @@ class Gltf:
         """
         self.path = path
         data = read_file(path)
+        self._size = len(data)
         self._binary: bytes | None = None
         if data[:4] == _GLB_MAGIC:
             text, self._binary = _glb_chunks(path, data)
@@ -101,6 +102,8 @@ class Gltf:
                 f"{self.path}: expected {needed} bytes for {entry.location}, got a view of "
                 f"{length} bytes at byte {start} of {len(data)}, one row each {stride} bytes."
             )
+        if not count:
+            return np.empty((0, width), kind)
         return np.ndarray((count, width), kind, data, start + offset, (stride, kind.itemsize))
 
     def _buffer(self, index: int) -> bytes:
@@ -132,16 +135,28 @@ class Gltf:
                 raise uri.error("a data URI in base64")
             try:
                 return base64.b64decode(body, validate=True)
-            except binascii.Error as error:
+            except ValueError as error:  # wrong letters, or a wrong number of them
                 raise uri.error("a data URI in base64") from error
-        name = unquote(text)
+        return read_bytes(self._beside(uri), "a buffer of glTF")
+
+    def _beside(self, uri: Json) -> Path:
+        """The file that a URI names."""
+        name = unquote(uri.text())
         relative = Path(name)
         if ":" in name or "\\" in name or relative.is_absolute() or ".." in relative.parts:
             raise uri.error("a file in the folder of this one")
         target = self.path.parent / relative
-        if not target.is_file():
-            raise MissingFileError(f"{target}: no such file, but {self.path.name} names it.")
-        return target.read_bytes()
+        if not is_file(target):
+            raise MissingFileError(
+                f"{self.path.parent}: no such file as {quoted(name)}, which {self.path.name} names."
+            )
+        return target
+
+    def packed_size(self) -> int:
+        """Bytes of the file and of the buffers that lie beside it."""
+        uris = [entry["uri"] for entry in self.root.optional_items("buffers") if "uri" in entry]
+        files = {self._beside(uri) for uri in uris if not uri.text().startswith("data:")}
+        return self._size + sum(file.stat().st_size for file in files)
 
     def meshes(self) -> Iterator[tuple[Json, NDArray[np.float64]]]:
         """Each mesh of the default scene with its ``world_from_mesh`` (4, 4), depth first.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.splats._common import check_file
 
 MAX_HEADER = 1 << 20
@@ -111,7 +111,7 @@ def _byte_order(path: Path, lines: list[str]) -> str:
         case _:
             raise FileFormatError(
                 f"{path}: expected one PLY line 'format binary_little_endian 1.0', "
-                f"got {len(formats)} format lines that say {formats}."
+                f"got {len(formats)} format lines that say {quoted(formats)}."
             )
 
 
@@ -120,24 +120,28 @@ def _tables(
 ) -> list[tuple[str, int, list[tuple[str, str]]]]:
     """Name, count and fields of each element, in file order."""
     tables: list[tuple[str, int, list[tuple[str, str]]]] = []
+    elements: set[str] = set()
+    properties: set[str] = set()
     for line in lines:
         match line.split():
             case ["element", name, count] if count.isdecimal() and len(count) < 16:
-                if name in (table[0] for table in tables):
-                    raise FileFormatError(f"{path}: the PLY element {name!r} stands twice.")
+                if name in elements:
+                    raise FileFormatError(f"{path}: the PLY element {quoted(name)} stands twice.")
+                elements.add(name)
+                properties = set()
                 tables.append((name, int(count), []))
             case ["property", "list", *_] if tables:
                 raise FileFormatError(
                     f"{path}: expected Gaussians, got a PLY file with the list property "
-                    f"{line.split()[-1]!r} in its element {tables[-1][0]!r}: a mesh."
+                    f"{quoted(line.split()[-1])} in its element {quoted(tables[-1][0])}: a mesh."
                 )
             case ["property", kind, name] if tables and kind in _TYPES:
-                fields = tables[-1][2]
-                if name in (field[0] for field in fields):
-                    raise FileFormatError(f"{path}: the PLY property {name!r} stands twice.")
-                fields.append((name, order + _TYPES[kind]))
+                if name in properties:
+                    raise FileFormatError(f"{path}: the PLY property {quoted(name)} stands twice.")
+                properties.add(name)
+                tables[-1][2].append((name, order + _TYPES[kind]))
             case ["element" | "property", *_]:
-                raise FileFormatError(f"{path}: cannot read the PLY header line {line!r}.")
+                raise FileFormatError(f"{path}: cannot read the PLY header line {quoted(line)}.")
             case _:
                 pass  # comments, obj_info, format
     return tables

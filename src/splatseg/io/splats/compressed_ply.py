@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE, SH_C0
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.splats._common import (
     Array,
     Filter,
@@ -106,7 +106,7 @@ def _elements(path: Path, header: PlyHeader) -> tuple[PlyElement, PlyElement, Pl
     if vertex is None or chunk is None:
         raise FileFormatError(
             f"{path}: expected the elements chunk and vertex of a compressed PLY file, "
-            f"got {', '.join(header.elements) or 'none'}."
+            f"got {quoted(', '.join(header.elements) or 'none')}."
         )
     _check_columns(path, vertex, _PACKED, "u4")
     coloured = any(name in (chunk.row.names or ()) for name in _MIN_MAX[12:])
@@ -136,9 +136,10 @@ def _check_columns(path: Path, element: PlyElement, names: tuple[str, ...], kind
     have = element.row.names or ()
     wrong = [n for n in names if n not in have or element.row[n].str[1:] != kind]
     if wrong:
+        listed, got = quoted(", ".join(wrong), 100), quoted(", ".join(have), 100)
         raise FileFormatError(
-            f"{path}: expected the columns {', '.join(wrong)} of type {np.dtype(kind)} in the "
-            f"element {element.name}, got {', '.join(have)}."
+            f"{path}: expected the columns {listed} of type {np.dtype(kind)} in the element "
+            f"{quoted(element.name)}, got {got}."
         )
 
 

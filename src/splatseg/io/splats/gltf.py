@@ -7,7 +7,7 @@ in 2026 and logs in its drafts, which are told apart by what linear scales canno
 come one after the other. Coordinates stay glTF's own (y up). See docs/formats/splats.md.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians, Similarity
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError
-from splatseg.io.splats._common import Array, Rows, finish, warn
+from splatseg.io.splats._common import Array, Rows, check_size, finish, warn
 from splatseg.io.splats._gltf_container import Gltf
 from splatseg.io.splats._json import Json
 
@@ -51,14 +51,19 @@ def read_gltf(path: Path) -> Gaussians:
         raise FileFormatError(
             f"{path}: it needs the glTF extension {', '.join(unknown)}, which is not understood."
         )
-    found = [
-        (_attributes(gltf, primitive), extension, transform)
+    shown = [
+        (primitive, extension, transform)
         for mesh, transform in gltf.meshes()
         for primitive in mesh["primitives"].items()
         if (extension := _extension(primitive)) is not None
     ]
-    if not found:
+    if not shown:
         raise FileFormatError(f"{path}: expected Gaussians ({EXTENSION}), got a glTF without.")
+    _check_amount(gltf, [primitive for primitive, _, _ in shown])
+    found = [
+        (_attributes(gltf, primitive), extension, transform)
+        for primitive, extension, transform in shown
+    ]
     logs = _scales_are_logs([attributes for attributes, _, _ in found])
     degree = max(_degree(path, attributes) for attributes, _, _ in found)
     kernels = sorted({extension["kernel"].text() for _, extension, _ in found} - {"ellipse"})
@@ -70,6 +75,18 @@ def read_gltf(path: Path) -> Gaussians:
         for (attributes, _, transform), space in zip(found, spaces, strict=True)
     ]
     return _marked(path, parts, spaces)
+
+
+def _check_amount(gltf: Gltf, primitives: Sequence[Json]) -> None:
+    """Refuse more Gaussians than the file may stand for: nodes show meshes again and again."""
+    tables = [primitive["attributes"] for primitive in primitives]
+    count = sum(
+        gltf.root["accessors"].element(table["POSITION"].integer())["count"].integer()
+        for table in tables
+        if "POSITION" in table
+    )
+    harmonics = any("SH_DEGREE_1" in name for table in tables for name in table.names())
+    check_size(gltf.path, count, MAX_DEGREE if harmonics else 0, packed=gltf.packed_size())
 
 
 def _extension(primitive: Json) -> Json | None:

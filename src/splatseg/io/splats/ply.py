@@ -64,6 +64,9 @@ _NAMES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "|i1": "char"} | {
     "<i4": "int",
 }
 
+_DIGITS = 6
+"""Of the components of a column, far more than a header has room for."""
+
 _NOTE = "splatseg column"
 """Comment lines ``splatseg column NAME COMPONENTS TYPE`` restore columns that PLY cannot say:
 those of several components (0 stands for a plain column) and those of a type it lacks."""
@@ -157,6 +160,8 @@ def _restore(header: PlyHeader, columns: Mapping[str, np.ndarray]) -> dict[str, 
         if not comment.startswith(_NOTE) or len(words) != 3 or words[2] not in types:
             continue
         name, components, kind = words
+        if not components.isdecimal() or len(components) > _DIGITS or int(components) > len(left):
+            continue  # more than there are
         parts = [name] if components == "0" else [f"{name}_{i}" for i in range(int(components))]
         if parts and all(part in left for part in parts):  # else an editor dropped some
             values = [left.pop(part).to(types[kind]) for part in parts]

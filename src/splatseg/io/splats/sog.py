@@ -10,7 +10,6 @@ Bundled files (``.sog``) are a zip of the same. See docs/formats/splats.md.
 
 import io
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,8 +19,11 @@ from PIL import Image
 
 from splatseg.core import Gaussians
 from splatseg.core.activations import sigmoid
-from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.splats._common import Array, Filter, Rows, blocks, check_file, finish
+from splatseg.core.sh import MAX_DEGREE
+from splatseg.errors import FileFormatError, MissingFileError, quoted
+from splatseg.io.archives import open_archive, open_member
+from splatseg.io.foreign import is_file, read_bytes, reading
+from splatseg.io.splats._common import Array, Filter, Rows, blocks, check_file, check_size, finish
 from splatseg.io.splats._json import Json
 from splatseg.io.splats._quaternions import assemble
 
@@ -29,8 +31,6 @@ _PALETTE_WIDTH = 64
 """Entries of the palette of harmonics in a row of its picture."""
 
 _MAX_META = 1 << 24
-_MAX_COUNT = 1 << 28
-"""More pixels than a WebP picture can have."""
 
 _TAG = 252
 """Alpha of a quaternion whose largest component is w; x, y and z follow."""
@@ -53,62 +53,61 @@ def read_sog(path: Path) -> Gaussians:
     with path.open("rb") as file:
         bundled = file.read(2) == b"PK"
     if not bundled:
-        return _read(path, lambda name, limit: _load_beside(path, name, limit), path.name)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            metas = [n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"]
-            if len(metas) != 1:
-                raise FileFormatError(
-                    f"{path}: expected a zip file with one meta.json, got {len(metas)}."
-                )
-            folder = metas[0].removesuffix("meta.json")
-            return _read(
-                path,
-                lambda name, limit: _load_member(path, archive, folder + name, limit),
-                "meta.json",
+        beside = [file for file in path.parent.glob("*.webp") if file.is_file()]
+        return _read(
+            path,
+            lambda name, limit: _load_beside(path, name, limit),
+            path.name,
+            packed=sum(file.stat().st_size for file in (path, *beside)),
+        )
+    with open_archive(path, where=path, expected="a zip file of SOG") as archive:
+        metas = [n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"]
+        if len(metas) != 1:
+            raise FileFormatError(
+                f"{path}: expected a zip file with one meta.json, got {len(metas)}."
             )
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        RuntimeError,
-        NotImplementedError,
-    ) as error:
-        raise FileFormatError(f"{path}: the zip file is damaged: {error}.") from error
+        folder = metas[0].removesuffix("meta.json")
+        return _read(
+            path,
+            lambda name, limit: _load_member(path, archive, folder + name, limit),
+            "meta.json",
+            packed=path.stat().st_size,
+        )
 
 
 def _load_beside(path: Path, name: str, limit: int) -> bytes:
     """A file in the folder of `path`; a name that points elsewhere is refused."""
     if Path(name).name != name:
-        raise FileFormatError(f"{path}: expected the name of a file beside it, got {name!r}.")
+        raise FileFormatError(f"{path}: expected the name of a file beside it, got {quoted(name)}.")
     member = path.parent / name
-    if not member.is_file():
-        raise MissingFileError(f"{member}: no such file, but {path.name} names it.")
+    if not is_file(member):
+        raise MissingFileError(
+            f"{path.parent}: no such file as {quoted(name)}, which {path.name} names."
+        )
     if member.stat().st_size > limit:
         raise FileFormatError(f"{member}: expected at most {limit} bytes.")
-    return member.read_bytes()
+    return read_bytes(member, "a picture of SOG")
 
 
 def _load_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
     """A member of a zip file, unpacked only if it is as small as it should be."""
-    if name not in archive.NameToInfo:
-        raise FileFormatError(f"{path}: expected a file {name!r} in it, got none.")
-    with archive.open(name) as member:
+    with open_member(archive, name, where=path, expected="a zip file of SOG") as (member, _):
         data = member.read(limit + 1)
     if len(data) > limit:
-        raise FileFormatError(f"{path}: expected at most {limit} bytes in {name!r}, got more.")
+        raise FileFormatError(
+            f"{path}: expected at most {limit} bytes in {quoted(name)}, got more."
+        )
     return data
 
 
-def _read(path: Path, load: Load, meta_name: str) -> Gaussians:
+def _read(path: Path, load: Load, meta_name: str, *, packed: int) -> Gaussians:
     """Read by a function that loads a file of the bundle by name."""
     meta = Json.parse(path, load(meta_name, _MAX_META))
     version = meta["version"].integer() if "version" in meta else 1
     if version not in (1, 2):
         raise FileFormatError(f"{path}: expected SOG version 1 or 2, got {version}.")
     count = (meta["count"] if version == 2 else meta["means"]["shape"].element(0)).integer()
-    if count > _MAX_COUNT:
-        raise meta.error(f"at most {_MAX_COUNT} Gaussians")
+    check_size(path, count, MAX_DEGREE if "shN" in meta else 0, packed=packed)
 
     def images(entry: Json, number: int) -> list[Pixels]:
         names = [item.text() for item in entry["files"].items()]
@@ -138,12 +137,12 @@ def _image(path: Path, load: Load, name: str, min_pixels: int) -> Pixels:
     with _opened(path, name, load(name, 8 * min_pixels + (1 << 20))) as image:
         if image.width * image.height < min_pixels:
             raise FileFormatError(
-                f"{path}: expected at least {min_pixels} pixels in {name!r}, got "
+                f"{path}: expected at least {min_pixels} pixels in {quoted(name)}, got "
                 f"{image.width} x {image.height}."
             )
         if image.width * image.height > 2 * min_pixels + (1 << 22):
             raise FileFormatError(
-                f"{path}: expected about {min_pixels} pixels in {name!r}, got "
+                f"{path}: expected about {min_pixels} pixels in {quoted(name)}, got "
                 f"{image.width} x {image.height}."
             )
         return _pixels(path, name, image).reshape(-1, 4)[:min_pixels]
@@ -152,17 +151,18 @@ def _image(path: Path, load: Load, name: str, min_pixels: int) -> Pixels:
 def _opened(path: Path, name: str, data: bytes) -> Image.Image:
     """A picture whose size is known but whose pixels are not decoded yet."""
     try:
-        return Image.open(io.BytesIO(data), formats=["WEBP"])
-    except (OSError, Image.DecompressionBombError) as error:
-        raise FileFormatError(f"{path}: expected a WebP picture in {name!r}: {error}.") from error
+        with reading(path, f"a WebP picture in {quoted(name)}"):
+            return Image.open(io.BytesIO(data), formats=["WEBP"])
+    except Image.DecompressionBombError as error:
+        raise FileFormatError(
+            f"{path}: expected a smaller WebP picture in {quoted(name)}."
+        ) from error
 
 
 def _pixels(path: Path, name: str, image: Image.Image) -> Pixels:
     """All pixels (height, width, 4); alpha is 255 where the picture has none."""
-    try:
+    with reading(path, f"a WebP picture in {quoted(name)}"):
         return np.asarray(image.convert("RGBA"))
-    except (OSError, EOFError, ValueError) as error:
-        raise FileFormatError(f"{path}: the picture {name!r} is damaged: {error}.") from error
 
 
 def _positions(rows: Rows, entry: Json, images: list[Pixels]) -> None:
@@ -221,7 +221,7 @@ def _sh(path: Path, load: Load, entry: Json, version: int) -> tuple[str, Array]:
         if image.width % _PALETTE_WIDTH or coefficients not in (3, 8, 15) or image.height > 1024:
             raise FileFormatError(
                 f"{path}: expected a palette of 192, 512 or 960 pixels a row and at most 1024 "
-                f"rows in {names[0]!r}, got {image.width} x {image.height}."
+                f"rows in {quoted(names[0])}, got {image.width} x {image.height}."
             )
         pixels = _pixels(path, names[0], image)[..., :3]
     pixels = pixels.reshape(-1, coefficients, 3)

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE
-from splatseg.errors import FileFormatError, RangeError
+from splatseg.errors import FileFormatError, RangeError, reason
 from splatseg.io.splats._common import (
     Array,
     Filter,
     Losses,
     Rows,
     blocks,
+    check_size,
     finish,
     logs,
     read_file,
@@ -42,10 +43,6 @@ _ANTIALIASED = 1
 _EXTENSIONS = 2
 _COLOUR_SCALE = 0.15
 """Colours are stored as 0.15 times the coefficient of degree 0, plus one half."""
-
-_MAX_RATIO = 4096
-"""A file that claims to unpack to more than this times its size (and 64 MiB) is refused."""
-_ALWAYS_ALLOWED = 1 << 26
 
 _FLIP = np.array([1, -1, -1], np.float32)
 _FLIP_ROTATION = np.array([1, 1, -1, -1], np.float32)
@@ -138,16 +135,6 @@ def _header(path: Path, data: bytes) -> _Header:
     )
 
 
-def _check_ratio(path: Path, header: _Header, compressed: int) -> None:
-    """Refuse to allocate what a file of this size cannot honestly hold."""
-    total = header.count * sum(header.sizes)
-    if total > max(_ALWAYS_ALLOWED, _MAX_RATIO * compressed):
-        raise FileFormatError(
-            f"{path}: its header promises {header.count} Gaussians in {compressed} bytes, "
-            "which cannot be."
-        )
-
-
 def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
     """The attributes of versions 2 and 3."""
     stream = zlib.decompressobj(wbits=31)
@@ -157,13 +144,15 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
             raise FileFormatError(
                 f"{path}: expected SPZ version 2 or 3 inside gzip, got {header.version}."
             )
-        _check_ratio(path, header, len(data))
+        check_size(path, header.count, header.degree, packed=len(data))
         body = sum(header.sizes) * header.count
         content = stream.decompress(stream.unconsumed_tail, body) if body else b""
         # Extensions may follow the attributes; anything else after them is a wrong count.
         more = stream.decompress(stream.unconsumed_tail, 1) if not stream.eof else b""
     except zlib.error as error:
-        raise FileFormatError(f"{path}: expected gzip data of an SPZ file: {error}.") from error
+        raise FileFormatError(
+            f"{path}: expected gzip data of an SPZ file: {reason(error)}."
+        ) from error
     if len(content) < body:
         raise FileFormatError(
             f"{path}: expected {body} bytes for {header.count} Gaussians of degree "
@@ -205,7 +194,7 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
             f"{path}: the table of streams at byte {table} lies outside the file of "
             f"{len(data)} bytes."
         )
-    _check_ratio(path, header, len(data))
+    check_size(path, header.count, header.degree, packed=len(data))
     entries = [_STREAM.unpack_from(data, table + i * _STREAM.size) for i in range(header.streams)]
     end = at + sum(compressed for compressed, _ in entries)
     if end != len(data):
@@ -227,7 +216,9 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
             part = reader.read(unpacked) if unpacked else b""
             more = reader.read(1)
         except zstandard.ZstdError as error:
-            raise FileFormatError(f"{path}: stream {i} is no zstd data: {error}.") from error
+            raise FileFormatError(
+                f"{path}: stream {i} is no zstd data: {reason(error)}."
+            ) from error
         if len(part) != unpacked or more:
             raise FileFormatError(
                 f"{path}: expected {unpacked} bytes in stream {i}, "
