@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import FeatureMap, MaskSet, Segment, Track
+from splatseg.errors import FileFormatError
 from splatseg.io.evidence import (
     open_evidence,
     save_features,
@@ -240,9 +241,9 @@ def change_runs(counts: object) -> Spoil:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (change_mask(level=2**40), "masks[0]: expected a whole number from -2147483648 to"),
-        (change_mask(score=float("nan")), "masks[0]: expected a finite score, got nan"),
-        (change_mask(score="high"), "masks[0]: expected a finite score, got 'high'"),
+        (change_mask(level=2**40), "masks[0]: level: expected a whole number in [-2147483648,"),
+        (change_mask(score=float("nan")), "masks[0]: score: expected a finite number, got nan"),
+        (change_mask(score="high"), "masks[0]: score: expected a finite number, got 'high'"),
         (change_mask(segmentation=7), "masks[0]: expected a run-length mask of 20 x 28"),
         (change_runs([1, 2]), "runs that add up to 20 x 28 = 560 pixels, got 3"),
         (change_runs([2**40]), "whole numbers from 0 to 4294967295, got 1099511627776"),
@@ -276,12 +277,13 @@ def test_masks(small, splatseg, refused, masks, command, spoil, words) -> None:
     assert words in sentence
 
 
-def test_a_score_beyond_floats_is_a_sure_one(masks) -> None:
+def test_a_score_beyond_floats_is_none(masks) -> None:
     change_mask(score=10**400)(masks / "train_1.json")
-    assert open_evidence(masks).masks("train_1").scores.tolist() == [1, 1]
+    with pytest.raises(FileFormatError, match="got a number of 1329 bits"):
+        open_evidence(masks).masks("train_1")
 
 
-@pytest.mark.parametrize(("height", "width"), [(10, 9), (40, 56), (20_000_000, 28_000_000)])
+@pytest.mark.parametrize(("height", "width"), [(10, 9), (40, 56), (2000, 2800)])
 def test_masks_of_the_wrong_size(refused, masks, height, width) -> None:
     content = {"height": height, "width": width, "masks": []}
     (masks / "train_1.json").write_text(json.dumps(content))
@@ -309,11 +311,11 @@ def test_empty_masks(refused, splatseg, small, masks, count) -> None:
         ({"levels": [0.5, 0]}, "a whole number as level for each of 2"),
         ({"levels": ["a", "b"]}, "a whole number as level for each of 2"),
         ({"scores": ["a", "b"]}, "a finite score for each of 2"),
-        ({"scores": [1j, 0]}, "a finite score for each of 2"),
+        ({"scores": [1j, 0]}, "expected an array of numbers or text"),
         ({"scores": [np.nan, 0]}, "a finite score for each of 2"),
         ({"masks": two().numpy().astype(float)}, "in booleans or 0 and 1, got float64"),
         ({"masks": np.zeros((2, 0, 0), bool)}, "got bool of (2, 0, 0)"),
-        ({"masks": np.array([None, {}])}, "expected an npz, but it cannot be read"),
+        ({"masks": np.array([None, {}])}, "expected an array of numbers or text"),
     ],
 )
 def test_arrays_of_masks(refused, masks, arrays, words) -> None:
@@ -321,7 +323,7 @@ def test_arrays_of_masks(refused, masks, arrays, words) -> None:
         (masks / f"{name}.json").unlink()
         np.savez(masks / f"{name}.npz", **({"masks": two().numpy()} | arrays))
     sentence = refused("segment", "--method", "associate", "--evidence", masks.name)
-    assert "train_0.npz: expected" in sentence
+    assert "train_0.npz: " in sentence
     assert words in sentence
 
 
@@ -335,14 +337,14 @@ def test_arrays_of_masks(refused, masks, arrays, words) -> None:
         ({"id": "1"}, "id and category_id up to 65535, got"),
         ({"category_id": 2**40}, "id and category_id up to 65535, got"),
         ({"category_id": None}, "id and category_id up to 65535, got"),
-        ({"score": "high"}, "expected a number as score of segment 1, got 'high'"),
-        ({"score": float("nan")}, "expected a number as score of segment 1, got nan"),
+        ({"score": "high"}, "score of segment 1: expected a finite number, got 'high'"),
+        ({"score": float("nan")}, "score of segment 1: expected a finite number, got nan"),
     ],
 )
 def test_segments(refused, panoptic, fields, words) -> None:
     edited(panoptic / "segments.json", lambda c: c["train_1"]["segments_info"][0].update(fields))
     sentence = refused("segment", "--method", "associate", "--evidence", panoptic.name)
-    assert "segments.json: view 'train_1': expected" in sentence
+    assert "segments.json: view 'train_1': " in sentence
     assert words in sentence
 
 
@@ -360,16 +362,16 @@ def test_a_table_without_a_view(refused, panoptic) -> None:
         ({"99999999999999": {}}, "expected tracks by id up to 65535"),
         ({"9" * 5000: {}}, "expected tracks by id up to 65535"),
         ({"\u0661": {}}, "expected tracks by id up to 65535"),
-        ({"1": {"category_votes": {"sky": "many"}}}, "category_votes of track 1, got 'many'"),
-        ({"1": {"category_votes": {"sky": None}}}, "category_votes of track 1, got None"),
-        ({"1": {"category_votes": {"sky": float("nan")}}}, "category_votes of track 1, got nan"),
+        ({"1": {"category_votes": {"sky": "many"}}}, "of at least 0, got 'many'"),
+        ({"1": {"category_votes": {"sky": None}}}, "of at least 0, got None"),
+        ({"1": {"category_votes": {"sky": float("nan")}}}, "of at least 0, got nan"),
         (None, "expected an object of tracks"),
     ],
 )
 def test_tracks(refused, tracked, tracks, words) -> None:
     (tracked / "tracks.json").write_text(json.dumps({} if tracks is None else {"tracks": tracks}))
     sentence = refused("segment", "--method", "associate", "--evidence", tracked.name)
-    assert "tracks.json: expected" in sentence
+    assert "tracks.json: " in sentence
     assert words in sentence
 
 

@@ -407,7 +407,7 @@ def test_a_checkpoint_of_another_training_is_refused(rng, views, tmp_path) -> No
             defaults=defaults, cancelled=cancelled,
         )  # fmt: skip
 
-    with pytest.raises(MissingFileError, match="no such checkpoint"):
+    with pytest.raises(MissingFileError, match="there is no such file"):
         training_summary(path)
     with pytest.raises(KeyboardInterrupt):
         run(settings={"blend": "a"}, resume=False, cancelled=Stop(2))

@@ -4,7 +4,7 @@ JSON has numbers of any size, and Python reads NaN, Infinity and 1e999 as well. 
 takes a number out of a file takes it from here.
 """
 
-from typing import cast
+from typing import TypeGuard, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ float32."""
 MAX_INTEGER = 2**63 - 1
 
 
-def is_json_number(value: object) -> bool:
+def is_json_number(value: object) -> TypeGuard[float]:
     """Whether a value of a JSON document is a number that is finite and at most `MAX_NUMBER`."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
@@ -43,10 +43,10 @@ def json_number(
         >>> json_number(3, where="file: fl_x")
         3.0
     """
-    if not is_json_number(value) or not low <= cast("float", value) <= high:
+    if not is_json_number(value) or not low <= value <= high:
         bounds = "" if (low, high) == (-MAX_NUMBER, MAX_NUMBER) else f" in [{low:g}, {high:g}]"
         raise FileFormatError(f"{where}: expected a finite number{bounds}, got {quoted(value)}.")
-    return float(cast("float", value))
+    return float(value)
 
 
 def json_integer(value: object, *, where: str, low: int = 0, high: int = MAX_INTEGER) -> int:

@@ -28,8 +28,8 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", "
 """Suffixes, in lower case, of the files that are taken for photographs."""
 
 _EXIF_ORIENTATION = 0x0112
-_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2}
-"""Bytes that Pillow takes for a pixel, by mode; all others take 4."""
+_BYTES_OF_PIXEL = 4
+"""What Pillow takes for a colour, and we for a depth; grey and palettes become one of these."""
 
 # Of the eight EXIF orientations, these four exchange rows and columns.
 _TURNED = frozenset({5, 6, 7, 8})
@@ -252,7 +252,7 @@ def check_pixels(where: object, image: Image.Image, *, packed: int) -> None:
     width, height = image.size
     check_unpacked(
         where,
-        width * height * _BYTES.get(image.mode, 4),
+        width * height * _BYTES_OF_PIXEL,
         packed=packed,
         what=f"a picture of {width}x{height} pixels",
     )

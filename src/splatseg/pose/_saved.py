@@ -20,6 +20,7 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import Capture
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures.build import RawView, build_capture
 from splatseg.io.captures.colmap import read_colmap_model
 from splatseg.io.captures.colmap_model import intrinsics_of, poses_of
@@ -62,7 +63,11 @@ def save_poses(folder: Path, *, model: Path, made_of: str, report: PoseReport) -
 
 
 def load_report(folder: Path, *, made_of: str) -> PoseReport | None:
-    """The report of poses that were made of just this; None where there are none."""
+    """The report of poses that were made of just this; None where there are none.
+
+    Raises:
+        FileFormatError: If the file is damaged.
+    """
     path = folder / FILE
     if not path.is_file():
         return None
@@ -70,7 +75,13 @@ def load_report(folder: Path, *, made_of: str) -> PoseReport | None:
     current = content.get("format") == FORMAT and content.get("version") == VERSION
     if not current or content.get("made_of") != made_of:
         return None
-    return PoseReport.from_json(cast(dict[str, Any], content["report"]))
+    report = content.get("report")
+    try:
+        return PoseReport.from_json(cast(dict[str, Any], report))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(
+            f"{path}: expected the report of poses, got {quoted(report)}."
+        ) from error
 
 
 def load_capture(model: Path, photographs: Sequence[Path], *, root: Path) -> Capture:

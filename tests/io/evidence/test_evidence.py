@@ -375,8 +375,14 @@ def test_uncompressed_runs_and_defaults(tmp_path) -> None:
         (lambda m: m["masks"][0]["segmentation"].update(counts=[1, 4]), "add up to 2 x 2"),
         (lambda m: m["masks"][0]["segmentation"].update(counts=[-1, 5]), r"masks\[0\]: "),
         (lambda m: m["masks"][0]["segmentation"].update(counts="~~"), "other characters"),
-        (lambda m: m["masks"][0].update(score="high"), "expected a finite score, got .high."),
-        (lambda m: m["masks"][0].update(level=2**31), "whole number .* as level, got 2147483648"),
+        (
+            lambda m: m["masks"][0].update(score="high"),
+            "score: expected a finite number, got .high.",
+        ),
+        (
+            lambda m: m["masks"][0].update(level=2**31),
+            "level: expected a whole number .*, got 2147483648",
+        ),
     ],
 )
 def test_masks_that_are_broken(tmp_path, change, message) -> None:

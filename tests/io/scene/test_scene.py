@@ -283,7 +283,7 @@ def _edit(path: Path, change) -> None:
     [
         (lambda c: c.update(version=2), "version 1 or less, got version 2; a later splatseg"),
         (lambda c: c.update(format="x"), "expected a scene, got 'x'"),
-        (lambda c: c.pop("gaussians"), "the number of Gaussians"),
+        (lambda c: c.pop("gaussians"), "gaussians: expected a whole number"),
         (lambda c: c.update(gaussians=4), "expected 4 Gaussians as scene.json says, got 3"),
         (lambda c: c["split"]["train"].pop(), "names each view of cameras/transforms.json once"),
         (lambda c: c["split"]["train"].append("right/1"), "names each view"),
@@ -312,7 +312,7 @@ def test_the_split_of_scene_json_counts(version_1) -> None:
     [
         (lambda c: c.pop("frames"), "expected a list of frames"),
         (lambda c: c["frames"][0].pop("name"), r"frames\[0\]: expected a name"),
-        (lambda c: c.pop("fl_x"), "expected a number for fl_x"),
+        (lambda c: c.pop("fl_x"), "fl_x: expected a finite number"),
         (lambda c: c["frames"][1]["transform_matrix"].pop(), "finite|last row|4 x 4|rotation"),
         (lambda c: c["frames"].__setitem__(0, 3), r"frames\[0\]: expected an object"),
     ],

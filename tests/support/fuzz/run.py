@@ -17,8 +17,9 @@ from support.fuzz.worker import work
 _START = 30
 """Seconds that a process may take to start."""
 
-_GRACE = 3
-"""Times the seconds of a case until a process is killed that its own alarm does not reach."""
+_GRACE = 30
+"""Times the seconds of a case, by the clock, until a process is killed that waits for something or
+that its own alarm does not reach."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +30,7 @@ class Limits:
     """MiB beyond what the process holds before."""
 
     seconds: float = 10.0
+    """Of the processor: what else a machine does is no fault of a reader."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,6 +36,7 @@ from splatseg.io.scene import load_scene, save_scene
 from splatseg.io.splats import read_splats, write_splats
 from splatseg.io.tensors import read_tensors
 from splatseg.lift.training import _state as training
+from splatseg.pose.doctor._files import read_for_doctor
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 WIDTH, HEIGHT = 8, 6
@@ -147,6 +148,15 @@ def nerfstudio(folder: Path) -> Target:
     content |= {"applied_transform": np.eye(4)[:3].tolist(), "ply_file_path": "points.ply"}
     (folder / "points.ply").write_bytes(_ascii_ply())
     return _capture(folder, "transforms.json", json.dumps(content).encode())
+
+
+@target("doctor-transforms.json")
+def doctor(folder: Path) -> Target:
+    """A capture whose sizes contradict its photographs, as `splatseg doctor` reads it."""
+    lens = {"camera_model": "OPENCV", "w": 3 * WIDTH, "h": HEIGHT, "fl_x": 9.0}
+    content = {**lens, "frames": _frames(), "applied_transform": np.eye(4)[:3].tolist()}
+    made = _capture(folder, "transforms.json", json.dumps(content).encode())
+    return Target(file=made.file, read=lambda: read_for_doctor(folder))
 
 
 @target("transforms_train.json")

@@ -247,13 +247,13 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
 def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back).
 
-    NaN where it is singular, which `checked_pose` refuses in its own words.
+    A singular one comes back as it is: no rotation, which `checked_pose` refuses in its own words.
     """
     world_from_opencv = world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
     try:
         return np.linalg.inv(world_from_opencv).astype(np.float64)
     except np.linalg.LinAlgError:
-        return np.full((4, 4), np.nan)
+        return world_from_opencv
 
 
 def _camera(

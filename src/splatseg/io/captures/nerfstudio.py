@@ -81,7 +81,7 @@ def frame_matrix(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]
 
 
 def cam_from_world_of(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]:
-    """cam_from_world with OpenCV axes of a frame; NaN where its matrix is singular."""
+    """cam_from_world with OpenCV axes of a frame, see `opencv_from_opengl`."""
     return opencv_from_opengl(frame_matrix(frame, where=where))
 
 

@@ -10,10 +10,12 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import Capture, PointCloud
+from splatseg.core.json_numbers import is_json_number, json_matrix, json_number
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.cameras import cameras_content
 from splatseg.io.captures import find_formats, read_capture
+from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import image_size
 from splatseg.io.json_files import read_json, write_json
 from splatseg.pose.doctor._corrections import PointCorrection
@@ -100,16 +102,10 @@ def similarity_from(matrix: object, scale: object, *, where: str) -> PointCorrec
     Raises:
         FileFormatError: If it is no such matrix, or turns and stretches.
     """
-    try:
-        values = np.array(matrix, dtype=np.float64)
-        factor = float(cast(float, scale))
-    except (TypeError, ValueError) as error:
-        raise FileFormatError(f"{where}: expected numbers, got something else.") from error
-    if values.shape not in ((3, 4), (4, 4)) or not np.isfinite(values).all() or not factor > 0:
-        raise FileFormatError(
-            f"{where}: expected 3 x 4 finite numbers and a positive scale, got shape "
-            f"{values.shape} and {factor:g}."
-        )
+    values = json_matrix(matrix, where=where, shapes=((3, 4), (4, 4)))
+    factor = json_number(scale, where=f"{where}: scale")
+    if not factor > 0:
+        raise FileFormatError(f"{where}: expected a positive scale, got {factor:g}.")
     stretch = float(np.cbrt(abs(np.linalg.det(values[:3, :3]))))
     if stretch < 1e-12:
         raise FileFormatError(f"{where}: expected a rotation, got a singular matrix.")
@@ -190,15 +186,16 @@ def _wrong_sizes(content: Mapping[str, Any], folder: Path) -> dict[int, tuple[in
     """Frames whose w and h are no uniform scale of their photograph: its size, and what is said."""
     wrong: dict[int, tuple[int, int, str]] = {}
     frames = content.get("frames")
-    for i, frame in enumerate(cast(list[object], frames) if isinstance(frames, list) else []):
-        if not isinstance(frame, dict):
-            continue
-        merged = {**content, **cast(dict[str, Any], frame)}
+    entries = cast(list[object], frames) if isinstance(frames, list) else []
+    if not all(isinstance(frame, dict) for frame in entries):
+        return {}  # `read_capture` says what is wrong with them
+    for i, frame in enumerate(cast(list[dict[str, Any]], entries)):
+        merged = {**content, **frame}
         w, h, name = merged.get("w"), merged.get("h"), merged.get("file_path")
-        if not (isinstance(w, (int, float)) and isinstance(h, (int, float)) and w > 0 and h > 0):
+        if not (is_json_number(w) and is_json_number(h) and w > 0 and h > 0):
             continue
         photograph = folder / str(name)
-        if not photograph.is_file():
+        if not is_file(photograph):
             continue
         width, height = image_size(photograph)
         if abs(width / w * h - height) > 1 and abs(height / h * w - width) > 1:
@@ -236,7 +233,7 @@ def _read_with_sizes(
         changed["ply_file_path"] = str(root / points)
     elif beside is not None:
         changed["ply_file_path"] = str(root / beside)
-    with tempfile.TemporaryDirectory() as temporary:
+    with tempfile.TemporaryDirectory() as temporary, made_from(folder):
         write_json(Path(temporary) / _TRANSFORMS, changed)
         if (folder / "metadata.json").is_file():
             shutil.copy(folder / "metadata.json", temporary)
