@@ -14,11 +14,11 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
 
-from splatseg.errors import InputError
+from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import TEMPORARY, is_running
 from splatseg.io.file_locks import try_lock
+from splatseg.io.json_files import parse_object
 from splatseg.io.write_errors import write_failures_named
 
 LOCK_FILE = f"{TEMPORARY}lock"
@@ -163,13 +163,12 @@ def _seems_to_run(owner: LockOwner | None) -> bool:
 def _read(handle: int) -> LockOwner | None:
     """What a lock file says; None where it says nothing yet."""
     try:
-        content = json.loads(os.pread(handle, 4096, 0))
-        entry = cast("dict[str, Any]", content)
+        entry = parse_object(os.pread(handle, 4096, 0), where=LOCK_FILE)
         return LockOwner(
             work=str(entry["work"])[:40],
             process=int(entry["process"]),
             host=str(entry["host"])[:80],
             since=float(entry["since"]),
         )
-    except (OSError, ValueError, KeyError, TypeError, OverflowError):
+    except (FileFormatError, OSError, ValueError, KeyError, TypeError, OverflowError):
         return None

@@ -20,14 +20,13 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, RangeError
 from splatseg.io.atomic import is_vacant
-from splatseg.io.export import column_table_of, label_columns, write_labelled_splats
+from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import is_scene, load_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.lift import Attached, AttachOptions, attach
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.import_scene import read_with_notes
 from splatseg.tasks.label_columns import label_tables
-from splatseg.tasks.new_scene import check_parent
 from splatseg.tasks.scene_parts import layer_of, whole_layer
 
 _LABEL_COLUMNS = ("class_id", "confidence", "instance_id", "instance_confidence", "selected")
