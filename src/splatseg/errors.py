@@ -10,8 +10,14 @@
     └── BackendError (RuntimeError)           a backend cannot run here
 
 Each class is also the builtin that fits, so ``except ValueError`` works. A message is one
-sentence that names the argument or the file, what was expected and what came.
+sentence that names the argument or the file, what was expected and what came. What came is foreign
+text, of any length and with any characters: `quoted` and `reason` make it fit for a message.
 """
+
+import reprlib
+
+_QUOTED = 60
+_REASON = 120
 
 
 class SplatsegError(Exception):
@@ -44,3 +50,48 @@ class MissingPackageError(SplatsegError, ImportError):
 
 class BackendError(SplatsegError, RuntimeError):
     """A rendering backend cannot run here or refuses what was asked of it."""
+
+
+def quoted(value: object, limit: int = _QUOTED) -> str:
+    """A value of a file as a message shows it: on one line, cut, all characters printable.
+
+    Only as much of it is looked at as is shown, so a list of millions costs nothing.
+
+    Example:
+        >>> quoted("a" * 100, 20)
+        "'aaaaaaa...aaaaaaaa'"
+        >>> quoted({"a": [1, float("nan")]})
+        "{'a': [1, nan]}"
+    """
+    shown = _Shown(limit).repr(value)
+    return shown if len(shown) <= limit else f"{shown[: limit - 3]}..."
+
+
+def reason(error: BaseException) -> str:
+    r"""What another library said of a file, as a message shows it: one line, cut, no full stop.
+
+    Example:
+        >>> reason(ValueError("bad header:\n" + "x" * 1000))[:14]
+        'bad header: xx'
+    """
+    try:
+        words = " ".join(str(error).split()[:40])
+    except ValueError:  # the error names a number of too many digits
+        words = ""
+    clean = "".join(c if c.isprintable() else "?" for c in words).rstrip(".")
+    clean = clean or type(error).__name__
+    return clean if len(clean) <= _REASON else f"{clean[: _REASON - 3]}..."
+
+
+class _Shown(reprlib.Repr):
+    """`repr` of as much of a value as fits."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = self.maxlong = limit
+        self.maxlevel = 3
+
+    def repr_int(self, x: int, level: int) -> str:
+        if x.bit_length() > 1024:  # Python refuses to write out numbers of many digits
+            return f"a number of {x.bit_length()} bits"
+        return super().repr_int(x, level)

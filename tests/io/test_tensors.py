@@ -64,13 +64,13 @@ def _file(path, header: object, body: bytes = b"") -> None:
     ("header", "match"),
     [
         (b"{", "JSON"),
-        ([], "tensors by name"),
+        ([], "a JSON object"),
         ({"x": {"dtype": "F32"}}, "type, shape and place"),
         ({"x": 3}, "type, shape and place"),
-        ({"x": {"dtype": "F8", "shape": [1], "data_offsets": [0, 1]}}, "got F8"),
+        ({"x": {"dtype": "F8", "shape": [1], "data_offsets": [0, 1]}}, "got 'F8'"),
         ({"x": {"dtype": "F32", "shape": [3], "data_offsets": [0, 8]}}, "size"),
         ({"x": {"dtype": "F32", "shape": [2], "data_offsets": [4, 12]}}, "size"),
-        ({"x": {"dtype": "F32", "shape": [-2], "data_offsets": [8, 0]}}, "size"),
+        ({"x": {"dtype": "F32", "shape": [-2], "data_offsets": [8, 0]}}, "whole number"),
     ],
 )
 def test_damaged_headers(tmp_path, header, match) -> None:

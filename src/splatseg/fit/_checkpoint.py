@@ -6,21 +6,19 @@ so a process that is killed at any moment leaves a complete one, and an unfinish
 next one overwrites. Each array has a checksum, so damage is detected.
 """
 
-import zipfile
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
-from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
+from splatseg.errors import FileFormatError, SplatsegError, quoted
 from splatseg.fit._state import FitState
 from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.npz import Npz, open_npz
 
 FORMAT = "splatseg-fit"
 VERSION = 1
@@ -76,9 +74,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
         CheckpointVersionError: If it is of another version.
         FileFormatError: If it is not a checkpoint, or damaged.
     """
-    with _opened(path) as archive:
+    with open_npz(path, expected="the checkpoint of a fit") as archive:
         header = _header(path, archive)
-        names = [name for name in archive.files if name != _HEADER]
+        names = [name for name in archive.names if name != _HEADER]
         tensors = {name: torch.from_numpy(_array(path, archive, name)) for name in names}
     state = FitState(tensors=tensors, content=header["content"], where=str(path))
     return Checkpoint(state=state, identity=header["identity"])
@@ -106,7 +104,7 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
         CheckpointVersionError: If it is of another version.
         FileFormatError: If it is not a checkpoint, or damaged.
     """
-    with _opened(path) as archive:
+    with open_npz(path, expected="the checkpoint of a fit") as archive:
         content = _header(path, archive)["content"]
     state = FitState(tensors={}, content=content, where=str(path))
     return CheckpointSummary(
@@ -129,45 +127,25 @@ def _unfinished(path: Path) -> Path:
     return path.with_name(f"{path.name}.new")
 
 
-@contextmanager
-def _opened(path: Path) -> Generator[NpzFile]:
-    if not path.is_file():
-        raise MissingFileError(f"{path}: there is no such checkpoint.")
-    try:
-        # NumPy reads a file that is not an archive as a single array, or as a pickle.
-        with zipfile.ZipFile(path):
-            pass
-        with np.load(path, allow_pickle=False) as archive:
-            yield archive
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(
-            f"{path}: expected the checkpoint of a fit, got a damaged file or another format "
-            f"({error})."
-        ) from error
-
-
-def _array(path: Path, archive: NpzFile, name: str) -> NDArray[Any]:
-    array = cast(object, archive[name])
-    # A member that is not .npy is read as bytes.
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
-        raise FileFormatError(f"{path}: expected {name!r} to be an array of numbers.")
+def _array(path: Path, archive: Npz, name: str) -> NDArray[Any]:
+    array = archive.array(name)
+    if array.dtype.kind not in "fiub":
+        raise FileFormatError(f"{path}: expected {quoted(name)} to be an array of numbers.")
     return array
 
 
-def _header(path: Path, archive: NpzFile) -> dict[str, Any]:
-    if _HEADER not in archive.files:
+def _header(path: Path, archive: Npz) -> dict[str, Any]:
+    if _HEADER not in archive:
         raise FileFormatError(f"{path}: expected the checkpoint of a fit, got another archive.")
     header = parse_object(_array(path, archive, _HEADER).tobytes(), where=str(path))
     if header.get("format") != FORMAT:
         raise FileFormatError(
-            f"{path}: expected the checkpoint of a fit, got {header.get('format')!r}."
+            f"{path}: expected the checkpoint of a fit, got {quoted(header.get('format'))}."
         )
     if header.get("version") != VERSION:
         raise CheckpointVersionError(
             f"{path}: this fit cannot be resumed, as another splatseg stopped it (expected a "
-            f"checkpoint of version {VERSION}, got version {header.get('version')!r})."
+            f"checkpoint of version {VERSION}, got version {quoted(header.get('version'))})."
         )
     if not isinstance(header.get("content"), dict) or not isinstance(header.get("identity"), dict):
         raise FileFormatError(f"{path}: expected a header with content and identity.")

@@ -11,6 +11,7 @@ from splatseg.core import Camera, Capture, View
 from splatseg.core.recorded_options import differing_names, option_differences
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
+from splatseg.io.json_files import parse_object
 
 # The length may differ: a fit can be resumed with another one. The number of Gaussians depends on
 # the length, and may differ with it.
@@ -92,7 +93,7 @@ def _other_options(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
 
 def _as_recorded(options: FitOptions) -> dict[str, Any]:
     """Options as JSON returns them: tuples become lists."""
-    return json.loads(json.dumps(asdict(options)))
+    return parse_object(json.dumps(asdict(options)), where="options")
 
 
 def _of(identity: Mapping[str, Any], group: str) -> Mapping[str, Any]:

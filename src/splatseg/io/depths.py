@@ -8,8 +8,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from splatseg.core import View
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError
 from splatseg.io.images import open_image
+from splatseg.io.npy import read_npy
 
 
 def load_depth(view: View) -> Float[torch.Tensor, "rows columns"]:
@@ -39,12 +40,10 @@ def load_depth(view: View) -> Float[torch.Tensor, "rows columns"]:
 
 
 def _npy(path: Path) -> NDArray[np.generic]:
-    try:
-        return np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: there is no such depth map.") from error
-    except (OSError, ValueError, EOFError) as error:
-        raise FileFormatError(f"{path}: cannot be read as an array ({error}).") from error
+    array = read_npy(path)
+    if array.dtype.kind not in "biuf":
+        raise FileFormatError(f"{path}: expected a depth map of numbers, got text.")
+    return array
 
 
 def _image(path: Path) -> NDArray[np.generic]:

@@ -1,29 +1,41 @@
 """JSON in files: read with clear errors, written whole."""
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core.json_values import plain_json
-from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.errors import FileFormatError, quoted, reason
 from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import read_bytes
+
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
+_LONE = re.compile("[\ud800-\udfff]")
+"""Pairs have become one character when JSON is parsed; what is left has no partner."""
 
 
 def parse_object(text: str | bytes, *, where: str) -> dict[str, Any]:
     """A JSON object from text; `where` starts the message of an error.
 
+    Its numbers are unchecked: `core.json_numbers` takes them out.
+
     Raises:
-        FileFormatError: If it is not JSON, or holds something other than an object.
+        FileFormatError: If it is not JSON, holds something other than an object, or text in it is
+            no Unicode (half of a pair of surrogates).
     """
     try:
-        value = json.loads(text)
+        decoded = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
+        value = json.loads(decoded)
     except (ValueError, RecursionError) as error:
         raise FileFormatError(
-            f"{where}: expected JSON, but it cannot be parsed ({error})."
+            f"{where}: expected JSON, but it cannot be parsed ({reason(error)})."
         ) from error
     if not isinstance(value, dict):
         raise FileFormatError(f"{where}: expected a JSON object, got {type(value).__name__}.")
+    if _SURROGATE.search(decoded) is not None:
+        _refuse_surrogates(cast(dict[str, Any], value), where)
     return cast(dict[str, Any], value)
 
 
@@ -34,13 +46,20 @@ def read_json(path: Path) -> dict[str, Any]:
         MissingFileError: If there is no such file.
         FileFormatError: If it is not JSON, or holds something other than an object.
     """
-    try:
-        text = path.read_bytes()
-    except FileNotFoundError as error:
-        raise MissingFileError(f"{path}: there is no such file.") from error
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from error
-    return parse_object(text, where=str(path))
+    return parse_object(read_bytes(path, "a JSON file"), where=str(path))
+
+
+def _refuse_surrogates(content: dict[str, Any], where: str) -> None:
+    """Refuse text that no file name, terminal or other file could hold."""
+    pending: list[object] = [content]
+    while pending:
+        value = pending.pop()
+        if isinstance(value, dict):
+            pending += [*value.keys(), *value.values()]  # pyright: ignore[reportUnknownArgumentType]
+        elif isinstance(value, list):
+            pending += value  # pyright: ignore[reportUnknownArgumentType]
+        elif isinstance(value, str) and _LONE.search(value) is not None:
+            raise FileFormatError(f"{where}: expected Unicode text, got {quoted(value)}.")
 
 
 def json_text(name: str, value: Mapping[str, Any], *, indent: int | None = None) -> str:

@@ -4,7 +4,6 @@ An npz is a ZIP archive of NumPy arrays. Entries are stored uncompressed and wit
 stamps, so that the same layer gives the same bytes.
 """
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -27,9 +26,10 @@ from splatseg.core import (
     layer_info_to_json,
     node_row,
 )
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.npz import open_npz
 
 FORMAT = "splatseg-layer"
 VERSION = 3
@@ -39,6 +39,12 @@ _INFO_VERSION = 3
 """Files before it have a flat object of any keys instead, under ``metadata``."""
 
 _HEADER = "header"
+_ARRAYS = (
+    _HEADER, "ids", "confidence", "candidates", "shares", "evidence", "effective_views",
+    "inferred", "values", "weights", "mask",
+)  # fmt: skip
+"""All that some kind of layer has; nothing else of a file is unpacked."""
+
 _VOID = 0
 
 
@@ -217,18 +223,8 @@ def _from_file(ids: NDArray[Any]) -> torch.Tensor:
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    if not path.is_file():
-        raise MissingFileError(f"{path}: there is no such layer.")
-    try:
-        # NumPy takes a file that is no archive for a single array, or for a pickle.
-        with zipfile.ZipFile(path):
-            pass
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise FileFormatError(
-            f"{path}: expected a layer, but it cannot be read as one ({error})."
-        ) from error
+    with open_npz(path, expected="a layer") as archive:
+        return {name: archive.array(name) for name in _ARRAYS if name in archive}
 
 
 def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

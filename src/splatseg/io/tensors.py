@@ -3,16 +3,18 @@
 PyTorch's own ``.pth`` files are pickles and are not read here; see `read_tensors`.
 """
 
-import json
 import math
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.core.json_numbers import json_integer
+from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.io.foreign import read_bytes, reading
+from splatseg.io.json_files import parse_object
+from splatseg.io.npz import open_npz
 
 _TYPES = {
     "F64": (torch.float64, 8),
@@ -24,6 +26,7 @@ _TYPES = {
     "U8": (torch.uint8, 1),
 }
 _MAX_HEADER = 100_000_000
+_MAX_SIDE = 1 << 40
 _CONVERT = (
     "python -c \"import numpy, torch; numpy.savez('weights.npz', "
     "**torch.load('weights.pth', weights_only=True))\""
@@ -57,45 +60,42 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _npz(path: Path) -> dict[str, Tensor]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: torch.from_numpy(np.array(file[name])) for name in file.files}
-    except (ValueError, OSError, KeyError, TypeError, EOFError) as error:
-        raise FileFormatError(f"{path}: expected an npz file of numbers ({error}).") from error
+    with open_npz(path, expected="an npz file of numbers") as archive:
+        arrays = {name: archive.array(name) for name in archive.names}
+    text = [name for name, array in arrays.items() if array.dtype.kind == "U"]
+    if text:
+        raise FileFormatError(f"{path}: expected numbers in {quoted(text[0])}, got text.")
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
 def _safetensors(path: Path) -> dict[str, Tensor]:
-    data = path.read_bytes()
+    data = read_bytes(path, "a safetensors file")
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(_MAX_HEADER, len(data) - 8):
         raise FileFormatError(f"{path}: expected a safetensors file, its header is cut off.")
-    try:
-        header: Any = json.loads(data[8 : 8 + length])
-    except ValueError as error:
-        raise FileFormatError(f"{path}: expected a header of JSON ({error}).") from error
-    if not isinstance(header, dict):
-        raise FileFormatError(f"{path}: expected a header of tensors by name, got something else.")
+    header = parse_object(data[8 : 8 + length], where=f"{path}: header")
     body = memoryview(data)[8 + length :]
-    entries = cast(dict[str, Any], header)
     return {
         name: _tensor(path, name, entry, body)
-        for name, entry in entries.items()
+        for name, entry in header.items()
         if name != "__metadata__"
     }
 
 
 def _tensor(path: Path, name: str, entry: Any, body: memoryview) -> Tensor:
-    try:
-        kind, shape = str(entry["dtype"]), [int(n) for n in entry["shape"]]
-        begin, end = (int(n) for n in entry["data_offsets"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected type, shape and place of {name!r}.") from error
-    if kind not in _TYPES:
-        raise FileFormatError(f"{path}: expected {name!r} of {', '.join(_TYPES)}, got {kind}.")
+    fields = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
+    kind, sides, place = (fields.get(key) for key in ("dtype", "shape", "data_offsets"))
+    where = f"{path}: tensor {quoted(name)}"
+    if not isinstance(sides, list) or not isinstance(place, list) or len(place) != 2:  # pyright: ignore[reportUnknownArgumentType]
+        raise FileFormatError(f"{where}: expected its type, shape and place, got {quoted(entry)}.")
+    if not isinstance(kind, str) or kind not in _TYPES:
+        raise FileFormatError(f"{where}: expected {', '.join(_TYPES)}, got {quoted(kind)}.")
+    shape = [json_integer(n, where=where, high=_MAX_SIDE) for n in cast("list[object]", sides)]
+    begin, end = (json_integer(n, where=where) for n in cast("list[object]", place))
     dtype, size = _TYPES[kind]
-    fits = 0 <= begin <= end <= len(body) and all(n >= 0 for n in shape)
-    if not fits or end - begin != size * math.prod(shape):
-        raise FileFormatError(f"{path}: {name!r} has not the size that its shape asks for.")
+    if not begin <= end <= len(body) or end - begin != size * math.prod(shape):
+        raise FileFormatError(f"{where}: it has not the size that its shape asks for.")
     if begin == end:
-        return torch.zeros(shape, dtype=dtype)
+        with reading(where, "a tensor"):
+            return torch.zeros(shape, dtype=dtype)
     return torch.frombuffer(bytearray(body[begin:end]), dtype=dtype).reshape(shape)

@@ -9,7 +9,6 @@ npz. It appears under its name only when it is complete.
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,9 +31,10 @@ from splatseg.core.models import (
     SemanticLabels,
     TextFeatures,
 )
-from splatseg.errors import InputError
+from splatseg.errors import InputError, reason
 from splatseg.io.atomic import atomic_file
-from splatseg.io.json_files import json_text
+from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.npz import open_npz
 from splatseg.models._content import image_digest
 from splatseg.models._packing import Answer, Precision, pack, unpack
 
@@ -176,9 +176,11 @@ def _decode(content: bytes) -> Answer:
     if hashlib.sha256(payload).digest() != digest:
         raise _DamagedError("it is half-written or damaged")
     try:
+        # The digest says that this is what was written here: it may unpack to any size.
         data = zstandard.ZstdDecompressor().decompress(payload)
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        return unpack(json.loads(arrays.pop("header").tobytes()), arrays)
-    except (zstandard.ZstdError, zipfile.BadZipFile, KeyError, ValueError, InputError) as error:
-        raise _DamagedError(f"it does not hold what a model gives ({error})") from error
+        with open_npz(data, where="entry", expected="the arrays of an entry") as archive:
+            arrays = {name: archive.array(name) for name in archive.names}
+        header = parse_object(arrays.pop("header").tobytes(), where="header")
+        return unpack(header, arrays)
+    except (zstandard.ZstdError, LookupError, TypeError, ValueError) as error:
+        raise _DamagedError(f"it does not hold what a model gives ({reason(error)})") from error

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import splatseg
-from splatseg.errors import BackendError, MissingPackageError
+from splatseg.errors import BackendError, FileFormatError, MissingPackageError
+from splatseg.io.json_files import parse_object, read_json
 
 _LOG_LINES = 3
 
@@ -79,7 +80,7 @@ def run_worker(
                     pipe.close()
     if status != 0 or not result.is_file():
         raise BackendError(_failure(status, log))
-    return cast(dict[str, Any], json.loads(result.read_text(encoding="utf-8")))
+    return read_json(result)
 
 
 def _environment(threads: int) -> dict[str, str]:
@@ -91,9 +92,9 @@ def _environment(threads: int) -> dict[str, str]:
 
 def _pass_on(line: str, progress: Callable[[str, int, int], None]) -> None:
     try:
-        message = json.loads(line)
+        message = parse_object(line, where="progress")
         stage, done, total = message["stage"], message["done"], message["total"]
-    except (ValueError, TypeError, KeyError):
+    except (FileFormatError, KeyError):
         return  # Something that a library printed.
     progress(str(stage), int(done), int(total))
 

@@ -28,6 +28,7 @@ from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.images import save_png
 from splatseg.io.json_files import read_json, write_json
+from splatseg.io.npy import read_npy
 from splatseg.io.scene import scene_layer_names
 from splatseg.render import BackendName
 from splatseg.report.legend import colour_labels, legend_of
@@ -272,10 +273,10 @@ def _finish_depth(folder: Path, views: Sequence[View], scene: Scene) -> None:
     """Depths of all views on one 16-bit scale, once the deepest is known."""
     held = folder / ".float"
     paths = [_file(held, view, ".npy") for view in views]
-    deepest = max(float(np.load(path, allow_pickle=False).max()) for path in paths)
+    deepest = max(float(read_npy(path).max()) for path in paths)
     unit = depth_unit(deepest)
     for view, path in zip(views, paths, strict=True):
-        depth = np.load(path, allow_pickle=False)
+        depth = read_npy(path)
         steps = np.floor(depth.astype(np.float64) / unit + 0.5)
         _save(torch.from_numpy(steps.clip(0, _DEEPEST).astype(np.int32)), folder, view)
     shutil.rmtree(held)

@@ -421,7 +421,10 @@ def edited_meta(files: dict[str, bytes], change: Callable[[dict], object]) -> by
         (lambda m: m.pop("scales"), "expected a member 'scales' at the root"),
         (lambda m: m["means"].pop("mins"), "expected a member 'mins' at means"),
         (lambda m: m["means"].update(mins=[0, 1]), "expected 3 numbers at means.mins"),
-        (lambda m: m["means"].update(mins=[0, 1, None]), r"a number at means\.mins\[2\], got None"),
+        (
+            lambda m: m["means"].update(mins=[0, 1, None]),
+            r"a finite number at means\.mins\[2\], got None",
+        ),
         (lambda m: m["means"].update(maxs=[0, 1, float("nan")]), "expected a finite number"),
         (lambda m: m["means"].update(maxs=[0, 1, 1e9]), "hold values that are NaN or infinite"),
         (lambda m: m["means"].update(files=["a"]), "expected 2 names of files at means.files"),

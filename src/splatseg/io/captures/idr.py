@@ -1,7 +1,6 @@
 """Reads IDR captures: cameras_sphere.npz, photographs and object masks (DTU as IDR ships it)."""
 
 import re
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import Intrinsics, RawView, build_capture
 from splatseg.io.images import find_images, image_size
+from splatseg.io.npz import open_npz
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
 _IMAGE_FOLDERS = ("images", "image")
@@ -109,22 +109,19 @@ def decompose(
 
 
 def _matrices(path: Path) -> list[NDArray[np.float64]]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            indices = sorted(
-                int(found[1])
-                for key in archive.files
-                if (found := re.fullmatch(r"world_mat_(\d+)", key))
-            )
-            matrices = [archive[f"world_mat_{i}"].astype(np.float64) for i in indices]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{path}: expected a NumPy archive, it cannot be read.") from error
-    for index, matrix in zip(indices, matrices, strict=True):
-        if matrix.shape not in ((4, 4), (3, 4)):
+    with open_npz(path) as archive:
+        names = sorted(
+            (int(found[1]), key)
+            for key in archive.names
+            if (found := re.fullmatch(r"world_mat_([0-9]{1,9})", key))
+        )
+        matrices = [archive.array(key) for _, key in names]
+    for (index, _), matrix in zip(names, matrices, strict=True):
+        if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "iuf":
             raise FileFormatError(
-                f"{path}: expected world_mat_{index} of 4 x 4, got shape {matrix.shape}."
+                f"{path}: expected world_mat_{index} of 4 x 4 numbers, got shape {matrix.shape}."
             )
-    return matrices
+    return [matrix.astype(np.float64) for matrix in matrices]
 
 
 def _scale(ks: list[NDArray[np.float64]], sizes: list[tuple[int, int]], path: Path) -> float:

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Capture
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError
 from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import Intrinsics, RawView, build_capture
 from splatseg.io.images import find_images
+from splatseg.io.npy import read_npy
 
 FILE = "poses_bounds.npy"
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", ".")
@@ -48,17 +49,9 @@ def read_llff(folder: Path) -> Capture:
 
 
 def _rows(path: Path) -> NDArray[np.float64]:
-    if not path.is_file():
-        raise MissingFileError(f"{path}: there is no such file.")
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise FileFormatError(f"{path}: expected a NumPy array, got something else.") from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17:
-        raise FileFormatError(
-            f"{path}: expected an array of shape (n, 17), "
-            f"got {getattr(rows, 'shape', 'an archive')}."
-        )
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "iuf":
+        raise FileFormatError(f"{path}: expected numbers of shape (n, 17), got {rows.shape}.")
     return rows.astype(np.float64)
 
 

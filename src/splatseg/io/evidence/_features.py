@@ -5,7 +5,6 @@ in quant.npz or basis.npz. Text features are principal components on top of that
 vector is ``normalise((q * scale + offset) @ basis + mean)``.
 """
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from splatseg._check import check_shape
 from splatseg.core import FeatureMap, MaskSet
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
-from splatseg.io.npz import read_npz
+from splatseg.io.npz import npz_names, read_npz
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"
@@ -201,20 +200,12 @@ def _check_finite(path: Path, name: str, values: NDArray[Any]) -> None:
 
 def holds_masks(path: Path) -> bool:
     """Whether a file is an npz with masks."""
-    return _holds(path, "masks.npy")
+    return "masks" in npz_names(path)
 
 
 def holds_features(path: Path) -> bool:
     """Whether a file is an npz with features in our own layout."""
-    return _holds(path, "features.npy")
-
-
-def _holds(path: Path, entry: str) -> bool:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return entry in archive.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
+    return "features" in npz_names(path)
 
 
 def _own_features(path: Path) -> FeatureMap:

@@ -5,7 +5,6 @@ nothing (``.splat`` has no header, ``.ksplat`` nothing that is its own). Each fo
 described in docs/formats/splats.md.
 """
 
-import json
 import zlib
 from pathlib import Path
 from typing import Literal
@@ -14,6 +13,7 @@ from splatseg._check import check_choice
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.json_files import read_json
 from splatseg.io.splats._common import Losses, StrPath, check_file
 from splatseg.io.splats._common import SplatWarning as SplatWarning
 
@@ -215,8 +215,8 @@ def _format_of_json(path: Path) -> SplatFormat | None:
     if path.name == "meta.json":
         return "sog"
     try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, RecursionError):
+        document = read_json(path)
+    except FileFormatError:
         return None
     if "means" in document and "quats" in document:
         return "sog"

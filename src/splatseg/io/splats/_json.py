@@ -1,12 +1,12 @@
 """Reading JSON that others wrote: every access says what was expected and what came."""
 
-import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from splatseg.errors import FileFormatError
+from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.errors import FileFormatError, quoted
+from splatseg.io.json_files import parse_object
 
 
 class Json:
@@ -24,21 +24,13 @@ class Json:
         Raises:
             FileFormatError: If it is no JSON or no object.
         """
-        try:
-            value = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise FileFormatError(f"{path}: expected JSON: {error}.") from error
-        root = Json(path, value)
-        if not isinstance(value, dict):
-            raise root.error("a JSON object")
-        return root
+        return Json(path, parse_object(text, where=str(path)))
 
     def error(self, expected: str) -> FileFormatError:
         """The error to raise where this value is not what was expected."""
-        shown = repr(self.value)
-        shown = shown if len(shown) <= 60 else shown[:57] + "..."
         return FileFormatError(
-            f"{self.path}: expected {expected} at {self.location or 'the root'}, got {shown}."
+            f"{self.path}: expected {expected} at {self.location or 'the root'}, got "
+            f"{quoted(self.value)}."
         )
 
     def __contains__(self, name: str) -> bool:
@@ -92,21 +84,17 @@ class Json:
 
     def integer(self, low: int = 0) -> int:
         """A whole number that is at least `low`."""
-        value = self.value
-        if isinstance(value, float) and value.is_integer():
-            value = int(value)
-        if not isinstance(value, int) or isinstance(value, bool) or value < low:
-            raise self.error(f"a whole number of at least {low}")
-        return value
+        try:
+            return json_integer(self.value, where="", low=low)
+        except FileFormatError:
+            raise self.error(f"a whole number of at least {low}") from None
 
     def number(self) -> float:
         """A finite number."""
-        value = self.value
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise self.error("a number")
-        if abs(value) > 1e300 or not math.isfinite(value):
-            raise self.error("a finite number")
-        return float(value)
+        try:
+            return json_number(self.value, where="")
+        except FileFormatError:
+            raise self.error("a finite number") from None
 
     def numbers(self, *, min_count: int, max_count: int | None = None) -> list[float]:
         """A list of finite numbers, `min_count` to `max_count` of them (`min_count` by default)."""

@@ -5,7 +5,6 @@ JSON. It is written under a second name and takes the place of the one before wh
 """
 
 import json
-import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.core.recorded_options import differing_names, option_differences
-from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
+from splatseg.errors import FileFormatError, InputError, SplatsegError, quoted
+from splatseg.io.json_files import parse_object
+from splatseg.io.npz import open_npz
 from splatseg.lift.training._adam import RowMoments
 
 FORMAT = "splatseg-training"
@@ -156,9 +158,8 @@ def training_summary(path: Path) -> TrainingSummary:
         FileFormatError: If it is no checkpoint, damaged, or of another version.
     """
     header, _ = _read(path, names=())
-    return TrainingSummary(
-        step=int(header["step"]), steps=int(header["identity"]["options"]["steps"])
-    )
+    steps = json_integer(header["identity"]["options"].get("steps"), where=f"{path}: steps")
+    return TrainingSummary(step=header["step"], steps=steps)
 
 
 def read_state(path: Path, start: TrainingState, identity: Mapping[str, Any]) -> TrainingState:
@@ -178,10 +179,9 @@ def read_state(path: Path, start: TrainingState, identity: Mapping[str, Any]) ->
     header, arrays = _read(path)
     _check_identity(path, header["identity"], identity)
     _fill(path, start, arrays, best=header["best"])
-    start.step, start.draw = int(header["step"]), int(header["draw"])
-    start.draw_began = int(header["draw_began"])
-    start.losses = [float(loss) for loss in header["losses"]]
-    start.scores = [(int(step), float(score)) for step, score in header["scores"]]
+    start.step, start.draw = header["step"], header["draw"]
+    start.draw_began = header["draw_began"]
+    start.losses, start.scores = header["losses"], header["scores"]
     return start
 
 
@@ -189,32 +189,45 @@ def _read(
     path: Path, names: Collection[str] | None = None
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """The header and the arrays of these names; None reads all of them."""
-    if not path.is_file():
-        raise MissingFileError(f"{path}: there is no such checkpoint.")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip() if names is None else None
-        if damaged is not None:
-            raise FileFormatError(f"{path}: {damaged} is damaged.")
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(bytes(file[_HEADER]))
-            wanted = [name for name in file.files if names is None or name in names]
-            arrays = {name: file[name] for name in wanted if name != _HEADER}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(
-            f"{path}: expected the checkpoint of a training, but it is damaged or none ({error})."
-        ) from error
-    if not isinstance(header, dict) or cast(dict[str, Any], header).get("format") != FORMAT:
+    with open_npz(path, expected="the checkpoint of a training") as file:
+        header = parse_object(file.array(_HEADER).tobytes(), where=str(path))
+        wanted = [name for name in file.names if names is None or name in names]
+        arrays = {name: file.array(name) for name in wanted if name != _HEADER}
+    if header.get("format") != FORMAT:
         raise FileFormatError(f"{path}: expected the checkpoint of a training, got another file.")
-    found = cast(dict[str, Any], header)
-    if found.get("version") != VERSION:
+    if header.get("version") != VERSION:
         raise FileFormatError(
             f"{path}: expected a checkpoint of version {VERSION}, got version "
-            f"{found.get('version')!r}; another splatseg wrote it."
+            f"{quoted(header.get('version'))}; another splatseg wrote it."
         )
-    return found, arrays
+    return _checked(path, header), arrays
+
+
+def _checked(path: Path, header: dict[str, Any]) -> dict[str, Any]:
+    """A header whose entries have the types that `write_state` gives them."""
+    for name in ("step", "draw", "draw_began"):
+        header[name] = json_integer(header.get(name), where=f"{path}: {name}")
+    losses, scores, identity = (header.get(name) for name in ("losses", "scores", "identity"))
+    if not isinstance(losses, list) or not isinstance(scores, list):
+        raise FileFormatError(f"{path}: expected lists of losses and scores, got others.")
+    header["losses"] = [
+        json_number(loss, where=f"{path}: losses") for loss in cast("list[object]", losses)
+    ]
+    pairs = [pair for pair in cast("list[object]", scores) if isinstance(pair, list)]
+    if len(pairs) != len(cast("list[object]", scores)) or any(len(pair) != 2 for pair in pairs):  # pyright: ignore[reportUnknownArgumentType]
+        raise FileFormatError(f"{path}: expected scores of a step and a number, got others.")
+    header["scores"] = [
+        (
+            json_integer(pair[0], where=f"{path}: scores"),
+            json_number(pair[1], where=f"{path}: scores"),
+        )
+        for pair in cast("list[list[object]]", pairs)
+    ]
+    header["best"] = header.get("best") is True
+    parts = cast("dict[str, Any]", identity) if isinstance(identity, dict) else {}
+    if not all(isinstance(parts.get(name), dict) for name in ("data", "options", "defaults")):
+        raise FileFormatError(f"{path}: expected an identity of data, options and defaults.")
+    return header
 
 
 def _check_identity(path: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:

@@ -4,14 +4,13 @@ import os
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.errors import SplatsegError
+from splatseg.io.npy import read_npy
 from splatseg.lift.training._targets import Ragged, Target, Targets
 from splatseg.render import SparseWeights
 
@@ -171,5 +170,4 @@ def _mapped(path: Path, tensor: Tensor) -> Tensor:
     if not tensor.numel():  # an empty file cannot be mapped
         return tensor
     # Copy on write: torch wants arrays it may write to, and the file is to stay as it is.
-    array: NDArray[Any] = np.load(path, mmap_mode="c", allow_pickle=False)
-    return torch.from_numpy(array)
+    return torch.from_numpy(read_npy(path, mapped=True))
