@@ -17,7 +17,7 @@ from typing_extensions import override
 from splatseg.core import FeatureMap, MaskSet, Rle
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
-from splatseg.io.evidence._labels import read_id_map
+from splatseg.io.evidence._label_files import read_id_map
 from splatseg.io.json_files import read_json
 from splatseg.io.npz import read_npz
 
