@@ -35,11 +35,12 @@ import torch
 from torch import Tensor
 
 from splatseg.core import Gaussians, LabelMap, Labels, Scene, Selection, View
-from splatseg.edit import CutBy, Document, Operation, Where, load_document, prepare, remove
+from splatseg.edit import CutBy, Document, Operation, load_document, prepare, remove
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.lift import CutOptions, GaussianField, UpliftOptions, cut_labels, uplift
 from splatseg.render import back_project
+from splatseg.selection import Where
 
 LAYER, FOLDER = "things", "instance"
 DEPTHS = (0, 1, 2)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from splatseg.cli import main
 from splatseg.core import Camera, Gaussians, LabelMap, Scene, View
@@ -226,7 +227,7 @@ def test_scenes_are_joined(room, tmp_path) -> None:
     ("words", "message"),
     [
         ([], "edit: expected something to do"),
-        (["--remove"], "--remove: expected --layer or --box, got neither"),
+        (["--remove"], "--remove: expected --layer, --box or another condition of what is meant"),
         (["--remove", "--extract", "--layer", "objects"], "expected one of the two, got both"),
         (["--remove", "--layer", "objects"], "ids: expected at least one id of layer 'objects'"),
         (["--remove", "--layer", "objects", "--ids", "4"], "no Gaussian with id 4; it has 3, 8"),
@@ -301,3 +302,114 @@ def test_ctrl_c_leaves_nothing_half_written(room, tmp_path, monkeypatch, capsys)
     assert main(words) == 0, "it can be done again under the same name"
     assert main(words) == 2, "and then it is there"
     assert f"{out}: expected a new folder" in capsys.readouterr().err.replace("\n", "")
+
+
+def run(room, out, *words):
+    return main(["edit", str(room), "-o", str(out), *map(str, words)])
+
+
+def test_pictures_before_and_after(room, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run(room, out, "--remove", "--layer", "objects", "--ids", 3, "--pictures", 2) == 0
+    said = capsys.readouterr().out
+    assert "pictures before and after" in said
+    reports = out / "reports"
+    facts = json.loads((reports / "edit.json").read_text())
+    assert facts["views"] == ["v0", "v1"], "the views that change most: they see most of it"
+    assert facts["before"] == 400
+    (step,) = facts["operations"]
+    assert facts["after"] == 400 + step["added"] - step["selected"]
+    page = (reports / "edit.html").read_text()
+    assert page.count("<img") == 4
+    assert f"{step['selected']} Gaussians selected" in page
+    with Image.open(reports / "edit.png") as sheet:
+        pixels = np.asarray(sheet.convert("RGB")).astype(int)
+    left, right = pixels[:, 20:500], pixels[:, 506:986]
+    assert np.abs(left - right).max() > 60, "what is gone is seen"
+    without = tmp_path / "without"
+    assert run(room, without, "--invert", "--box", 0, -9, -9, 9, 9, 9, "--move", 1, 0, 0) == 0
+    assert (without / "reports" / "edit.html").is_file()
+    none = tmp_path / "none"
+    assert run(room, none, "--remove", "--layer", "objects", "--ids", 3, "--pictures", 0) == 0
+    assert not any((none / "reports").iterdir())
+
+
+def test_growth_by_splitting_is_said(room, tmp_path, capsys) -> None:
+    thing = ["--remove", "--layer", "objects", "--names", "thing", "--measure", 0]
+    assert run(room, tmp_path / "split", *thing) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    (edit,) = history(tmp_path / "split")
+    added = edit["result"]["added"]
+    assert added >= 2 * edit["result"]["split"] > 0
+    assert f"splitting added {added} Gaussians, {added / 400:.0%} of the scene; --cut off" in said
+    assert run(room, tmp_path / "whole", *thing, "--cut", "off") == 0
+    assert "splitting added" not in capsys.readouterr().out
+    assert history(tmp_path / "whole")[0]["result"]["added"] == 0
+
+
+def test_selections_by_value_and_place(room, tmp_path) -> None:
+    g = load_scene(room).gaussians
+    size, far = g.scales.amax(dim=1), torch.linalg.vector_norm(g.means.double(), dim=1)
+    grey = torch.linalg.vector_norm(g.colours.double() - 0.5, dim=1)
+    for number, (words, gone) in enumerate(
+        [
+            (["--sphere", 0, 0, 0, 0.5], far <= 0.5),
+            (["--size", 0.15, "inf"], size >= 0.15),
+            (["--colour-near", 0.5, 0.5, 0.5, 0.2], grey <= 0.2),
+            (["--sphere", 0, 0, 0, 0.5, "--size", 0.15, 9], (far <= 0.5) & (size >= 0.15)),
+            (
+                ["--sphere", 0, 0, 0, 0.5, "--size", 0.15, 9, "--match", "any"],
+                (far <= 0.5) | (size >= 0.15),
+            ),
+            (["--opacity", 0.8, 1, "--invert", "--sphere", 0, 0, 0, 9], None),
+        ]
+    ):
+        out = tmp_path / f"out{number}"
+        code = run(room, out, "--remove", *words, "--pictures", 0)
+        if gone is None:
+            assert code == 2, "none is as opaque, and all others are all"
+            continue
+        assert code == 0
+        assert 0 < int(gone.sum()) < 400
+        assert torch.equal(load_scene(out).gaussians.means, g.means[~gone]), words
+
+
+def test_one_piece_of_a_layer(room, tmp_path) -> None:
+    """The wall's far half is moved away, so that the wall is two pieces."""
+    apart = tmp_path / "apart"
+    half = ["--layer", "objects", "--ids", 8, "--box", 0.8, -9, -9, 9, 9, 9, "--cut", "off"]
+    assert run(room, apart, *half, "--move", 20, 0, 0, "--pictures", 0) == 0
+    wall = ["--extract", "--layer", "objects", "--ids", 8, "--cut", "off", "--pictures", 0]
+    assert run(apart, tmp_path / "near", *wall, "--largest-component") == 0
+    assert run(apart, tmp_path / "far", *wall, "--component-at", 21, 0, 0) == 0
+    near, far = (load_scene(tmp_path / n).gaussians.means[:, 0] for n in ("near", "far"))
+    assert len(near) > len(far) > 20
+    assert float(near.max()) < 1
+    assert float(far.min()) > 20
+
+
+def test_specks_go_along(room, tmp_path, capsys) -> None:
+    """Three Gaussians of the thing that carry the wall's label, in the midst of the thing."""
+    labels = load_scene_layer(room, "objects")
+    means = load_scene(room).gaussians.means
+    away = torch.linalg.vector_norm(means - torch.tensor([-1.2, 0, 0]), dim=1)
+    specks = away.argsort()[:3]
+    ids = labels.ids.clone()
+    ids[specks] = 8
+    save_scene_layer(room, "objects", replace(labels, ids=ids, candidates=None, shares=None))
+    thing = ["--remove", "--layer", "objects", "--ids", 3, "--cut", "off", "--pictures", 0]
+    assert run(room, tmp_path / "clean", *thing) == 0
+    assert "3 of them specks" in " ".join(capsys.readouterr().out.split())
+    (edit,) = history(tmp_path / "clean")
+    assert edit["specks"] == 30
+    assert edit["result"]["specks"] == 3
+    left = load_scene(tmp_path / "clean").gaussians.means
+    assert float(left[:, 0].min()) > -0.4
+    assert run(room, tmp_path / "dirty", *thing, "--specks", 0) == 0
+    assert len(load_scene(tmp_path / "dirty").gaussians) == len(left) + 3
+    assert "specks" not in history(tmp_path / "dirty")[0]
+    twice = ["--duplicate", "--layer", "objects", "--ids", 8, "--cut", "off", "--move", 0, 0, 9]
+    assert run(tmp_path / "clean", tmp_path / "twice", *twice) == 0
+    assert run(tmp_path / "twice", tmp_path / "again", "--undo") == 0
+    again = load_scene(tmp_path / "again").gaussians
+    assert torch.equal(again.means, left), "undo does it again, specks included"

@@ -272,3 +272,98 @@ def test_points_take_labels_by_the_rule_asked_for(labelled, splatseg, rng, tmp_p
         assert figures["points_accuracy"] == pytest.approx(right[rule])
         assert figures["points_rule"] == rule
     assert right["weighted"] != right["nearest"], "the case must tell the rules apart"
+
+
+def evaluated(labelled, splatseg, *words) -> tuple[dict, str]:
+    words = ("evaluate", labelled.scene, "--layer", "classes", "--json", *words, *CPU)
+    status, text, err = splatseg(*words)
+    assert status == 0, err
+    return json.loads(text), " ".join(err.split())
+
+
+def test_names_pixels_and_confusion(labelled, splatseg, tmp_path) -> None:
+    """Counts add up to the truth's pixels, row by row, and give the IoU that is said."""
+    truth = labelled.capture / "semantic"
+    files = {kind: tmp_path / f"c.{kind}" for kind in ("csv", "md", "tex")}
+    for kind, path in files.items():
+        table = tmp_path / f"t.{kind}"
+        figures, _ = evaluated(
+            labelled, splatseg, "--truth", truth, "--split", "all", "--table", table,
+            "--confusion", path,
+        )  # fmt: skip
+    assert figures["names_per_class"] == {"1": "sky", "2": "left wall", "7": "right wall"}
+    ids = np.concatenate([np.array(Image.open(p)).ravel() for p in truth.iterdir()])
+    pixels = {str(i): int((ids == i).sum()) for i in (1, 2, 7)}
+    assert figures["pixels_per_class"] == pixels
+    matrix = figures["confusion"]
+    assert [sum(row) for row in matrix["counts"]] == list(pixels.values())
+    counts = np.array(matrix["counts"])
+    row, column = matrix["true"].index(2), matrix["predicted"].index(2)
+    hits = counts[row, column]
+    iou = hits / (counts[row].sum() + counts[:, column].sum() - hits)
+    assert figures["per_class"]["2"] == pytest.approx(iou)
+
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    assert lines[0] == "id,class,pixels,IoU"
+    assert lines[2].startswith(f"2,left wall,{pixels['2']},{figures['per_class']['2']}")
+    assert lines[-1] == f",mean,{sum(pixels.values())},{figures['mIoU']}"
+    markdown = (tmp_path / "t.md").read_text().splitlines()
+    assert markdown[:2] == ["| id | class | pixels | IoU |", "| ---: | --- | ---: | ---: |"]
+    assert f"| {figures['mIoU']:.4f} |" in markdown[-1]
+    latex = (tmp_path / "t.tex").read_text()
+    assert latex.startswith("\\begin{tabular}{rlrr}\n")
+    assert f"2 & left wall & {pixels['2']} & {figures['per_class']['2']:.4f} \\\\" in latex
+    lines = files["csv"].read_text().splitlines()
+    assert lines[0].startswith("true class,")
+    assert lines[0].endswith("left wall,right wall")
+    assert lines[2].split(",")[0] == "left wall"
+    assert sum(map(int, lines[2].split(",")[1:])) == pixels["2"]
+    assert files["md"].read_text().startswith("| true class | ")
+    status, text, _ = splatseg(
+        "evaluate", labelled.scene, "--layer", "classes", "--truth", truth, *CPU
+    )
+    assert status == 0
+    assert "pixels" in text
+    assert "left wall" in text
+
+
+def test_classes_scored_against_instances_are_noticed(labelled, splatseg, tmp_path) -> None:
+    instance = labelled.capture / "instance"
+    _, said = evaluated(labelled, splatseg, "--truth", instance)
+    assert "holds instances" in said
+    assert "metric instances compares things whatever their ids" in said
+    other = tmp_path / "other"
+    other.mkdir()
+    for path in (labelled.capture / "semantic").iterdir():
+        ids = np.array(Image.open(path)).astype(int)
+        np.save(other / f"{path.stem}_gt.npy", np.where(ids == 2, 40, np.where(ids == 7, 50, 0)))
+    figures, said = evaluated(labelled, splatseg, "--truth", other, "--suffix", "_gt")
+    assert figures["mIoU"] == 0
+    assert "once ids are matched one to one" in said
+    _, said = evaluated(labelled, splatseg, "--truth", labelled.capture / "semantic")
+    assert "matched" not in said
+    assert "instances" not in said
+
+
+def test_the_truths_own_table(labelled, splatseg) -> None:
+    figures, _ = evaluated(
+        labelled, splatseg, "--truth", labelled.capture / "semantic", "--classes", "ade20k"
+    )
+    assert figures["names_per_class"]["2"] == "building"
+
+
+def test_tables_are_of_classes(labelled, splatseg, tmp_path) -> None:
+    words = ("evaluate", labelled.scene, "--layer", "objects", "--truth")
+    instance = labelled.capture / "instance"
+    for more, message in (
+        (("--table", "t.xls"), "--table: expected a file that ends in .csv, .md or .tex"),
+        (("--confusion", tmp_path / "no" / "c.csv"), "--confusion: expected an existing folder"),
+        (
+            ("--metric", "instances", "--table", tmp_path / "t.md"),
+            "expected scores of classes (metric semantic)",
+        ),
+    ):
+        status, _, err = splatseg(*words, instance, *more, *CPU)
+        assert status == 2
+        assert message in " ".join(err.split())
+    assert not (tmp_path / "t.md").exists()

@@ -512,3 +512,37 @@ def test_other_words_that_cannot_be_used(small, splatseg, recorded) -> None:
     assert "--void" in sentence
     sentence = refused(splatseg("see", small.scene, "--model", "classical", "--evidence", "../up"))
     assert "--evidence" in sentence
+
+
+def test_label_maps_as_people_have_them(small, splatseg, tmp_path) -> None:
+    """Half-size soft maps in float16 with an ending in their names: named, enlarged, said."""
+    folder = tmp_path / "predictions"
+    folder.mkdir()
+    views = [view for view in load_scene(small.scene).views if view.split == "train"]
+    rng = np.random.default_rng(0)
+    scores = {}
+    for view in views:
+        height, width = view.camera.height // 2, view.camera.width // 2
+        scores[view.name] = rng.normal(size=(133, height, width)).astype(np.float16)
+        np.save(folder / f"{view.name}_pred.npy", scores[view.name])
+        np.save(folder / f"{view.name}.npy", np.zeros((3, 3), int))
+    words = ("--suffix", "_pred", "--classes", "coco", "--json")
+    status, text, err = splatseg(
+        "see", small.scene, "--model", folder, "--evidence", "mine", *words
+    )
+    assert status == 0, err
+    (note,) = [n for n in json.loads(text)["notes"] if "smaller" in n]
+    assert note.startswith(f"{len(views)} label maps were smaller than their photographs")
+    assert "nearest" in note
+    evidence = open_evidence(small.scene / "evidence" / "mine")
+    assert evidence.classes.name_of(1) == "person"
+    name = views[0].name
+    found = evidence.label_map(name)
+    large = scores[name].argmax(axis=0).repeat(2, axis=0).repeat(2, axis=1) + 1
+    assert np.array_equal(found.ids.numpy(), large)
+    assert float(found.confidence.min()) > 0
+    status, _, err = splatseg(
+        "see", small.scene, "--model", "classical", "--evidence", "b", "--classes", "coco"
+    )
+    assert status == 2
+    assert "expected with evidence recorded elsewhere" in " ".join(err.split())

@@ -20,22 +20,20 @@ from splatseg.edit import (
     Document,
     Operation,
     Recolour,
-    Where,
     apply,
-    ids_named,
     load_document,
     merge,
     merged_layers,
     prepare,
     replay,
     save_document,
-    select,
     undo,
 )
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.scene import load_scene
 from splatseg.lift import CutOptions
 from splatseg.render import render
+from splatseg.selection import Where, ids_named, select
 
 from .conftest import BACKEND, camera, layers_of, random_gaussians
 from .test_operations import same, turned
@@ -260,7 +258,7 @@ def test_a_merge_reads_the_other_scene(document, rng, tmp_path) -> None:
     torch.testing.assert_close(after.scene.gaussians.means[24:], moved.means)
     assert after.layers["objects"].ids[24:].tolist() == [6] * 5  # 3 is another thing here
     assert after.scene.views == document.scene.views
-    assert after.history[-1]["result"] == {"before": 24, "after": 29, "split": 0}
+    assert after.history[-1]["result"] == {"before": 24, "after": 29, "split": 0, "added": 0}
 
 
 def test_what_is_selected(document) -> None:
@@ -316,9 +314,12 @@ def test_masks_are_refused_after_things_moved(document) -> None:
         ({"kind": "merge", "other": 3}, InputError, "other: expected a folder, got 3"),
         ({"kind": "remove", "where": {"layer": "a"}, "other": "b"}, InputError, "takes no other"),
         ({"kind": "remove", "where": {"layer": "a", "x": 1}}, InputError, "got 'x'"),
-        ({"kind": "remove", "where": {"box": [0, 0, 0]}}, InputError, "a box of six numbers"),
-        ({"kind": "remove", "where": {"ids": [1]}}, InputError, "a layer or a box, got neither"),
+        ({"kind": "remove", "where": {"box": [0, 0, 0]}}, InputError, "a box of 6 numbers"),
+        ({"kind": "remove", "where": {"ids": [1]}}, InputError, "or another condition"),
         ({"kind": "remove", "where": {"layer": "a", "ids": [1.5]}}, InputError, "list of integers"),
+        ({"kind": "remove", "where": {"layer": "a"}, "specks": 1.5}, InputError, "a number of"),
+        ({"kind": "remove", "where": {"layer": "a"}, "specks": -1}, RangeError, "0 or more"),
+        ({"kind": "extract", "where": {"layer": "a"}, "specks": 9}, InputError, "takes no specks"),
         ({"kind": "remove", "where": 3}, InputError, "where: expected an object, got 3"),
         ({"kind": "remove", "why": 3}, InputError, "expected the keys of an edit, got 'why'"),
         (

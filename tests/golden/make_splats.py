@@ -151,6 +151,40 @@ def splat():
     return data
 
 
+def ksplat():
+    """Level 2, degree 1: a section of a full bucket of one row and of a bucket of one more, and
+    a section with room for a row that is not there."""
+    low, high, edge, steps = -1.0, 1.0, 8.0, 32767
+
+    def row(g, centre):
+        place = [
+            math.floor((x - c) / (edge / 2 / steps) + steps + 0.5)
+            for x, c in zip(g["mean"], centre, strict=True)
+        ]
+        rgba = [byte((0.5 + C0 * v) * 255) for v in g["sh"][0]] + [byte(g["opacity"] * 255)]
+        rest = [
+            byte((g["sh"][1 + k][c] - low) / (high - low) * 255) for c in range(3) for k in range(3)
+        ]
+        scales = [math.exp(v) for v in g["log_scale"]]
+        return struct.pack("<3H7e13B", *place, *scales, *g["rotation"], *rgba, *rest)
+
+    def section(count, room, full, lengths, centres, rows):
+        buckets = full + len(lengths)
+        head = struct.pack("<4IfHxx", count, room, 1, buckets, edge, 12)
+        head += struct.pack("<4IH", steps, 0, full, len(lengths), 1)
+        flat = [x for centre in centres for x in centre]
+        body = struct.pack(f"<{len(lengths)}I{len(flat)}f", *lengths, *flat)
+        return head.ljust(1024, b"\0"), body + b"".join(rows)
+
+    centres = [(1.0, -1.0, 4.0), (0.0, 0.0, 8.0)]
+    rows = [row(g, centre) for g, centre in zip(SCENE, centres, strict=False)]
+    first = section(2, 2, 1, [1], centres, rows)
+    last = [row(SCENE[2], (2.0, 2.0, 2.0)), b"\xff" * 33]
+    second = section(1, 2, 0, [1], [(2.0, 2.0, 2.0)], last)
+    head = struct.pack("<4B4IHxx3f2f", 0, 1, 0, 0, 2, 2, 4, 3, 2, 0, 0, 0, low, high)
+    return head.ljust(4096, b"\0") + first[0] + second[0] + first[1] + second[1]
+
+
 def spz_streams(version, bits):
     positions, opacities, colours, scales, rotations, harmonics = (b"" for _ in range(6))
     for g in SCENE:
@@ -330,6 +364,7 @@ def main():
         "three.ply": ply(),
         "three.compressed.ply": compressed_ply(),
         "three.splat": splat(),
+        "three.ksplat": ksplat(),
         "three.v2.spz": spz_gzip(2),
         "three.v3.spz": spz_gzip(3),
         "three.v4.spz": spz_4(),

@@ -1,11 +1,13 @@
 """Makes the splat files in tests/golden/tools with other programs, from one generated scene.
 
-    npm install --ignore-scripts @playcanvas/splat-transform@2.7.1     (in any folder F)
+    npm install --ignore-scripts @playcanvas/splat-transform@2.7.1 \\
+        @mkkellogg/gaussian-splats-3d@0.4.7 three@0.187.0              (in any folder F)
     python tests/golden/make_tools.py F
 
-Needs gsplat==1.5.3 and numpy. gsplat writes a PLY, a .splat and a compressed PLY; PlayCanvas's
-splat-transform makes the others of that PLY. splatseg is not used. ring.npz has what went in;
-versions.json the programs. A test makes gsplat's files again and compares the bytes.
+Needs gsplat==1.5.3 and numpy. gsplat writes a PLY, a .splat and a compressed PLY; of that PLY
+PlayCanvas's splat-transform makes the others, and GaussianSplats3D the .ksplat files. splatseg is
+not used. ring.npz has what went in; versions.json the programs. A test makes gsplat's files again
+and compares the bytes.
 """
 
 import json
@@ -28,6 +30,20 @@ TRANSFORMED: dict[str, tuple[str, ...]] = {
     "ring.sog": ("--max-workers", "0"),
     "ring.glb": (),
 }
+
+KSPLAT = {"ring.0.ksplat": 0, "ring.1.ksplat": 1, "ring.2.ksplat": 2}
+"""Compression level by file."""
+
+WRITE_KSPLAT = """
+globalThis.window = globalThis;  // it is made for browsers
+const { PlyLoader } = await import("@mkkellogg/gaussian-splats-3d");
+const fs = await import("fs");
+const [source, target, level] = process.argv.slice(1);
+const file = fs.readFileSync(source);
+const bytes = file.buffer.slice(file.byteOffset, file.byteOffset + file.byteLength);
+const made = await PlyLoader.loadFromFileData(bytes, 0, Number(level), true, 2);
+fs.writeFileSync(target, Buffer.from(made.bufferData));
+"""
 
 
 def ring() -> dict[str, np.ndarray]:
@@ -60,15 +76,22 @@ def write_with_gsplat(folder: Path) -> None:
 
 
 def main() -> None:
-    installed = Path(sys.argv[1]) / "node_modules" / "@playcanvas" / "splat-transform"
+    modules = Path(sys.argv[1]) / "node_modules"
+    installed = modules / "@playcanvas" / "splat-transform"
     FOLDER.mkdir(exist_ok=True)
     np.savez_compressed(FOLDER / "ring.npz", **ring())
     write_with_gsplat(FOLDER)
     for name, options in TRANSFORMED.items():
         command = ["node", str(installed / "bin" / "cli.mjs"), "-q", "-w", "-g", "cpu", *options]
         subprocess.run([*command, str(FOLDER / "ring.ply"), str(FOLDER / name)], check=True)
-    package = json.loads((installed / "package.json").read_text())
-    versions = {"gsplat": version("gsplat"), package["name"]: package["version"]}
+    for name, level in KSPLAT.items():
+        command = ["node", "--input-type=module", "-e", WRITE_KSPLAT]
+        files = [str((FOLDER / file).resolve()) for file in ("ring.ply", name)]
+        subprocess.run([*command, *files, str(level)], check=True, cwd=sys.argv[1])
+    versions = {"gsplat": version("gsplat")}
+    for folder in (installed, modules / "@mkkellogg" / "gaussian-splats-3d"):
+        package = json.loads((folder / "package.json").read_text())
+        versions[package["name"]] = package["version"]
     (FOLDER / "versions.json").write_text(json.dumps(versions, indent=1) + "\n")
 
 

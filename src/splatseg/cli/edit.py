@@ -19,13 +19,18 @@ class Command:
 
     The result is a new scene with the layers in step and the edit written down; SCENE stays as
     it is. What is selected: --layer with --ids or --names, a layer that is a selection, a --box,
-    or a layer within a box. One of --extract, --remove, --duplicate or --merge may be given;
-    --move, --rotate, --scale and the colours go with --extract and alone, moves also with
-    --duplicate (the copy moves) and --merge (OTHER moves). Without a selection moves and colours
+    a --sphere, ranges of --opacity and --size, --colour-near, and of these only one connected
+    piece (--largest-component, --component-at). Of several conditions all hold, or any with
+    --match any; --invert takes all others.
+
+    One of --extract, --remove, --duplicate or --merge may be given; --move, --rotate, --scale
+    and the colours go with --extract and alone, moves also with --duplicate (the copy moves) and
+    --merge (OTHER moves). Without a selection moves and colours
     are of the whole scene, and its cameras move along.
 
     Gaussians that reach over the boundary of what is selected are cut first (--cut), so that no
-    half of them goes along or stays behind; how much that alone changes renders is printed.
+    half of them goes along or stays behind; how much that alone changes renders, and how many
+    Gaussians it adds, is printed. What would stay behind of a removed thing as specks goes along.
 
     For example:
 
@@ -34,6 +39,8 @@ class Command:
     splatseg edit room -o two-chairs --duplicate --layer objects --ids 3,4 --move 1 0 0
 
     splatseg edit room -o corner --extract --box -1 -1 0 1 1 2
+
+    splatseg edit room -o cleaner --remove --opacity 0 0.02 --size 0.5 inf --match any
 
     splatseg edit room -o room-before --undo
     """
@@ -71,7 +78,11 @@ def run(command: Command) -> None:
         "gaussians": count,
         "layers": list(made.document.layers),
         "operations": [dict(operation) for operation in made.operations],
+        "report": made.report,
         "seconds": round(time.monotonic() - started, 3),
     }
     layers = ", ".join(made.document.layers) or "no layers"
-    print_result(facts, [f"{made.folder}: {count} Gaussians; {layers}"], json=command.json)
+    lines = [f"{made.folder}: {count} Gaussians; {layers}"]
+    if made.report is not None:
+        lines.append(f"pictures before and after: {made.report}")
+    print_result(facts, lines, json=command.json)

@@ -15,6 +15,7 @@ from splatseg.core import Scene
 from splatseg.io.json_files import write_json
 from splatseg.tasks import EvaluationOptions, evaluate
 from splatseg.tasks.new_scene import check_parent
+from splatseg.tasks.score_tables import check_table_file, write_class_table, write_confusion
 
 _PER_CLASS = {
     "per_class": "classes",
@@ -44,6 +45,8 @@ class Command:
 
     splatseg evaluate room --layer objects --truth capture/instance --metric instances --json
 
+    splatseg evaluate room --layer semantic --truth gt --table classes.tex --confusion pixels.csv
+
     splatseg evaluate room --split train --photographs
     """
 
@@ -51,6 +54,13 @@ class Command:
 
     scoring: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
     """What is scored against what."""
+
+    table: Path | None = None
+    """Also write the scores of classes (id, name, pixels, IoU) to this file: .csv, .md or .tex."""
+
+    confusion: Path | None = None
+    """Also write the confusion matrix, pixels by true class (rows) and class of the layer
+    (columns), to this file: .csv, .md or .tex."""
 
     json_file: Path | None = None
     """Also write what --json prints to this file."""
@@ -65,6 +75,8 @@ def run(command: Command) -> None:
     """Evaluate a scene."""
     if command.json_file is not None:
         check_parent(command.json_file)
+    check_table_file("table", command.table)
+    check_table_file("confusion", command.confusion)
     scene = open_scene(command.scene, command.data)
     figures = evaluate(
         scene,
@@ -73,6 +85,10 @@ def run(command: Command) -> None:
         observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
     figures["scene"] = str(command.scene)
+    if command.table is not None:
+        write_class_table(command.table, figures)
+    if command.confusion is not None:
+        write_confusion(command.confusion, figures)
     if command.json_file is not None:
         write_json(command.json_file, figures)
     if command.json:
@@ -91,7 +107,12 @@ def _print_tables(figures: Mapping[str, Any], scene: Scene) -> None:
     console.print(table)
     for key, title in _PER_CLASS.items():
         if key in figures:
-            console.print(_class_table(figures[key], scene, title))
+            rows = figures[key]
+            if key == "per_class" and "pixels_per_class" in figures:
+                pixels = figures["pixels_per_class"]
+                rows = {id: {"pixels": pixels[id], "IoU": iou} for id, iou in rows.items()}
+            names = figures.get("names_per_class", {})
+            console.print(_class_table(rows, names, scene, title))
     if figures.get("learned_from"):
         console.print(
             f"The layer was made from {figures['learned_from']} of these views: "
@@ -99,16 +120,19 @@ def _print_tables(figures: Mapping[str, Any], scene: Scene) -> None:
         )
 
 
-def _class_table(rows: Mapping[str, Any], scene: Scene, title: str) -> Table:
+def _class_table(
+    rows: Mapping[str, Any], known: Mapping[str, str], scene: Scene, title: str
+) -> Table:
     """One row a class; its figures are one value, or several by name."""
     first = next(iter(rows.values()), 0.0)
-    names = tuple(first) if isinstance(first, dict) else ("IoU",)
-    table = Table("id", "class", *names, title=title)
+    measures = tuple(first) if isinstance(first, dict) else ("IoU",)
+    table = Table("id", "class", *measures, title=title)
     for column in table.columns[2:]:
         column.justify = "right"
     for key, value in rows.items():
         values = value.values() if isinstance(value, dict) else (value,)
-        name = "" if scene.classes is None else scene.classes.name_of(int(key))
+        other = "" if scene.classes is None else scene.classes.name_of(int(key))
+        name = known.get(key, other)
         shown = (f"{v:.4f}" if isinstance(v, float) else str(v) for v in values)
         table.add_row(key, name, *shown)
     return table

@@ -44,7 +44,7 @@ class Command:
     scene: SceneFolder
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
-    """File to write: .ply, .compressed.ply, .splat, .spz for splats. Folder for objects and
+    """File to write: .ply, .compressed.ply, .splat, .spz, .sog for splats. Folder for objects and
     coco."""
 
     what: What = "splat"

@@ -28,6 +28,8 @@ class Command:
     splatseg see room --model sam-masks --evidence masks_sam --views all --allow-missing
 
     splatseg see room --model label-maps --evidence labels --zero-is-class --void 255
+
+    splatseg see room --model predictions --evidence ade --suffix _pred --classes ade20k-train
     """
 
     scene: SceneFolder
@@ -54,6 +56,16 @@ class Command:
 
     void: int | None = None
     """A further id of recorded label maps that means none, such as 255."""
+
+    suffix: str = ""
+    """What stands in the names of recorded files between the view and the ending, such as _pred
+    for 000_pred.png; files without it are left aside."""
+
+    classes: Annotated[str | None, tyro.conf.arg(metavar="NAME_OR_FILE")] = None
+    """Names of the ids of recorded label maps: ade20k, coco, cityscapes or scannet, for the ids
+    of their annotations, with -train behind it for the ids from 0 that networks learn; or a
+    JSON file with "classes" (id, name, isthing, colour). Pictures in a table's colours are read
+    by it."""
 
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder where the model's answers are kept by the content of the photographs, for other

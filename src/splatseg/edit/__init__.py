@@ -6,10 +6,6 @@ from splatseg.edit._operation import Operation as Operation
 from splatseg.edit._operation import Recolour as Recolour
 from splatseg.edit._prepare import Prepared as Prepared
 from splatseg.edit._prepare import prepare as prepare
-from splatseg.edit._where import Where as Where
-from splatseg.edit._where import ids_named as ids_named
-from splatseg.edit._where import layer_called as layer_called
-from splatseg.edit._where import select as select
 from splatseg.edit.document import Document as Document
 from splatseg.edit.document import load_document as load_document
 from splatseg.edit.document import save_document as save_document

@@ -8,15 +8,15 @@ from typing import Any, Literal, cast
 import torch
 
 from splatseg.core import Similarity
-from splatseg.edit._where import Where
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.boundaries.cut import CutOptions
+from splatseg.selection import Where
 
 Kind = Literal["extract", "remove", "duplicate", "transform", "recolour", "merge", "split"]
 
 _TAKES: dict[str, tuple[set[str], set[str]]] = {
     "extract": ({"where"}, {"cut"}),
-    "remove": ({"where"}, {"cut"}),
+    "remove": ({"where"}, {"cut", "specks"}),
     "split": ({"where", "cut"}, set()),
     "duplicate": ({"where", "transform"}, {"cut"}),
     "transform": ({"transform"}, {"where", "cut"}),
@@ -82,19 +82,25 @@ class Operation:
     cut: CutBy | None = None
     """How what straddles the boundary is split first; None splits nothing."""
 
+    specks: int | None = None
+    """Most Gaussians of a piece that goes along because it touches nothing but what is removed;
+    None leaves all pieces."""
+
     def __post_init__(self) -> None:
         if self.kind not in _TAKES:
             raise InputError(f"operation: expected one of {', '.join(_TAKES)}, got {self.kind!r}.")
         must, may = _TAKES[self.kind]
         given = {
             name
-            for name in ("where", "transform", "recolour", "other", "cut")
+            for name in ("where", "transform", "recolour", "other", "cut", "specks")
             if getattr(self, name) is not None
         }
         for name in sorted(must - given):
             raise InputError(f"{self.kind}: expected {name}, got none.")
         for name in sorted(given - must - may):
             raise InputError(f"{self.kind}: takes no {name}.")
+        if self.specks is not None and self.specks < 0:
+            raise RangeError(f"specks: expected 0 or more, got {self.specks}.")
         if self.cut is not None and self.where is None:
             raise InputError(f"{self.kind}: expected where to cut, got none.")
 
@@ -115,6 +121,8 @@ class Operation:
             content["other"] = self.other
         if self.cut is not None:
             content["cut"] = _lists(asdict(self.cut))
+        if self.specks is not None:
+            content["specks"] = self.specks
         return content
 
     @classmethod
@@ -131,6 +139,9 @@ class Operation:
         recolour, cut, other = content.get("recolour"), content.get("cut"), content.get("other")
         if not (other is None or isinstance(other, str)):
             raise InputError(f"other: expected a folder, got {other!r:.60}.")
+        specks = content.get("specks")
+        if not (specks is None or (isinstance(specks, int) and not isinstance(specks, bool))):
+            raise InputError(f"specks: expected a number of Gaussians, got {specks!r:.60}.")
         return cls(
             kind=cast("Kind", content.get("kind")),
             where=None if where is None else Where.from_json(_table("where", where)),
@@ -138,6 +149,7 @@ class Operation:
             recolour=None if recolour is None else _recolour(_table("recolour", recolour)),
             other=other,
             cut=None if cut is None else _cut(_table("cut", cut)),
+            specks=specks,
         )
 
 

@@ -19,13 +19,13 @@ from splatseg.core import (
     layer_address,
 )
 from splatseg.edit._operation import CutBy, Operation
-from splatseg.edit._where import Where, layer_called, select
 from splatseg.edit.document import Document
 from splatseg.errors import InputError
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import label_map
 from splatseg.lift.boundaries.box import cut_box
 from splatseg.lift.boundaries.cut import cut_masks
+from splatseg.selection import Where, layer_called, leftovers, select
 
 Progress = Callable[[int, int], None]
 MOVES = ("duplicate", "transform", "merge", "remove", "extract")
@@ -44,6 +44,9 @@ class Prepared:
 
     split: int
     """How many Gaussians were split."""
+
+    specks: int = 0
+    """How many Gaussians go along because they would stay behind as specks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,8 +93,32 @@ def prepare(
     chosen = select(gaussians, document.layers, where)
     if operation.cut is None:
         _check_some(chosen, where)
-        return Prepared(document=document, selection=chosen, split=0)
-    return _split_at(_Task(document, where, operation.cut, backend, progress))
+        ready = Prepared(document=document, selection=chosen, split=0)
+    else:
+        ready = _split_at(_Task(document, where, operation.cut, backend, progress))
+    return _with_specks(ready, where, operation.specks) if operation.specks else ready
+
+
+def _with_specks(ready: Prepared, where: Where, most: int) -> Prepared:
+    """With the specks that the selection would leave behind added to it."""
+    chosen = ready.selection
+    if chosen is None:
+        return ready
+    named = None
+    if where.layer is not None:
+        layer = layer_called(ready.document.layers, where.layer)
+        named = layer if isinstance(layer, Labels) else None
+    gaussians = ready.document.scene.gaussians
+    specks = leftovers(gaussians, chosen, most=most, labels=_without(named, where.ids))
+    return replace(ready, selection=chosen | specks, specks=specks.count)
+
+
+def _without(labels: Labels | None, ids: Sequence[int]) -> Labels | None:
+    """Labels of other things only: what has one of `ids` is no thing of its own."""
+    if labels is None:
+        return None
+    wanted = torch.tensor(ids, dtype=labels.ids.dtype)
+    return replace(labels, ids=torch.where(torch.isin(labels.ids, wanted), UNLABELLED, labels.ids))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +155,11 @@ def _split_at(task: _Task) -> Prepared:
         inside = inside[boxed.edited.rows] & boxed.inside
         split += boxed.split
     selection = ~inside if where.invert else inside
+    if set(where.conditions) - {"layer", "box"}:
+        # What the cut has decided is not asked again.
+        rest = replace(where, layer=None, ids=(), box=None)
+        now = document.scene.gaussians
+        selection = select(now, document.layers, rest, among=inside)
     _check_some(selection, where)
     return Prepared(document=document, selection=selection, split=split)
 

@@ -41,7 +41,8 @@ def apply(
 
     Returns:
         A new document; the last of its `history` is this edit with, under ``result``, the
-        numbers of Gaussians before and after and of those that were split.
+        numbers of Gaussians before and after, of those that were split and by how many the scene
+        grew by that, and of specks that went along.
 
     Raises:
         InputError: If the edit cannot be done; one sentence says why.
@@ -62,7 +63,10 @@ def apply(
         "before": len(document.scene.gaussians),
         "after": len(after.scene.gaussians),
         "split": ready.split,
+        "added": len(now.scene.gaussians) - len(document.scene.gaussians),
     }
+    if operation.specks is not None:
+        result["specks"] = ready.specks
     edits = [*document.history, operation.to_json() | {"result": result}]
     provenance = dict(after.scene.provenance) | {HISTORY: edits}
     return replace(after, scene=replace(after.scene, provenance=provenance))

@@ -20,6 +20,7 @@ from splatseg.evaluate.metrics import BinaryScore as BinaryScore
 from splatseg.evaluate.metrics import Confusion as Confusion
 from splatseg.evaluate.metrics import SemanticScore as SemanticScore
 from splatseg.evaluate.metrics import binary_score as binary_score
+from splatseg.evaluate.metrics import matched_miou as matched_miou
 from splatseg.evaluate.metrics import per_image_miou as per_image_miou
 from splatseg.evaluate.metrics import psnr as psnr
 from splatseg.evaluate.metrics import semantic_score as semantic_score

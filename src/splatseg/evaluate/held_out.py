@@ -65,6 +65,9 @@ class SemanticReport(ViewsReport):
     boundary: BoundaryScore
     """Boundary IoU, pooled over all views."""
 
+    confusion: Confusion
+    """Pixels of all views by true class and class of the layer."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BinaryReport(ViewsReport):
@@ -105,8 +108,10 @@ def evaluate_semantic(
     for drawn, true in drawn_and_true(field, scored, layer, truth, progress=progress):
         confusions.append(Confusion.of(drawn.ids, true.ids))
         outlines = outlines + BoundaryCounts.of(drawn.ids, true.ids)
+    pooled = sum(confusions, start=Confusion.none())
     return SemanticReport(
-        score=semantic_score(sum(confusions, start=Confusion.none())),
+        score=semantic_score(pooled),
+        confusion=pooled,
         per_image_miou=per_image_miou(confusions),
         boundary=boundary_score(outlines),
         views=tuple(view.name for view in scored),

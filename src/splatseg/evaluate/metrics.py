@@ -161,6 +161,31 @@ def semantic_score(confusion: Confusion) -> SemanticScore:
     )
 
 
+def matched_miou(confusion: Confusion) -> float:
+    """Mean IoU over the true classes once each was matched with another class of the layer.
+
+    The matching is one to one and the best there is; a true class without a partner counts 0.
+    Where this is far above the mean IoU, the two number their classes differently.
+
+    Raises:
+        InputError: If no pixel of the truth has a class.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    counts = confusion.counts.double()[1:, 1:]
+    in_truth = confusion.counts.double().sum(dim=1)[1:]
+    present = in_truth > 0
+    if not bool(present.any()):
+        raise InputError("truth: expected at least one pixel with a class, all are void.")
+    predicted = confusion.counts.double().sum(dim=0)[1:]
+    used = predicted > 0
+    shared = counts[present][:, used]
+    union = in_truth[present, None] + predicted[None, used] - shared
+    iou = (shared / union).numpy()
+    rows, columns = linear_sum_assignment(iou, maximize=True)
+    return float(iou[rows, columns].sum()) / int(present.sum())
+
+
 def per_image_miou(confusions: Iterable[Confusion]) -> float:
     """Mean over views of each view's own mean IoU over the classes its truth has.
 

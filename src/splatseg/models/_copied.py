@@ -9,8 +9,8 @@ from typing import Any, Literal
 import torch
 from typing_extensions import override
 
-from splatseg.core import UNLABELLED, ClassTable, LabelMap, View
-from splatseg.errors import InputError
+from splatseg.core import UNLABELLED, ClassTable, LabelMap, View, camera_of_map
+from splatseg.errors import InputError, ShapeError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.evidence import (
     TEXT_FILE,
@@ -87,6 +87,9 @@ class _Copied(Source):
 
     highest: list[int] = field(default_factory=lambda: [256])
     """The highest id of the maps so far; those of 8 bits end at 255, plus 1."""
+
+    enlarged: list[str] = field(default_factory=list[str])
+    """Sizes of label maps that were smaller than the photograph, one entry a view."""
 
     unnamed: set[int] = field(default_factory=set[int])
     """Ids that the class table does not name."""
@@ -175,7 +178,7 @@ class _Copied(Source):
         maps = (
             evidence.maps if isinstance(evidence, (PanopticEvidence, TrackedEvidence)) else evidence
         )
-        ids = maps.label_map(name)
+        ids = self._fitted(maps.label_map(name), view)
         check_size(evidence, name, (ids.height, ids.width), size)
         self._note_ids(ids)
         self.highest.append(int(ids.ids.max()))
@@ -201,12 +204,33 @@ class _Copied(Source):
         if self.bare:
             what = "mask" if self.evidence.kind == "masks" else "label"
             notes.append(f"{len(self.bare)} views have no {what} at all ({some(self.bare)}).")
+        if self.enlarged:
+            sizes = some(sorted(set(self.enlarged)))
+            notes.append(
+                f"{len(self.enlarged)} label maps were smaller than their photographs ({sizes}) "
+                "and enlarged to them, each pixel taking the nearest id."
+            )
         if self.unnamed:
             ids = some([str(id) for id in sorted(self.unnamed)])
             notes.append(
                 f"Ids that the class table does not name are used ({ids}); --void makes one none."
             )
         return tuple(notes)
+
+    def _fitted(self, ids: LabelMap, view: View) -> LabelMap:
+        """A smaller map in the photograph's proportions at its size, each pixel the nearest."""
+        height, width = view.camera.height, view.camera.width
+        if (ids.height, ids.width) == (height, width):
+            return ids
+        try:
+            camera_of_map(view, ids.height, ids.width)
+        except ShapeError:
+            return ids  # `check_size` says what is wrong
+        self.enlarged.append(f"{ids.width}x{ids.height}")
+        rows = ((torch.arange(height) + 0.5) * ids.height / height).long()
+        columns = ((torch.arange(width) + 0.5) * ids.width / width).long()
+        confidence = None if ids.confidence is None else ids.confidence[rows][:, columns]
+        return LabelMap(ids=ids.ids[rows][:, columns], confidence=confidence)
 
     def _note_ids(self, ids: LabelMap) -> None:
         table = self.evidence.classes if isinstance(self.evidence, LabelEvidence) else None

@@ -8,6 +8,7 @@ of the views that the model was opened with.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from splatseg.core import ClassTable, LabelMap, View
 from splatseg.core.models import Image, Panoptic
@@ -97,6 +98,8 @@ def recorded_model(
     kind: EvidenceKind | None = None,
     zero_is_class: bool = False,
     void: int | None = None,
+    suffix: str = "",
+    classes: str | None = None,
 ) -> AnyRecorded:
     """The model that a folder of recorded evidence stands for.
 
@@ -109,17 +112,23 @@ def recorded_model(
         kind: As for `open_evidence`.
         zero_is_class: As for `open_evidence`.
         void: As for `open_evidence`.
+        suffix: As for `open_evidence`.
+        classes: As for `open_evidence`.
 
     Raises:
         MissingFileError: If there is no such folder.
         InputError: If it holds no evidence, or none of any view.
         FileFormatError: If a table in it is broken.
     """
-    evidence = open_evidence(folder, zero_is_class=zero_is_class, void=void, kind=kind)
+    evidence = open_evidence(
+        folder, zero_is_class=zero_is_class, void=void, kind=kind, suffix=suffix, classes=classes
+    )
     if not evidence.view_names:
         raise InputError(f"{evidence.folder}: expected evidence of at least one view, got none.")
     by_content = ViewsByContent(tuple(views))
-    reading = {"zero_is_class": zero_is_class, "void": void}
+    reading: dict[str, Any] = {"zero_is_class": zero_is_class, "void": void}
+    reading |= {"suffix": suffix} if suffix else {}
+    reading |= {"classes": classes} if classes else {}
     if isinstance(evidence, FeatureEvidence):
         words = recorded_words(evidence)
         if words is not None:

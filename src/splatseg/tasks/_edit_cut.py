@@ -11,13 +11,14 @@ from splatseg.core import (
     LayerInfo,
     View,
 )
-from splatseg.edit import CutBy, Document, Where
+from splatseg.edit import CutBy, Document
 from splatseg.errors import InputError
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import CutOptions, GaussianField
 from splatseg.methods import keeps_ids
 from splatseg.render import BackendName, render
+from splatseg.selection import Where
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.scene_parts import views_that_made
 
@@ -41,8 +42,11 @@ def cut_of(document: Document, where: Where, cut: Cut, observer: Observer) -> Cu
     if cut.by == "off" or cut.options.rounds == 0:
         return None
     if cut.by == "box" or where.layer is None:
+        if where.box is None and cut.by == "auto":
+            return None
         if where.box is None:
-            raise InputError("cut: box is at the sides of `box`, which was not given.")
+            needed = "`box`" if cut.by == "box" else "`layer`"
+            raise InputError(f"cut: {cut.by} goes with {needed}, which was not given.")
         return CutBy(by="box", options=cut.options)
     masks = _masks(document, where, cut)
     if masks is not None:

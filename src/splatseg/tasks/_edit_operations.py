@@ -3,7 +3,7 @@
 import math
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -12,13 +12,10 @@ from splatseg.edit import (
     Document,
     Operation,
     Recolour,
-    Where,
-    ids_named,
-    layer_called,
-    select,
 )
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.scene import is_scene
+from splatseg.selection import Where, ids_named, layer_called, select
 from splatseg.tasks._edit_cut import Cut, cut_of
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.edit_options import EditOptions
@@ -30,17 +27,29 @@ def where_of(options: EditOptions, document: Document) -> Where | None:
     Raises:
         InputError: If names are unknown, or the layer has none.
     """
-    if options.layer is None and options.box is None:
+    if not options.conditions:
         return None
     ids = options.ids
     if options.names and options.layer is not None:
         layer = layer_called(document.layers, options.layer)
         if isinstance(layer, Labels):
-            named = ids_named(layer, options.names, classes=document.scene.classes)
-            ids = tuple(sorted({*ids, *named}))
+            called = ids_named(layer, options.names, classes=document.scene.classes)
+            ids = tuple(sorted({*ids, *called}))
         else:
             raise InputError(f"names: layer {options.layer!r} has no names.")
-    return Where(layer=options.layer, ids=ids, box=options.box, invert=options.invert)
+    named: dict[str, Any] = {} if options.layer is None else {"layer": options.layer, "ids": ids}
+    plain = ("box", "sphere", "opacity", "size", "colour_near")
+    values: dict[str, Any] = {name: getattr(options, name) for name in plain}
+    pieces: dict[str, Any] = {
+        "largest_component": options.largest_component,
+        "component_at": options.component_at,
+        "invert": options.invert,
+    }
+    if options.match == "all":
+        return Where(**named, **values, **pieces)
+    given = [{name: value} for name, value in values.items() if value is not None]
+    parts = [Where(**part) for part in ([named] if named else []) + given]
+    return Where(any_of=tuple(parts), **pieces)
 
 
 def operations_of(
@@ -75,7 +84,9 @@ def operations_of(
     found: list[Operation] = []
     if options.extract or options.remove:
         kind: Literal["extract", "remove"] = "extract" if options.extract else "remove"
-        found.append(Operation(kind=kind, where=where, cut=split_by))
+        of_things = options.layer is not None and not options.invert
+        specks = (options.specks or None) if options.remove and of_things else None
+        found.append(Operation(kind=kind, where=where, cut=split_by, specks=specks))
     if options.duplicate:
         moved = _similarity(options, _median(document, where))
         return (Operation(kind="duplicate", where=where, transform=moved, cut=split_by),)

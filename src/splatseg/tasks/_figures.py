@@ -1,5 +1,6 @@
 """What ``splatseg evaluate`` says, by the names that scorers use, and the small files it reads."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from splatseg.errors import FileFormatError
 from splatseg.evaluate import (
     BinaryReport,
+    Confusion,
     InstanceReport,
     PanopticReport,
     PointReport,
@@ -21,8 +23,8 @@ from splatseg.io.json_files import read_json
 from splatseg.io.npz import read_npz
 
 
-def semantic_figures(report: SemanticReport) -> dict[str, Any]:
-    """Classes, pooled over views unless they say otherwise."""
+def semantic_figures(report: SemanticReport, name_of: Callable[[int], str]) -> dict[str, Any]:
+    """Classes, pooled over views unless they say otherwise; `name_of` names an id."""
     figures = _views(report) | _classes(report.score)
     per_class = figures.pop("per_class")
     return figures | {
@@ -30,6 +32,25 @@ def semantic_figures(report: SemanticReport) -> dict[str, Any]:
         "boundary_mIoU": report.boundary.mean,
         "classes": len(per_class),
         "per_class": per_class,
+        "names_per_class": {id: name_of(int(id)) for id in per_class},
+        "pixels_per_class": {
+            id: int(report.confusion.counts[int(id) + 1].sum()) for id in per_class
+        },
+        "confusion": _confusion(report.confusion, name_of),
+    }
+
+
+def _confusion(confusion: Confusion, name_of: Callable[[int], str]) -> dict[str, Any]:
+    """Pixels by true class (rows) and class of the layer (columns, -1 where it has none)."""
+    counts = confusion.counts
+    true = [int(i) for i in torch.nonzero(counts.sum(dim=1)).flatten().tolist()]
+    predicted = [int(i) for i in torch.nonzero(counts.sum(dim=0)).flatten().tolist()]
+    ids = sorted({*true, *predicted})
+    return {
+        "true": [i - 1 for i in true],
+        "predicted": [i - 1 for i in predicted],
+        "counts": counts[true][:, predicted].tolist(),
+        "names": {str(i - 1): "unlabelled" if i == 0 else name_of(i - 1) for i in ids},
     }
 
 

@@ -30,7 +30,7 @@ from splatseg.tasks.label_columns import label_tables
 from splatseg.tasks.scene_parts import layer_of, whole_layer
 
 _LABEL_COLUMNS = ("class_id", "confidence", "instance_id", "instance_confidence", "selected")
-_NO_COLUMNS = (".spz", ".splat", ".sog", ".glb", ".gltf")
+_NO_COLUMNS = (".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

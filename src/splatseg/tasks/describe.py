@@ -46,7 +46,7 @@ _CAPTURE_FILES = (
     "cameras_sphere.npz",
     "cameras.npz",
 )
-_SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".gltf", ".glb")
+_SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".gltf", ".glb")
 
 
 def describe(path: Path, *, format: str = "auto") -> dict[str, Any]:

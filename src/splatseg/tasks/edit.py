@@ -22,9 +22,11 @@ from splatseg.lift import CutOptions
 from splatseg.render import BackendName
 from splatseg.tasks._edit_cut import Cut, measured_change
 from splatseg.tasks._edit_operations import operations_of, where_of
+from splatseg.tasks._edit_pictures import draw_edit, write_edit_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.edit_options import EditOptions
 from splatseg.tasks.new_scene import check_new_folder
+from splatseg.tasks.outputs import REPORTS_FOLDER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,7 +36,11 @@ class EditedScene:
     folder: Path
     document: Document
     operations: tuple[Mapping[str, Any], ...]
-    """One a step: its kind, how many Gaussians were selected and split, what was measured."""
+    """One a step: its kind, how many Gaussians were selected, were specks, were split and were
+    added by that, what was measured."""
+
+    report: Path | None = None
+    """The page of pictures before and after; None where none were wanted or there are no views."""
 
 
 def edit_scene(
@@ -76,8 +82,16 @@ def edit_scene(
             observer=observer,
         )
         after, done = _edited(work, document)
+    with observer.stage("pictures"):
+        pictures = draw_edit(document.scene, after.scene, views=options.pictures, backend=backend)
     saved = save_document(_with_base(root, folder, document, after), folder)
-    return EditedScene(folder=folder, document=saved, operations=tuple(done))
+    report = None
+    if pictures is not None:
+        counts = (len(document.scene.gaussians), len(after.scene.gaussians))
+        reports = folder / REPORTS_FOLDER
+        write_edit_report(reports, pictures, counts=counts, operations=done)
+        report = reports / "edit.html"
+    return EditedScene(folder=folder, document=saved, operations=tuple(done), report=report)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,16 +119,28 @@ def _edited(work: _Work, document: Document) -> tuple[Document, list[Mapping[str
         with work.observer.stage(operation.kind) as step:
             ready = prepare(document, operation, backend=work.backend, progress=step)
         measured: dict[str, float] = {}
+        added = len(ready.document.scene.gaussians) - len(document.scene.gaussians)
         if ready.split:
             measured = measured_change(
                 document, ready.document, views=options.measure, backend=work.backend
             )
             work.observer.info(_split_sentence(operation, ready.split, measured))
+            work.observer.info(_growth_sentence(added, len(document.scene.gaussians)))
         after = apply(document, operation, prepared=ready, backend=work.backend)
         count = None if ready.selection is None else ready.selection.count
         if count is not None:
-            work.observer.info(f"{operation.kind}: {count} Gaussians selected")
-        done.append({"kind": operation.kind, "selected": count, "split": ready.split, **measured})
+            specks = f", {ready.specks} of them specks" if ready.specks else ""
+            work.observer.info(f"{operation.kind}: {count} Gaussians selected{specks}")
+        done.append(
+            {
+                "kind": operation.kind,
+                "selected": count,
+                "specks": ready.specks,
+                "split": ready.split,
+                "added": added,
+                **measured,
+            }
+        )
         document = _with_result(after, measured)
     return document, done
 
@@ -133,6 +159,13 @@ def _split_sentence(operation: Operation, split: int, measured: Mapping[str, flo
             f"{measured['photographs_after']:.2f} dB"
         )
     return text
+
+
+def _growth_sentence(added: int, before: int) -> str:
+    return (
+        f"splitting added {added} Gaussians, {added / before:.0%} of the scene; --cut off splits "
+        "none, --rounds 1 or a larger --min-pixels fewer"
+    )
 
 
 def _with_result(document: Document, measured: Mapping[str, float]) -> Document:

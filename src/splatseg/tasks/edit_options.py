@@ -8,6 +8,9 @@ from splatseg.errors import InputError
 
 Triple = tuple[float, float, float]
 
+_CONDITIONS = ("layer", "box", "sphere", "opacity", "size", "colour_near", "component_at")
+_NOTHING_SELECTED = "expected `layer`, `box` or another condition of what is meant, got none."
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EditOptions:
@@ -41,6 +44,29 @@ class EditOptions:
 
     box: tuple[float, float, float, float, float, float] | None = None
     """Least x, y, z and largest x, y, z of a box in the world, scene units."""
+
+    sphere: tuple[float, float, float, float] | None = None
+    """Centre x, y, z and radius of a ball in the world, scene units."""
+
+    opacity: tuple[float, float] | None = None
+    """Least and largest opacity, in [0, 1]."""
+
+    size: tuple[float, float] | None = None
+    """Least and largest size: the standard deviation along the longest axis, scene units. The
+    largest may be inf."""
+
+    colour_near: tuple[float, float, float, float] | None = None
+    """Red, green, blue in [0, 1] and the largest distance of a mean colour from it."""
+
+    largest_component: bool = False
+    """Of what fits all else, only the connected piece of the most Gaussians."""
+
+    component_at: Triple | None = None
+    """Of what fits all else, only the connected piece nearest to this point, world."""
+
+    match: Literal["all", "any"] = "all"
+    """Whether all conditions of the selection must hold, or one of them is enough. What is
+    selected by any of several is not cut."""
 
     invert: bool = False
     """Select all others instead."""
@@ -79,14 +105,23 @@ class EditOptions:
     evidence: str | None = None
     """Name of the label maps for `cut` masks. None takes those the layer was made from."""
 
+    specks: int = 30
+    """With `remove` of a layer's ids: small connected pieces that touch nothing but what is
+    removed go along, up to this many Gaussians each, unless they are most of another thing of
+    the layer. 0 leaves them."""
+
+    pictures: int = 3
+    """Views drawn before and after, those that change most, for reports/edit.html and edit.png
+    of the new scene. 0 draws none."""
+
     measure: int = 4
     """Training views in which the change by the cut alone is measured. 0 skips it."""
 
     def __post_init__(self) -> None:
         action = self._action()
-        selecting = self.layer is not None or self.box is not None
+        selecting = bool(self.conditions)
         if action in ("extract", "remove", "duplicate") and not selecting:
-            raise InputError(f"{action}: expected `layer` or `box`, got neither.")
+            raise InputError(f"{action}: {_NOTHING_SELECTED}")
         if action in ("merge", "undo") and selecting:
             raise InputError(f"{action}: takes no selection.")
         if action in ("remove", "undo") and self.moves:
@@ -100,9 +135,20 @@ class EditOptions:
                 "edit: expected something to do, such as `remove` or `move`, got nothing."
             )
         if self.invert and not selecting:
-            raise InputError("invert: expected `layer` or `box`, got neither.")
+            raise InputError(f"invert: {_NOTHING_SELECTED}")
+        if self.match == "any" and len(self.conditions) < 2:
+            raise InputError("match: any needs two conditions or more to choose among.")
+        if self.specks < 0 or self.pictures < 0:
+            raise InputError("specks, pictures: expected 0 or more of each.")
         if self.measure < 0:
             raise InputError(f"measure: expected 0 or more, got {self.measure}.")
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the conditions of the selection that are given."""
+        given = (name for name in _CONDITIONS if getattr(self, name) is not None)
+        pieces = ("largest_component",) if self.largest_component else ()
+        return (*given, *pieces)
 
     def _action(self) -> str | None:
         actions = {

@@ -1,6 +1,6 @@
 """A layer against truth, and renders against photographs."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from splatseg.evaluate import (
     evaluate_photographs,
     evaluate_points,
     evaluate_semantic,
+    matched_miou,
 )
 from splatseg.evaluate.lpips import Lpips, load_lpips
 from splatseg.io.class_tables import class_table
@@ -35,6 +36,9 @@ from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import gaussian_field, mask_use, views_of_split
 
 Metric = Literal["semantic", "instances", "panoptic", "binary"]
+
+# Folders of a capture whose true ids are of instances.
+_INSTANCE_FOLDERS = ("instance", "instances")
 
 # The array of a file of points that holds the truth of each metric.
 _POINT_TRUTH: Mapping[str, str] = {"semantic": "semantic", "instances": "instance"}
@@ -80,6 +84,15 @@ class EvaluationOptions:
 
     void: int | None = None
     """A further id of the truth's files that means void, such as 255."""
+
+    suffix: str = ""
+    """What stands in the names of the truth's files between the view and the ending, such as
+    _gt for 000_gt.png; files without it are left aside."""
+
+    classes: str | None = None
+    """Names of the truth's ids: ade20k, coco, cityscapes or scannet, with -train behind it for
+    the ids from 0 that networks learn; or a JSON file with "classes". Pictures in a table's
+    colours are read by it. None takes what the truth, the layer or the scene tells."""
 
     split: str = "test"
     """Which views: test, train, another split of the scene, or all."""
@@ -204,7 +217,11 @@ def _in_views(job: _Job, views: tuple[View, ...], network: Lpips | None) -> dict
     figures: dict[str, Any] = {}
     if job.options.layer is not None and job.options.truth is not None:
         truth = open_evidence(
-            job.options.truth, zero_is_class=job.options.zero_is_class, void=job.options.void
+            job.options.truth,
+            zero_is_class=job.options.zero_is_class,
+            void=job.options.void,
+            suffix=job.options.suffix,
+            classes=job.options.classes,
         )
         check_map_sizes(truth, views)
         figures |= _layer_figures(job, views, job.options.layer, truth)
@@ -245,8 +262,42 @@ def _layer_figures(
     with job.observer.stage("evaluate") as step:
         report = method(job.field, views, layer, truth, progress=step)
     if isinstance(report, SemanticReport):
-        return semantic_figures(report)
+        _note_other_ids(job, layer, truth, report)
+        return semantic_figures(report, _names(job, layer, truth))
     return instance_figures(report)
+
+
+def _names(job: _Job, layer: str, truth: Evidence) -> Callable[[int], str]:
+    """Names of ids: those of the truth, else of the layer's record, else of the scene."""
+    known: dict[int, str] = {}
+    if job.scene.classes is not None:
+        known |= {row.id: row.name for row in job.scene.classes.rows}
+    known |= job.field.layer(layer).info.names
+    if truth.kind == "labels" and truth.classes is not None:
+        known |= {row.id: row.name for row in truth.classes.rows}
+    return lambda id: known.get(id, f"id {id}")
+
+
+_OTHER_IDS = 0.3
+"""By how much more the mean IoU would be with ids matched than as they are, for a note."""
+
+
+def _note_other_ids(job: _Job, layer: str, truth: Evidence, report: SemanticReport) -> None:
+    """Say that ids look like instances, or like those of another table."""
+    folder = truth.folder.name
+    if truth.kind in ("tracked", "panoptic") or folder in _INSTANCE_FOLDERS:
+        job.observer.note(
+            f"{truth.folder} holds instances, and its ids were compared with the classes of "
+            f"{layer}; metric instances compares things whatever their ids"
+        )
+        return
+    matched = matched_miou(report.confusion)
+    if matched - report.score.miou >= _OTHER_IDS:
+        job.observer.note(
+            f"mIoU is {report.score.miou:.3f}, but {matched:.3f} once ids are matched one to one: "
+            f"{layer} and {truth.folder} number their ids differently (instances? metric instances "
+            "compares these; another class table? see `classes` and `zero_is_class`)"
+        )
 
 
 def _panoptic_figures(

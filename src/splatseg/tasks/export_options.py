@@ -23,8 +23,8 @@ class ExportOptions:
     and the ids of `layer` their classes; without, the ids of `layer` are the objects."""
 
     splat_format: WritableFormat | None = None
-    """Format of splats: ply, compressed.ply, splat, spz, spz3 (SPZ version 3). Default: what
-    the file is named, ply for objects."""
+    """Format of splats: ply, compressed.ply, splat, spz, spz3 (SPZ version 3), sog. Default:
+    what the file is named, ply for objects."""
 
     only: tuple[str, ...] = ()
     """Only these objects, by id or name. Other Gaussians are left out."""

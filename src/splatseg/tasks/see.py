@@ -39,6 +39,16 @@ class SeeOptions:
     void: int | None = None
     """A further id of recorded label maps that means none, such as 255."""
 
+    suffix: str = ""
+    """What stands in the names of recorded files between the view and the ending, such as _pred
+    for 000_pred.png; files without it are left aside."""
+
+    classes: str | None = None
+    """Names of the ids of recorded label maps: ade20k, coco, cityscapes or scannet, for the ids
+    of their annotations, with -train behind it for the ids from 0 that networks learn; or a
+    JSON file with "classes" (id, name, isthing, colour). Pictures in a table's colours are read
+    by it."""
+
     cache: Path | None = None
     """Folder where the model's answers are kept by the content of the photographs, for other
     scenes of them."""
@@ -116,11 +126,17 @@ def _model(asked: str | Model, options: SeeOptions, regions: RegionOptions | Non
     if isinstance(model, AnyRecorded) and isinstance(asked, str):
         kind = "masks" if options.what == "masks" else None
         return recorded_model(
-            name, kind=kind, zero_is_class=options.zero_is_class, void=options.void
+            name,
+            kind=kind,
+            zero_is_class=options.zero_is_class,
+            void=options.void,
+            suffix=options.suffix,
+            classes=options.classes,
         )
-    if options.zero_is_class or options.void is not None:
+    if options.zero_is_class or options.void is not None or options.suffix or options.classes:
         raise InputError(
-            f"zero_is_class, void: expected with recorded label maps, got model {name}."
+            "zero_is_class, void, suffix, classes: expected with evidence recorded elsewhere, got "
+            f"model {name}."
         )
     if isinstance(model, Classical) and regions is not None:
         return Classical(regions=regions)

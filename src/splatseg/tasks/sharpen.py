@@ -16,7 +16,7 @@ from splatseg.core import (
     View,
     layer_address,
 )
-from splatseg.edit import Document, layer_called, save_document
+from splatseg.edit import Document, save_document
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
 from splatseg.evaluate import psnr, render_and_photograph
@@ -45,6 +45,7 @@ from splatseg.lift import (
 )
 from splatseg.methods import keeps_ids
 from splatseg.render import BackendName
+from splatseg.selection import layer_called
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.new_scene import check_new_folder
 from splatseg.tasks.scene_parts import mask_use, views_that_made

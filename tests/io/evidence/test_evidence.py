@@ -328,7 +328,7 @@ def test_label_maps_that_have_no_place_in_a_file(tmp_path, ids, error, message) 
 
 @pytest.mark.parametrize("name", ["", "../a", "/a", "a//b", ".a", "a/../../b"])
 def test_names_stay_inside_the_folder(tmp_path, name) -> None:
-    with pytest.raises(InputError, match="view: expected a name"):
+    with pytest.raises(InputError, match="expected a view.s name"):
         save_label_map(tmp_path, name, LabelMap(ids=torch.ones(1, 1)))
 
 

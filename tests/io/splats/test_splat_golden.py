@@ -41,6 +41,14 @@ BOUNDS = {
         rest=8 / 256 / 2,
     ),
     "three.splat": Bound(format="splat", rotation=1.5 / 128, dc=0.5 / 255 / 0.282, rest=None),
+    "three.ksplat": Bound(
+        format="ksplat",
+        mean=2e-3,
+        log_scale=5e-4,
+        rotation=1e-3,
+        dc=0.5 / 255 / 0.282,
+        rest=2 / 255,
+    ),
     "three.v2.spz": Bound(format="spz", rotation=1.5 / 127.5, dc=_SPZ_COLOUR),
     "three.v3.spz": Bound(format="spz", rotation=3 / 1022, dc=_SPZ_COLOUR),
     "three.v4.spz": Bound(format="spz", rotation=3 / 1022, dc=_SPZ_COLOUR),
@@ -135,7 +143,7 @@ def test_sog_labels_have_two_bytes(golden: Path, tmp_path: Path) -> None:
     assert rest.unique(dim=1).squeeze().tolist() == [[0.5] * 3, [-0.25] * 3, [-0.25] * 3]
 
 
-@pytest.mark.parametrize("name", [name for name in BOUNDS if name != "three.splat"])
+@pytest.mark.parametrize("name", [name for name in BOUNDS if not name.endswith("splat")])
 def test_content_comes_before_the_name(golden: Path, tmp_path: Path, name: str) -> None:
     for wrong in ("a.splat", "noname"):
         shutil.copy(golden / name, tmp_path / wrong)

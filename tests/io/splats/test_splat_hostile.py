@@ -33,6 +33,7 @@ NAMES = (
     "three.v2.sog",
     "three.glb",
     "three.draft.gltf",
+    "three.ksplat",
 )
 
 

@@ -22,6 +22,10 @@ CHUNKED = (5.4 / 1023 / 2, 2 / 1023 / 2, BYTE, 2.7 / 255 / 2, 8 / 256 / 2)
 SPZ = (2**-13, 1 / 32, BYTE, BYTE / 0.15, 8.5 / 128)
 # Places go by their logs; scales and colours by codebooks of 256 entries, the widest gap of which
 # is a few times the mean one; opacities are cut.
+# Colours and harmonics are cut, not rounded; a position has 32767 steps for half of 5 units.
+KSPLAT = (0.0, 1e-6, 2 * BYTE, 2 * BYTE / 0.28209479, 0.0)
+KSPLAT_HALF = (2.5 / 32767 / 2, 2**-10, 2 * BYTE, 2 * BYTE / 0.28209479, 2**-12)
+KSPLAT_BYTE = (*KSPLAT_HALF[:4], 0.8 / 255)
 SOG = (4e-4, 5 / 255, 2 * BYTE, 2.7 / 255, 1 / 255)
 BOUNDS = {
     "ring.ply": ("ply", EXACT),
@@ -32,6 +36,9 @@ BOUNDS = {
     "ring.spz": ("spz", SPZ),
     "ring.v3.spz": ("spz", SPZ),
     "ring.sog": ("sog", SOG),
+    "ring.0.ksplat": ("ksplat", KSPLAT),
+    "ring.1.ksplat": ("ksplat", KSPLAT_HALF),
+    "ring.2.ksplat": ("ksplat", KSPLAT_BYTE),
 }
 HALF_TURN = Similarity(  # glTF is y up: what PLY holds is turned about z
     rotation=torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)),

@@ -235,3 +235,15 @@ def test_biker_is_the_same_to_both(
     within(ours.opacities, theirs.opacities, 0)
     within(ours.sh, theirs.sh, 0)
     assert math.isclose(float(ours.means[:, 1].min()), -3.18017578125)  # down is positive y
+
+
+def test_our_sog(scene: Gaussians, tmp_path: Path, splat_transform: Convert) -> None:
+    """They decode what we decode, row by row, in the order in which it was written."""
+    write_splats(scene, tmp_path / "ours.sog")
+    ours = read_splats(tmp_path / "ours.sog")
+    got = read_splats(splat_transform(tmp_path / "ours.sog", tmp_path / "theirs.ply"))
+    within(got.means, ours.means, 0)
+    within(got.scales.log(), ours.scales.log(), 0)
+    turned(got.rotations, ours.rotations, 0)
+    within(got.opacities, ours.opacities, 0)
+    within(got.sh, ours.sh, 0)

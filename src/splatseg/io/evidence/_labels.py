@@ -1,8 +1,7 @@
-"""Label maps: a single-channel PNG a view, 8 or 16 bit, 0 for none."""
+"""Label maps: one file a view; as we write it a PNG of one channel, 8 or 16 bit, 0 for none."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,12 +18,7 @@ from splatseg.io.evidence._base import (
     FileEvidence,
     refuse,
 )
-from splatseg.io.foreign import reading
-from splatseg.io.images import open_image
-from splatseg.io.limits import check_unpacked
-
-_BYTES_OF_PIXEL = 5
-"""A byte as it is decoded and an int32."""
+from splatseg.io.evidence._label_files import Palette, read_id_map, read_label_file
 
 CONFIDENCE_STEPS = 65535
 """A confidence of 1 in a file of confidences, 16 bit."""
@@ -34,8 +28,9 @@ CONFIDENCE_STEPS = 65535
 class IdRule:
     """How ids in files become ids in memory.
 
-    Without a change 0 is void and becomes -1, other ids stay. With `zero_is_class` every id
-    grows by 1, so that 0 stays free for void; `void` is then the file's id of void, if any.
+    -1 is none in either. Without a change 0 is void and becomes -1, other ids stay. With
+    `zero_is_class` every id grows by 1, so that 0 stays free for void; `void` is then the file's
+    id of void, if any.
     """
 
     zero_is_class: bool = False
@@ -43,7 +38,7 @@ class IdRule:
 
     def to_memory(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
         """Ids as they are in memory."""
-        none = np.zeros(ids.shape, bool) if self.zero_is_class else ids == 0
+        none = (ids < 0) if self.zero_is_class else (ids <= 0)
         if self.void is not None:
             none |= ids == self.void
         shifted = ids + 1 if self.zero_is_class else ids
@@ -63,37 +58,6 @@ class IdRule:
         return {id + 1: id for id in range(MAX_FILE_ID + 1) if id != self.void}
 
 
-def read_id_map(path: Path) -> NDArray[np.int32]:
-    """The ids of a single-channel image as they stand in the file.
-
-    A palette image gives its indices, not its colours.
-
-    Raises:
-        MissingFileError: If there is no such file.
-        FileFormatError: If it has more than one channel, or cannot be decoded.
-    """
-    with open_image(path) as image:
-        if len(image.getbands()) != 1 or image.mode == "F":
-            raise FileFormatError(
-                f"{path}: expected one channel of ids, got {image.mode}; a coloured picture of "
-                "labels is no label map."
-            )
-        width, height = image.size
-        check_unpacked(
-            path,
-            width * height * _BYTES_OF_PIXEL,
-            packed=path.stat().st_size,
-            what=f"a label map of {width}x{height} pixels",
-        )
-        with reading(path, "a label map"):
-            ids = np.asarray(image)
-    if ids.size and (ids.min() < 0 or ids.max() > MAX_FILE_ID):
-        raise FileFormatError(
-            f"{path}: expected ids in [0, {MAX_FILE_ID}], got [{ids.min()}, {ids.max()}]."
-        )
-    return ids.astype(np.int32)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LabelEvidence(FileEvidence):
     """One label map a view."""
@@ -102,6 +66,12 @@ class LabelEvidence(FileEvidence):
     """Classes by the ids of the files."""
 
     rule: IdRule = IdRule()
+
+    palette: Palette | None = None
+    """Ids by colour, where the class table has colours."""
+
+    channels: int | None = None
+    """How many classes soft maps have; None takes what is there."""
 
     recorded: Mapping[int, int] | None = None
     """The model's own id by id in the files, as evidence.json has it."""
@@ -123,9 +93,12 @@ class LabelEvidence(FileEvidence):
 
     @override
     def label_map(self, name: str) -> LabelMap:
-        ids = self.rule.to_memory(read_id_map(self.file_of(name)))
+        path = self.file_of(name)
+        read, sure = read_label_file(path, palette=self.palette, channels=self.channels)
+        ids = self.rule.to_memory(read)
         self._check_recorded(name, ids)
-        return LabelMap(ids=torch.from_numpy(ids), confidence=self._confidence(name, ids.shape))
+        confidence = self._confidence(name, ids.shape) if sure is None else torch.from_numpy(sure)
+        return LabelMap(ids=torch.from_numpy(ids), confidence=confidence)
 
     @override
     def masks(self, name: str) -> MaskSet:

@@ -18,7 +18,7 @@ from splatseg.core import FeatureMap, MaskSet, Rle
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
-from splatseg.io.evidence._labels import read_id_map
+from splatseg.io.evidence._label_files import read_id_map
 from splatseg.io.json_files import read_json
 from splatseg.io.limits import check_unpacked
 from splatseg.io.npz import read_npz

@@ -17,7 +17,8 @@ from splatseg.io.evidence._features import (
     holds_masks,
     open_features,
 )
-from splatseg.io.evidence._labels import LabelEvidence, check_rule
+from splatseg.io.evidence._label_files import LABEL_NAMES, Palette, is_soft
+from splatseg.io.evidence._labels import IdRule, LabelEvidence, check_rule
 from splatseg.io.evidence._masks import MaskEvidence, mask_folders
 from splatseg.io.evidence._segments import (
     SEGMENTS_FILE,
@@ -26,6 +27,8 @@ from splatseg.io.evidence._segments import (
     open_tracked,
 )
 from splatseg.io.json_files import read_json
+from splatseg.io.label_tables import LabelTable, label_table, training_table
+from splatseg.io.npz import npz_names
 
 FORMAT = "splatseg-evidence"
 VERSION = 1
@@ -44,18 +47,27 @@ def open_evidence(
     zero_is_class: bool = False,
     void: int | None = None,
     kind: EvidenceKind | None = None,
+    suffix: str = "",
+    classes: str | None = None,
     unfinished: Literal["refuse", "allow"] = "refuse",
 ) -> Evidence:
     """Open a folder of evidence, ours or recorded by others; no view is read yet.
 
     Names of ids come from its evidence.json, else from the metadata.json of the capture that
-    the folder lies in.
+    the folder lies in. Label maps are PNG files, else ``.npy`` or npz files of ids or of scores
+    (soft maps: probabilities or logits a class), whose highest class counts: its id is its
+    channel plus 1, as with `zero_is_class`.
 
     Args:
         folder: The folder.
         zero_is_class: Of label maps whose 0 is a real class: every id grows by 1 in memory,
             and `Evidence.source_ids` tells the ids of the files.
         void: A further id of label maps that means none, such as 255.
+        suffix: What stands between the name of a view and the ending of its file, such as
+            ``_pred``; files without it are of no view.
+        classes: Names of the ids of label maps, instead of those that the folder tells: a
+            table by name or file, see `label_table`. It says what 0 means, and
+            gives pictures of colours their ids.
         kind: What it holds, where its files could be two things; None looks at them. A folder
             of folders of PNGs is label maps unless SAM's metadata.csv or this says masks.
         unfinished: Whether evidence may be opened whose views are not all there, because
@@ -71,24 +83,32 @@ def open_evidence(
         raise MissingFileError(f"{folder}: there is no such folder of evidence.")
     header = _header(folder)
     rule = check_rule(zero_is_class, void)
-    maps, arrays = view_files(folder, ".png"), view_files(folder, ".npz")
-    objects = view_files(folder, ".json")
+    maps, arrays = view_files(folder, suffix + ".png"), view_files(folder, suffix + ".npz")
+    objects = view_files(folder, suffix + ".json")
+    if not maps and (kind is None or kind == "labels"):
+        maps = _label_arrays(folder, suffix, arrays)
     if unfinished == "refuse":
         _check_finished(folder, header, views=max(len(maps), len(arrays), len(objects)))
     if kind is not None and header.get("kind", kind) != kind:
         raise InputError(f"{folder}: expected evidence of {kind}, got {header['kind']}.")
     found: str | None = kind or header.get("kind") or _kind(folder, maps, objects, arrays)
     if found in ("labels", "panoptic", "tracked"):
+        soft = bool(maps) and is_soft(next(iter(maps.values())))
+        table = _named_table(classes, soft=soft)
         labels = LabelEvidence(
             root=folder,
             files=maps,
-            table=_classes(folder, header),
-            rule=rule,
+            table=_classes(folder, header) if table is None else table.classes,
+            rule=_rule(rule, table, soft=soft),
+            palette=None if table is None else Palette(table.classes),
+            channels=None if table is None else len(table.classes.rows),
             recorded=_recorded_ids(folder, header),
         )
         if found == "labels":
             return labels
         return open_panoptic(labels) if found == "panoptic" else open_tracked(labels)
+    if classes is not None:
+        raise InputError(f"classes: goes with label maps, {folder} has none.")
     if found == "masks":
         files = objects or arrays or mask_folders(folder, marked_by="*.png")
         return MaskEvidence(root=folder, files=files)
@@ -98,6 +118,32 @@ def open_evidence(
         f"{folder}: expected evidence (PNG label maps, JSON masks or npz features, one a view), "
         "got a folder of something else."
     )
+
+
+def _label_arrays(folder: Path, suffix: str, arrays: Mapping[str, Path]) -> Mapping[str, Path]:
+    """Files of arrays that are label maps: ids or scores."""
+    plain = view_files(folder, suffix + ".npy")
+    if plain or not arrays:
+        return plain
+    names = npz_names(next(iter(arrays.values())))
+    return arrays if any(name in names for name in LABEL_NAMES) else {}
+
+
+def _named_table(classes: str | None, *, soft: bool) -> LabelTable | None:
+    """The table that was asked for; of a soft map that with a class a channel."""
+    if classes is None:
+        return None
+    table = label_table(classes)
+    return (training_table(classes) or table) if soft else table
+
+
+def _rule(rule: IdRule, table: LabelTable | None, *, soft: bool) -> IdRule:
+    """What 0 and other ids mean: what was said, else what the table or a soft map says."""
+    void = rule.void
+    if void is None and table is not None and not soft:
+        void = table.void
+    zero = rule.zero_is_class or soft or (table is not None and table.zero_is_class)
+    return IdRule(zero_is_class=zero, void=void)
 
 
 def evidence_header(folder: Path | str) -> dict[str, Any] | None:

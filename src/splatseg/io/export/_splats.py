@@ -31,6 +31,7 @@ _ENDINGS: dict[WritableFormat, str] = {
     "splat": "splat",
     "spz": "spz",
     "spz3": "spz",
+    "sog": "sog",
 }
 
 

@@ -1,7 +1,8 @@
 """Splat files of every common tool, to and from `core.Gaussians`.
 
 Which layout a file has is told by its first bytes, and by its name only where those say
-nothing (``.splat`` has no header). Each format's bytes are described in docs/formats/splats.md.
+nothing (``.splat`` has no header, ``.ksplat`` nothing that is its own). Each format's bytes are
+described in docs/formats/splats.md.
 """
 
 import zlib
@@ -17,8 +18,8 @@ from splatseg.io.json_files import read_json
 from splatseg.io.splats._common import Losses, StrPath, check_file
 from splatseg.io.splats._common import SplatWarning as SplatWarning
 
-SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "gltf"]
-WritableFormat = Literal["ply", "compressed.ply", "splat", "spz", "spz3"]
+SplatFormat = Literal["ply", "compressed.ply", "splat", "ksplat", "spz", "sog", "gltf"]
+WritableFormat = Literal["ply", "compressed.ply", "splat", "spz", "spz3", "sog"]
 
 _WRITABLE: dict[WritableFormat, str] = {
     "compressed.ply": "a compressed PLY file",
@@ -26,6 +27,7 @@ _WRITABLE: dict[WritableFormat, str] = {
     "splat": "a .splat file",
     "spz": "an SPZ file",
     "spz3": "an SPZ file",
+    "sog": "a SOG file",
 }
 _PEEK = 4096
 
@@ -33,9 +35,9 @@ _PEEK = 4096
 def read_splats(path: StrPath) -> Gaussians:
     """Read Gaussians from a splat file of any known format.
 
-    PLY (3DGS, any further columns kept), SuperSplat's compressed PLY, ``.splat``, SPZ versions
-    2 to 4, SOG versions 1 and 2 (bundled, or by ``meta.json`` or its folder), and glTF with
-    KHR_gaussian_splatting. In memory scales are linear, opacities in [0, 1], quaternions
+    PLY (3DGS, any further columns kept), SuperSplat's compressed PLY, ``.splat``, ``.ksplat``,
+    SPZ versions 2 to 4, SOG versions 1 and 2 (bundled, or by ``meta.json`` or its folder), and
+    glTF with KHR_gaussian_splatting. In memory scales are linear, opacities in [0, 1], quaternions
     wxyz of unit length.
 
     Args:
@@ -61,6 +63,8 @@ def read_splats(path: StrPath) -> Gaussians:
             from splatseg.io.splats.compressed_ply import read_compressed_ply as read
         case "splat":
             from splatseg.io.splats.splat import read_splat as read
+        case "ksplat":
+            from splatseg.io.splats.ksplat import read_ksplat as read
         case "spz":
             from splatseg.io.splats.spz import read_spz as read
         case "sog":
@@ -81,8 +85,8 @@ def write_splats(
     Args:
         gaussians: What to write; converted to float32 on the CPU.
         path: The file. Its ending gives the format unless `format` does.
-        format: ``ply``, ``compressed.ply``, ``splat``, ``spz`` (version 4) or ``spz3``
-            (version 3, for readers that do not know zstd yet).
+        format: ``ply``, ``compressed.ply``, ``splat``, ``spz`` (version 4), ``spz3``
+            (version 3, for readers that do not know zstd yet) or ``sog`` (bundled).
 
     Raises:
         InputError: If no format can be told, or an extra column has a name or type that PLY
@@ -121,6 +125,10 @@ def write_splats(
             from splatseg.io.splats.splat import write_splat
 
             write_splat(gaussians, temporary, losses=losses)
+        elif chosen == "sog":
+            from splatseg.io.splats._sog_writer import write_sog
+
+            write_sog(gaussians, temporary, losses=losses)
         else:
             from splatseg.io.splats.spz import write_spz
 
@@ -135,7 +143,8 @@ def _format_of_name(path: Path) -> WritableFormat:
         if name.endswith(f".{known}") and known != "spz3":
             return known
     raise InputError(
-        f"{path}: expected a name that ends in .ply, .compressed.ply, .splat or .spz, or a format."
+        f"{path}: expected a name that ends in .ply, .compressed.ply, .splat, .spz or .sog, or a "
+        "format."
     )
 
 
@@ -143,7 +152,7 @@ def splat_format(path: StrPath) -> SplatFormat:
     """Tell the format of a splat file by its first bytes, or by its name where those say nothing.
 
     Returns:
-        ``ply``, ``compressed.ply``, ``splat``, ``spz``, ``sog`` or ``gltf``.
+        ``ply``, ``compressed.ply``, ``splat``, ``ksplat``, ``spz``, ``sog`` or ``gltf``.
 
     Raises:
         FileFormatError: If it is none of them, is empty, or is a folder without ``meta.json``.
@@ -164,9 +173,11 @@ def splat_format(path: StrPath) -> SplatFormat:
         return found
     if source.suffix.lower() == ".splat":
         return "splat"
+    if source.suffix.lower() == ".ksplat":
+        return "ksplat"
     raise FileFormatError(
-        f"{source}: expected a splat file (PLY, compressed PLY, .splat, SPZ, SOG or glTF with "
-        f"Gaussians), but it starts with {head[:8]!r}."
+        f"{source}: expected a splat file (PLY, compressed PLY, .splat, .ksplat, SPZ, SOG or "
+        f"glTF with Gaussians), but it starts with {head[:8]!r}."
     )
 
 

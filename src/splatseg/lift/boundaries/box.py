@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from splatseg.core import Camera, Edited, Gaussians, Selection
-from splatseg.errors import RangeError, ShapeError
+from splatseg.errors import ShapeError
 from splatseg.lift.boundaries.cut import Cut, CutOptions
 from splatseg.lift.boundaries.geometry import axes_of, directions_of_normals, line_extent
 from splatseg.lift.boundaries.split import split_along
+from splatseg.selection import box_corners
 
 
 def cut_box(
@@ -85,22 +86,6 @@ def _straddling(
     large = line_extent(gaussians, directions, cameras).pixels >= options.min_pixels
     sized = gaussians.scales.amax(dim=1) > 0
     return (mass >= max(options.min_side, 1e-6)) & large & sized, directions
-
-
-def box_corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Corners of a box as float64, after a check that there is something between them."""
-    lower = torch.tensor([float(v) for v in low], dtype=torch.float64)
-    upper = torch.tensor([float(v) for v in high], dtype=torch.float64)
-    if lower.shape != (3,) or upper.shape != (3,):
-        raise ShapeError(f"box: expected two points, got {len(lower)} and {len(upper)} numbers.")
-    if not bool(torch.isfinite(lower).all() and torch.isfinite(upper).all()):
-        raise RangeError(f"box: expected finite numbers, got {lower.tolist()}, {upper.tolist()}.")
-    if not bool((lower < upper).all()):
-        raise RangeError(
-            "box: expected a first corner below the second along every axis, got "
-            f"{lower.tolist()} and {upper.tolist()}."
-        )
-    return lower, upper
 
 
 def _nearest_face(gaussians: Gaussians, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

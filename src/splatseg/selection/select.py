@@ -1,11 +1,9 @@
-"""Which Gaussians an edit is of, in words that a file can hold: a layer's ids, a box."""
+"""Descriptions made into selections of the Gaussians at hand."""
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, cast
 
 import torch
+from torch import Tensor
 
 from splatseg.core import (
     ClassTable,
@@ -18,96 +16,41 @@ from splatseg.core import (
     layer_address,
 )
 from splatseg.errors import InputError, ShapeError
-from splatseg.lift.boundaries.box import box_corners
-
-_BOX = 6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Where:
-    """A set of Gaussians by description. Of several conditions all must hold.
-
-    Example:
-        >>> Where(layer="objects", ids=(3, 7)).to_json()
-        {'layer': 'objects', 'ids': [3, 7]}
-    """
-
-    layer: str | None = None
-    """A layer of labels, with `ids`, or of a selection, without."""
-
-    ids: tuple[int, ...] = ()
-    """Ids of the layer."""
-
-    box: tuple[float, float, float, float, float, float] | None = None
-    """Least x, y, z, then largest x, y, z of the centres, world, scene units."""
-
-    invert: bool = False
-    """All others instead."""
-
-    def __post_init__(self) -> None:
-        if self.layer is None and self.box is None:
-            raise InputError("where: expected a layer or a box, got neither.")
-        if self.ids and self.layer is None:
-            raise InputError("where: expected a layer that the ids are of, got none.")
-        if self.box is not None:
-            box_corners(self.box[:3], self.box[3:])
-
-    def to_json(self) -> dict[str, Any]:
-        """As values that JSON holds; what is not set is left out."""
-        content: dict[str, Any] = {}
-        if self.layer is not None:
-            content["layer"] = self.layer
-        if self.ids:
-            content["ids"] = list(self.ids)
-        if self.box is not None:
-            content["box"] = list(self.box)
-        if self.invert:
-            content["invert"] = True
-        return content
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Where":
-        """Inverse of `to_json`.
-
-        Raises:
-            InputError: If it is nothing that `to_json` writes.
-        """
-        unknown = sorted(set(content) - {"layer", "ids", "box", "invert"})
-        if unknown:
-            raise InputError(f"where: expected layer, ids, box and invert, got {unknown[0]!r}.")
-        layer, invert = content.get("layer"), content.get("invert", False)
-        ids, box = content.get("ids", []), content.get("box")
-        if not (layer is None or isinstance(layer, str)) or not isinstance(invert, bool):
-            raise InputError("where: expected the name of a layer, and invert true or false.")
-        if not _are_numbers(ids, int):
-            raise InputError(f"where: expected ids as a list of integers, got {ids!r:.60}.")
-        if box is not None and not (_are_numbers(box, float) and len(box) == _BOX):
-            raise InputError(f"where: expected a box of six numbers, got {box!r:.60}.")
-        corners = None if box is None else tuple(float(v) for v in box)
-        return cls(
-            layer=layer,
-            ids=tuple(ids),
-            box=cast("tuple[float, float, float, float, float, float] | None", corners),
-            invert=invert,
-        )
+from splatseg.selection.components import components
+from splatseg.selection.shapes import box_corners
+from splatseg.selection.where import Where
 
 
-def _are_numbers(values: Any, kind: type) -> bool:
-    allowed = (int,) if kind is int else (int, float)
-    return isinstance(values, list) and all(
-        isinstance(v, allowed) and not isinstance(v, bool) and math.isfinite(v)
-        for v in cast("list[Any]", values)
-    )
-
-
-def select(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) -> Selection:
+def select(
+    gaussians: Gaussians,
+    layers: Mapping[str, Layer],
+    where: Where,
+    *,
+    among: Selection | None = None,
+) -> Selection:
     """The Gaussians that a description means; it may be none of them.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        layers: Its layers by name, of which a description may speak.
+        where: The description.
+        among: A condition more: only these fit. None is all.
 
     Raises:
         InputError: If there is no such layer, it is one of features, ids are missing or not
             wanted, or the layer has none of an id.
         ShapeError: If the layer is of other Gaussians.
     """
+    mask = _fitting(gaussians, layers, where)
+    if among is not None:
+        mask &= among.mask
+    if where.largest_component or where.component_at is not None:
+        mask = _one_piece(gaussians, mask, where)
+    return Selection(mask=~mask if where.invert else mask)
+
+
+def _fitting(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) -> Tensor:
+    """Which Gaussians (n,) fit all conditions, before pieces and the rest are looked at."""
     mask = torch.ones(len(gaussians), dtype=torch.bool)
     if where.layer is not None:
         layer = layer_called(layers, where.layer)
@@ -116,11 +59,44 @@ def select(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) -> S
                 f"layer {where.layer!r}: expected {len(gaussians)} rows, got {len(layer)}."
             )
         mask &= _of_layer(layer, where)
+    centres = gaussians.means.double()
     if where.box is not None:
         low, high = box_corners(where.box[:3], where.box[3:])
-        centres = gaussians.means.double()
         mask &= ((centres >= low) & (centres <= high)).all(dim=1)
-    return Selection(mask=~mask if where.invert else mask)
+    if where.sphere is not None:
+        mask &= _near(centres, where.sphere)
+    if where.colour_near is not None:
+        mask &= _near(gaussians.colours.double(), where.colour_near)
+    for interval, values in (
+        (where.opacity, gaussians.opacities),
+        (where.size, gaussians.scales.amax(dim=1)),
+    ):
+        if interval is not None:
+            mask &= (values >= interval[0]) & (values <= interval[1])
+    if where.any_of:
+        found = [select(gaussians, layers, part).mask for part in where.any_of]
+        mask &= torch.stack(found).any(dim=0)
+    return mask
+
+
+def _near(points: Tensor, ball: Sequence[float]) -> Tensor:
+    """Which points (n, 3) lie within a distance of a point."""
+    centre = torch.tensor(ball[:3], dtype=torch.float64)
+    return torch.linalg.vector_norm(points - centre, dim=1) <= ball[3]
+
+
+def _one_piece(gaussians: Gaussians, mask: Tensor, where: Where) -> Tensor:
+    """Of what is selected the largest connected piece, or that at a point."""
+    if not bool(mask.any()):
+        return mask
+    piece_of = components(gaussians, Selection(mask=mask))
+    if where.component_at is None:
+        wanted = int(torch.bincount(piece_of[mask]).argmax())
+    else:
+        point = torch.tensor(where.component_at, dtype=torch.float64)
+        away = torch.linalg.vector_norm(gaussians.means.double() - point, dim=1)
+        wanted = int(piece_of[torch.where(mask, away, torch.inf).argmin()])
+    return piece_of == wanted
 
 
 def layer_called(layers: Mapping[str, Layer], address: str) -> FlatLayer:
@@ -136,7 +112,7 @@ def layer_called(layers: Mapping[str, Layer], address: str) -> FlatLayer:
     return flat_layer(layers[name], level, name=name)
 
 
-def _of_layer(layer: FlatLayer, where: Where) -> torch.Tensor:
+def _of_layer(layer: FlatLayer, where: Where) -> Tensor:
     match layer:
         case Selection():
             if where.ids:
