@@ -116,7 +116,7 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
     if camera.model not in _LENSES:
         raise InputError(
             f"{where}: expected a camera model that can be undistorted ({', '.join(_LENSES)}), "
-            f"got {quoted(camera.model).strip("'")}; undistort the photographs with COLMAP first."
+            f"got {quoted(camera.model)}; undistort the photographs with COLMAP first."
         )
     expected, values = PARAMETER_COUNTS[camera.model], camera.parameters
     if len(values) != expected:
