@@ -72,7 +72,7 @@ def layer_info_from_json(record: Mapping[str, Any], *, where: str) -> LayerInfo:
     if version > LAYER_INFO_VERSION:
         raise FileFormatError(
             f"{where}: expected a record of version {LAYER_INFO_VERSION} or less, got version "
-            f"{version}; a later splatseg wrote it."
+            f"{quoted(version)}; a later splatseg wrote it."
         )
     values = {name: value for name, value in record.items() if name in _KNOWN}
     others = {name: value for name, value in record.items() if name not in (*_KNOWN, "version")}

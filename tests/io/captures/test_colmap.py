@@ -102,7 +102,7 @@ def test_lenses_see_what_colmap_sees(golden_colmap, model) -> None:
 def test_other_lenses_are_refused_by_name(golden_colmap, model) -> None:
     lens = json.loads((golden_colmap / "expected.json").read_text())["lenses"][model]
     raw = ColmapCamera(model=model, width=8, height=8, parameters=tuple(lens["parameters"]))
-    with pytest.raises(InputError, match=rf"x: .* got {model}; undistort"):
+    with pytest.raises(InputError, match=rf"x: .* got '{model}'; undistort"):
         intrinsics_of(raw, where="x")
 
 

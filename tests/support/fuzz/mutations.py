@@ -1,5 +1,6 @@
 """Ways to damage a file. Containers are opened, damaged within and closed with right check sums."""
 
+import copy
 import gzip
 import io
 import json
@@ -111,7 +112,7 @@ def json_values(random: Random, data: bytes) -> bytes | None:
         for _ in range(random.choice((1, 1, 1, 2, 4))):
             _change(random, root)
         text = json.dumps(root)
-    except RecursionError:  # lists in lists, more than Python writes
+    except (RecursionError, ValueError):  # deeper than Python writes, or in itself
         return None
     return (text + " " * (-len(text) % 4)).encode()
 
@@ -143,7 +144,8 @@ def _change(random: Random, root: Any) -> None:
     holder, key = random.choice(places)
     chance = random.random()
     if chance < 0.6:
-        holder[key] = random.choice(VALUES)
+        # A copy: later changes of the case must not reach the next one.
+        holder[key] = copy.deepcopy(random.choice(VALUES))
     elif chance < 0.75:
         del holder[key]
     elif chance < 0.85 and isinstance(holder, dict):
@@ -152,7 +154,7 @@ def _change(random: Random, root: Any) -> None:
         for _ in range(random.choice((1, 50, 900))):
             holder[key] = [holder[key]]
     elif isinstance(holder, list):
-        holder.extend([holder[key]] * random.choice((1, 100)))
+        holder.extend(copy.deepcopy([holder[key]]) * random.choice((1, 100)))
     else:
         other, name = random.choice(places)
         holder[key] = json.loads(json.dumps(other[name])) if other is not holder else None
