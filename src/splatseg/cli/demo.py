@@ -11,6 +11,7 @@ from rich.table import Table
 
 from splatseg.cli._types import Backend, Json, Quiet
 from splatseg.cli._work import ConsoleObserver, print_result
+from splatseg.report.words import counted
 from splatseg.tasks import Demo, DemoOptions, make_demo
 
 
@@ -73,7 +74,7 @@ def _print_tables(made: Demo) -> None:
         scores.add_row(what, views, f"{row['mIoU']:.3f}", f"{row['accuracy']:.3f}")
     console.print(scores)
     console.print(
-        f"Renders of held-out views: PSNR {figures.test['PSNR']:.2f} dB, "
+        f"Renders of {counted(figures.test['photographs'], 'held-out view')}: PSNR {figures.test['PSNR']:.2f} dB, "
         f"SSIM {figures.test['SSIM']:.3f}"
     )
     console.print(

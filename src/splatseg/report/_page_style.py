@@ -25,6 +25,7 @@ nav { display: flex; flex-wrap: wrap; gap: .15rem 1rem; margin-top: 1.25rem; pad
 nav a { color: var(--quiet); text-decoration: none; padding: .15rem 0; }
 nav a:hover { color: var(--ink); text-decoration: underline; }
 .summary { max-width: 46rem; margin: 0; color: var(--quiet); font-size: 1.05rem; }
+.made { max-width: 60rem; margin: .5rem 0 0; font-size: .85rem; color: var(--quiet); }
 .note { max-width: 46rem; margin: 0 0 .75rem; color: var(--quiet); font-size: .9rem; }
 .notice { max-width: 60rem; margin: 1rem 0 0; padding: .7rem 1rem; background: var(--card);
   border: 1px solid var(--line); border-left: .3rem solid var(--good); border-radius: .4rem; }
@@ -39,6 +40,8 @@ nav a:hover { color: var(--ink); text-decoration: underline; }
   font-variant-numeric: tabular-nums; }
 .figure .note { margin: .15rem 0 0; font-size: .82rem; }
 .wide { overflow-x: auto; }
+.tall { max-height: 32rem; overflow-y: auto; border-bottom: 1px solid var(--line); }
+.tall thead th { position: sticky; top: 0; background: var(--paper); }
 table { border-collapse: collapse; }
 th, td { text-align: left; padding: .35rem .9rem .35rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
@@ -48,7 +51,7 @@ figure { margin: 0; min-width: 0; }
 figcaption { color: var(--quiet); font-size: .8rem; margin-top: .2rem; }
 figcaption b { color: var(--ink); font-weight: 550; }
 img { display: block; width: 100%; height: auto; border-radius: .3rem; }
-.row { margin-top: 1rem; }
+.row, .key { margin-top: 1rem; }
 .row h3 small { color: var(--quiet); font-weight: 450; }
 .shots { display: grid; gap: .6rem;
   grid-template-columns: repeat(auto-fill, minmax(min(100%, var(--least-width, 14.5rem)), 1fr)); }
@@ -69,21 +72,24 @@ img { display: block; width: 100%; height: auto; border-radius: .3rem; }
 .open { position: absolute; inset: 0; width: 100%; height: 100%; padding: 0; border: 0;
   background: none; cursor: zoom-in; }
 .objects { list-style: none; margin: 0; padding: 0; display: grid; gap: .75rem;
-  grid-template-columns: repeat(auto-fill, minmax(min(100%, 9.5rem), 1fr)); }
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, 10.5rem), 1fr)); }
 .objects li { background: var(--card); border: 1px solid var(--line); border-radius: .5rem;
   padding: .5rem; min-width: 0; content-visibility: auto; contain-intrinsic-size: 9.5rem 16rem; }
 .objects h3 { margin: .4rem 0 .2rem; line-height: 1.3; }
 .objects h3 i, .keys i { display: inline-block; width: .85em; height: .85em; border-radius: .2em;
   margin-right: .4em; vertical-align: -.08em; }
 .objects dl { gap: 0 .6rem; font-size: .8rem; }
+.objects .long { grid-column: 1 / -1; }
+.objects dt.long { position: absolute; width: 1px; height: 1px; overflow: hidden;
+  clip-path: inset(50%); }
 .objects .unseen { display: grid; place-items: center; aspect-ratio: 1; background: var(--paper);
   color: var(--quiet); font-size: .8rem; text-align: center; border-radius: .3rem; }
 .keys { display: flex; flex-wrap: wrap; gap: .3rem 1.1rem; font-size: .9rem;
   margin-bottom: .75rem; }
 .scale { display: grid; grid-template-columns: auto minmax(6rem, 18rem) auto; gap: .6rem;
-  align-items: center; margin: .9rem 0 0; font-size: .85rem; color: var(--quiet); }
+  align-items: center; justify-content: start; margin: .9rem 0 0;
+  font-size: .85rem; color: var(--quiet); }
 .scale i { height: .8rem; border-radius: .2rem; border: 1px solid var(--line); }
-.scale span { grid-column: 1 / -1; }
 .bars { display: grid; grid-template-columns: max-content minmax(6rem, 40rem);
   gap: .5rem 1rem; align-items: center; }
 .bars .name { font-size: .92rem; }
@@ -113,9 +119,10 @@ dt { color: var(--quiet); } dd { margin: 0; }
   .figures { grid-template-columns: 1fr 1fr; } .figure .value { font-size: 1.3rem; }
   .bars { grid-template-columns: 1fr; gap: .15rem; } .bars .group { margin-bottom: .4rem; }
   section dl { grid-template-columns: minmax(0, 1fr); gap: 0; }
-  section dl dd { margin-bottom: .4rem; } .objects dl { grid-template-columns: auto 1fr; }
-  .objects dl dd { margin: 0; }
-  .objects { grid-template-columns: 1fr 1fr; } }
-@media print { body { background: none; } .wide { overflow: visible; } nav { display: none; }
+  section dl dd { margin-bottom: .4rem; } .objects li dl { grid-template-columns: auto 1fr; }
+  .objects li dl dd { margin: 0; }
+  .objects, .shots { grid-template-columns: 1fr 1fr; } }
+@media print { body { background: none; }
+  .wide { overflow: visible; max-height: none; } nav { display: none; }
   .objects li { content-visibility: visible; } }
 """

@@ -13,6 +13,10 @@ from splatseg.report._words import name_text, text
 from splatseg.report.images import SHADES, Gallery, GalleryImage, ObjectCard, ObjectGallery, Scale
 
 _JPEG_QUALITY = 86
+_SHORT = 8
+
+_LEAST_WIDTH = {2: 30, 3: 20, 4: 17, 5: 13, 6: 11.5}
+"""Least width of a picture, in letters' heights, where so many are to stand in one line."""
 
 
 def data_uri(panel: GalleryImage) -> str:
@@ -37,13 +41,15 @@ class PictureHtml:
     def gallery(self, gallery: Gallery) -> str:
         """Rows with a heading each, and under it their pictures with the columns' names."""
         rows: list[str] = []
+        least = _LEAST_WIDTH.get(len(gallery.columns))
+        width = "" if least is None else f' style="--least-width:{least}rem"'
         for label, panels in gallery.rows:
             shots = "".join(
                 self._shot(panel, column, f"{label}: {panel.caption or column}")
                 for panel, column in zip(panels, gallery.columns, strict=True)
             )
             head = f"<h3>{name_text(label)}</h3>"
-            rows.append(f'<div class="row">{head}<div class="shots">{shots}</div></div>')
+            rows.append(f'<div class="row">{head}<div class="shots"{width}>{shots}</div></div>')
         return "".join(rows)
 
     def objects(self, gallery: ObjectGallery) -> str:
@@ -87,8 +93,15 @@ class PictureHtml:
             picture = '<div class="unseen">in no view that was looked at</div>'
         else:
             picture = self._frame(card.image, f"object {title}")
-        facts = "".join(f"<dt>{text(k)}</dt><dd>{name_text(v)}</dd>" for k, v in card.facts)
+        swatch = f"background:rgb({red},{green},{blue})"
+        facts = "".join(_fact(name, value) for name, value in card.facts)
         return (
-            f'<li id="object-{card.id}">{picture}<h3><i style="background:rgb({red},{green},{blue})">'
-            f"</i>{name_text(title)}</h3><dl>{facts}</dl></li>"
+            f'<li id="object-{card.id}">{picture}<h3><i style="{swatch}"></i>'
+            f"{name_text(title)}</h3><dl>{facts}</dl></li>"
         )
+
+
+def _fact(name: str, value: str) -> str:
+    """A short value beside its name; a long one, such as a file, alone on its line."""
+    kind = ' class="long"' if len(value) > _SHORT else ""
+    return f"<dt{kind}>{text(name)}</dt><dd{kind}>{name_text(value)}</dd>"

@@ -18,6 +18,9 @@ from splatseg.report.legend import colour_of
 
 Cell = str | int | float | None
 
+_TALL = 40
+"""Tables of more rows scroll within the page."""
+
 _MIN_CONTENTS = 3
 """From so many sections on, a page begins with links to them."""
 
@@ -80,6 +83,8 @@ class Legend:
 
     classes: ClassTable
     title: str = "Colours"
+    with_ids: bool = False
+    """Whether ids stand before names; pictures have them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,6 +126,9 @@ class Report:
 
     title: str
     summary: str = ""
+    command: str = ""
+    """The words that made it; told under the summary."""
+
     notices: tuple[Notice, ...] = ()
     figures: tuple[Figure, ...] = ()
     blocks: tuple[Block, ...] = ()
@@ -144,25 +152,31 @@ def report_html(report: Report) -> str:
     parts = [f"<h1>{name_text(report.title)}</h1>"]
     if report.summary:
         parts.append(f'<p class="summary">{text(report.summary)}</p>')
+    if report.command:
+        parts.append(f'<p class="made">Made by <code>{text(report.command)}</code></p>')
     parts += [_notice(notice) for notice in report.notices]
-    titles = [block.title for block in report.blocks] + ["How it was made"] * bool(report.facts)
+    pictures = PictureHtml()
+    sections: list[tuple[str, str]] = []
+    for block in report.blocks:
+        content = _block(block, pictures)
+        if isinstance(block, Legend | Scale) and sections:
+            title, before = sections[-1]
+            key = f'<div class="key"><h3>{text(block.title)}</h3>{content}</div>'
+            sections[-1] = (title, before + key)
+        else:
+            sections.append((block.title, content))
+    if report.facts:
+        sections.append(("How it was made", _facts(report.facts)))
+    titles = [title for title, _ in sections]
     if len(titles) >= _MIN_CONTENTS:
         links = "".join(f'<a href="#s{i}">{text(title)}</a>' for i, title in enumerate(titles))
         parts.append(f'<nav aria-label="Contents">{links}</nav>')
     if report.figures:
         cards = "".join(_figure(figure) for figure in report.figures)
         parts.append(f'<section class="figures">{cards}</section>')
-    pictures = PictureHtml()
-    inner = [_block(block, pictures) for block in report.blocks]
-    if report.facts:
-        rows = "".join(
-            f"<dt>{text(name)}</dt><dd>{text(shown(value))}</dd>"
-            for name, value in report.facts.items()
-        )
-        inner.append(f"<dl>{rows}</dl>")
     parts += [
         f'<section id="s{i}"><h2>{name_text(title)}</h2>{content}</section>'
-        for i, (title, content) in enumerate(zip(titles, inner, strict=True))
+        for i, (title, content) in enumerate(sections)
     ]
     body = "\n".join(parts)
     return (
@@ -171,6 +185,13 @@ def report_html(report: Report) -> str:
         f"<title>{text(report.title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n"
         f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
+
+
+def _facts(facts: Mapping[str, Any]) -> str:
+    rows = "".join(
+        f"<dt>{text(name)}</dt><dd>{text(shown(value))}</dd>" for name, value in facts.items()
+    )
+    return f"<dl>{rows}</dl>"
 
 
 def _notice(notice: Notice) -> str:
@@ -228,7 +249,12 @@ def _table(table: Table) -> str:
         for row in table.rows
     )
     inside = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
-    return f'<div class="wide"><table>{inside}</table></div>'
+    tall = " tall" if len(table.rows) > _TALL else ""
+    # What scrolls can be reached by keys.
+    opening = (
+        f'<div class="wide{tall}" tabindex="0" role="region" aria-label="{text(table.title)}">'
+    )
+    return f"{opening}<table>{inside}</table></div>"
 
 
 def _bars(bars: Bars) -> str:
@@ -238,7 +264,8 @@ def _bars(bars: Bars) -> str:
     rows: list[str] = []
     for name, values in bars.rows:
         lines = "".join(
-            f'<div class="bar-line"><i class="series{i}" style="width:{100 * (value or 0):.1f}%"></i>'
+            f'<div class="bar-line"><i class="series{i}" '
+            f'style="width:{100 * (value or 0):.1f}%"></i>'
             f"<b>{shown(value)}</b></div>"
             for i, value in enumerate(values)
         )
@@ -265,7 +292,9 @@ def _legend(legend: Legend) -> str:
     entries: list[str] = []
     for row in legend.classes.rows:
         red, green, blue = colour_of(row.id, legend.classes)
+        said = not legend.with_ids or str(row.id) in row.name.split()
+        name = row.name if said else f"{row.id} {row.name}"
         entries.append(
-            f'<span><i style="background:rgb({red},{green},{blue})"></i>{text(row.name)}</span>'
+            f'<span><i style="background:rgb({red},{green},{blue})"></i>{text(name)}</span>'
         )
     return f'<div class="keys">{"".join(entries)}</div>'

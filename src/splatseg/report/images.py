@@ -18,7 +18,13 @@ _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 _WRONG: Colour = (226, 48, 48)
 _UNKNOWN: Colour = (90, 120, 220)
-SHADES: tuple[Colour, ...] = ((22, 24, 60), (26, 74, 118), (38, 132, 138), (126, 184, 126), (244, 226, 150))
+SHADES: tuple[Colour, ...] = (
+    (22, 24, 60),
+    (26, 74, 118),
+    (38, 132, 138),
+    (126, 184, 126),
+    (244, 226, 150),
+)
 """From far to near, from little to much: dark blue, teal, sand. Brightness grows steadily."""
 
 _PAPER: Colour = (250, 249, 246)

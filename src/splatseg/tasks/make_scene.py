@@ -1,5 +1,7 @@
 """Photographs become a scene: poses where they lack them, a fit, scores, a report."""
 
+import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -22,6 +24,7 @@ from splatseg.fit import (
 from splatseg.io.scene import CHECKPOINT_FILE, save_scene
 from splatseg.pose import PoseReport
 from splatseg.render import BackendName
+from splatseg.report.fit_verdict import FitVerdict
 from splatseg.tasks._fit_report import score_and_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._photographs import Poses, capture_of
@@ -79,6 +82,12 @@ class MadeScene:
     poses: PoseReport | None
     """How poses were found; None where they came with the capture."""
 
+    verdict: FitVerdict
+    """What the fit is good for."""
+
+    timings: Mapping[str, float]
+    """Seconds by part: photographs and poses, optimisation, what follows it."""
+
 
 def make_scene(
     data: Path,
@@ -114,13 +123,19 @@ def make_scene(
     options = options or MakeSceneOptions()
     fit_options = fit_options or FitOptions()
     resumed = check_fit_output(folder, options)
+    began = time.monotonic()
     capture, poses = _capture(data, folder, options, fit_options, observer)
+    timings = {"photographs and poses": time.monotonic() - began}
     if resumed is not None:
         observer.info(resumed)
+    began = time.monotonic()
     result, stopped = _fitted(
         capture, folder, options, fit_options, backend=backend, observer=observer
     )
-    scores, report = score_and_report(
+    # What was done before a fit was resumed counts as optimisation.
+    timings["optimisation"] = result.seconds
+    timings["scene written"] = max(0.0, time.monotonic() - began - result.seconds)
+    done = score_and_report(
         folder,
         capture,
         result,
@@ -128,16 +143,21 @@ def make_scene(
         backend=backend,
         scoring=not stopped,
         command=command,
+        timings=timings,
     )
+    if done.verdict.warns:
+        observer.note(f"{done.verdict.words.lower()}: {done.verdict.sentence.rstrip('.')}")
     return MadeScene(
         folder=folder,
         capture=capture,
         result=result,
         interrupted=stopped,
-        scores=scores,
+        scores=done.scores,
         held_out=sum(view.image is not None for view in capture.test_views),
-        report=report,
+        report=done.report,
         poses=poses,
+        verdict=done.verdict,
+        timings=done.timings,
     )
 
 
