@@ -73,9 +73,9 @@ def _print_tables(made: Demo) -> None:
     ):
         scores.add_row(what, views, f"{row['mIoU']:.3f}", f"{row['accuracy']:.3f}")
     console.print(scores)
+    views = counted(figures.test["photographs"], "held-out view")
     console.print(
-        f"Renders of {counted(figures.test['photographs'], 'held-out view')}: PSNR {figures.test['PSNR']:.2f} dB, "
-        f"SSIM {figures.test['SSIM']:.3f}"
+        f"Renders of {views}: PSNR {figures.test['PSNR']:.2f} dB, SSIM {figures.test['SSIM']:.3f}"
     )
     console.print(
         f"Objects from masks without weights: {figures.objects['predicted_instances']} for "

@@ -80,7 +80,7 @@ class PictureHtml:
             f'<div class="frame" style="--aspect-ratio:{width}/{height}">'
             f'<div class="zoom" popover id="{name}"><img{flat} src="{data_uri(panel)}" '
             f'width="{width}" height="{height}" alt="{words}" loading="lazy">'
-            f'<div class="bar"><span>{name_text(alternative)}</span><button type="button" '
+            f'<div class="bar"><span>{words}</span><button type="button" '
             f'popovertarget="{name}" popovertargetaction="hide">Close</button></div></div>'
             f'<button type="button" class="open" popovertarget="{name}" '
             f'aria-label="Enlarge {words}"></button></div>'

@@ -5,6 +5,7 @@ import re
 from typing import Any
 
 _LONG = 24
+_BREAKS = re.compile(r"(?<=[_/\-])(?=\w)|(?<=\.)(?=[A-Za-z])")
 
 
 def text(words: str) -> str:
@@ -13,7 +14,7 @@ def text(words: str) -> str:
 
 
 def name_text(name: str) -> str:
-    """A name, escaped; a long one may be broken after ``_``, ``-``, ``/`` and ``.`` alone.
+    """A name, escaped; a long one may be broken after ``_``, ``-``, ``/``, and at its ending.
 
     Example:
         >>> name_text("a_1")
@@ -23,7 +24,7 @@ def name_text(name: str) -> str:
     """
     if len(name) <= _LONG:
         return text(name)
-    return "<wbr>".join(text(part) for part in re.split(r"(?<=[_/.\-])(?=\w)", name))
+    return "<wbr>".join(text(part) for part in _BREAKS.split(name))
 
 
 def shown(value: Any) -> str:

@@ -129,7 +129,8 @@ def _sheet(figures: DemoFigures, held_out: Gallery, classes: ClassTable) -> Tens
             rows=spread(held_out.rows, _SHEET_ROWS),
         ),
         subtitle=(
-            f"PSNR {figures.test['PSNR']:.1f} dB on {counted(figures.test['photographs'], 'held-out view')}; "
+            f"PSNR {figures.test['PSNR']:.1f} dB on "
+            f"{counted(figures.test['photographs'], 'held-out view')}; "
             f"mIoU of the labels {figures.came.miou:.2f} as they came, "
             f"{figures.test['mIoU']:.2f} lifted into 3D and rendered"
         ),

@@ -175,7 +175,7 @@ def report_html(report: Report) -> str:
         cards = "".join(_figure(figure) for figure in report.figures)
         parts.append(f'<section class="figures">{cards}</section>')
     parts += [
-        f'<section id="s{i}"><h2>{name_text(title)}</h2>{content}</section>'
+        f'<section id="s{i}"><h2>{text(title)}</h2>{content}</section>'
         for i, (title, content) in enumerate(sections)
     ]
     body = "\n".join(parts)

@@ -2,9 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 
+from torch import Tensor
+
 from splatseg.core import (
     TREE_LEVELS,
     UNLABELLED,
+    ClassTable,
     Gaussians,
     InstanceTree,
     Renderable,
@@ -83,6 +86,10 @@ def _cuts(
         note="Groups hold objects, objects hold parts. What has no level above it, or none below, "
         "is shown at the next.",
     )
+
+
+def _picture(photograph: Tensor, ids: Tensor, colours: ClassTable) -> GalleryImage:
+    return GalleryImage(image=draw_ids(overlay_labels(photograph, ids, colours), ids))
 
 
 def _nodes(tree: InstanceTree) -> Table:
