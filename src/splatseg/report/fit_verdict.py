@@ -8,7 +8,7 @@ from splatseg.report.words import counted
 
 MIN_PSNR = 20.0
 """Renders less like the photographs than this, in dB, carry labels badly: in scenes of known truth
-a fifth to a half of the mIoU of a longer fit was lost (``benchmarks/fit_length.py``, decision
+a fifth to two thirds of the mIoU of a longer fit was lost (``benchmarks/fit_length.py``, decision
 0025)."""
 
 
@@ -62,7 +62,7 @@ def fit_verdict(
         words = "Poor"
         sentence = (
             f"Renders are less like the photographs than the {MIN_PSNR:g} dB from which labels "
-            f"hold; poses, exposure or moving things may be wrong, see the worst views.{of}"
+            f"hold: too few photographs, wrong poses or moving things, see the worst views.{of}"
         )
     elif scores is None:
         words = "Not judged"

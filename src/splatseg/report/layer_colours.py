@@ -15,7 +15,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, Gaussians, Labels, RenderableLayer
 from splatseg.report.legend import Colour, colour_of, names_of
 
-_CELLS = 96
+_MAX_CELLS, _MIN_CELLS = 64, 8
 """Cells along the longest side of the scene; things in one cell or in two that share a side are
 neighbours."""
 
@@ -106,9 +106,11 @@ def _contacts(
         return sparse.csr_matrix((count, count))
     # A few Gaussians far outside must not make one cell of all the rest.
     low, high = np.quantile(points[:: max(1, len(points) // 100_000)], (0.01, 0.99), axis=0)
-    side = max(float((high - low).max()), 1e-9) / _CELLS
-    cells = np.clip((points - low) / side, -_CELLS, 2 * _CELLS).astype(np.int64) + _CELLS + 1
-    strides = np.array([1, 4 * _CELLS, 16 * _CELLS**2])
+    # On a surface about four points share a cell: where there are few, cells are large.
+    most = min(_MAX_CELLS, max(_MIN_CELLS, int((len(points) / 4) ** 0.5)))
+    side = max(float((high - low).max()), 1e-9) / most
+    cells = np.clip((points - low) / side, -most, 2 * most).astype(np.int64) + most + 1
+    strides = np.array([1, 4 * most, 16 * most**2])
     keys, row = np.unique(cells @ strides, return_inverse=True)
     ones = np.ones(len(row), dtype=np.int32)
     inside = sparse.csr_matrix((ones, (row.reshape(-1), index)), shape=(len(keys), count))

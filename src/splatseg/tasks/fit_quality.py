@@ -36,7 +36,7 @@ class FitQuality:
         views = counted(self.views, f"{split} view")
         return (
             f"this scene is too poor to carry labels well: its renders have {self.psnr:.1f} dB "
-            f"PSNR on {views}; below {MIN_PSNR:g} dB a fifth to a half of the mIoU was lost in "
+            f"PSNR on {views}; below {MIN_PSNR:g} dB a fifth to two thirds of the mIoU was lost in "
             "scenes of known truth; fit it longer"
         )
 
