@@ -52,7 +52,15 @@ class Page(HTMLParser):
 
 def test_a_finished_fit(fitted) -> None:
     root, capture, result = fitted
-    done = score_and_report(root, capture, result, options=OPTIONS, backend="cpu", scoring=True)
+    done = score_and_report(
+        root,
+        capture,
+        result,
+        options=OPTIONS,
+        backend="cpu",
+        scoring=True,
+        timings={"optimisation": 61.5},
+    )
     found, where = done.scores, done.report
     scores = evaluate_photographs(
         GaussianField(result.gaussians, backend="cpu"), capture.test_views
@@ -67,6 +75,10 @@ def test_a_finished_fit(fitted) -> None:
     assert record["gaussians"] == len(result.gaussians)
     assert record["file_bytes"] == (root / "gaussians.ply").stat().st_size
     assert record["seed"] == 3
+    assert (record["sensible_steps"], record["too_short"]) == (1000, True)
+    assert record["verdict"].startswith("Too short. 120 steps done, where 1000 or more")
+    assert done.verdict.too_short
+    assert record["seconds_by_part"].keys() == {"optimisation", "scores and report"}
     assert record["options"]["max_gaussians"] == 70
     assert record["held_out"]["psnr"] == pytest.approx(scores.psnr)
     assert record["held_out"]["psnr_min"] == pytest.approx(scores.psnr_min)
@@ -94,6 +106,11 @@ def test_a_finished_fit(fitted) -> None:
         f"{worst.psnr:.2f} dB, SSIM {worst.ssim:.3f}",
         f"{scores.psnr:.2f} dB",
         "11",
+        "SSIM",
+        "mean of 3 held-out views",
+        "second worst" if len(scores.views) > 4 else "median",
+        "1 min 02 s",
+        "Cameras and points",
         "14 of 56x48",
         "max_gaussians",
         "as asked for, which is too short",
@@ -134,6 +151,7 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
     root, capture, result = fitted
     (root / "capture").mkdir()
     report = {"photographs": 12, "registered": ["a", "b"], "error": 0.61234, "mapper": "global"}
+    report["seconds"] = {"copies": 1.5, "features": 20.25, "mapping": 8.0}
     (root / "capture" / "poses.json").write_text(json.dumps({"report": report}))
     noted = replace(capture, notes=("sizes were <odd> & fixed",))
     short = replace(result, history=(), notes=("exposure +0.1",))
@@ -143,6 +161,8 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
     assert page.tags.count("svg") == 0
     words = " ".join(page.words)
     for expected in ("sizes were <odd> & fixed", "exposure +0.1", "poses: mapper", "0.612"):
+        assert expected in words
+    for expected in ("29.8 s (copies 1.5, features 20.2, mapping 8.0)", "poses: seconds"):
         assert expected in words
     assert "<odd>" not in text
     assert json.loads((root / "reports" / "fit.json").read_text())["poses"] == report
