@@ -154,7 +154,7 @@ def _axes(cameras: _Cameras, up: tuple[float, float, float] | None) -> NDArray[n
     flat = np.vstack((flat, 1e-6 * (np.eye(3) - np.outer(above, above))))
     right = np.linalg.svd(flat, full_matrices=False)[2][0]
     right = right * (1.0 if right[np.abs(right).argmax()] > 0 else -1.0)
-    return np.stack((right, np.cross(above, right), above))
+    return np.stack((right, np.cross(above, right), above)).astype(np.float64)
 
 
 def _points(gaussians: Gaussians) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

@@ -162,6 +162,8 @@ def _cut(
     inside = mask[rows][:, columns]
     grey = 0.35 * pixels.mean(axis=2, keepdims=True) + 0.15 * pixels + 90
     out = np.where(inside[..., None], pixels, grey)
-    wider = np.asarray(ndimage.binary_dilation(inside, iterations=max(1, size // 110)))
+    wider = np.asarray(
+        ndimage.binary_dilation(inside, iterations=max(1, size // 110)), dtype=np.bool_
+    )
     out[wider & ~inside] = colour
     return np.clip(out + 0.5, 0, 255).astype(np.uint8)

@@ -72,9 +72,7 @@ def _cuts(
             (
                 view.name,
                 tuple(
-                    GalleryImage(
-                        image=draw_ids(overlay_labels(photograph, ids, tables[level]), ids)
-                    )
+                    _picture(photograph, ids, tables[level])
                     for level, ids in zip(TREE_LEVELS, drawn, strict=True)
                 ),
             )
