@@ -115,7 +115,7 @@ def test_cards_and_json_say_which_object_is_which(scene, labels, tmp_path) -> No
         tmp_path,
         files={BOX: "exports/things/objects/007_red-box.ply"},
         warnings=("The fit is poor.",),
-        command="splatseg segment S",
+        command="splatseg segment S --report",
     )
     card = re.search(rf'<li id="object-{BOX}">.*?</li>', page, re.S)
     assert card is not None
@@ -123,7 +123,7 @@ def test_cards_and_json_say_which_object_is_which(scene, labels, tmp_path) -> No
     for words in ("7 red box", "81", "0.50", "v0", "007_red-box.ply"):
         assert words in said, words
     assert "exports/things/objects" in page
-    assert "splatseg segment S" in page
+    assert 'segment S <span class="option">--report</span></code>' in page
     assert "The fit is poor." in page
     first, second = record["objects"]
     assert (first["id"], first["name"], first["gaussians"], first["best_view"]) == (

@@ -26,6 +26,7 @@ nav a { color: var(--quiet); text-decoration: none; padding: .15rem 0; }
 nav a:hover { color: var(--ink); text-decoration: underline; }
 .summary { max-width: 46rem; margin: 0; color: var(--quiet); font-size: 1.05rem; }
 .made { max-width: 60rem; margin: .5rem 0 0; font-size: .85rem; color: var(--quiet); }
+.option { white-space: nowrap; } .made code { overflow-wrap: break-word; }
 .note { max-width: 46rem; margin: 0 0 .75rem; color: var(--quiet); font-size: .9rem; }
 .notice { max-width: 60rem; margin: 1rem 0 0; padding: .7rem 1rem; background: var(--card);
   border: 1px solid var(--line); border-left: .3rem solid var(--good); border-radius: .4rem; }

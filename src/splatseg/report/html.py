@@ -153,7 +153,7 @@ def report_html(report: Report) -> str:
     if report.summary:
         parts.append(f'<p class="summary">{text(report.summary)}</p>')
     if report.command:
-        parts.append(f'<p class="made">Made by <code>{text(report.command)}</code></p>')
+        parts.append(f'<p class="made">Made by <code>{_command(report.command)}</code></p>')
     parts += [_notice(notice) for notice in report.notices]
     pictures = PictureHtml()
     sections: list[tuple[str, str]] = []
@@ -184,6 +184,14 @@ def report_html(report: Report) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{text(report.title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n"
         f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _command(line: str) -> str:
+    """A command line, which no narrow window breaks within the name of an option."""
+    return " ".join(
+        f'<span class="option">{text(word)}</span>' if word.startswith("-") else text(word)
+        for word in line.split(" ")
     )
 
 
