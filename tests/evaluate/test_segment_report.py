@@ -165,7 +165,8 @@ def test_the_page_needs_nothing_else_and_says_everything(write) -> None:
     for words in (
         "v4, held out", "evidence as it came", "confidence", "truth", "errors in red",
         "2 held-out views", "Coverage", "at least 3 views", "Conflicts", "1.8 s", "3.00 GiB",
-        "splatseg segment SCENE", "--report</span></code>", "seed", "torch", "candidates", "blue wall",
+        "splatseg segment SCENE", "--report</span></code>", "seed", "torch", "candidates",
+        "blue wall",
     ):  # fmt: skip
         assert words in page, words
     # Four views that it was made from and two held out, seven images each, and three labels.
