@@ -83,7 +83,19 @@ def test_the_record_holds_the_figures_that_the_report_shows(finished: Path):
     assert 3 < record["psnr_test"] < 50
     assert sum(record["seconds"].values()) == pytest.approx(record["seconds_total"], abs=1.0)
     assert page.count("data:image/") >= 10
-    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    assert list(record["seconds"]) == [
+        "generate", "fit", "segment semantic", "see", "segment objects", "render",
+        "evaluate semantic, train", "evaluate semantic, test", "evaluate objects, test",
+        "export", "report",
+    ]  # fmt: skip
+    assert "<td>segment semantic</td>" in page
+    assert "<td>segment objects</td>" in page
+    objects = (finished / "scene" / "reports" / "objects.html").read_text(encoding="utf-8")
+    (made_by,) = re.findall(r"Made by <code>(.*?)</code>", objects)
+    made_by = re.sub(r"</?span[^>]*>", "", made_by)
+    assert made_by in [line.replace("&", "&amp;") for line in record["commands"]]
+    assert "--method associate" in made_by
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
 
 
 def test_what_is_printed_makes_the_same(finished: Path, earlier: Path):

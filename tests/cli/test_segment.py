@@ -1,6 +1,7 @@
 """segment: every method, completion, exports and the report, as the shell runs it."""
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -189,13 +190,29 @@ def test_files_and_report_of_one_command(masks, splatseg) -> None:
     assert sorted(len(read_splats(path)) for path in objects) == sorted(
         int((layer.ids == i).sum()) for i in (1, 2)
     )
-    with (exports / "objects.csv").open() as file:
+    with (exports / "objects.csv").open(encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
     assert {int(row["gaussians"]) for row in rows} == {int((layer.ids == i).sum()) for i in (1, 2)}
+    for row in rows:
+        assert row["file"].startswith(f"objects/{int(row['id']):03d}")
+        assert len(read_splats(exports / row["file"])) == int(row["gaussians"])
     whole = read_splats(exports / "labelled.ply")
     assert torch.equal(whole.extra["class_id"], layer.ids.clamp_min(0))
     drawn = np.array(Image.open(exports / "label_maps" / "walls" / "test_2.png"))
     assert set(np.unique(drawn[12:]).tolist()) == {1, 2}
+    views = {path.stem for path in (exports / "label_maps" / "walls").glob("*.png")}
+    assert views == {"train_0", "train_1", "test_2", "train_3"}, "all photographs"
+    assert "label maps of 4 views" in out
+    record = json.loads((masks.scene / "reports" / "walls.json").read_text())
+    assert {row["file"] for row in record["objects"] if row["gaussians"]} == {
+        f"exports/walls/{row['file']}" for row in rows
+    }
+    legend = json.loads((exports / "label_maps" / "walls" / "legend.json").read_text())["ids"]
+    assert {int(id): row["colour"] for id, row in legend.items()} == {
+        row["id"]: row["colour"] for row in record["objects"]
+    }, "one colour an object, whatever shows it"
+    labelled = json.loads((exports / "labelled.json").read_text())["columns"]["class_id"]["ids"]
+    assert all(labelled[id]["colour"] == row["colour"] for id, row in legend.items())
     page = (masks.scene / "reports" / "walls.html").read_text()
     assert f"report: {masks.scene / 'reports' / 'walls.html'}" in out
     assert "object 1" in page

@@ -117,7 +117,7 @@ def test_nested_masks_become_a_tree_with_files_and_a_report(nested, run) -> None
         assert f"{indent}{node.name}<" in page
         assert f"\u2003{indent}{node.name}<" not in page
     # Children stand below their parents.
-    table = page[page.index(">The tree<") :]
+    table = page[page.index("<h2>The tree</h2>") :]
     at = {node.id: table.index(f"{node.name}<") for node in tree.nodes}
     assert all(at[node.parent] < at[node.id] for node in tree.nodes if node.parent > 0)
 

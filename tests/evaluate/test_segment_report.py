@@ -35,7 +35,8 @@ from splatseg.io.evidence import (
 from splatseg.io.images import save_png
 from splatseg.lift import GaussianField
 from splatseg.report import _segment_ids, _segment_panels, _segment_tables, segment_report
-from splatseg.report.segment_report import write_segmentation_report
+from splatseg.report.layer_colours import layer_colours
+from splatseg.report.segment_report import SegmentationRun, write_segmentation_report
 
 WIDTH, HEIGHT = 40, 30
 CLASSES = ClassTable(
@@ -44,6 +45,14 @@ CLASSES = ClassTable(
         ClassInfo(id=2, name="red <wall>", colour=(200, 0, 0)),
         ClassInfo(id=3, name="blue wall", colour=(0, 0, 100)),
     )
+)
+
+
+RUN = SegmentationRun(
+    timings={"lifting": 1.25, "writing": 0.5},
+    peak_bytes=3 << 30,
+    command="splatseg segment SCENE --report",
+    backend="cpu",
 )
 
 
@@ -122,9 +131,7 @@ def write(tmp_path):
             "evidence": maps_of(scene, ["v0", "v1", "v2", "v3"], wrong=True),
             "views": scene.train_views,
             "truth": None,
-            "timings": {"lifting": 1.25, "writing": 0.5},
-            "peak_bytes": 3 << 30,
-            "command": "splatseg segment SCENE --report",
+            "run": RUN,
         }
         given |= words
         labels = layer_of(scene) if labels is None else labels
@@ -134,7 +141,6 @@ def write(tmp_path):
             field=GaussianField(scene.gaussians, {"walls & sky": labels}, backend="cpu"),
             labels=labels,
             layer="walls & sky",
-            backend="cpu",
             **given,
         )
         return (tmp_path / name).read_text()
@@ -151,7 +157,7 @@ def pictures(page: str) -> list[np.ndarray]:
 
 def test_the_page_needs_nothing_else_and_says_everything(write) -> None:
     page = write(truth=maps_of(write.scene, ["v0", "v4", "v5"]))
-    assert not re.search(r'(src|href)="(?!data:)', page)
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
     assert "<script" not in page
     assert "red &lt;wall&gt;" in page
     assert "red <wall>" not in page
@@ -159,11 +165,12 @@ def test_the_page_needs_nothing_else_and_says_everything(write) -> None:
     for words in (
         "v4, held out", "evidence as it came", "confidence", "truth", "errors in red",
         "2 held-out views", "Coverage", "at least 3 views", "Conflicts", "1.8 s", "3.00 GiB",
-        "splatseg segment SCENE --report", "seed", "torch", "candidates", "blue wall",
+        "splatseg segment SCENE", "--report</span></code>", "seed", "torch", "candidates",
+        "blue wall",
     ):  # fmt: skip
         assert words in page, words
-    # Four views that it was made from and two held out, six images each.
-    assert len(pictures(page)) == 6 * 6
+    # Four views that it was made from and two held out, seven images each, and three labels.
+    assert len(pictures(page)) == 6 * 7 + 3
 
 
 def test_figures_are_those_of_the_maps(write) -> None:
@@ -190,7 +197,7 @@ def test_without_truth_and_evidence_the_columns_are_left_out(write) -> None:
     assert "errors in red" not in page
     assert "evidence as it came" not in page
     assert "differs from the layer" not in page
-    assert len(pictures(page)) == 6 * 3
+    assert len(pictures(page)) == 6 * 4 + 3
 
 
 def test_views_without_photographs_are_rendered(write) -> None:
@@ -213,7 +220,7 @@ def test_truth_with_other_ids_is_matched(write) -> None:
     page = write(truth=other, labels=labels, evidence=other, views=write.scene.train_views)
     assert "mIoU of instances" in page
     assert "matched one to one, 2 held-out views" in page
-    right = [float(v) for v in re.findall(r">([\d.]+)% right", page)]
+    right = [float(v) for v in re.findall(r" ([\d.]+)% right</figcaption>", page)]
     assert len(right) == 2
     assert min(right) > 90
 
@@ -272,12 +279,13 @@ def test_a_page_that_is_too_large_gets_smaller_pictures(write, monkeypatch) -> N
     monkeypatch.setattr(segment_report, "_IMAGE_SIZES", (448, 20, 10))
     monkeypatch.setattr(segment_report, "_LARGEST", len(large.encode()) - 1)
     small = write()
-    assert {p.shape[:2] for p in pictures(large)} == {(HEIGHT, WIDTH)}
-    assert {p.shape[:2] for p in pictures(small)} == {(15, 20)}
+    cut = (256, 256)
+    assert {p.shape[:2] for p in pictures(large)} == {(HEIGHT, WIDTH), cut}
+    assert {p.shape[:2] for p in pictures(small)} == {(15, 20), cut}
     assert len(small) < len(large)
     # And where nothing is small enough, the smallest is written.
     monkeypatch.setattr(segment_report, "_LARGEST", 1)
-    assert {p.shape[:2] for p in pictures(write())} == {(8, 10)}
+    assert {p.shape[:2] for p in pictures(write())} == {(8, 10), cut}
 
 
 def test_nothing_half_written_stays(write) -> None:
@@ -334,10 +342,10 @@ def test_ids_agree_by_their_names(write) -> None:
 
 def test_names_and_colours(write) -> None:
     bare = layer_of(write.scene, info={"names": {}})
-    known = _segment_ids.class_table(RenderableLayer.of(bare), CLASSES, unnamed_are_classes=True)
+    known = layer_colours(RenderableLayer.of(bare), CLASSES)
     assert known.rows[1].name == "red <wall>"
     assert known.rows[1].colour == (200, 0, 0)
-    tracks = _segment_ids.class_table(RenderableLayer.of(bare), CLASSES, unnamed_are_classes=False)
+    tracks = layer_colours(RenderableLayer.of(bare), None)
     assert [row.name for row in tracks.rows] == ["id 1", "id 2", "id 3"]
     assert tracks.rows[1].colour != (200, 0, 0)
 

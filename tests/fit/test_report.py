@@ -37,7 +37,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "wbr"):
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attrs):
@@ -52,9 +52,16 @@ class Page(HTMLParser):
 
 def test_a_finished_fit(fitted) -> None:
     root, capture, result = fitted
-    found, where = score_and_report(
-        root, capture, result, options=OPTIONS, backend="cpu", scoring=True
+    done = score_and_report(
+        root,
+        capture,
+        result,
+        options=OPTIONS,
+        backend="cpu",
+        scoring=True,
+        timings={"optimisation": 61.5},
     )
+    found, where = done.scores, done.report
     scores = evaluate_photographs(
         GaussianField(result.gaussians, backend="cpu"), capture.test_views
     )
@@ -68,6 +75,10 @@ def test_a_finished_fit(fitted) -> None:
     assert record["gaussians"] == len(result.gaussians)
     assert record["file_bytes"] == (root / "gaussians.ply").stat().st_size
     assert record["seed"] == 3
+    assert (record["sensible_steps"], record["too_short"]) == (1000, True)
+    assert record["verdict"].startswith("Too short. 120 steps done, where 1000 or more")
+    assert done.verdict.too_short
+    assert record["seconds_by_part"].keys() == {"optimisation", "scores and report"}
     assert record["options"]["max_gaussians"] == 70
     assert record["held_out"]["psnr"] == pytest.approx(scores.psnr)
     assert record["held_out"]["psnr_min"] == pytest.approx(scores.psnr_min)
@@ -83,10 +94,10 @@ def test_a_finished_fit(fitted) -> None:
     text = (root / "reports" / "fit.html").read_text()
     page = Page(text)
     words = " ".join(page.words)
-    assert page.tags.count("img") == 9, "photograph, render, difference; worst, median, best"
+    assert page.tags.count("img") == 9 + 2, "three views in three pictures each, two maps"
     assert page.tags.count("svg") == 3
     assert "script" not in page.tags
-    assert not re.search(r'(src|href)="(?!data:)', text), "nothing from elsewhere"
+    assert not re.search(r'(src|href)="(?!data:|#)', text), "nothing from elsewhere"
     worst = min(scores.per_view, key=lambda score: score.psnr)
     best = max(scores.per_view, key=lambda score: score.psnr)
     for expected in (
@@ -95,9 +106,14 @@ def test_a_finished_fit(fitted) -> None:
         f"{worst.psnr:.2f} dB, SSIM {worst.ssim:.3f}",
         f"{scores.psnr:.2f} dB",
         "11",
+        "SSIM",
+        "mean of 3 held-out views",
+        "second worst" if len(scores.views) > 4 else "median",
+        "1 min 02 s",
+        "Cameras and points",
         "14 of 56x48",
         "max_gaussians",
-        "as planned",
+        "as asked for, which is too short",
     ):
         assert expected in words, expected
     for stage in result.stages:
@@ -107,10 +123,8 @@ def test_a_finished_fit(fitted) -> None:
 def test_an_interrupted_fit_is_not_scored(fitted) -> None:
     root, capture, result = fitted
     stopped = replace(result, interrupted=True)
-    found, _ = score_and_report(
-        root, capture, stopped, options=OPTIONS, backend="cpu", scoring=False
-    )
-    assert found is None
+    done = score_and_report(root, capture, stopped, options=OPTIONS, backend="cpu", scoring=False)
+    assert done.scores is None
     record = json.loads((root / "reports" / "fit.json").read_text())
     assert record["interrupted"] is True
     assert record["held_out"] is None
@@ -122,13 +136,13 @@ def test_an_interrupted_fit_is_not_scored(fitted) -> None:
 
 def test_one_held_out_view_and_none(fitted) -> None:
     root, capture, result = fitted
-    for count, images in ((1, 3), (0, 0)):
+    for count, images in ((1, 3 + 2), (0, 2)):
         views = (*capture.train_views, *capture.test_views[:count])
         fewer = replace(capture, views=views)
-        found, _ = score_and_report(
+        done = score_and_report(
             root, fewer, replace(result, views=views), options=OPTIONS, backend="cpu", scoring=True
         )
-        assert (found is not None) == (count > 0)
+        assert (done.scores is not None) == (count > 0)
         page = Page((root / "reports" / "fit.html").read_text())
         assert page.tags.count("img") == images
 
@@ -137,6 +151,7 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
     root, capture, result = fitted
     (root / "capture").mkdir()
     report = {"photographs": 12, "registered": ["a", "b"], "error": 0.61234, "mapper": "global"}
+    report["seconds"] = {"copies": 1.5, "features": 20.25, "mapping": 8.0}
     (root / "capture" / "poses.json").write_text(json.dumps({"report": report}))
     noted = replace(capture, notes=("sizes were <odd> & fixed",))
     short = replace(result, history=(), notes=("exposure +0.1",))
@@ -146,6 +161,8 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
     assert page.tags.count("svg") == 0
     words = " ".join(page.words)
     for expected in ("sizes were <odd> & fixed", "exposure +0.1", "poses: mapper", "0.612"):
+        assert expected in words
+    for expected in ("29.8 s (copies 1.5, features 20.2, mapping 8.0)", "poses: seconds"):
         assert expected in words
     assert "<odd>" not in text
     assert json.loads((root / "reports" / "fit.json").read_text())["poses"] == report

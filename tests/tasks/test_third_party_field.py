@@ -238,9 +238,6 @@ def test_a_report_of_a_field_without_gaussians(scene, field, truth) -> None:
             layer="things",
             evidence=open_evidence(truth / "things"),
             views=scene.train_views,
-            timings={},
-            peak_bytes=None,
-            command="",
             **words,
         )
         return (truth / "report.html").read_text()
@@ -255,6 +252,7 @@ def test_a_report_of_a_field_without_gaussians(scene, field, truth) -> None:
     assert f'<td>ball</td><td class="number">{shown}</td><td class="number">0.500</td>' in found
     assert "There is no truth to score" in page()
     assert field.open == 0
+    assert page().count('<li id="object-') == 2, "objects of any field are cut out"
 
 
 def test_what_fields_must_not_do_is_refused(scene, field, truth, tmp_path) -> None:

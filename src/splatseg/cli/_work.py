@@ -1,6 +1,7 @@
 """What commands share: who is told of the work, and how its result is printed."""
 
 import json
+import shlex
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ def typed(words: Sequence[str]) -> str:
     name = Path(words[0]).name if words else ""
     if name not in ("splatseg", "__main__.py"):
         return ""
-    return " ".join(["splatseg", *words[1:]])
+    return shlex.join(["splatseg", *words[1:]])
 
 
 def print_result(facts: Mapping[str, Any], lines: Sequence[str], *, json: bool) -> None:

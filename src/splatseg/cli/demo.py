@@ -11,6 +11,7 @@ from rich.table import Table
 
 from splatseg.cli._types import Backend, Json, Quiet
 from splatseg.cli._work import ConsoleObserver, print_result
+from splatseg.report.words import counted
 from splatseg.tasks import Demo, DemoOptions, make_demo
 
 
@@ -72,9 +73,9 @@ def _print_tables(made: Demo) -> None:
     ):
         scores.add_row(what, views, f"{row['mIoU']:.3f}", f"{row['accuracy']:.3f}")
     console.print(scores)
+    views = counted(figures.test["photographs"], "held-out view")
     console.print(
-        f"Renders of held-out views: PSNR {figures.test['PSNR']:.2f} dB, "
-        f"SSIM {figures.test['SSIM']:.3f}"
+        f"Renders of {views}: PSNR {figures.test['PSNR']:.2f} dB, SSIM {figures.test['SSIM']:.3f}"
     )
     console.print(
         f"Objects from masks without weights: {figures.objects['predicted_instances']} for "

@@ -10,6 +10,7 @@ import tyro
 from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Overwrite, Quiet, Seed
 from splatseg.cli._work import ConsoleObserver, print_result, typed
 from splatseg.fit import FitOptions, Preset, Strategy
+from splatseg.report.fit_verdict import scored_of
 from splatseg.tasks import MadeScene, MakeSceneOptions, make_scene
 
 _DEFAULT = FitOptions()
@@ -39,7 +40,8 @@ class Command:
     output: MadeSceneFolder
 
     minutes: float | None = None
-    """Length of the optimisation; the whole command ends within a minute more. None is the
+    """Length of the optimisation. Finding poses is not counted and comes before it; scores and
+    the report take up to a minute after it. What the whole took is said at the end. None is the
     preset's."""
 
     steps: int | None = None
@@ -171,10 +173,16 @@ def _facts(made: MadeScene) -> dict[str, Any]:
         "scene": made.folder,
         "gaussians": len(result.gaussians),
         "steps": result.steps,
+        "sensible_steps": made.verdict.sensible_steps,
+        "too_short": made.verdict.too_short,
+        "verdict": f"{made.verdict.words}. {made.verdict.sentence}",
         "seconds": round(result.seconds, 3),
+        "seconds_by_part": {name: round(spent, 3) for name, spent in made.timings.items()},
+        "seconds_together": round(sum(made.timings.values()), 3),
         "interrupted": made.interrupted,
         "train_views": len(made.capture.train_views),
         "test_views": len(made.capture.test_views),
+        "held_out_views": made.held_out,
         "scored_views": 0 if scores is None else len(scores.views),
         "psnr": None if scores is None else scores.psnr,
         "ssim": None if scores is None else scores.ssim,
@@ -196,8 +204,12 @@ def _lines(made: MadeScene) -> list[str]:
     if not made.held_out:
         lines.append("no held-out views to score")
     elif made.scores is not None:
-        scored = f"{made.held_out} held-out views"
-        if len(made.scores.views) < made.held_out:
-            scored = f"{len(made.scores.views)} of {made.held_out} held-out views"
+        scored = scored_of(made.scores, made.held_out)
         lines.append(f"PSNR {made.scores.psnr:.2f} dB on {scored}, SSIM {made.scores.ssim:.3f}")
-    return [*lines, f"report: {made.report}"]
+    parts = ", ".join(f"{name} {spent:.0f} s" for name, spent in made.timings.items())
+    return [
+        *lines,
+        f"{made.verdict.words}: {made.verdict.sentence}",
+        f"the whole took {sum(made.timings.values()):.0f} s: {parts}",
+        f"report: {made.report}",
+    ]

@@ -19,8 +19,10 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.lift import CompletionOptions
 from splatseg.methods import Method, find_method, methods
+from splatseg.report.words import counted
 from splatseg.tasks import (
     CheckpointOptions,
+    Exported,
     Segmentation,
     SegmentOptions,
     check_layer_exports,
@@ -80,10 +82,11 @@ class Command:
 
     export: bool = False
     """Also write SCENE/exports/LAYER: one splat file an object, a table of objects, all
-    Gaussians with their labels as columns, and label maps of the held-out views."""
+    Gaussians with their labels as columns, and label maps of all views."""
 
     report: bool = False
-    """Also write SCENE/reports/LAYER.html: pictures, confidence, coverage and conflicts."""
+    """Also write SCENE/reports/LAYER.html and LAYER.json: a picture of each object, views,
+    confidence, coverage and conflicts."""
 
     truth: Path | None = None
     """Folder of true maps, shown and scored in the report."""
@@ -176,8 +179,11 @@ def run(command: Command) -> None:
         lines = [_summary(result, time.monotonic() - started), str(path)]
         made = _facts(result, path)
         timings = {"load": opened}
+        files: tuple[Exported, ...] = ()
         if command.export:
-            _export(command, scene, result, observer, lines=lines, made=made, timings=timings)
+            files = _export(
+                command, scene, result, observer, lines=lines, made=made, timings=timings
+            )
         if command.report:
             where = report_layer(
                 scene,
@@ -185,6 +191,7 @@ def run(command: Command) -> None:
                 result,
                 truth=truth,
                 timings=timings,
+                exported=files,
                 command=typed(sys.argv),
                 backend=command.backend,
             )
@@ -203,7 +210,7 @@ def _export(
     lines: list[str],
     made: dict[str, Any],
     timings: dict[str, float],
-) -> None:
+) -> tuple[Exported, ...]:
     """Write the exports, and add what they are to what is printed."""
     began = time.monotonic()
     files, maps = export_layer(
@@ -218,8 +225,9 @@ def _export(
     lines += [f"{file.summary} in {file.output}" for file in files]
     made["exports"] = [file.output for file in files]
     if maps is not None:
-        lines.append(f"{maps.views} views in {maps.folder}")
+        lines.append(f"label maps of {maps.views} views in {maps.folder}")
         made["exports"].append(maps.folder)
+    return files
 
 
 def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
@@ -229,6 +237,7 @@ def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
         "file": path,
         "kind": type(result.layer).__name__.lower(),
         "views": len(result.views),
+        "warnings": list(result.warnings),
         "stage_seconds": {name: round(value, 3) for name, value in result.timings.items()},
     }
     if not isinstance(result.layer, Features):
@@ -255,7 +264,7 @@ def _summary(result: Segmentation, seconds: float) -> str:
         count, channels = result.layer.values.shape
         return (
             f"features of {channels} channels on {count} Gaussians, "
-            f"from {views} views in {seconds:.1f} s"
+            f"from {counted(views, 'view')} in {seconds:.1f} s"
         )
     labels = result.labels
     labelled = int((labels.ids != UNLABELLED).sum())
@@ -264,8 +273,9 @@ def _summary(result: Segmentation, seconds: float) -> str:
     inferred = 0 if labels.inferred is None else int(labels.inferred.sum())
     guessed = f", {inferred} of them inferred from neighbours" if inferred else ""
     return (
-        f"{labelled} of {len(labels)} Gaussians labelled ({share:.1f} %){guessed}, {ids} ids, "
-        f"from {views} views in {seconds:.1f} s; background: {_background(labels)}"
+        f"{labelled} of {len(labels)} Gaussians labelled ({share:.1f} %){guessed}, "
+        f"{counted(ids, 'id')}, from {counted(views, 'view')} in {seconds:.1f} s; "
+        f"background: {_background(labels)}"
     )
 
 

@@ -14,7 +14,7 @@ from splatseg.core import Renderable, View
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import Progress
 from splatseg.evaluate.metrics import SSIM_WINDOW, psnr, ssim
-from splatseg.io.images import load_alpha, load_image, load_mask
+from splatseg.io.images import image_camera, load_alpha, load_image, load_mask
 
 MaskUse = Literal["off", "ignore", "alpha"]
 """What the masks of views mean, as in a fit."""
@@ -64,6 +64,7 @@ def evaluate_photographs(
     *,
     masks: MaskUse = "off",
     lpips: Callable[[torch.Tensor, torch.Tensor], float] | None = None,
+    longest: int | None = None,
     seconds: float = math.inf,
     progress: Progress | None = None,
 ) -> PhotographReport:
@@ -79,6 +80,8 @@ def evaluate_photographs(
             and a view without a mask: every pixel.
         lpips: A network with weights (`splatseg.evaluate.lpips.load_lpips`); None leaves that
             score out.
+        longest: Longest side in pixels to which larger photographs are reduced, and drawn in;
+            None keeps every pixel.
         seconds: After so long no further view is begun; at least one is scored.
         progress: Called with the views done and their number.
 
@@ -91,7 +94,7 @@ def evaluate_photographs(
     scores: list[ViewScore] = []
     begin = time.monotonic()
     for done, view in enumerate(views, start=1):
-        score = _view_score(field, view, masks=masks, lpips=lpips)
+        score = _view_score(field, view, masks=masks, lpips=lpips, longest=longest)
         if score is not None:
             scores.append(score)
         if progress is not None:
@@ -117,10 +120,11 @@ def _view_score(
     *,
     masks: MaskUse,
     lpips: Callable[[torch.Tensor, torch.Tensor], float] | None,
+    longest: int | None,
 ) -> ViewScore | None:
     """The scores of a view; None where its mask keeps nothing that could be scored."""
-    rendered, photograph = render_and_photograph(field, view, masks=masks)
-    mask = load_mask(view) if masks == "ignore" else None
+    rendered, photograph = render_and_photograph(field, view, masks=masks, longest=longest)
+    mask = load_mask(view, longest=longest) if masks == "ignore" else None
     keep = None if mask is None else mask > 0
     if keep is not None:
         border = SSIM_WINDOW // 2
@@ -141,18 +145,19 @@ def render_and_photograph(
     view: View,
     *,
     masks: MaskUse = "off",
+    longest: int | None = None,
 ) -> tuple[UInt8[Tensor, "height width 3"], UInt8[Tensor, "height width 3"]]:
     """What a field shows in a view, and what the camera saw, both as 8-bit files hold them.
 
     Arguments and errors are those of `evaluate_photographs`.
     """
-    photograph = load_image(view)
-    with field.view(view.camera) as looked_at:
+    photograph = load_image(view, longest=longest)
+    with field.view(image_camera(view, longest)) as looked_at:
         shown = looked_at.signals()
     if shown.colour is None:
         raise InputError("field: expected colours of a view, got none.")
     image = shown.colour.double()
-    opaque = load_alpha(view) if masks == "alpha" else None
+    opaque = load_alpha(view, longest=longest) if masks == "alpha" else None
     if opaque is not None:
         image = image + (1 - shown.alpha.double())[..., None]
         photograph = _over_white(photograph, opaque, view)

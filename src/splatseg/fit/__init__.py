@@ -23,5 +23,6 @@ from splatseg.fit._records import FitRecord as FitRecord
 from splatseg.fit._records import FitResult as FitResult
 from splatseg.fit._refine import Refinement as Refinement
 from splatseg.fit._refine import refine as refine
+from splatseg.fit._sensible import sensible_steps as sensible_steps
 from splatseg.fit._start import random_point_count as random_point_count
 from splatseg.fit._step import ExtraLoss as ExtraLoss

@@ -15,11 +15,6 @@ def spread(items: Sequence[_T], count: int) -> tuple[_T, ...]:
     return tuple(items[i * len(items) // kept] for i in range(kept))
 
 
-def count_text(count: int) -> str:
-    """A count with thin spaces between thousands."""
-    return f"{count:,}".replace(",", "\N{THIN SPACE}")
-
-
 def environment() -> dict[str, Any]:
     """What a report was made with."""
     return {

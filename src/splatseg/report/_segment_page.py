@@ -11,8 +11,8 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, ClassTable, Labels, RenderableLayer
 from splatseg.evaluate.metrics import SemanticScore
 from splatseg.evaluate.overlaps import InstanceScore
-from splatseg.report._common import count_text
-from splatseg.report._segment_panels import ViewPanel, gallery
+from splatseg.report._object_facts import ObjectFacts, object_cards
+from splatseg.report._segment_panels import ViewPanel, confidence_range, gallery
 from splatseg.report._segment_tables import (
     association_tables,
     confidence_bars,
@@ -21,10 +21,14 @@ from splatseg.report._segment_tables import (
     difference_tables,
     fact_rows,
     id_table,
+    instances_without_labels,
     seen_id_table,
     support_table,
 )
-from splatseg.report.html import Block, Commands, Figure, Legend, Report, Table
+from splatseg.report.html import Block, Figure, Legend, Notice, Report, Table
+from splatseg.report.images import ObjectGallery, Scale
+from splatseg.report.object_gallery import MAX_OBJECTS
+from splatseg.report.words import count_text, counted
 
 _LEGEND = 40
 
@@ -77,6 +81,15 @@ class SegmentationReportData:
     """Largest resident memory of the process."""
 
     command: str = ""
+    objects: tuple[ObjectFacts, ...] = ()
+    """What is known of each id."""
+
+    looked_at: int = 0
+    """Views that objects were looked for in."""
+
+    warnings: tuple[str, ...] = ()
+    """What a reader should know before all else, in sentences."""
+
     tree: tuple[Block, ...] = ()
     """What there is to show of the levels above and below, see `tree_section`."""
 
@@ -102,8 +115,9 @@ def segmentation_page(data: SegmentationReportData, *, longest: int) -> Report:
                 longest=longest,
             )
         )
-        blocks.append(_legend(data))
-    blocks += data.tree
+        low, high = confidence_range(data.panels)
+        blocks += [_scale(low, high), _legend(data)]
+    blocks += [_objects(data), *data.tree]
     if labels is not None:
         blocks += [support_table(labels), confidence_bars(labels)]
     if data.seen_of:
@@ -119,18 +133,56 @@ def segmentation_page(data: SegmentationReportData, *, longest: int) -> Report:
         else id_table(labels, data.classes, scores=scores, scored=data.scored)
     )
     blocks += _cost(data)
-    if data.command:
-        blocks.append(Commands(title="The same from the shell", lines=(data.command,)))
-    method = data.summary.info.method or "unknown"
-    carriers = "" if labels is None else f" on {count_text(len(labels))} Gaussians"
     return Report(
         title=f"Segmentation {data.layer}",
-        summary=f"{len(data.classes.rows)} labels{carriers}, by {method} from {data.views} views. "
-        + (f"Scores are of {data.scored}." if data.scored else "There is no truth to score."),
+        summary=_summary(data),
+        command=data.command,
+        notices=tuple(
+            Notice(verdict="Take care", sentence=words, warns=True) for words in data.warnings
+        ),
         figures=_figures(data),
         blocks=tuple(blocks),
         facts=data.facts,
     )
+
+
+def _summary(data: SegmentationReportData) -> str:
+    method = data.summary.info.method or "an unknown method"
+    labels = counted(len(data.classes.rows), "label")
+    carriers = "" if data.labels is None else f" on {counted(len(data.labels), 'Gaussian')}"
+    return " ".join(
+        [
+            f"{labels}{carriers}, by {method} from {counted(data.views, 'view')}.",
+            *instances_without_labels(data.summary),
+            f"Scores are of {data.scored}." if data.scored else "There is no truth to score.",
+        ]
+    )
+
+
+def _scale(low: float, high: float) -> Scale:
+    return Scale(
+        title="Confidence",
+        low=f"{low:.2f} or less" if low > 0 else "0",
+        high=f"{high:.2f} or more" if high < 1 else "1",
+        note="Confidence is the share of the votes that speak for a label; nothing is there where "
+        "it is nearly black.",
+    )
+
+
+def _objects(data: SegmentationReportData) -> ObjectGallery:
+    """The largest objects, each from the view that shows it best."""
+    kept = data.objects[:MAX_OBJECTS]
+    more = len(data.objects) - len(kept)
+    notes = [f"The {len(kept)} largest; {more} more are in the JSON file."] if more else []
+    notes.append(
+        f"Each from the one of {counted(data.looked_at, 'view')} that shows most of it; what is "
+        "not it is grey."
+    )
+    folders = sorted({one.file.rpartition("/")[0] for one in kept if one.file})
+    notes += [f"Files are in {folder}, in the scene's folder." for folder in folders]
+    if not folders:
+        notes.append("segment --export writes each into a file of its own.")
+    return ObjectGallery(title="Objects", cards=object_cards(kept), note=" ".join(notes))
 
 
 def _legend(data: SegmentationReportData) -> Legend:
@@ -144,7 +196,11 @@ def _legend(data: SegmentationReportData) -> Legend:
     rows = {row.id: row for row in data.classes.rows}
     kept = [rows[id] for id in ids[:_LEGEND] if id in rows]
     more = f", the {len(kept)} seen most of {len(ids)}" if len(ids) > len(kept) else ""
-    return Legend(classes=ClassTable(rows=tuple(kept)), title=f"Colours of the labels{more}")
+    return Legend(
+        classes=ClassTable(rows=tuple(kept)),
+        title=f"Colours of the labels{more}",
+        with_ids=True,
+    )
 
 
 def _figures(data: SegmentationReportData) -> tuple[Figure, ...]:
@@ -163,7 +219,7 @@ def _figures(data: SegmentationReportData) -> tuple[Figure, ...]:
             Figure(
                 label="Evidence that differs from the layer",
                 value=f"{differ / max(pixels, 1):.1%}",
-                note=f"of the pixels of {len(data.compared)} views",
+                note=f"of the pixels of {counted(len(data.compared), 'view')}",
             )
         )
     if isinstance(score, SemanticScore):

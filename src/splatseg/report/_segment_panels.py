@@ -1,5 +1,6 @@
 """What a report of a segmentation shows of single views."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,9 +21,11 @@ from splatseg.core import (
 )
 from splatseg.evaluate.agreement import Agreement, agreement
 from splatseg.evaluate.held_out import label_map_in
+from splatseg.evaluate.metrics import psnr
 from splatseg.evaluate.overlaps import Overlaps, instance_score
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import image_camera, load_image, reduced_size
+from splatseg.report.drawn_ids import draw_ids
 from splatseg.report.images import (
     Gallery,
     GalleryImage,
@@ -47,6 +50,9 @@ class ViewPanel:
     held_out: bool
     image: UInt8[Tensor, "height width 3"]
     """The photograph, or the rendering where there is none."""
+
+    rendered: UInt8[Tensor, "height width 3"] | None
+    """The rendering, beside a photograph."""
 
     drawn: Int[Tensor, "height width"]
     """The layer."""
@@ -84,9 +90,8 @@ def view_panel(
     with field.view(camera) as looked_at:
         shown = label_map_in(looked_at, layer, camera).ids
         confidence = looked_at.confidence(layer)
-        if view.image is None:
-            image = rendered_image(looked_at, size)
-        else:
+        image = rendered = rendered_image(looked_at, size)
+        if view.image is not None:
             image = _resized(load_image(view, longest=max(size)), size)
     seen = _evidence_ids(evidence, view.name)
     seen = None if seen is None else _nearest(seen, size)
@@ -94,6 +99,7 @@ def view_panel(
         name=view.name,
         held_out=held_out,
         image=image,
+        rendered=None if view.image is None else rendered,
         drawn=shown,
         confidence=confidence,
         evidence=seen,
@@ -130,6 +136,22 @@ def rename_truth(panels: Sequence[ViewPanel]) -> dict[int, int]:
     }
 
 
+def confidence_range(panels: Sequence[ViewPanel]) -> tuple[float, float]:
+    """What confidence is shown darkest and lightest: what all but a fiftieth of the pixels have.
+
+    Both are whole twentieths, at least two of them apart.
+    """
+    values = torch.cat([torch.zeros(0), *(panel.confidence.reshape(-1) for panel in panels)])
+    values = values[values >= 0].double()
+    if not len(values):
+        return 0.0, 1.0
+    values = values[:: max(1, len(values) // 1_000_000)]
+    low, high = torch.quantile(values, torch.tensor((0.02, 0.98), dtype=values.dtype)).tolist()
+    high = min(1.0, math.ceil(20 * high) / 20)
+    low = max(0.0, math.floor(20 * low) / 20)
+    return (low, high) if high - low >= 0.1 else (max(0.0, high - 0.1), max(high, 0.1))
+
+
 def gallery(
     panels: Sequence[ViewPanel],
     classes: ClassTable,
@@ -147,41 +169,50 @@ def gallery(
         evidence_has_same_ids: Evidence is coloured as the layer is; otherwise by its own ids.
         longest: Of the pictures, pixels.
     """
+    with_photographs = any(panel.rendered is not None for panel in panels)
     with_evidence = any(panel.evidence is not None for panel in panels)
     with_truth = any(panel.truth is not None for panel in panels)
-    columns = ["photograph", "labels on it", "confidence"]
-    if with_evidence:
-        columns.insert(1, "evidence as it came")
-    if with_truth:
-        columns += ["truth", "errors in red"]
+    columns = ["photograph", "rendered"] if with_photographs else ["rendered"]
+    columns += ["evidence as it came"] * with_evidence + ["labels on it", "confidence"]
+    columns += ["truth", "errors in red"] * with_truth
+    low, high = confidence_range(panels)
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for panel in panels:
         size = _size(panel.image, longest)
         photograph = _resized(panel.image, size)
         drawn = _nearest(panel.drawn, size)
-        shown = [
-            GalleryImage(image=photograph),
-            GalleryImage(image=overlay_labels(photograph, drawn, classes)),
-            GalleryImage(image=colour_share(_nearest(panel.confidence, size))),
-        ]
+        shown = [GalleryImage(image=photograph)]
+        if with_photographs:
+            shown.append(_rendered(panel, size))
         if with_evidence:
             table = classes if evidence_has_same_ids else None
-            shown.insert(1, _evidence_image(panel, table, size))
+            shown.append(_evidence_image(panel, table, size))
+        confidence = _nearest(panel.confidence, size)
+        shown += [
+            GalleryImage(image=draw_ids(overlay_labels(photograph, drawn, classes), drawn)),
+            GalleryImage(image=colour_share(confidence, low=low, high=high)),
+        ]
         if with_truth:
             shown += _truth_images(panel, classes, truth_names, photograph)
-        label = f"{panel.name}, held out" if panel.held_out else panel.name
-        rows.append((label, tuple(shown)))
+        rows.append((f"{panel.name}, held out" if panel.held_out else panel.name, tuple(shown)))
     return Gallery(
         title="What it looks like",
         columns=tuple(columns),
         rows=tuple(rows),
-        note="Confidence goes from dark (no share of the votes) to light (all of them). "
+        note="Numbers are ids of the layer. A click, or the Enter key, enlarges a picture. "
         + (
             "Errors: red is a wrong label, blue none; grey pixels are right or void."
             if with_truth
             else ""
         ),
     )
+
+
+def _rendered(panel: ViewPanel, size: tuple[int, int]) -> GalleryImage:
+    if panel.rendered is None:
+        return _nothing(size)
+    likeness = psnr(panel.rendered, panel.image)
+    return GalleryImage(image=_resized(panel.rendered, size), caption=f"{likeness:.1f} dB")
 
 
 def _evidence_image(

@@ -12,11 +12,12 @@ from splatseg.core import (
     ClassTable,
     Labels,
     LayerInfo,
+    RenderableLayer,
 )
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
-from splatseg.report._common import count_text
 from splatseg.report._segment_panels import ViewPanel
 from splatseg.report.html import Bars, Block, Cell, Table
+from splatseg.report.words import count_text
 
 _BINS = 10
 _MIN_VIEWS = (1, 2, 3, 5, 10, 20, 50, 100)
@@ -172,6 +173,23 @@ def association_tables(info: LayerInfo) -> list[Block]:
             title = name.replace("_", " ").capitalize()
             blocks.append(Table(title=title, columns=("what", "value"), rows=tuple(rows[:_ROWS])))
     return blocks
+
+
+def instances_without_labels(layer: RenderableLayer) -> list[str]:
+    """A sentence on instances that no Gaussian carries, where the method says how many it made."""
+    facts = layer.info.details.get("associate")
+    made = facts.get("instances") if isinstance(facts, Mapping) else None
+    merged = layer.info.edit("merge_panoptic") is not None
+    if not isinstance(made, int) or merged or layer.info.cut not in (None, "object"):
+        return []
+    lost = made - len([id for id in layer.ids if id != layer.background])
+    if lost <= 0:
+        return []
+    nouns = ("instance", "has", "its") if lost == 1 else ("instances", "have", "their")
+    return [
+        f"Masks were joined into {made} instances; {lost} {nouns[0]} {nouns[1]} no label, for "
+        f"other instances won all of {nouns[2]} Gaussians."
+    ]
 
 
 def id_table(

@@ -12,7 +12,7 @@ from jaxtyping import Int
 from PIL import Image
 from torch import Tensor
 
-from splatseg.core import ClassTable, Labels, Scene
+from splatseg.core import ClassTable, InstanceTree, Labels, RenderableLayer, Scene
 from splatseg.errors import InputError
 from splatseg.evaluate import Confusion, SemanticScore, psnr, semantic_score
 from splatseg.io.atomic import atomic_file
@@ -21,7 +21,8 @@ from splatseg.io.images import load_image, save_png
 from splatseg.io.json_files import read_json
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import label_map
-from splatseg.report._common import count_text, environment, spread
+from splatseg.report._common import environment, spread
+from splatseg.report.drawn_ids import draw_ids
 from splatseg.report.html import Bars, Commands, Figure, Legend, Report, Table, report_html
 from splatseg.report.images import (
     Gallery,
@@ -30,7 +31,9 @@ from splatseg.report.images import (
     contact_sheet,
     mark_errors,
 )
+from splatseg.report.layer_colours import layer_colours
 from splatseg.report.legend import colour_labels
+from splatseg.report.words import count_text, counted
 
 _HELD_OUT_ROWS = 6
 _TRAIN_ROWS = 4
@@ -126,7 +129,8 @@ def _sheet(figures: DemoFigures, held_out: Gallery, classes: ClassTable) -> Tens
             rows=spread(held_out.rows, _SHEET_ROWS),
         ),
         subtitle=(
-            f"PSNR {figures.test['PSNR']:.1f} dB on {figures.test['photographs']} held-out views; "
+            f"PSNR {figures.test['PSNR']:.1f} dB on "
+            f"{counted(figures.test['photographs'], 'held-out view')}; "
             f"mIoU of the labels {figures.came.miou:.2f} as they came, "
             f"{figures.test['mIoU']:.2f} lifted into 3D and rendered"
         ),
@@ -141,7 +145,7 @@ def _figures(figures: DemoFigures, scene: Scene) -> tuple[Figure, ...]:
         Figure(
             label="Pictures of held-out views",
             value=f"{figures.test['PSNR']:.1f} dB",
-            note=f"PSNR, mean of {figures.test['photographs']} views; "
+            note=f"PSNR, mean of {counted(figures.test['photographs'], 'view')}; "
             f"SSIM {figures.test['SSIM']:.3f}",
         ),
         Figure(
@@ -174,6 +178,13 @@ def _held_out_gallery(
 ) -> Gallery:
     """Photograph, rendering, depth, labels, truth, errors and objects of some test views."""
     renders = folder / "render"
+    tree = load_scene_layer(folder / "scene", objects)
+    found = tree.cut() if isinstance(tree, InstanceTree) else tree
+    colours = None
+    if isinstance(found, Labels):
+        colours = layer_colours(
+            RenderableLayer.of(found), None, gaussians=scene.gaussians, labels=found
+        )
     unit = read_json(renders / "depth" / "depth.json")["unit"]
     views = spread(scene.test_views, _HELD_OUT_ROWS)
     depths = [_read(renders / "depth" / f"{view.name}.png").double() * unit for view in views]
@@ -198,7 +209,9 @@ def _held_out_gallery(
                         image=mark_errors(photograph, ids, truth=true),
                         caption=f"{_right(ids, true):.1%} right",
                     ),
-                    _labels(things, None),
+                    GalleryImage(
+                        image=draw_ids(colour_labels(things, colours), things), kind="chart"
+                    ),
                 ),
             )
         )
@@ -215,7 +228,8 @@ def _held_out_gallery(
         ),
         rows=tuple(rows),
         note="No photograph and no label of these views was used before. Objects come from masks "
-        "that need no weights, joined in 3D; their colours are arbitrary.",
+        "that need no weights, joined in 3D; objects.html in scene/reports shows each of "
+        "them by its number.",
     )
 
 

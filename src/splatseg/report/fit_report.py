@@ -6,15 +6,16 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from importlib import metadata
-from typing import Any
+from typing import Any, cast
 
 from splatseg.core import Capture, View
 from splatseg.evaluate.photographs import PhotographReport
 from splatseg.fit import FitOptions, FitRecord, FitResult, reduction_note
-from splatseg.report._common import count_text
 from splatseg.report.chart import Chart, Line
-from splatseg.report.html import Bars, Block, Commands, Curves, Figure, Report, Table
+from splatseg.report.fit_verdict import FitVerdict, fit_verdict, scored_of
+from splatseg.report.html import Bars, Block, Curves, Figure, Notice, Report, Table
 from splatseg.report.images import Gallery
+from splatseg.report.words import count_text
 
 _LONG_LIST = 200
 
@@ -44,16 +45,33 @@ class FitReportData:
     poses: Mapping[str, Any] | None = None
     """What structure from motion said, where it found the poses."""
 
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Seconds of the command by part: poses, optimisation, what follows it."""
+
     facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """More of how it was made, such as the backend."""
 
 
-def fit_report(data: FitReportData, *, pairs: Gallery | None = None) -> Report:
+def verdict_of(data: FitReportData) -> FitVerdict:
+    """What the fit is good for."""
+    return fit_verdict(
+        steps=data.result.steps,
+        train_views=sum(view.image is not None for view in data.capture.train_views),
+        interrupted=data.result.interrupted,
+        scores=data.scores,
+        held_out=data.held_out,
+    )
+
+
+def fit_report(
+    data: FitReportData, *, pairs: Gallery | None = None, cameras: Gallery | None = None
+) -> Report:
     """The page.
 
     Args:
         data: The fit.
-        pairs: Photographs beside pictures of held-out views.
+        pairs: Photographs beside renders of held-out views, the worst first.
+        cameras: Where cameras stood.
     """
     result, scores = data.result, data.scores
     rate = result.steps / max(result.seconds, 1e-9)
@@ -64,18 +82,21 @@ def fit_report(data: FitReportData, *, pairs: Gallery | None = None) -> Report:
         else "No held-out view was scored."
     )
     blocks: list[Block] = [] if pairs is None else [pairs]
+    if scores is not None:
+        blocks.append(_score_table(scores))
+    if cameras is not None:
+        blocks.append(cameras)
     curves = _curves(result.history)
     if curves is not None:
         blocks.append(curves)
-    blocks += [_stages(result), _input(data), _output(data)]
-    if scores is not None:
-        blocks.append(_score_table(scores))
+    blocks += [_stages(result), _time(data), _input(data), _output(data)]
     blocks.append(_changed_options(data.options))
-    if data.command:
-        blocks.append(Commands(title="The same from the shell", lines=(data.command,)))
+    verdict = verdict_of(data)
     return Report(
         title=f"Fit of {data.capture.path.name}",
         summary=f"{_length(result)}, {rate:.1f} steps a second. {ended}{held_out}",
+        command=data.command,
+        notices=(Notice(verdict=verdict.words, sentence=verdict.sentence, warns=verdict.warns),),
         figures=_figures(data),
         blocks=tuple(blocks),
         facts=_facts(data),
@@ -84,13 +105,17 @@ def fit_report(data: FitReportData, *, pairs: Gallery | None = None) -> Report:
 
 def fit_record(data: FitReportData) -> dict[str, Any]:
     """The same as values that JSON holds: fit.json."""
-    result, scores = data.result, data.scores
+    result, scores, verdict = data.result, data.scores, verdict_of(data)
     return {
         "made_by": "splatseg fit",
         "command": data.command,
         "interrupted": result.interrupted,
         "steps": result.steps,
+        "sensible_steps": verdict.sensible_steps,
+        "too_short": verdict.too_short,
+        "verdict": f"{verdict.words}. {verdict.sentence}",
         "seconds": round(result.seconds, 3),
+        "seconds_by_part": {name: round(spent, 3) for name, spent in data.timings.items()},
         "gaussians": len(result.gaussians),
         "file_bytes": data.file_bytes,
         "held_out": None
@@ -122,15 +147,21 @@ def _figures(data: FitReportData) -> tuple[Figure, ...]:
     result, scores = data.result, data.scores
     out: list[Figure] = []
     if scores is not None:
-        of = f"{len(scores.views)} of {data.held_out}"
         out.append(
             Figure(
                 label="Held-out views",
                 value=f"{scores.psnr:.2f} dB",
-                note=f"PSNR, mean of {of} views; worst {scores.psnr_min:.2f} dB",
+                note=f"PSNR, mean of {scored_of(scores, data.held_out)}; worst "
+                f"{scores.psnr_min:.2f} dB",
             )
         )
-        out.append(Figure(label="Likeness", value=f"{scores.ssim:.3f}", note="SSIM, mean"))
+        out.append(
+            Figure(
+                label="SSIM",
+                value=f"{scores.ssim:.3f}",
+                note=f"mean of {scored_of(scores, data.held_out)}",
+            )
+        )
     if result.history:
         out.append(
             Figure(
@@ -185,6 +216,25 @@ def _stages(result: FitResult) -> Bars:
     )
 
 
+def _time(data: FitReportData) -> Table:
+    """What each part of the command took; `--minutes` is the length of one of them."""
+    rows = [(name, _duration(spent)) for name, spent in data.timings.items()]
+    if len(rows) > 1:
+        rows.append(("together", _duration(sum(data.timings.values()))))
+    return Table(
+        title="Time",
+        columns=("part", "time"),
+        rows=tuple(rows or [("optimisation", _duration(data.result.seconds))]),
+        note="--minutes is the length of the optimisation; finding poses comes before it, scores "
+        "and this report after it.",
+    )
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
+
+
 def _input(data: FitReportData) -> Table:
     notes = (*data.capture.notes, *data.result.notes)
     rows = [*_input_rows(data), *(("note", note) for note in notes)]
@@ -223,12 +273,20 @@ def _pose_rows(poses: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What structure from motion says of itself, as far as it fits into a cell."""
     rows: list[tuple[str, str]] = []
     for name, value in poses.items():
-        words = f"{len(value)}" if isinstance(value, (list, dict)) else str(value)
-        if isinstance(value, float):
-            words = f"{value:.3f}"
+        words = f"{value:.3f}" if isinstance(value, float) else str(value)
+        if name == "seconds" and isinstance(value, Mapping):
+            words = _pose_seconds(cast(Mapping[str, float], value))
+        elif isinstance(value, (list, tuple, dict)):
+            words = f"{len(cast(Sequence[Any], value))}"
         if len(words) <= _LONG_LIST:
             rows.append((f"poses: {name.replace('_', ' ')}", words))
     return rows
+
+
+def _pose_seconds(seconds: Mapping[str, float]) -> str:
+    """The whole, and the stages that it was made of."""
+    stages = ", ".join(f"{stage} {spent:.1f}" for stage, spent in seconds.items())
+    return f"{sum(seconds.values()):.1f} s" + (f" ({stages})" if stages else "")
 
 
 def _output(data: FitReportData) -> Table:
@@ -239,18 +297,25 @@ def _output(data: FitReportData) -> Table:
         ("harmonics", f"degree {gaussians.sh_degree}"),
         ("file", f"{data.file_bytes / 1e6:.1f} MB"),
         ("steps", str(result.steps)),
+        ("steps that make sense", f"{verdict_of(data).sensible_steps} or more"),
         ("time", f"{result.seconds:.1f} s"),
-        ("ended", "interrupted" if result.interrupted else "as planned"),
+        ("ended", _ended(data)),
     ]
     if data.scores is not None:
         rows.append(("held-out views scored", f"{len(data.scores.views)} of {data.held_out}"))
     return Table(title="What came out", columns=("what", "value"), rows=tuple(rows))
 
 
+def _ended(data: FitReportData) -> str:
+    if data.result.interrupted:
+        return "interrupted"
+    return "as asked for, which is too short" if verdict_of(data).too_short else "as planned"
+
+
 def _score_table(scores: PhotographReport) -> Table:
     worst_first = sorted(scores.per_view, key=lambda score: score.psnr)
     return Table(
-        title="Held-out views, the worst first",
+        title="Scores of held-out views, the worst first",
         columns=("view", "PSNR, dB", "SSIM"),
         rows=tuple((score.name, score.psnr, score.ssim) for score in worst_first),
     )

@@ -18,8 +18,14 @@ _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 _WRONG: Colour = (226, 48, 48)
 _UNKNOWN: Colour = (90, 120, 220)
-# From far to near: dark blue, teal, sand. Its brightness grows steadily.
-_DEPTH_STEPS = ((22, 24, 60), (26, 74, 118), (38, 132, 138), (126, 184, 126), (244, 226, 150))
+SHADES: tuple[Colour, ...] = (
+    (22, 24, 60),
+    (26, 74, 118),
+    (38, 132, 138),
+    (126, 184, 126),
+    (244, 226, 150),
+)
+"""From far to near, from little to much: dark blue, teal, sand. Brightness grows steadily."""
 
 _PAPER: Colour = (250, 249, 246)
 _INK: Colour = (32, 34, 40)
@@ -67,6 +73,47 @@ class Gallery:
                 )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObjectCard:
+    """One object of a layer, as a page shows it."""
+
+    id: int
+    name: str
+    """Empty where it has none."""
+
+    colour: Colour
+    """That of its id in every picture."""
+
+    image: GalleryImage | None
+    """It, cut out of the view that shows it best; None where no view that was looked at does."""
+
+    facts: tuple[tuple[str, str], ...]
+    """What is known of it: names and values."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObjectGallery:
+    """Objects beside each other."""
+
+    title: str
+    cards: tuple[ObjectCard, ...]
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scale:
+    """What the shades of `colour_share` mean."""
+
+    title: str
+    low: str
+    """What is shown darkest."""
+
+    high: str
+    """What is shown lightest."""
+
+    note: str = ""
+
+
 def colour_depth(
     depth: Float[Tensor, "height width"], *, near: float | None = None, far: float | None = None
 ) -> UInt8[Tensor, "height width 3"]:
@@ -110,10 +157,16 @@ def overlay_labels(
     return torch.where(edge.unsqueeze(-1), 0.5 * out + 120, out).round().to(torch.uint8)
 
 
-def colour_share(values: Float[Tensor, "height width"]) -> UInt8[Tensor, "height width 3"]:
-    """Values from dark blue (0) to sand (1); nearly black where they are negative, nothing."""
+def colour_share(
+    values: Float[Tensor, "height width"], *, low: float = 0.0, high: float = 1.0
+) -> UInt8[Tensor, "height width 3"]:
+    """Values from dark blue (`low` and less) to sand (`high` and more).
+
+    Nearly black where they are negative: nothing is there.
+    """
     check_shape("values", values, (None, None))
-    mixed = _ramp(values.double().clamp(0, 1)).round()
+    stretched = (values.double() - low) / max(high - low, 1e-9)
+    mixed = _ramp(stretched.clamp(0, 1)).round()
     nothing = torch.tensor(NOTHING, dtype=torch.float64)
     return torch.where((values >= 0).unsqueeze(-1), mixed, nothing).to(torch.uint8)
 
@@ -217,7 +270,7 @@ def _swatches(
 
 def _ramp(share: Tensor) -> Tensor:
     """Colours, as float64, of values in [0, 1]."""
-    steps = torch.tensor(_DEPTH_STEPS, dtype=torch.float64)
+    steps = torch.tensor(SHADES, dtype=torch.float64)
     position = share * (len(steps) - 1)
     low = position.floor().long().clamp(max=len(steps) - 2)
     return torch.lerp(steps[low], steps[low + 1], (position - low).unsqueeze(-1))

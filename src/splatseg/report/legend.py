@@ -51,13 +51,22 @@ def names_of(layer: RenderableLayer, classes: ClassTable | None) -> dict[int, st
     return dict(layer.info.names) or {row.id: row.name for row in rows if row.id in present}
 
 
-def legend_of(layer: RenderableLayer, classes: ClassTable | None) -> dict[str, Any]:
-    """The content of legend.json for a layer."""
+def legend_of(
+    layer: RenderableLayer, classes: ClassTable | None, *, colours: ClassTable | None = None
+) -> dict[str, Any]:
+    """The content of legend.json for a layer.
+
+    Args:
+        layer: What is known of it.
+        classes: Of the scene.
+        colours: Of its ids, see `splatseg.report.layer_colours`; None takes those of the classes.
+    """
+    colours = classes if colours is None else colours
     names = names_of(layer, classes)
     sources = layer.info.source_ids or {}
     rows: dict[str, dict[str, Any]] = {}
     for id in layer.ids:
-        rows[str(id)] = {"name": names.get(id, ""), "colour": list(colour_of(id, classes))}
+        rows[str(id)] = {"name": names.get(id, ""), "colour": list(colour_of(id, colours))}
         if id in sources:
             rows[str(id)]["source_id"] = sources[id]
     background = 0 if layer.background == UNLABELLED else layer.background

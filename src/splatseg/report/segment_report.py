@@ -1,10 +1,13 @@
 """The report of a segmentation: what was seen, what became of it, and what it rests on."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from pathlib import Path
 from typing import Any
 
 from splatseg.core import (
+    ClassTable,
     InstanceTree,
     Labels,
     LabelSource,
@@ -17,12 +20,17 @@ from splatseg.evaluate.agreement import SEEN_LONGEST, views_that_show
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
 from splatseg.evaluate.overlaps import InstanceScore, Overlaps, instance_score
 from splatseg.io.atomic import atomic_file
+from splatseg.io.json_files import write_json
 from splatseg.methods import keeps_ids
 from splatseg.report._common import environment, spread
-from splatseg.report._segment_ids import class_table, ids_agree, ids_are_classes
+from splatseg.report._object_facts import ObjectFacts, object_facts
+from splatseg.report._segment_ids import ids_agree, ids_are_classes
 from splatseg.report._segment_page import SegmentationReportData, segmentation_page
 from splatseg.report._segment_panels import ViewPanel, rename_truth, view_panel
+from splatseg.report._segment_record import segmentation_record
 from splatseg.report.html import report_html
+from splatseg.report.layer_colours import layer_colours
+from splatseg.report.object_gallery import MAX_OBJECTS, MAX_VIEWS, sightings
 from splatseg.report.tree_section import tree_section
 
 _LEARNED_ROWS = 4
@@ -30,11 +38,34 @@ _HELD_OUT_ROWS = 3
 _TREE_ROWS = 3
 _COMPARED = 12
 _COVERAGE_VIEWS = 100
-_LARGEST = 4_500_000
+_LARGEST = 9_000_000
 """Bytes of the page above which its pictures are made smaller."""
 
-_IMAGE_SIZES = (448, 320, 224, 128)
+_IMAGE_SIZES = (640, 448, 320, 224, 128)
 """Longest sides of the pictures, pixels, the one to prefer first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SegmentationRun:
+    """How the layer of a report was made, for its reader. Everything may be left out."""
+
+    timings: Mapping[str, float] = dataclass_field(default_factory=dict[str, float])
+    """Seconds by step."""
+
+    peak_bytes: int | None = None
+    """Largest resident memory of the process."""
+
+    command: str = ""
+    """The words that started it."""
+
+    files: Mapping[int, str] = dataclass_field(default_factory=dict[int, str])
+    """Where objects were exported to, by id."""
+
+    warnings: tuple[str, ...] = ()
+    """What a reader should know before all else, in sentences."""
+
+    backend: str = "auto"
+    """Who renders, said in the page and asked what views show of Gaussians."""
 
 
 def write_segmentation_report(
@@ -46,20 +77,18 @@ def write_segmentation_report(
     evidence: LabelSource | None,
     views: Sequence[View],
     truth: LabelSource | None = None,
-    timings: Mapping[str, float],
-    peak_bytes: int | None,
-    command: str,
     labels: Labels | None = None,
     tree: InstanceTree | None = None,
-    backend: str = "auto",
+    run: SegmentationRun | None = None,
 ) -> None:
-    """Write the report of a segmentation as one HTML file; atomic.
+    """Write the report of a segmentation as one HTML file, and beside it as JSON; both atomic.
 
     A few of the views are shown, spread over all of them, and a few held-out ones; coverage is
-    measured in at most 100. The file stays below 5 MB.
+    measured in at most 100, and objects are looked for in at most 60. At most 1000 objects are
+    shown, the JSON has all. The page stays below 10 MB.
 
     Args:
-        path: The file to write. Its folder must exist.
+        path: The file to write, NAME.html; NAME.json comes beside it. Its folder must exist.
         scene: The scene.
         field: What is rendered: its Gaussians, or another field of the same views.
         layer: Name of the field's layer.
@@ -67,18 +96,38 @@ def write_segmentation_report(
         views: Those it was made from.
         truth: True maps of any views, of classes or of instances; ids that do not mean the same
             as the layer's are matched.
-        timings: Seconds by step.
-        peak_bytes: Largest resident memory of the process; None leaves it out.
-        command: The words that started it; may be empty.
         labels: The labels of Gaussians of the scene, of which tables tell; None leaves these out,
             where the layer is not one of Gaussians.
         tree: The layer with all its levels, where it has levels; `labels` is a cut of it.
-        backend: Who renders, said in the page and asked what views show of Gaussians.
+        run: How it was made.
 
     Raises:
         MissingFileError: If the folder, or a photograph that is shown, is not there.
         ShapeError: If a truth does not have its photograph's proportions.
     """
+    data = _gathered(
+        scene, field, layer, views,
+        evidence=evidence, truth=truth, labels=labels, tree=tree, run=run or SegmentationRun(),
+    )  # fmt: skip
+    page = _small_page(data)
+    with atomic_file(path) as temporary:
+        temporary.write_text(page, encoding="utf-8", newline="\n")
+    write_json(path.with_suffix(".json"), segmentation_record(data))
+
+
+def _gathered(
+    scene: Scene,
+    field: Renderable,
+    layer: str,
+    views: Sequence[View],
+    *,
+    evidence: LabelSource | None,
+    truth: LabelSource | None,
+    labels: Labels | None,
+    tree: InstanceTree | None,
+    run: SegmentationRun,
+) -> SegmentationReportData:
+    """Everything that the page and its JSON tell."""
     summary = field.layer(layer)
     same = evidence is not None and ids_agree(
         summary, evidence, otherwise=keeps_ids(summary.info.method or "uplift")
@@ -87,32 +136,56 @@ def write_segmentation_report(
         scene, field, layer, views, evidence=evidence, truth=truth, same_ids=same
     )
     looked_at = () if labels is None else spread(views, _COVERAGE_VIEWS)
-    seen = views_that_show(scene.gaussians, looked_at, backend=backend)
     truth_names, score, scored = _scores(summary, evidence, truth, panels)
     shown = [scene.view(panel.name) for panel in panels[:_TREE_ROWS]]
-    data = SegmentationReportData(
+    known = scene.classes if summary.info.names or ids_are_classes(evidence) else None
+    colours = layer_colours(summary, known, gaussians=scene.gaussians, labels=labels)
+    return SegmentationReportData(
         layer=layer,
         summary=summary,
         labels=labels,
-        classes=class_table(summary, scene.classes, unnamed_are_classes=ids_are_classes(evidence)),
+        classes=colours,
         panels=panels,
         compared=tuple(s for s in (*panels, *further) if s.agreement is not None),
-        seen=seen,
+        seen=views_that_show(scene.gaussians, looked_at, backend=run.backend),
         seen_of=len(looked_at),
         views=len(views),
         score=score,
         scored=scored,
         evidence_has_same_ids=same,
         truth_names=truth_names,
-        timings=timings,
-        peak_bytes=peak_bytes,
-        command=command,
-        tree=() if tree is None else tree_section(field, layer, tree, shown),
-        facts=_facts(summary, layer, backend),
+        timings=run.timings,
+        peak_bytes=run.peak_bytes,
+        command=run.command,
+        warnings=run.warnings,
+        objects=_objects(scene, field, layer, colours, labels=labels, files=run.files),
+        looked_at=min(MAX_VIEWS, sum(map(_at_hand, scene.views))),
+        tree=()
+        if tree is None
+        else tree_section(field, layer, tree, shown, gaussians=scene.gaussians),
+        facts=_facts(summary, layer, run.backend),
     )
-    page = _small_page(data)
-    with atomic_file(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", newline="\n")
+
+
+def _objects(
+    scene: Scene,
+    field: Renderable,
+    layer: str,
+    colours: ClassTable,
+    *,
+    labels: Labels | None,
+    files: Mapping[int, str],
+) -> tuple[ObjectFacts, ...]:
+    """Each object with the picture of it, where it is among those that are shown."""
+    summary = field.layer(layer)
+    views = [view for view in scene.views if _at_hand(view)]
+    largest = object_facts(
+        summary, colours, labels=labels, classes=scene.classes, seen={}, files=files
+    )[:MAX_OBJECTS]
+    seen = sightings(field, layer, views, {one.id: one.colour for one in largest})
+    return object_facts(
+        summary, colours, labels=labels, classes=scene.classes, seen=seen, files=files
+    )
 
 
 def _panels(
@@ -180,7 +253,7 @@ def _scores(
     held_out = [panel for panel in with_truth if panel.held_out]
     scored = held_out or with_truth
     kind = "held-out view" if held_out else "view that the layer was made from"
-    words = f"{len(scored)} {kind.replace('view', 'views', 1) if len(scored) > 1 else kind}"
+    words = f"{len(scored)} {kind.replace('view', 'views', 1) if len(scored) != 1 else kind}"
     otherwise = ids_are_classes(evidence) and keeps_ids(layer.info.method or "uplift")
     if ids_agree(layer, truth, otherwise=otherwise):
         pooled = Confusion.none()

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
+from torch import Tensor
+
 from splatseg.core import (
     TREE_LEVELS,
     UNLABELLED,
-    ClassInfo,
     ClassTable,
+    Gaussians,
     InstanceTree,
     Renderable,
     View,
@@ -15,16 +17,22 @@ from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.export import node_rows
 from splatseg.io.images import image_camera, load_image
 from splatseg.report._segment_panels import rendered_image
+from splatseg.report.drawn_ids import draw_ids
 from splatseg.report.html import Block, Table
 from splatseg.report.images import Gallery, GalleryImage, overlay_labels
-from splatseg.report.legend import colour_of
+from splatseg.report.layer_colours import layer_colours
 
 _LONGEST = 448
 _MAX_ROWS = 400
 
 
 def tree_section(
-    field: Renderable, layer: str, tree: InstanceTree, views: Sequence[View]
+    field: Renderable,
+    layer: str,
+    tree: InstanceTree,
+    views: Sequence[View],
+    *,
+    gaussians: Gaussians,
 ) -> tuple[Block, ...]:
     """The pictures of three cuts in some views, and a table of all nodes, children indented.
 
@@ -33,17 +41,21 @@ def tree_section(
         layer: Name of the layer of the field.
         tree: The layer.
         views: Those that are rendered.
+        gaussians: Who carries the labels; colours follow from them.
     """
-    pictures = (_cuts(field, layer, tree, views),) if views else ()
+    pictures = (_cuts(field, layer, tree, views, gaussians),) if views else ()
     return (*pictures, _nodes(tree))
 
 
-def _cuts(field: Renderable, layer: str, tree: InstanceTree, views: Sequence[View]) -> Gallery:
-    table = ClassTable(
-        rows=tuple(
-            ClassInfo(id=node.id, name=node.name, colour=colour_of(node.id)) for node in tree.nodes
+def _cuts(
+    field: Renderable, layer: str, tree: InstanceTree, views: Sequence[View], gaussians: Gaussians
+) -> Gallery:
+    tables = {
+        level: layer_colours(
+            field.layer(f"{layer}@{level}"), None, gaussians=gaussians, labels=tree.cut(level)
         )
-    )
+        for level in TREE_LEVELS
+    }
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for view in views:
         camera = image_camera(view, _LONGEST)
@@ -59,7 +71,10 @@ def _cuts(field: Renderable, layer: str, tree: InstanceTree, views: Sequence[Vie
         rows.append(
             (
                 view.name,
-                tuple(GalleryImage(image=overlay_labels(photograph, ids, table)) for ids in drawn),
+                tuple(
+                    _picture(photograph, ids, tables[level])
+                    for level, ids in zip(TREE_LEVELS, drawn, strict=True)
+                ),
             )
         )
     return Gallery(
@@ -69,6 +84,10 @@ def _cuts(field: Renderable, layer: str, tree: InstanceTree, views: Sequence[Vie
         note="Groups hold objects, objects hold parts. What has no level above it, or none below, "
         "is shown at the next.",
     )
+
+
+def _picture(photograph: Tensor, ids: Tensor, colours: ClassTable) -> GalleryImage:
+    return GalleryImage(image=draw_ids(overlay_labels(photograph, ids, colours), ids))
 
 
 def _nodes(tree: InstanceTree) -> Table:

@@ -42,6 +42,8 @@ class ExportJob:
     """Of `ExportOptions.layer`, where that is one."""
 
     instances: Labels | None
+    files: Mapping[int, str]
+    """Where each object's splats are, by id, as far as that is known."""
 
     @property
     def objects(self) -> Labels:
@@ -76,6 +78,7 @@ def open_job(
     options: ExportOptions,
     layers: Mapping[str, Layer] | None,
     *,
+    files: Mapping[int, str],
     backend: BackendName,
     observer: Observer,
 ) -> ExportJob:
@@ -110,6 +113,7 @@ def open_job(
         classes=classes,
         selection=selection,
         instances=instances,
+        files=files,
     )
 
 
@@ -182,9 +186,21 @@ def meaning_of(job: ExportJob) -> dict[str, Any]:
     table: dict[str, Any] = {}
     classes = job.selection if job.classes is None else job.classes
     if classes is not None and job.options.layer is not None:
-        table |= label_tables(classes, "class", job.options.layer, job.scene.classes)
+        table |= label_tables(
+            classes,
+            "class",
+            job.options.layer,
+            job.scene.classes,
+            gaussians=job.scene.gaussians,
+        )
     if job.instances is not None and job.options.instances is not None:
-        table |= label_tables(job.instances, "instance", job.options.instances, job.scene.classes)
+        table |= label_tables(
+            job.instances,
+            "instance",
+            job.options.instances,
+            job.scene.classes,
+            gaussians=job.scene.gaussians,
+        )
     return table
 
 

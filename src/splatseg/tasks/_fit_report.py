@@ -1,7 +1,8 @@
 """The end of a fit: held-out views are scored and reports/fit.html is written."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,29 @@ from splatseg.io.scene import GAUSSIANS_FILE, POSES_FOLDER
 from splatseg.io.scene_folder import scene_path
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
-from splatseg.report.fit_report import FitReportData, fit_record, fit_report
+from splatseg.report.camera_map import camera_map
+from splatseg.report.fit_report import FitReportData, fit_record, fit_report, verdict_of
+from splatseg.report.fit_verdict import FitVerdict
 from splatseg.report.html import report_html
 from splatseg.report.images import Gallery, GalleryImage, colour_difference
 
+_NEXT = ("worst", "second worst", "third worst")
+
 # Scoring the held-out views may take this long, seconds: writing belongs to the minutes too.
 _SCORING = 20.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedScene:
+    """What is known of a fit once it was scored and told."""
+
+    scores: PhotographReport | None
+    """None where no view was scored."""
+
+    report: Path
+    verdict: FitVerdict
+    timings: Mapping[str, float]
+    """Seconds by part of the command."""
 
 
 def score_and_report(
@@ -32,15 +50,24 @@ def score_and_report(
     backend: BackendName,
     scoring: bool,
     command: str = "",
-) -> tuple[PhotographReport | None, Path]:
+    timings: Mapping[str, float] | None = None,
+) -> FittedScene:
     """Score the held-out views, write SCENE/reports/fit.html and fit.json.
 
     As many views are scored as the time for it allows; with `scoring` False none is, for who
     stopped a fit does not want to wait.
 
-    Returns:
-        The scores, None where no view was scored, and the report.
+    Args:
+        root: Folder of the scene.
+        capture: What it was fitted to.
+        result: The fit.
+        options: Of the fit.
+        backend: Who renders.
+        scoring: Whether held-out views are scored.
+        command: The words that started it; may be empty.
+        timings: Seconds by part of the command until now.
     """
+    began = time.monotonic()
     views = [view for view in capture.test_views if view.image is not None]
     scores = None
     if views and scoring:
@@ -64,12 +91,15 @@ def score_and_report(
     pairs = None
     if scores is not None:
         pairs = _pairs(result, views, scores, masks=options.masks, backend=backend)
+    cameras = camera_map(result.gaussians, data.capture.views, up=capture.up)
+    spent = {**(timings or {}), "scores and report": time.monotonic() - began}
+    data = replace(data, timings=spent)
     where = scene_path(root, "reports", "fit.html")
     with atomic_file(where) as path:
-        page = report_html(fit_report(data, pairs=pairs))
+        page = report_html(fit_report(data, pairs=pairs, cameras=cameras))
         path.write_text(page, encoding="utf-8", newline="\n")
     write_json(scene_path(root, "reports", "fit.json"), fit_record(data))
-    return scores, where
+    return FittedScene(scores=scores, report=where, verdict=verdict_of(data), timings=spent)
 
 
 def _pairs(
@@ -80,11 +110,12 @@ def _pairs(
     masks: MaskUse,
     backend: BackendName,
 ) -> Gallery:
-    """Photograph, picture and difference of the worst, the median and the best view."""
+    """Photograph, render and difference of the worst views, the median and the best one."""
     ordered = sorted(scores.per_view, key=lambda score: score.psnr)
     median, last = len(ordered) // 2, len(ordered) - 1
-    # Of few views some are two of the three; each is shown once.
-    ranks = {0: "worst", median: "median", last: "best"} if last else {0: "the only one"}
+    # Of few views some are two of these; each is shown once.
+    ranks = {0: "worst"} | {i: _NEXT[i] for i in range(1, min(len(_NEXT), median))}
+    ranks |= {median: "median", last: "best"} if last else {0: "the only one"}
     names = {view.name: view for view in views}
     rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
     for rank, label in ranks.items():
@@ -105,7 +136,7 @@ def _pairs(
             )
         )
     return Gallery(
-        title="Held-out views",
+        title="Held-out views, the worst first",
         columns=("photograph", "rendered", "difference"),
         rows=tuple(rows),
         note="The difference is four times as bright as it is.",

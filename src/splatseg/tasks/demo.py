@@ -1,5 +1,6 @@
 """The main job on a generated room, of which the truth is known."""
 
+import shlex
 import shutil
 import time
 from collections.abc import Generator
@@ -18,6 +19,7 @@ from splatseg.io.scene import load_scene, save_scene_layer
 from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
 from splatseg.report.demo_report import DemoFigures, machine_score, write_report
+from splatseg.report.fit_verdict import scored_of
 from splatseg.synthetic import cameras, room, write_capture
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate
@@ -177,7 +179,9 @@ class _MainJob:
             self._fit(capture, root)
         scene = load_scene(root)
         with self._step(
-            "segment", root, "--method", "uplift", "--evidence", _EVIDENCE, "--layer", _LAYER
+            *("segment", root, "--method", "uplift"),
+            *("--evidence", _EVIDENCE, "--layer", _LAYER),
+            what=_LAYER,
         ):
             self._segment(scene, "uplift", SegmentOptions(evidence=_EVIDENCE, layer=_LAYER))
         with self._step("see", root, "--model", "classical", "--evidence", _MASKS):
@@ -185,12 +189,15 @@ class _MainJob:
         with self._step(
             *("segment", root, "--method", "associate", "--evidence", _MASKS),
             *("--layer", _OBJECTS, "--export", "--report"),
+            what=_OBJECTS,
         ):
             made = self._segment(
                 scene, "associate", SegmentOptions(evidence=_MASKS, layer=_OBJECTS)
             )
-            export_layer(scene, root, _OBJECTS, made.layer, backend=backend, observer=observer)
-            report_layer(scene, root, made, command=self.lines[-1], backend=backend)
+            files, _ = export_layer(
+                scene, root, _OBJECTS, made.layer, backend=backend, observer=observer
+            )
+            report_layer(scene, root, made, exported=files, command=self.lines[-1], backend=backend)
         what = ("rgb", "depth", _LAYER, _OBJECTS)
         with self._step("render", root, "--what", ",".join(what), "-o", folder / "render"):
             render_views(
@@ -232,6 +239,7 @@ class _MainJob:
         with self._step(
             *("evaluate", self.folder / "scene", "--layer", layer, "--truth", truth),
             *("--split", split, "--metric", metric),
+            what=f"{layer}, {split}",
         ):
             found = evaluate(
                 scene,
@@ -244,19 +252,16 @@ class _MainJob:
         self.observer.info("  ".join(f"{key} {value:.3f}" for key, value in shown.items()))
 
     @contextmanager
-    def _step(self, name: str, *words: object) -> Generator[None]:
-        """Tell a command, and time what does the same."""
+    def _step(self, name: str, *words: object, what: str = "") -> Generator[None]:
+        """Tell a command, and time what does the same; `what` tells commands of one name apart."""
         chosen = [] if self.backend == "auto" or name == "see" else ["--backend", self.backend]
-        line = " ".join(["splatseg", name, *map(str, words), *chosen])
+        line = shlex.join(["splatseg", name, *map(str, words), *chosen])
         self.lines.append(line)
         self.observer.info(f"\n$ {line}")
         begin = time.monotonic()
         yield
         seconds = time.monotonic() - begin
-        if self.steps[-1][0] == name:
-            self.steps[-1] = (name, self.steps[-1][1] + seconds)
-        else:
-            self.steps.append((name, seconds))
+        self.steps.append((f"{name} {what}".strip(), seconds))
 
     def _minutes(self) -> float | None:
         options = self.options
@@ -271,7 +276,9 @@ class _MainJob:
 
 
 def _fitted(made: MadeScene) -> str:
-    scores = "" if made.scores is None else f"; PSNR {made.scores.psnr:.2f} dB held out"
+    scores = ""
+    if made.scores is not None:
+        scores = f"; PSNR {made.scores.psnr:.2f} dB on {scored_of(made.scores, made.held_out)}"
     return f"{len(made.result.gaussians)} Gaussians in {made.result.steps} steps{scores}"
 
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from splatseg.io.export import (
 from splatseg.io.splats import SplatWarning
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
+from splatseg.report.words import counted
 from splatseg.tasks._export_job import (
     ExportJob,
     class_names,
@@ -51,6 +52,9 @@ class Exported:
     table: Path | None = None
     """The file beside it that says what the ids mean."""
 
+    files: Mapping[int, str] = field(default_factory=dict[int, str])
+    """With objects: the name of each object's file in the folder, by id."""
+
 
 def export(
     scene: Scene,
@@ -59,6 +63,7 @@ def export(
     *,
     options: ExportOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
+    files: Mapping[int, str] | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> Exported:
@@ -72,6 +77,7 @@ def export(
         what: splat, objects, points, coco or table, see ``docs/exports.md``.
         options: Which layers, and how.
         layers: Layers at hand; others are read from the scene's folder.
+        files: With table: where each object's splats are, by id; it is said in the table.
         backend: Who renders.
         observer: Is told of the progress, and of what a format cannot hold.
 
@@ -82,7 +88,16 @@ def export(
     options = options or ExportOptions()
     _check(scene, output, what, options)
     job = with_only(
-        open_job(scene, output, what, options, layers, backend=backend, observer=observer)
+        open_job(
+            scene,
+            output,
+            what,
+            options,
+            layers,
+            files=files or {},
+            backend=backend,
+            observer=observer,
+        )
     )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SplatWarning)
@@ -146,17 +161,22 @@ def _splat(job: ExportJob) -> Exported:
 
 
 def _folder_of_objects(job: ExportJob) -> Exported:
+    rows = rows_of(job)
     files = write_object_splats(
         job.scene.gaussians,
         job.objects,
         job.output,
-        rows=rows_of(job),
+        rows=rows,
         format=job.options.splat_format or "ply",
         columns=columns_of(job),
         about=job.about,
         unlabelled=job.options.unlabelled,
     )
-    return Exported(output=job.output, summary=f"{len(files)} objects and objects.json")
+    return Exported(
+        output=job.output,
+        summary=f"{counted(len(files), 'object')} and objects.json",
+        files={row.id: file.name for row, file in zip(rows, files, strict=True)},
+    )
 
 
 def _points(job: ExportJob) -> Exported:
@@ -180,8 +200,8 @@ def _bare(gaussians: Gaussians) -> Gaussians:
 
 def _table(job: ExportJob) -> Exported:
     rows = rows_of(job)
-    write_object_table(rows, job.output, about=job.about)
-    return Exported(output=job.output, summary=f"{len(rows)} objects")
+    write_object_table(rows, job.output, about=job.about, files=job.files)
+    return Exported(output=job.output, summary=counted(len(rows), "object"))
 
 
 def _coco(job: ExportJob) -> Exported:

@@ -7,11 +7,13 @@ import torch
 from splatseg.core import (
     UNLABELLED,
     ClassTable,
+    Gaussians,
     Labels,
     RenderableLayer,
     Selection,
     layer_info_to_json,
 )
+from splatseg.report.layer_colours import layer_colours
 from splatseg.report.legend import colour_of, names_of
 
 _NONE = 0
@@ -22,6 +24,8 @@ def label_tables(
     kind: Literal["class", "instance"],
     name: str,
     classes: ClassTable | None,
+    *,
+    gaussians: Gaussians | None = None,
 ) -> dict[str, Any]:
     """The entry of the column that a layer becomes: where it is from and what its ids mean."""
     if isinstance(layer, Selection):
@@ -34,20 +38,22 @@ def label_tables(
             "none": _NONE,
             "background": _NONE if layer.background == UNLABELLED else layer.background,
             "confidence": "confidence" if kind == "class" else "instance_confidence",
-            "ids": _rows(layer, classes),
+            "ids": _rows(layer, classes, gaussians),
             "made": layer_info_to_json(layer.info),
         }
     }
 
 
-def _rows(layer: Labels, classes: ClassTable | None) -> dict[str, Any]:
-    names = names_of(RenderableLayer.of(layer), classes)
+def _rows(layer: Labels, classes: ClassTable | None, gaussians: Gaussians | None) -> dict[str, Any]:
+    summary = RenderableLayer.of(layer)
+    colours = layer_colours(summary, classes, gaussians=gaussians, labels=layer)
+    names = names_of(summary, classes)
     ids, counts = torch.unique(layer.ids, return_counts=True)
     count_of = dict(zip(ids.tolist(), counts.tolist(), strict=True))
     return {
         str(id): {
             "name": names.get(id, ""),
-            "colour": list(colour_of(id, classes)),
+            "colour": list(colour_of(id, colours)),
             "gaussians": count_of.get(id, 0),
         }
         for id in layer.present.tolist()

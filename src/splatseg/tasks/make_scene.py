@@ -1,5 +1,7 @@
 """Photographs become a scene: poses where they lack them, a fit, scores, a report."""
 
+import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +25,7 @@ from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scene import CHECKPOINT_FILE, save_scene
 from splatseg.pose import PoseReport
 from splatseg.render import BackendName
+from splatseg.report.fit_verdict import FitVerdict
 from splatseg.tasks._fit_report import score_and_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._photographs import Poses, capture_of
@@ -80,6 +83,12 @@ class MadeScene:
     poses: PoseReport | None
     """How poses were found; None where they came with the capture."""
 
+    verdict: FitVerdict
+    """What the fit is good for."""
+
+    timings: Mapping[str, float]
+    """Seconds by part: photographs and poses, optimisation, what follows it."""
+
 
 def make_scene(
     data: Path,
@@ -117,7 +126,9 @@ def make_scene(
     fit_options = fit_options or FitOptions()
     onwards = check_fit_output(folder, options)
     with fit_folder(folder):
+        began = time.monotonic()
         capture, poses = _capture(data, folder, options, fit_options, observer)
+        timings = {"photographs and poses": time.monotonic() - began}
         checkpoints = options.checkpoints(
             folder / CHECKPOINT_FILE,
             at_end=options.keep_checkpoint,
@@ -126,10 +137,14 @@ def make_scene(
         )
         if options.resume and onwards is None:
             observer.info(f"{folder}: nothing to go on from, beginning")
+        began = time.monotonic()
         result, stopped = _fitted(
             capture, folder, options, fit_options, checkpoints, backend=backend, observer=observer
         )
-        scores, report = score_and_report(
+        # What was done before a fit was resumed counts as optimisation.
+        timings["optimisation"] = result.seconds
+        timings["scene written"] = max(0.0, time.monotonic() - began - result.seconds)
+        done = score_and_report(
             folder,
             capture,
             result,
@@ -137,16 +152,21 @@ def make_scene(
             backend=backend,
             scoring=not stopped,
             command=command,
+            timings=timings,
         )
+    if done.verdict.warns:
+        observer.note(f"{done.verdict.words.lower()}: {done.verdict.sentence.rstrip('.')}")
     return MadeScene(
         folder=folder,
         capture=capture,
         result=result,
         interrupted=stopped,
-        scores=scores,
+        scores=done.scores,
         held_out=sum(view.image is not None for view in capture.test_views),
-        report=report,
+        report=done.report,
         poses=poses,
+        verdict=done.verdict,
+        timings=done.timings,
     )
 
 

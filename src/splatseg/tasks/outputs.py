@@ -2,7 +2,7 @@
 
 import resource
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
@@ -13,7 +13,7 @@ from splatseg.io.scene_folder import scene_path
 from splatseg.io.write_errors import write_failures_named
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
-from splatseg.report.segment_report import write_segmentation_report
+from splatseg.report.segment_report import SegmentationRun, write_segmentation_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.export import Exported, check_export, export
 from splatseg.tasks.export_options import ExportOptions, What
@@ -57,8 +57,8 @@ def export_layer(
 ) -> tuple[tuple[Exported, ...], Rendering | None]:
     """Write ROOT/exports/NAME: everything that a layer of labels is good for elsewhere.
 
-    Objects as splat files, a table of them, all Gaussians with their labels as columns, and
-    label maps of the held-out views (of all views where none is held out). Of a tree these are
+    Objects as splat files, a table of them that names the files, all Gaussians with their labels
+    as columns, and label maps of all views. Of a tree these are
     its objects; with it come the table of all nodes, and label maps of its groups and parts. Of
     features with a classifier, files have the labels of Gaussians (the hard readout), and label
     maps are rendered ones.
@@ -72,34 +72,35 @@ def export_layer(
     with write_failures_named(folder):
         folder.mkdir(exist_ok=True)
     layers: Mapping[str, Layer] = {name: of_files}
-    files = tuple(
-        export(
+    files: list[Exported] = []
+    names: dict[int, str] = {}
+    for what, file in _FILES:
+        made = export(
             scene,
             folder / file,
             what,
             options=ExportOptions(layer=name),
             layers=layers,
+            files=names,
             backend=backend,
             observer=observer,
         )
-        for what, file in _FILES
-    )
+        files.append(made)
+        names |= {id: f"{file}/{stem}" for id, stem in made.files.items()}
     if isinstance(layer, InstanceTree):
         write_node_table(layer, folder / _NODES)
         said = f"{len(layer.nodes)} groups, objects and parts"
-        files = (*files, Exported(output=folder / _NODES, summary=said))
+        files.append(Exported(output=folder / _NODES, summary=said))
     if not scene.views:
-        return files, None
+        return tuple(files), None
     maps = render_views(
         scene,
         folder / _LABEL_MAPS,
-        options=RenderingOptions(
-            split="test" if scene.test_views else "all", what=_drawn(name, layer), coloured=True
-        ),
+        options=RenderingOptions(split="all", what=_drawn(name, layer), coloured=True),
         field=field,
         observer=observer,
     )
-    return files, maps
+    return tuple(files), maps
 
 
 def _drawn(name: str, layer: Layer) -> tuple[str, ...]:
@@ -116,10 +117,11 @@ def report_layer(
     *,
     truth: Evidence | None = None,
     timings: Mapping[str, float] | None = None,
+    exported: Sequence[Exported] = (),
     command: str = "",
     backend: BackendName = "auto",
 ) -> Path:
-    """Write ROOT/reports/NAME.html; gives its path.
+    """Write ROOT/reports/NAME.html, and NAME.json beside it; gives the path of the page.
 
     Args:
         scene: The scene.
@@ -127,6 +129,7 @@ def report_layer(
         result: The layer, and what it was made from.
         truth: True maps, shown and scored.
         timings: Seconds by stage, besides those of the result.
+        exported: What `export_layer` wrote of it; objects are told with their files.
         command: The words that started it; may be empty.
         backend: Who renders.
     """
@@ -143,10 +146,23 @@ def report_layer(
         evidence=None if result.evidence.kind == "masks" else result.evidence,
         views=result.views,
         truth=truth,
-        timings={**result.timings, **(timings or {})},
-        peak_bytes=unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        command=command,
         tree=result.layer if isinstance(result.layer, InstanceTree) else None,
-        backend=backend,
+        run=SegmentationRun(
+            timings={**result.timings, **(timings or {})},
+            peak_bytes=unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+            command=command,
+            files=_files_of_objects(root, exported),
+            warnings=result.warnings,
+            backend=backend,
+        ),
     )
     return path
+
+
+def _files_of_objects(root: Path, exported: Sequence[Exported]) -> dict[int, str]:
+    """The file of each object, within the scene's folder."""
+    return {
+        id: (one.output / file).relative_to(root).as_posix()
+        for one in exported
+        for id, file in one.files.items()
+    }

@@ -31,7 +31,9 @@ from splatseg.io.json_files import read_json, write_json
 from splatseg.io.npy import read_npy
 from splatseg.io.paths import path_inside
 from splatseg.io.scene import scene_layer_names
+from splatseg.lift import GaussianField
 from splatseg.render import BackendName
+from splatseg.report.layer_colours import layer_colours
 from splatseg.report.legend import colour_labels, legend_of
 from splatseg.tasks._film import check_film, path_views, write_film, write_path
 from splatseg.tasks._observer import SILENT, Observer
@@ -85,6 +87,7 @@ class _Layer:
 
     name: str
     summary: RenderableLayer
+    colours: ClassTable
 
     @property
     def is_selection(self) -> bool:
@@ -125,7 +128,7 @@ def render_views(
     _check_layers(scene, names, layers, field)
     if field is None:
         field = gaussian_field(scene, names, layers, backend=backend)
-    drawn = _layers(field, names)
+    drawn = _layers(scene, field, names)
     if on_path:
         views = path_views(scene, field, frames=options.frames)
     else:
@@ -145,13 +148,14 @@ def render_views(
         write_json(path_inside(output, _RECORD), record | dict.fromkeys([*folders, *files], entry))
         if on_path:
             write_path(output, views, pictures="rgb" in folders)
+        coloured = {layer.name: layer.colours for layer in drawn}
         for name in films:
             write_film(
                 output / name,
                 views,
                 fps=options.fps,
                 is_label_map=name in label_maps,
-                classes=scene.classes,
+                classes=coloured.get(name),
             )
     finally:
         # Only a folder that nothing was written to is still empty.
@@ -180,13 +184,13 @@ def _render(
                 with field.view(view.camera) as looked_at:
                     _draw_pictures(looked_at, view, into)
                     for layer in layers:
-                        _draw_layer(looked_at, view, layer, into, scene.classes)
+                        _draw_layer(looked_at, view, layer, into)
                 step(done, len(views))
         if "depth" in into:
             _finish_depth(into["depth"], views, scene)
         for layer in layers:
             if not layer.is_selection:
-                legend = legend_of(layer.summary, scene.classes)
+                legend = legend_of(layer.summary, scene.classes, colours=layer.colours)
                 write_json(into[layer.name] / "legend.json", legend)
 
 
@@ -222,13 +226,20 @@ def _check_layers(
             )
 
 
-def _layers(field: Renderable, names: Sequence[str]) -> list[_Layer]:
-    layers = [_Layer(name=name, summary=field.layer(name)) for name in names]
-    for layer in layers:
-        if layer.summary.kind == "features":
+def _layers(scene: Scene, field: Renderable, names: Sequence[str]) -> list[_Layer]:
+    layers: list[_Layer] = []
+    for name in names:
+        summary = field.layer(name)
+        if summary.kind == "features":
             raise InputError(
-                f"what: {layer.name} holds features without a classifier, which are no image."
+                f"what: {name} holds features without a classifier, which are no image."
             )
+        colours = layer_colours(summary, scene.classes)
+        if isinstance(field, GaussianField) and summary.kind == "labels":
+            colours = layer_colours(
+                summary, scene.classes, gaussians=scene.gaussians, labels=field.labels(name)
+            )
+        layers.append(_Layer(name=name, summary=summary, colours=colours))
     return layers
 
 
@@ -317,7 +328,6 @@ def _draw_layer(
     view: View,
     layer: _Layer,
     into: Mapping[str, Path],
-    classes: ClassTable | None,
 ) -> None:
     ids = label_map_in(looked_at, layer.name, view.camera).ids
     if layer.is_selection:
@@ -326,7 +336,7 @@ def _draw_layer(
     _save(torch.where(ids == UNLABELLED, 0, ids), into[layer.name], view)
     pictures = into.get(f"{layer.name}_coloured")
     if pictures is not None:
-        _save(colour_labels(ids, classes), pictures, view)
+        _save(colour_labels(ids, layer.colours), pictures, view)
 
 
 def _save(image: Tensor, folder: Path, view: View) -> None:

@@ -37,6 +37,7 @@ from splatseg.methods import Method, MethodInputs, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.checkpoint_options import CheckpointOptions
+from splatseg.tasks.fit_quality import fit_quality
 from splatseg.tasks.scene_parts import layer_of, views_asked, views_recorded
 from splatseg.tasks.stopped_training import told_how_to_resume, training_checkpoints
 
@@ -89,6 +90,9 @@ class Segmentation:
     views: tuple[View, ...]
     timings: Mapping[str, float]
     """Seconds by stage."""
+
+    warnings: tuple[str, ...] = ()
+    """What should be known of it, in sentences: that the scene is too poor to carry labels."""
 
     checkpoint: Path | None = None
     """What a method that trains keeps until the layer is written, see `save_segmentation`."""
@@ -161,13 +165,32 @@ def segment(
         checkpoints=training_checkpoints(scene, name, method, checkpoints, observer),
     )
     timings = {"open": time.monotonic() - started}
+    warnings = _checked_fit(scene, backend, timings, observer)
     with told_how_to_resume(inputs.checkpoints, observer):
         layer = _run(method, inputs, chosen, timings, observer)
         if options.complete and method.complete and not options.published:
             layer = _completed(scene, layer, completion, timings)
         layer = _panoptic(scene, layer, merged, method)
     layer = _described(layer, method, evidence_name, inputs, options)
-    return _segmentation(layer, name, inputs, timings)
+    return replace(_segmentation(layer, name, inputs, timings), warnings=warnings)
+
+
+def _checked_fit(
+    scene: Scene, backend: BackendName, timings: dict[str, float], observer: Observer
+) -> tuple[str, ...]:
+    """Tell where the scene is too poor to carry labels, or cannot be held against photographs."""
+    began = time.monotonic()
+    try:
+        quality = fit_quality(scene, backend=backend)
+    except InputError as error:
+        said = f"the scene was not held against its photographs: {str(error).rstrip('.')}"
+        observer.note(said)
+        return (f"{said}.",)
+    timings["check fit"] = time.monotonic() - began
+    if quality is None or quality.warning is None:
+        return ()
+    observer.note(quality.warning)
+    return (f"{quality.warning}.",)
 
 
 def save_segmentation(root: Path, made: Segmentation) -> Path:

@@ -207,7 +207,7 @@ def _header(folder: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path}: expected evidence, got {quoted(header.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
-            f"{path}: expected evidence of version {VERSION} or less, got version {quoted(version)}; "
+            f"{path}: expected evidence of version {VERSION} or less, got {quoted(version)}; "
             "a later splatseg wrote it."
         )
     return header

@@ -17,7 +17,11 @@ _DIGITS = 6
 
 
 def write_object_table(
-    rows: Sequence[ObjectRow], path: Path, *, about: Mapping[str, Any] | None = None
+    rows: Sequence[ObjectRow],
+    path: Path,
+    *,
+    about: Mapping[str, Any] | None = None,
+    files: Mapping[int, str] | None = None,
 ) -> None:
     """Write a table of objects; atomic. The ending, .csv or .json, gives the format.
 
@@ -25,17 +29,22 @@ def write_object_table(
         rows: The objects.
         path: The file.
         about: Further members of the JSON: scene, layers, units. CSV has no place for them.
+        files: Where each object's splats are, by id. CSV has an empty cell for one without.
 
     Raises:
         InputError: If the name ends otherwise.
         MissingFileError: If the folder of `path` does not exist.
     """
+    files = files or {}
     match path.suffix.lower():
         case ".json":
-            objects = [object_content(row) for row in rows]
+            objects = [
+                object_content(row) | ({"file": files[row.id]} if row.id in files else {})
+                for row in rows
+            ]
             write_json(path, {"made_by": MADE_BY} | dict(about or {}) | {"objects": objects})
         case ".csv":
-            _write_csv(rows, path)
+            _write_csv(rows, path, files)
         case _:
             raise InputError(f"{path}: expected a table's name to end in .csv or .json.")
 
@@ -62,7 +71,7 @@ def object_content(row: ObjectRow) -> dict[str, Any]:
     }
 
 
-def _write_csv(rows: Sequence[ObjectRow], path: Path) -> None:
+def _write_csv(rows: Sequence[ObjectRow], path: Path, files: Mapping[int, str]) -> None:
     with (
         atomic_file(path) as temporary,
         # The byte order mark is what makes spreadsheets read names as UTF-8.
@@ -70,13 +79,13 @@ def _write_csv(rows: Sequence[ObjectRow], path: Path) -> None:
     ):
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_HEADER)
-        writer.writerows(_cells(object_content(row)) for row in rows)
+        writer.writerows([*_cells(object_content(row)), files.get(row.id, "")] for row in rows)
 
 
 _HEADER = (
     "id", "name", "class_id", "class", "gaussians", "centroid_x", "centroid_y", "centroid_z",
     "box_x", "box_y", "box_z", "size_1", "size_2", "size_3", "rot_w", "rot_x", "rot_y", "rot_z",
-    "volume", "red", "green", "blue", "confidence", "evidence", "inferred",
+    "volume", "red", "green", "blue", "confidence", "evidence", "inferred", "file",
 )  # fmt: skip
 
 
