@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Quiet
+from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Quiet, Strict
 from splatseg.cli._work import ConsoleObserver, print_result
 from splatseg.tasks import ImportOptions, import_scene
 from splatseg.tasks.import_scene import UpAxis
@@ -43,6 +43,8 @@ class Command:
 
     as_is: bool = False
     """Take the file as it stands, without comparing it with the photographs."""
+
+    strict: Strict = False
 
     up: UpAxis = "auto"
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else, which is

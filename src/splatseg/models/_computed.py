@@ -28,7 +28,6 @@ from splatseg.io.evidence import (
     save_masks,
     save_segments,
 )
-from splatseg.io.images import load_image
 from splatseg.io.json_files import read_json, write_json
 from splatseg.models._cache import ModelCache
 from splatseg.models._sources import SEGMENT_PARTS, Source, What, some, without_empty
@@ -54,8 +53,14 @@ def abilities(model: Model) -> tuple[What, ...]:
     return tuple(what for what, protocol in _PROTOCOLS.items() if isinstance(model, protocol))
 
 
-def computed(model: Model, *, what: What | None, cache: ModelCache | None) -> Source:
-    """Evidence from running a model.
+def computed(
+    model: Model,
+    *,
+    what: What | None,
+    cache: ModelCache | None,
+    image_of: Callable[[View], Image],
+) -> Source:
+    """Evidence from running a model on what `image_of` gives of each view.
 
     Raises:
         InputError: If the model cannot give this, or nothing at all.
@@ -70,7 +75,7 @@ def computed(model: Model, *, what: What | None, cache: ModelCache | None) -> So
         raise InputError(
             f"model {model.name!r}: expected one of what it gives ({', '.join(can)}), got {what!r}."
         )
-    return _Computed(model=model, asked=what, cache=cache)
+    return _Computed(model=model, asked=what, cache=cache, image_of=image_of)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,6 +83,7 @@ class _Computed(Source):
     model: Any
     asked: What
     cache: ModelCache | None
+    image_of: Callable[[View], Image]
     counts: dict[str, int] = field(default_factory=dict[str, int])
     """Masks by view, for the notes."""
 
@@ -119,7 +125,7 @@ class _Computed(Source):
 
     @override
     def write(self, folder: Path, view: View) -> int:
-        image = load_image(view)
+        image = self.image_of(view)
         if self.asked == "masks":
             masks = without_empty(self._ask(ModelCache.masks, self.model.masks, image))
             self._check_size(view, masks.height, masks.width)

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from splatseg.core import View
-from splatseg.core.models import Model, ModelWithDefaults
+from splatseg.core.models import Image, Model, ModelWithDefaults
 from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
 from splatseg.errors import InputError
 from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header
+from splatseg.io.images import load_image
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.models._cache import ModelCache
 from splatseg.models._computed import computed
@@ -65,6 +66,7 @@ def record_evidence(
     overwrite: bool = False,
     missing: Literal["refuse", "skip"] = "refuse",
     cache: ModelCache | None = None,
+    image_of: Callable[[View], Image] = load_image,
     progress: Callable[[int, int], None] | None = None,
 ) -> SeenEvidence:
     """Write what a model sees in views, one view at a time; a second call does what is left.
@@ -82,6 +84,8 @@ def record_evidence(
         overwrite: Whether evidence of the same name is deleted first.
         missing: Whether it is an error that recorded evidence lacks a view.
         cache: Where to look before the model is run.
+        image_of: Gives the picture of a view that the model is to see, in the pixels of its
+            camera; by default its photograph. It is called once the folder is there.
         progress: Called with the number of views done and of all.
 
     Raises:
@@ -95,7 +99,7 @@ def record_evidence(
     source = (
         copied(model, views, what=what, missing=missing)
         if isinstance(model, AnyRecorded)
-        else computed(model, what=what, cache=cache)
+        else computed(model, what=what, cache=cache, image_of=image_of)
     )
     source.check_target(folder)
     available = source.available(views)

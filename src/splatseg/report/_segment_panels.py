@@ -1,7 +1,8 @@
 """What a report of a segmentation shows of single views."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -46,7 +47,10 @@ class ViewPanel:
     name: str
     held_out: bool
     image: UInt8[Tensor, "height width 3"]
-    """The photograph, or the rendering where there is none."""
+    """The photograph; where there is none the render, the model's own if it was kept."""
+
+    rendered: bool
+    """Whether there is no photograph."""
 
     drawn: Int[Tensor, "height width"]
     """The layer."""
@@ -84,16 +88,18 @@ def view_panel(
     with field.view(camera) as looked_at:
         shown = label_map_in(looked_at, layer, camera).ids
         confidence = looked_at.confidence(layer)
-        if view.image is None:
+        picture = view.image or _kept_render(evidence, view.name)
+        if picture is None:
             image = rendered_image(looked_at, size)
         else:
-            image = _resized(load_image(view, longest=max(size)), size)
+            image = _resized(load_image(replace(view, image=picture), longest=max(size)), size)
     seen = _evidence_ids(evidence, view.name)
     seen = None if seen is None else _nearest(seen, size)
     return ViewPanel(
         name=view.name,
         held_out=held_out,
         image=image,
+        rendered=view.image is None,
         drawn=shown,
         confidence=confidence,
         evidence=seen,
@@ -149,7 +155,7 @@ def gallery(
     """
     with_evidence = any(panel.evidence is not None for panel in panels)
     with_truth = any(panel.truth is not None for panel in panels)
-    columns = ["photograph", "labels on it", "confidence"]
+    columns = [_picture_name(panels), "labels on it", "confidence"]
     if with_evidence:
         columns.insert(1, "evidence as it came")
     if with_truth:
@@ -182,6 +188,18 @@ def gallery(
             else ""
         ),
     )
+
+
+def _picture_name(panels: Sequence[ViewPanel]) -> str:
+    """What the pictures of views are."""
+    if not any(panel.rendered for panel in panels):
+        return "photograph"
+    return "render" if all(panel.rendered for panel in panels) else "photograph or render"
+
+
+def _kept_render(evidence: LabelSource | None, name: str) -> Path | None:
+    """What the model was shown of a view without a photograph, where it was kept."""
+    return evidence.render(name) if isinstance(evidence, Evidence) else None
 
 
 def _evidence_image(

@@ -33,6 +33,9 @@ class ImportOptions:
     as_is: bool = False
     """Take the file as it stands, without comparing it with the photographs."""
 
+    strict: bool = False
+    """Refuse a capture that lists a photograph which is not there."""
+
     up: UpAxis = "auto"
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else."""
 
@@ -58,6 +61,8 @@ class ImportOptions:
             )
         if self.as_is and self.data is None:
             raise InputError("as_is: goes with `data`, which says what the file is compared with.")
+        if self.strict and self.data is None:
+            raise InputError("strict: goes with `data`, whose photographs it is about.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,7 +112,7 @@ def import_scene(
     provenance = _provenance(file, backend)
     alignment, placed = None, None
     if options.data is not None:
-        capture = read_capture(options.data, format=options.format)
+        capture = read_capture(options.data, format=options.format, strict=options.strict)
         for note in capture.notes:
             observer.note(note)
         if not options.as_is:
