@@ -139,14 +139,15 @@ def open_alpha(scene: Scene, name: str) -> np.ndarray:
     return render(scene.gaussians, scene.view(name).camera).alpha.numpy()
 
 
-def test_what_was_stopped_goes_on_over_the_same_background(imported) -> None:
+@pytest.mark.parametrize("after", [0, 4])
+def test_what_was_stopped_goes_on_over_the_same_background(imported, after) -> None:
     scene = coloured(imported, -1.8)
     whole = pictures(see(scene, Halves(), "whole").folder / "_renders")
     with pytest.raises(KeyboardInterrupt):
-        see(scene, Halves(after=4), "m")
+        see(scene, Halves(after=after), "m")
     model = Halves()
     seen = see(scene, model, "m")
-    assert (seen.kept, len(model.shown)) == (4, 7)
+    assert (seen.kept, len(model.shown)) == (after, 11 - after)
     kept = pictures(seen.folder / "_renders")
     assert list(kept) == list(whole)
     for name, image in kept.items():

@@ -50,8 +50,9 @@ class Command:
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else, which is
     what most tools write."""
 
-    max_views: int = _DEFAULT.max_views
-    """Most virtual cameras to place. Every eighth is a test view."""
+    max_views: int | None = _DEFAULT.max_views
+    """Most virtual cameras to place. None takes 40 around an object and 96 within a room. Every
+    eighth is a test view."""
 
     width: int = _DEFAULT.width
     """Width of the virtual views, pixels."""

@@ -39,8 +39,9 @@ class ImportOptions:
     up: UpAxis = "auto"
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else."""
 
-    max_views: int = 40
-    """Most virtual cameras to place. Every eighth is a test view."""
+    max_views: int | None = None
+    """Most virtual cameras to place; None takes 40 around an object and 96 within a room. Every
+    eighth is a test view."""
 
     width: int = 800
     """Width of the virtual views, pixels."""
@@ -53,7 +54,7 @@ class ImportOptions:
     scene surrounds them."""
 
     def __post_init__(self) -> None:
-        if self.max_views < 1:
+        if self.max_views is not None and self.max_views < 1:
             raise InputError(f"max_views: expected at least 1, got {self.max_views}.")
         if min(self.width, self.height) < 16:
             raise InputError(
