@@ -46,6 +46,20 @@ def test_with_its_capture(small, splat_file, splatseg, tmp_path) -> None:
     assert scene.provenance["alignment"]["moved"] is None
 
 
+def test_a_capture_that_lacks_photographs(small, splat_file, splatseg, tmp_path) -> None:
+    (small.capture / "images" / "train_1.png").unlink()
+    words = ("import", splat_file, "-o", tmp_path / "s", "--data", small.scene / "cameras")
+    status, _, err = splatseg(*words, "--strict")
+    assert status == 2
+    assert "1 of 4 photographs that it lists are not there, expected all of them" in err
+    assert not (tmp_path / "s").exists()
+    status, _, err = splatseg(*words)
+    assert status == 0, err
+    assert "1 of 4 photographs that the capture lists is not there and left out" in err
+    assert "train_1.png" in err
+    assert len(load_scene(tmp_path / "s").views) == 3
+
+
 def test_a_wrong_frame_is_found_and_undone(small, splat_file, splatseg, tmp_path) -> None:
     turn = Similarity(
         rotation=torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).double(),
@@ -115,6 +129,7 @@ def test_bad_input_is_one_sentence(small, splat_file, splatseg, tmp_path) -> Non
         ((splat_file, "-o", layered), "got a scene with layers (mine)"),
         ((splat_file, *out, "--data", tmp_path / "empty"), "expected a capture"),
         ((splat_file, *out, "--as-is"), "--as-is: goes with --data"),
+        ((splat_file, *out, "--strict"), "--strict: goes with --data"),
         ((splat_file, *out, "--max-views", 0), "--max-views: expected at least 1"),
     ]:
         status, _, err = splatseg("import", *words)

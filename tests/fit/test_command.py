@@ -298,3 +298,19 @@ def test_a_folder_with_a_checkpoint_alone_is_known(folder: Path, tmp_path: Path,
     (scene / "holiday.jpg").unlink()
     assert main([*words, "--overwrite"]) == 0
     assert not (scene / "fit").exists()
+
+
+def test_a_capture_that_lacks_photographs(folder, tmp_path, capsys) -> None:
+    """They are named, in the report too; --strict refuses the capture."""
+    lost = folder / f"{sorted(p.stem for p in folder.glob('*.png'))[3]}.png"
+    lost.unlink()
+    words = ["fit", str(folder), "-o", str(tmp_path / "s"), "--steps", "2"]
+    assert main([*words, "--strict"]) == 2
+    sentence = capsys.readouterr().err
+    assert "photographs that it lists are not there, expected all of them" in sentence
+    assert lost.name in sentence
+    assert not (tmp_path / "s").exists()
+    assert main(words) == 0
+    assert f"is not there and left out ({lost.name})" in capsys.readouterr().err
+    assert lost.stem not in {view.name for view in load_scene(tmp_path / "s").views}
+    assert lost.name in (tmp_path / "s" / "reports" / "fit.html").read_text()

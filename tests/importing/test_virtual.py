@@ -6,7 +6,7 @@ import torch
 
 from splatseg.core import Gaussians
 from splatseg.errors import InputError
-from splatseg.importing import place_cameras
+from splatseg.importing import VIEWS, place_cameras
 from splatseg.render import render
 
 UP = (0.0, -1.0, 0.0)
@@ -19,16 +19,19 @@ def test_cameras_around_an_object(blobs) -> None:
     assert [view.name for view in placed.views] == [f"virtual_{i:04d}" for i in range(24)]
     assert [i for i, v in enumerate(placed.views) if v.split == "test"] == [0, 8, 16]
     middle = torch.tensor([5.0, -3.0, 2.0], dtype=torch.float64)
+    off_centre = []
     for view in placed.views:
         assert view.image is None
         pixel, depth = view.camera.project(middle)
-        # It looks at the middle, from outside the ball.
-        assert (pixel - torch.tensor([400.0, 300.0])).norm() < 60
-        assert depth > 2
+        off_centre.append(float((pixel - torch.tensor([400.0, 300.0])).norm()))
+        assert depth > 2, "from outside the ball"
         # Upright: the image's up is no more than its pitch away from the world's.
         assert view.camera.cam_from_world[1, 1] > 0.4
         # Level: right has no part along up.
         assert abs(view.camera.cam_from_world[0, 1]) < 1e-9
+    # They look at the middle; the nearer ones at the ends too, as it is twice as high as wide.
+    assert sum(pixels < 60 for pixels in off_centre) >= 12
+    assert 60 < max(off_centre) < 250
 
 
 def test_the_whole_object_is_in_some_views(blobs) -> None:
@@ -57,6 +60,30 @@ def test_the_kind_can_be_said(walls) -> None:
     placed = place_cameras(walls, up=UP, count=13, kind="object")
     assert placed.kind == "object"
     assert all((view.camera.centre.abs() > 2).any() for view in placed.views)
+
+
+def test_as_many_as_its_kind_needs(blobs, monkeypatch) -> None:
+    assert VIEWS["room"] > VIEWS["object"]
+    monkeypatch.setattr("splatseg.importing._virtual.VIEWS", {"object": 14, "room": 1})
+    assert len(place_cameras(blobs, up=UP).views) == 14
+
+
+def test_views_look_where_detail_is(walls, rng) -> None:
+    """Small Gaussians on a spot of one wall draw cameras towards it."""
+    spot = np.array([2.9, 0.0, 0.0])
+    around = spot + rng.normal(size=(len(walls), 3)) * 0.15
+    many = walls.replace(
+        means=torch.from_numpy(around).float(), scales=torch.full((len(walls), 3), 0.02)
+    )
+
+    def shown(scene: Gaussians) -> int:
+        views = place_cameras(scene, up=UP, count=16, kind="room").views
+        pixels, depth = zip(*(v.camera.project(torch.from_numpy(spot)) for v in views), strict=True)
+        at, ahead = torch.stack(pixels), torch.stack(depth)
+        inside = (at > 0).all(dim=1) & (at < torch.tensor([800, 600])).all(dim=1) & (ahead > 0)
+        return int(inside.sum())
+
+    assert shown(Gaussians.concatenate([walls, many])) > shown(walls)
 
 
 def test_the_same_every_time(blobs) -> None:

@@ -157,6 +157,16 @@ def test_a_healthy_capture(healthy) -> None:
     assert max(map(abs, add)) < 0.15
 
 
+def test_photographs_that_are_not_there_are_a_doubt(healthy) -> None:
+    """They are nothing to correct."""
+    capture = replace(healthy.capture, missing=("a.png", "b.png"))
+    diagnosis = diagnose(capture, options=OPTIONS, matches=healthy.matches)
+    assert diagnosis.doubts[0] == (
+        "2 photographs that the capture lists are not there (a.png, b.png)."
+    )
+    assert diagnosis.healthy
+
+
 def test_without_points_cameras_are_still_examined(healthy) -> None:
     bare = replace(healthy.capture, points=None)
     sound = diagnose(bare, options=OPTIONS, matches=healthy.matches)

@@ -58,6 +58,15 @@ Format: TypeAlias = Annotated[
     ),
 ]
 
+Strict: TypeAlias = Annotated[
+    bool,
+    _named(
+        None,
+        "Refuse a capture that lists a photograph which is not there. Without it such photographs "
+        "are left out and named, as long as half of them are there.",
+    ),
+]
+
 Overwrite: TypeAlias = Annotated[
     bool,
     _named(None, "Replace what an earlier run left under the same name."),

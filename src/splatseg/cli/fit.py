@@ -7,7 +7,16 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Overwrite, Quiet, Seed
+from splatseg.cli._types import (
+    Backend,
+    Format,
+    Json,
+    MadeSceneFolder,
+    Overwrite,
+    Quiet,
+    Seed,
+    Strict,
+)
 from splatseg.cli._work import ConsoleObserver, print_result, typed
 from splatseg.fit import FitOptions, Preset, Strategy
 from splatseg.report.fit_verdict import scored_of
@@ -109,6 +118,7 @@ class Command:
     seed: Seed = 0
     backend: Backend = "auto"
     format: Format = "auto"
+    strict: Strict = False
 
     poses: Literal["auto", "given", "sfm"] = _SCENE.poses
     """Where cameras come from. given: DATA. sfm: they are found from the photographs alone, by
@@ -128,6 +138,7 @@ def run(command: Command) -> None:
         command.output,
         options=MakeSceneOptions(
             format=command.format,
+            strict=command.strict,
             poses=command.poses,
             frames=command.frames,
             resume=command.resume,

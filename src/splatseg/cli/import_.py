@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Quiet
+from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Quiet, Strict
 from splatseg.cli._work import ConsoleObserver, print_result
 from splatseg.tasks import ImportOptions, import_scene
 from splatseg.tasks.import_scene import UpAxis
@@ -44,12 +44,15 @@ class Command:
     as_is: bool = False
     """Take the file as it stands, without comparing it with the photographs."""
 
+    strict: Strict = False
+
     up: UpAxis = "auto"
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else, which is
     what most tools write."""
 
-    max_views: int = _DEFAULT.max_views
-    """Most virtual cameras to place. Every eighth is a test view."""
+    max_views: int | None = _DEFAULT.max_views
+    """Most virtual cameras to place. None takes 40 around an object and 96 within a room. Every
+    eighth is a test view."""
 
     width: int = _DEFAULT.width
     """Width of the virtual views, pixels."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from splatseg.cli._types import Data, Json, Overwrite, Quiet, SceneFolder
+from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder
 from splatseg.cli._words import listed
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.models import SeenEvidence
@@ -75,6 +75,7 @@ class Command:
     """How features are kept in the cache."""
 
     overwrite: Overwrite = False
+    backend: Backend = "auto"
     data: Data = None
     json: Json = False
     quiet: Quiet = False
@@ -93,6 +94,7 @@ def run(command: Command) -> None:
         command.evidence,
         options=SeeOptions(**asked),
         regions=command.regions,
+        backend=command.backend,
         observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
     facts = {

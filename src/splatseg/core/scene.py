@@ -167,6 +167,9 @@ class Capture(_WithViews):
     notes: tuple[str, ...] = ()
     """What a person should know of how it was read."""
 
+    missing: tuple[str, ...] = ()
+    """Photographs that it lists and that are not there, as it calls them; no view is of them."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene(_WithViews):

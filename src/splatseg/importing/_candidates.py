@@ -42,7 +42,8 @@ class Frame:
 def outside(extent: Extent, frame: Frame) -> list[Camera]:
     """Cameras around the scene, at heights from below to far above.
 
-    The first half has all of the bounds in the picture, the second stands nearer.
+    The first half has all of the bounds in the picture. The second stands nearer, and where one
+    side of the bounds is the longest by far, it looks at its ends in turn as well as at its middle.
     """
     half = extent.half
     signs = torch.cartesian_prod(*([torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3))
@@ -50,6 +51,9 @@ def outside(extent: Extent, frame: Frame) -> list[Camera]:
     tangent_x = math.tan(math.radians(OUTSIDE_VIEW) / 2)
     tangent_y = tangent_x * frame.height / frame.width
     cameras: list[Camera] = []
+    half_lengths, axes = half.sort(descending=True)
+    along = torch.zeros(3, dtype=torch.float64)
+    along[axes[0]] = half_lengths[0] - half_lengths[1]
     for near in _NEARER:
         for height in _HEIGHTS:
             for turn in range(_TURNS):
@@ -67,7 +71,8 @@ def outside(extent: Extent, frame: Frame) -> list[Camera]:
                 x, y, z = (corners @ rotation.T).unbind(-1)
                 needed = torch.maximum(x.abs() / tangent_x, y.abs() / tangent_y) - z
                 distance = _MARGIN * float(needed.max()) * near
-                eye = extent.centre + distance * away
+                target = extent.centre + (turn % 3 - 1) * (1 - near) * along
+                eye = target + distance * away
                 cameras.append(_camera(extent, eye, rotation, frame, OUTSIDE_VIEW))
     return cameras
 

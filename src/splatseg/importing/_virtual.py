@@ -1,8 +1,9 @@
 """Virtual cameras for a splat scene without photographs, so that everything else works on it."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Literal
 
 import torch
@@ -25,16 +26,24 @@ SURROUNDED = 0.6
 """A scene is a room if this share of the view all round is covered at the median free place
 within it. Objects have up to 0.4, rooms 0.75 and more."""
 
+VIEWS: Mapping[SceneKind, int] = MappingProxyType({"object": 40, "room": 96})
+"""Most views where nobody says: a room is larger than what a view of it shows."""
+
+OFTEN = 6
+"""So many views that show a place well are enough: labels of it are decided by votes."""
+
 _SMALL = 96
 _CELLS = 40
-# A place counts in full until this many views show it.
-_OFTEN = 3
+# A cell of many Gaussians counts up to so many times as much as one of the mean number.
+_MAX_DETAIL = 4.0
+# What each further view of a cell counts, of the one before.
+_AGAIN = 0.7
 _NEAR_INSIDE, _NEAR_OUTSIDE = 0.08, 0.25
 _MAX_NEAR = 0.2
 _MIN_ALPHA = {"object": 0.02, "room": 0.5}
 _GAIN = 2e-3
 _FAINT = 0.05
-_PIXELS_A_CELL = 4
+_PIXELS_A_CELL = 12
 _MIN_VIEWS = 12
 # A flat thing has a free place or two within its bounds, and is no room.
 _MIN_POSITIONS = 6
@@ -58,7 +67,7 @@ def place_cameras(
     gaussians: Gaussians,
     *,
     up: tuple[float, float, float],
-    count: int = 40,
+    count: int | None = None,
     width: int = 800,
     height: int = 600,
     kind: SceneKind | None = None,
@@ -70,13 +79,15 @@ def place_cameras(
     Candidates stand around the robust bounds of the scene looking in, or at free places within
     looking out. Each is drawn small; its alpha and median depth say which cells of a grid (a
     fortieth of the longest side) it shows, and how well. Then the candidate that adds most is
-    taken, again and again; a cell counts less with every view that shows it and nothing more
-    after three. The result depends on the Gaussians alone.
+    taken, again and again. A cell counts by the Gaussians in it, since things have more of them
+    than bare walls; it counts in full when it is large in the picture, less with every view that
+    shows it, and nothing more after `OFTEN`. The result depends on the Gaussians alone.
 
     Args:
         gaussians: The scene.
         up: Direction away from the ground, world.
-        count: Most views; fewer are placed when nothing is left to gain, twelve at least.
+        count: Most views; fewer are placed when nothing is left to gain, twelve at least. None
+            takes `VIEWS` of its kind.
         width: Pixels a row.
         height: Rows.
         kind: ``object`` or ``room``; None finds out.
@@ -86,7 +97,8 @@ def place_cameras(
     Raises:
         InputError: If there is no Gaussian, or no candidate sees any.
     """
-    check_range("count", count, 1, 10000)
+    if count is not None:
+        check_range("count", count, 1, 10000)
     check_range("width", width, 16, 16384)
     check_range("height", height, 16, 16384)
     extent = extent_of(gaussians, up)
@@ -107,7 +119,7 @@ def place_cameras(
         raise InputError("gaussians: expected a scene that can be seen, but no camera sees it.")
     # Half of the views of an object show it whole; the others stand where they add most.
     overview = [i for i, g in enumerate(glimpses) if g.overview]
-    chosen = _greedy(glimpses, count, begin=overview)
+    chosen = _greedy(glimpses, count or VIEWS[kind], begin=overview, detail=_detail(extent))
     cameras = _in_order([glimpses[i].camera.resized(width, height) for i in chosen], extent)
     seen = _seen(gaussians, [glimpses[i].camera for i in chosen], backend)
     # Every fourth candidate is enough to tell what can be seen at all.
@@ -210,10 +222,7 @@ def _glimpse(
     pixels = camera.pixel_centres()[solid]
     points = camera.unproject(pixels, depth[solid]) @ extent.world_from_level
     inside_bounds = ((points - extent.centre).abs() <= 1.3 * extent.half).all(dim=1)
-    cell = 2 * float(extent.half.max()) / _CELLS
-    index = torch.floor((points[inside_bounds] - extent.centre) / cell).long() + 2 * _CELLS
-    flat = (index[:, 0] * 4 * _CELLS + index[:, 1]) * 4 * _CELLS + index[:, 2]
-    cells, inverse = flat.unique(return_inverse=True)
+    cells, inverse = _cells(points[inside_bounds], extent).unique(return_inverse=True)
     if not len(cells):
         return None
     # Pixels a cell: a few make it well seen, more add nothing.
@@ -223,22 +232,49 @@ def _glimpse(
     return _Glimpse(camera=camera, cells=cells, worth=worth, overview=overview)
 
 
-def _greedy(glimpses: Sequence[_Glimpse], count: int, *, begin: Sequence[int]) -> list[int]:
+def _cells(points_level: Tensor, extent: Extent) -> Tensor:
+    """The cell of the grid that each point lies in."""
+    cell = 2 * float(extent.half.max()) / _CELLS
+    index = torch.floor((points_level - extent.centre) / cell).long() + 2 * _CELLS
+    return (index[:, 0] * 4 * _CELLS + index[:, 1]) * 4 * _CELLS + index[:, 2]
+
+
+def _detail(extent: Extent) -> tuple[Tensor, Tensor]:
+    """Cells that hold solid Gaussians, ascending, and how much each counts, about 1."""
+    inside = ((extent.solid - extent.centre).abs() <= 1.3 * extent.half).all(dim=1)
+    cells, counts = _cells(extent.solid[inside], extent).unique(return_counts=True)
+    share = counts.double() / counts.double().mean().clamp_min(1e-9)
+    return cells, 0.5 + share.clamp_max(_MAX_DETAIL)
+
+
+def _greedy(
+    glimpses: Sequence[_Glimpse],
+    count: int,
+    *,
+    begin: Sequence[int],
+    detail: tuple[Tensor, Tensor],
+) -> list[int]:
     """Candidates by what they add, until enough are taken or nothing is left to gain.
 
     The first half is taken from `begin`, as far as there are any.
     """
     every = torch.cat([g.cells for g in glimpses]).unique()
     rows = [torch.searchsorted(every, g.cells) for g in glimpses]
+    # A cell that shows a surface and holds no centre counts as one of few.
+    held, share = detail
+    at = torch.searchsorted(held, every).clamp_max(max(len(held) - 1, 0))
+    counts = torch.full((len(every),), 0.5, dtype=torch.float64)
+    if len(held):
+        counts = torch.where(held[at] == every, share[at], counts)
     often = torch.zeros(len(every), dtype=torch.float64)
     chosen: list[int] = []
     while len(chosen) < min(count, len(glimpses)):
-        value = torch.where(often < _OFTEN, 0.5**often, torch.zeros_like(often))
+        value = torch.where(often < OFTEN, counts * _AGAIN**often, torch.zeros_like(often))
         first = [i for i in begin if i not in chosen] if len(chosen) < (count + 1) // 2 else []
         able = first or [i for i in range(len(glimpses)) if i not in chosen]
         gains = {i: float((value[rows[i]] * glimpses[i].worth).sum()) for i in able}
         best = max(able, key=gains.__getitem__)
-        if not first and len(chosen) >= _MIN_VIEWS and gains[best] < _GAIN * len(every):
+        if not first and len(chosen) >= _MIN_VIEWS and gains[best] < _GAIN * float(counts.sum()):
             break
         chosen.append(best)
         often[rows[best]] += glimpses[best].worth

@@ -1,6 +1,6 @@
 """2D models behind small protocols: recorded ones, stand-ins without weights, and other people's.
 
-Models see photographs and give evidence; they never see Gaussians. See ``docs/models.md``.
+Models see images and give evidence; they never see Gaussians. See ``docs/models.md``.
 """
 
 from splatseg.models._cache import ModelCache as ModelCache

@@ -55,8 +55,14 @@ def abilities(model: Model) -> tuple[What, ...]:
     return tuple(what for what, protocol in _PROTOCOLS.items() if isinstance(model, protocol))
 
 
-def computed(model: Model, *, what: What | None, cache: ModelCache | None) -> Source:
-    """Evidence from running a model.
+def computed(
+    model: Model,
+    *,
+    what: What | None,
+    cache: ModelCache | None,
+    image_of: Callable[[View, Path], Image] | None,
+) -> Source:
+    """Evidence from running a model on what `image_of` gives of each view.
 
     Raises:
         InputError: If the model cannot give this, or nothing at all.
@@ -71,7 +77,7 @@ def computed(model: Model, *, what: What | None, cache: ModelCache | None) -> So
         raise InputError(
             f"model {model.name!r}: expected one of what it gives ({', '.join(can)}), got {what!r}."
         )
-    return _Computed(model=model, asked=what, cache=cache)
+    return _Computed(model=model, asked=what, cache=cache, image_of=image_of)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,6 +85,7 @@ class _Computed(Source):
     model: Any
     asked: What
     cache: ModelCache | None
+    image_of: Callable[[View, Path], Image] | None
     counts: dict[str, int] = field(default_factory=dict[str, int])
     """Masks by view, for the notes."""
 
@@ -125,7 +132,7 @@ class _Computed(Source):
 
     @override
     def write(self, folder: Path, view: View) -> int:
-        image = load_image(view)
+        image = load_image(view) if self.image_of is None else self.image_of(view, folder)
         if self.asked == "masks":
             masks = without_empty(self._ask(ModelCache.masks, self.model.masks, image))
             self._check_size(view, masks.height, masks.width)

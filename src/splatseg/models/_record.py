@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from splatseg.core import View
-from splatseg.core.models import Model, ModelWithDefaults
+from splatseg.core.models import Image, Model, ModelWithDefaults
 from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
 from splatseg.errors import InputError
 from splatseg.io.atomic import TEMPORARY, hidden_folder, is_vacant, replace_folder, sweep
@@ -68,6 +68,7 @@ def record_evidence(
     overwrite: bool = False,
     missing: Literal["refuse", "skip"] = "refuse",
     cache: ModelCache | None = None,
+    image_of: Callable[[View, Path], Image] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SeenEvidence:
     """Write what a model sees in views, one view at a time; a second call does what is left.
@@ -86,6 +87,9 @@ def record_evidence(
         overwrite: Whether evidence of the same name is replaced, once the new one is complete.
         missing: Whether it is an error that recorded evidence lacks a view.
         cache: Where to look before the model is run.
+        image_of: Gives the picture of a view that the model is to see, in the pixels of its
+            camera, and may keep it in the folder where the evidence is being written, which it
+            is given too. None takes photographs.
         progress: Called with the number of views done and of all.
 
     Raises:
@@ -100,7 +104,7 @@ def record_evidence(
     source = (
         copied(model, views, what=what, missing=missing)
         if isinstance(model, AnyRecorded)
-        else computed(model, what=what, cache=cache)
+        else computed(model, what=what, cache=cache, image_of=image_of)
     )
     source.check_target(target)
     available = source.available(views)

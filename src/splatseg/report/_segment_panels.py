@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -49,7 +50,10 @@ class ViewPanel:
     name: str
     held_out: bool
     image: UInt8[Tensor, "height width 3"]
-    """The photograph, or the rendering where there is none."""
+    """The photograph; where there is none the render, the model's own if it was kept."""
+
+    photographed: bool
+    """Whether the picture is a photograph."""
 
     rendered: UInt8[Tensor, "height width 3"] | None
     """The rendering, beside a photograph."""
@@ -91,14 +95,16 @@ def view_panel(
         shown = label_map_in(looked_at, layer, camera).ids
         confidence = looked_at.confidence(layer)
         image = rendered = rendered_image(looked_at, size)
-        if view.image is not None:
-            image = _resized(load_image(view, longest=max(size)), size)
+        picture = view.image or _kept_render(evidence, view.name)
+        if picture is not None:
+            image = _resized(load_image(replace(view, image=picture), longest=max(size)), size)
     seen = _evidence_ids(evidence, view.name)
     seen = None if seen is None else _nearest(seen, size)
     return ViewPanel(
         name=view.name,
         held_out=held_out,
         image=image,
+        photographed=view.image is not None,
         rendered=None if view.image is None else rendered,
         drawn=shown,
         confidence=confidence,
@@ -172,7 +178,7 @@ def gallery(
     with_photographs = any(panel.rendered is not None for panel in panels)
     with_evidence = any(panel.evidence is not None for panel in panels)
     with_truth = any(panel.truth is not None for panel in panels)
-    columns = ["photograph", "rendered"] if with_photographs else ["rendered"]
+    columns = [_picture_name(panels)] + ["rendered"] * with_photographs
     columns += ["evidence as it came"] * with_evidence + ["labels on it", "confidence"]
     columns += ["truth", "errors in red"] * with_truth
     low, high = confidence_range(panels)
@@ -213,6 +219,18 @@ def _rendered(panel: ViewPanel, size: tuple[int, int]) -> GalleryImage:
         return _nothing(size)
     likeness = psnr(panel.rendered, panel.image)
     return GalleryImage(image=_resized(panel.rendered, size), caption=f"{likeness:.1f} dB")
+
+
+def _picture_name(panels: Sequence[ViewPanel]) -> str:
+    """What the pictures of views are."""
+    if all(panel.photographed for panel in panels):
+        return "photograph"
+    return "photograph or render" if any(panel.photographed for panel in panels) else "render"
+
+
+def _kept_render(evidence: LabelSource | None, name: str) -> Path | None:
+    """What the model was shown of a view without a photograph, where it was kept."""
+    return evidence.render(name) if isinstance(evidence, Evidence) else None
 
 
 def _evidence_image(

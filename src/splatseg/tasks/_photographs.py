@@ -30,6 +30,7 @@ def capture_of(
     *,
     scene: Path,
     format: str,
+    strict: bool,
     poses: Poses,
     frames: int,
     seed: int,
@@ -42,6 +43,7 @@ def capture_of(
         scene: The scene folder; poses that are found are kept in it, and read from there by a
             later run with the same photographs.
         format: How a capture is read; see `read_capture`.
+        strict: Whether a capture may list photographs that are not there; see `read_capture`.
         poses: Where cameras come from.
         frames: Frames taken from a video.
         seed: Of everything that is drawn at random.
@@ -51,7 +53,7 @@ def capture_of(
         The capture, and how its poses were found; None where they came with it.
     """
     if not _without_poses(data, format, poses):
-        return read_capture(data, format=format), None
+        return read_capture(data, format=format, strict=strict), None
     check_utf8(data)
     options = PoseOptions(seed=seed, frames=frames)
     with observer.pose_stage() as step:

@@ -34,11 +34,15 @@ class ImportOptions:
     as_is: bool = False
     """Take the file as it stands, without comparing it with the photographs."""
 
+    strict: bool = False
+    """Refuse a capture that lists a photograph which is not there."""
+
     up: UpAxis = "auto"
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else."""
 
-    max_views: int = 40
-    """Most virtual cameras to place. Every eighth is a test view."""
+    max_views: int | None = None
+    """Most virtual cameras to place; None takes 40 around an object and 96 within a room. Every
+    eighth is a test view."""
 
     width: int = 800
     """Width of the virtual views, pixels."""
@@ -51,7 +55,7 @@ class ImportOptions:
     scene surrounds them."""
 
     def __post_init__(self) -> None:
-        if self.max_views < 1:
+        if self.max_views is not None and self.max_views < 1:
             raise InputError(f"max_views: expected at least 1, got {self.max_views}.")
         if min(self.width, self.height) < 16:
             raise InputError(
@@ -59,6 +63,8 @@ class ImportOptions:
             )
         if self.as_is and self.data is None:
             raise InputError("as_is: goes with `data`, which says what the file is compared with.")
+        if self.strict and self.data is None:
+            raise InputError("strict: goes with `data`, whose photographs it is about.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -109,7 +115,7 @@ def import_scene(
     provenance = _provenance(file, backend)
     alignment, placed = None, None
     if options.data is not None:
-        capture = read_capture(options.data, format=options.format)
+        capture = read_capture(options.data, format=options.format, strict=options.strict)
         for note in capture.notes:
             observer.note(note)
         if not options.as_is:

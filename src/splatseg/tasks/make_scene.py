@@ -40,6 +40,9 @@ class MakeSceneOptions(CheckpointOptions):
     format: str = "auto"
     """How the capture is read: auto, nerfstudio, colmap, blender, llff or idr."""
 
+    strict: bool = False
+    """Refuse a capture that lists a photograph which is not there."""
+
     poses: Poses = "auto"
     """Where cameras come from: given, the capture; sfm, from the photographs alone; auto, sfm
     where the capture has none."""
@@ -182,6 +185,7 @@ def _capture(
         data,
         scene=folder,
         format=options.format,
+        strict=options.strict,
         poses=options.poses,
         frames=options.frames,
         seed=fit_options.seed,

@@ -1,17 +1,20 @@
 """A 2D model looks at a scene's photographs, and what it sees is written down."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from splatseg.core import Model, Scene
 from splatseg.errors import InputError
+from splatseg.io.evidence import RENDERS_FOLDER
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import ModelCache, SeenEvidence, find_model, record_evidence
 from splatseg.models.classical import Classical, RegionOptions
 from splatseg.models.recorded import AnyRecorded, recorded_model
+from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._view_images import ViewImages
 from splatseg.tasks.scene_parts import views_asked, views_recorded
 
 EVIDENCE_FOLDER = "evidence"
@@ -67,9 +70,13 @@ def see(
     *,
     options: SeeOptions | None = None,
     regions: RegionOptions | None = None,
+    backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> SeenEvidence:
     """Write what a model sees in views to SCENE/evidence/NAME, a file a view.
+
+    A view with a photograph is shown by it. One that has none, a virtual view, is drawn, and the
+    render is kept beside the evidence in ``_renders``; models get images only.
 
     A call that was stopped, by an exception out of the observer too, has written whole views;
     the same call again does the rest.
@@ -80,6 +87,7 @@ def see(
         evidence: Name of the evidence to write.
         options: What is asked.
         regions: Settings of the masks of the model ``classical``.
+        backend: Who renders views without photographs.
         observer: Is told of the progress.
 
     Raises:
@@ -98,23 +106,35 @@ def see(
         cache = ModelCache(folder=options.cache, precision=options.precision, report=observer.note)
     if found.note:
         observer.note(f"{found.name}: {found.note}")
+    folder = scene_path(scene.root, EVIDENCE_FOLDER, evidence)
+    images = ViewImages(scene, backend=backend)
     with work_on_scene(scene.root, "see"), observer.stage("see") as step:
         seen = record_evidence(
             found,
             views,
-            scene_path(scene.root, EVIDENCE_FOLDER, evidence),
+            folder,
             what=options.what,
             asked=views_recorded(options.views),
             overwrite=options.overwrite,
             missing="skip" if options.allow_missing else "refuse",
             cache=cache,
+            image_of=images,
             progress=step,
         )
+    if images.drawn:
+        seen = replace(seen, notes=(*seen.notes, _rendered(images.drawn, folder)))
     for note in seen.notes:
         observer.note(note)
     if cache is not None:
         observer.note(f"{cache.folder}: {cache.size()}")
     return seen
+
+
+def _rendered(drawn: int, folder: Path) -> str:
+    views = (
+        "view that has no photograph was" if drawn == 1 else "views that have no photograph were"
+    )
+    return f"{drawn} {views} rendered for the model; the renders are in {folder / RENDERS_FOLDER}."
 
 
 def _model(asked: str | Model, options: SeeOptions, regions: RegionOptions | None) -> Model:

@@ -130,13 +130,6 @@ def test_a_missing_mask_is_named(nerfstudio) -> None:
         read_capture(folder)
 
 
-def test_missing_photographs_are_counted_and_five_named(nerfstudio) -> None:
-    folder = nerfstudio(tuple(f"{i}.png" for i in range(7)), images=False)
-    with pytest.raises(MissingFileError, match="7 of 7 photographs are missing") as caught:
-        read_capture(folder)
-    assert str(caught.value).count(".png") == 5
-
-
 def test_photographs_of_a_uniform_scale_are_taken_and_it_is_said(nerfstudio) -> None:
     folder = nerfstudio(top={"w": 2 * WIDTH, "h": 2 * HEIGHT + 1})
     capture = read_capture(folder)
@@ -256,14 +249,6 @@ def test_blender_captures(tmp_path) -> None:
     camera = capture.views[0].camera
     assert (camera.fx, camera.cx) == (pytest.approx(40), 20)
     assert (load_image(capture.views[0]) == 255).all(), "transparent is white"
-
-
-def test_a_missing_blender_photograph_is_named(tmp_path) -> None:
-    frame = {"file_path": "./train/r_0", "transform_matrix": opengl_pose().tolist()}
-    content = {"camera_angle_x": 0.7, "frames": [frame]}
-    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
-    with pytest.raises(MissingFileError, match=r"1 of 1 photographs .*train/r_0.png"):
-        read_capture(tmp_path)
 
 
 @pytest.mark.parametrize(

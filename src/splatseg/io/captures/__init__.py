@@ -25,23 +25,26 @@ FORMATS = ("nerfstudio", "blender", "colmap", "llff", "idr")
 """Layouts that are read, in the order in which they are looked for."""
 
 
-def read_capture(path: Path | str, *, format: str = "auto") -> Capture:
+def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False) -> Capture:
     """Read a capture: cameras, split, start points and classes, not the photographs themselves.
 
     Views are sorted by name. The split is the capture's own, else every 8th view by sorted
     name (0, 8, 16, ...) is a test view. Photographs are checked to be there and to have the
-    size their intrinsics say, or a uniform scale of it, which is noted.
+    size their intrinsics say, or a uniform scale of it, which is noted. Those that are listed
+    and not there are left out, which is noted too, as long as half of them are there.
 
     Args:
         path: The capture's folder, or its transforms.json, poses_bounds.npy or
             cameras_sphere.npz, or the folder of a COLMAP model.
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
+        strict: Refuse a capture that lists a photograph which is not there.
 
     Returns:
         The capture, with `notes` on what a person should know of how it was read.
 
     Raises:
-        MissingFileError: If there is no such folder, or photographs are missing.
+        MissingFileError: If there is no such folder, or more than half of the photographs (with
+            `strict` any) are missing.
         InputError: If no layout is found, or what it says cannot be; one sentence with the
             reason.
     """
@@ -59,15 +62,15 @@ def read_capture(path: Path | str, *, format: str = "auto") -> Capture:
         format = found[0]
     match format:
         case "nerfstudio":
-            return read_nerfstudio(folder)
+            return read_nerfstudio(folder, strict=strict)
         case "blender":
-            return read_blender(folder)
+            return read_blender(folder, strict=strict)
         case "colmap":
-            return read_colmap(folder)
+            return read_colmap(folder, strict=strict)
         case "llff":
-            return read_llff(folder)
+            return read_llff(folder, strict=strict)
         case _:
-            return read_idr(folder)
+            return read_idr(folder, strict=strict)
 
 
 def find_formats(folder: Path) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ def find_blender(folder: Path) -> bool:
     return (folder / "transforms_train.json").is_file()
 
 
-def read_blender(folder: Path) -> Capture:
+def read_blender(folder: Path, *, strict: bool = False) -> Capture:
     """Read a NeRF-synthetic capture; see `read_capture`.
 
     One file a split; ``camera_angle_x`` (radians) gives the focal length, the principal point
@@ -42,7 +42,7 @@ def read_blender(folder: Path) -> Capture:
         if not isinstance(frames, list):
             raise FileFormatError(f"{path}: expected a list of frames, got none.")
         raw += [_raw_view(content, frame, split, path=path) for frame in frames]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-    return build_capture(folder, raw, format="blender", points=points_beside(folder))
+    return build_capture(folder, raw, format="blender", points=points_beside(folder), strict=strict)
 
 
 def _raw_view(content: Mapping[str, Any], frame: object, split: str, *, path: Path) -> RawView:

@@ -33,6 +33,12 @@ MAX_SIDE = 1 << 24
 _LONGEST = 100
 """Characters of a path in a message; its end is kept."""
 
+MIN_THERE = 0.5
+"""Least share of the photographs that a capture lists which must be there."""
+
+# So many photographs that are not there are named in a note.
+_NAMED = 20
+
 _ROTATION_TOLERANCE = 1e-3
 # A matrix this close to a rotation is kept to the last bit; others are made exact.
 _ROTATION_EXACT = 1e-9
@@ -83,13 +89,19 @@ def build_capture(
     points: PointCloud | None = None,
     splats: Path | None = None,
     notes: Sequence[str] = (),
+    strict: bool = False,
 ) -> Capture:
     """Check what a reader found and make the capture of it.
+
+    Photographs that are listed and not there are left out, and a note names them. They are
+    left out before views are split, and after they are named: a view keeps its name when the
+    others come back.
 
     Raises:
         InputError: If there is no photograph, one is listed twice, a pose or focal length is
             impossible, or a photograph's size is not that of its intrinsics.
-        MissingFileError: If photographs, masks or depth maps are missing; five are named.
+        MissingFileError: If more than half of the photographs are missing, or any with
+            `strict`, or masks or depth maps of those that are there.
     """
     if not raw:
         raise InputError(
@@ -98,6 +110,10 @@ def build_capture(
     with made_from(path):
         names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
+    missing = tuple(raw[i].relative for i in order if not is_file(raw[i].image))
+    _check_missing(path, missing, listed=len(raw), strict=strict)
+    order = [i for i in order if is_file(raw[i].image)]
+    left_out = [_left_out(missing, listed=len(raw))] if missing else []
     raw, names = [raw[i] for i in order], [names[i] for i in order]
     _check_paths(path, raw)
     _check_files(path, raw)
@@ -122,7 +138,7 @@ def build_capture(
             )
         )
     metadata = read_metadata(path)
-    found = (*notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
+    found = (*left_out, *notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
     return Capture(
         path=path,
         format=format,
@@ -133,6 +149,7 @@ def build_capture(
         metres_per_unit=metadata.metres_per_unit,
         splats=splats,
         notes=found,
+        missing=missing,
     )
 
 
@@ -290,9 +307,29 @@ def _check_paths(path: Path, raw: Sequence[RawView]) -> None:
                 check_utf8(file)
 
 
+def _check_missing(path: Path, missing: Sequence[str], *, listed: int, strict: bool) -> None:
+    """Refuse a capture of which too much is missing."""
+    there = listed - len(missing)
+    if not missing or (not strict and there >= MIN_THERE * listed):
+        return
+    allowed = "all of them" if strict else "at least half of them"
+    raise MissingFileError(
+        f"{path}: {len(missing)} of {listed} photographs that it lists are not there, expected "
+        f"{allowed} ({_first(missing)})."
+    )
+
+
+def _left_out(missing: Sequence[str], *, listed: int) -> str:
+    """The note that names photographs that are not there."""
+    verb = "is" if len(missing) == 1 else "are"
+    return (
+        f"{len(missing)} of {listed} photographs that the capture lists {verb} not there and left "
+        f"out ({_first(missing, _NAMED)})"
+    )
+
+
 def _check_files(path: Path, raw: Sequence[RawView]) -> None:
     for what, files in (
-        ("photographs", [view.image for view in raw]),
         ("masks", [view.mask for view in raw if view.mask is not None]),
         ("depth maps", [view.depth for view in raw if view.depth is not None]),
     ):

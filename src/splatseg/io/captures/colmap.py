@@ -7,7 +7,7 @@ from splatseg.core import Capture
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures import _colmap_binary, _colmap_text
 from splatseg.io.captures._nerfstudio_split import splits_beside
-from splatseg.io.captures.build import RawView, build_capture
+from splatseg.io.captures.build import MIN_THERE, RawView, build_capture
 from splatseg.io.captures.colmap_model import ColmapModel, intrinsics_of, poses_of
 from splatseg.io.foreign import is_file
 
@@ -27,7 +27,7 @@ def find_colmap(folder: Path) -> Path | None:
     return None
 
 
-def read_colmap(folder: Path) -> Capture:
+def read_colmap(folder: Path, *, strict: bool = False) -> Capture:
     """Read a capture with a COLMAP model; see `read_capture`.
 
     The model is sought in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, ``colmap/sparse`` and
@@ -76,6 +76,7 @@ def read_colmap(folder: Path) -> Capture:
         format="colmap",
         points=model.points,
         notes=_notes(model_folder),
+        strict=strict,
     )
 
 
@@ -99,14 +100,23 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 
 
 def _image_folder(folder: Path, names: Iterable[str]) -> tuple[Path, Path]:
-    """The capture's folder and the one its photographs lie in."""
-    first = [name.replace("\\", "/") for name in names][:20]
+    """The capture's folder and the one its photographs lie in.
+
+    The first that has enough of them; a complete one comes after, if it is of another size.
+    """
+    images = [name.replace("\\", "/") for name in names]
     # The folder may be the model itself, or one between it and the capture.
     roots = [folder, *list(folder.resolve().parents)[:_LEVELS_UP]]
     for root in roots:
-        for name in _IMAGE_FOLDERS:
-            if any(is_file(root / name / image) for image in first):
-                return root, root / name
+        best, most = root, 0
+        for candidate in (root / name for name in _IMAGE_FOLDERS):
+            there = sum(is_file(candidate / image) for image in images)
+            if there > most:
+                best, most = candidate, there
+            if most >= MIN_THERE * len(images) > 0:
+                break
+        if most:
+            return root, best
     # None is there: the complaint about missing photographs names where they belong.
     return folder, folder / _IMAGE_FOLDERS[0]
 

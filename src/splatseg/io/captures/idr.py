@@ -1,6 +1,7 @@
 """Reads IDR captures: cameras_sphere.npz, photographs and object masks (DTU as IDR ships it)."""
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def find_idr(folder: Path) -> Path | None:
     return next((folder / name for name in FILES if (folder / name).is_file()), None)
 
 
-def read_idr(folder: Path) -> Capture:
+def read_idr(folder: Path, *, strict: bool = False) -> Capture:
     """Read an IDR capture; see `read_capture`.
 
     ``world_mat_i`` holds the 3 x 4 projection P = K [R | t] of the photograph i by name, in
@@ -38,26 +39,26 @@ def read_idr(folder: Path) -> Capture:
     that brings the principal points closest to the middle of the photographs. An object mask of
     the same stem in ``masks`` or ``mask`` becomes the view's mask.
 
+    Where there are fewer photographs than matrices, the numbers at the end of their names tell
+    which are missing, if the first photograph is there to show where numbers begin.
+
     Raises:
         MissingFileError: If there is no such file, or photographs are missing.
-        InputError: If a matrix is no projection, or no scale fits the photographs.
+        InputError: If a matrix is no projection, no scale fits the photographs, or it cannot be
+            told which photographs are missing.
     """
     path = find_idr(folder)
     if path is None:
         raise MissingFileError(f"{folder}: expected {' or '.join(FILES)}, got neither.")
     matrices = _matrices(path)
     images = next((found for name in _IMAGE_FOLDERS if (found := find_images(folder / name))), ())
-    if len(images) != len(matrices):
-        raise InputError(
-            f"{path}: expected one world_mat a photograph, got {len(matrices)} for "
-            f"{len(images)} photographs."
-        )
+    of_images = _matrices_of(images, matrices, path)
     if not images:
         raise InputError(f"{path}: expected photographs with poses, got none.")
     masks = {mask.stem: mask for name in _MASK_FOLDERS for mask in find_images(folder / name)}
     parts = [
         decompose(p, where=f"{path}: world_mat of {i.name}")
-        for p, i in zip(matrices, images, strict=True)
+        for i, p in ((image, matrices[of_images[image]]) for image in images)
     ]
     sizes = [image_size(image) for image in images]
     scale = _scale([k for k, _ in parts], sizes, path)
@@ -78,8 +79,12 @@ def read_idr(folder: Path) -> Capture:
         )
         for image, (k, pose), (width, height) in zip(images, parts, sizes, strict=True)
     ]
+    used = set(of_images.values())
+    raw += [_missing(folder, index) for index in matrices if index not in used]
     notes = [] if scale == 1 else [f"intrinsics were scaled by {scale:g} to fit the photographs"]
-    return build_capture(folder, raw, format="idr", points=points_beside(folder), notes=notes)
+    return build_capture(
+        folder, raw, format="idr", points=points_beside(folder), notes=notes, strict=strict
+    )
 
 
 def decompose(
@@ -113,20 +118,48 @@ def decompose(
     return k, pose
 
 
-def _matrices(path: Path) -> list[NDArray[np.float64]]:
+def _matrices_of(
+    images: Sequence[Path], matrices: Mapping[int, NDArray[np.float64]], path: Path
+) -> dict[Path, int]:
+    """The number of each photograph's matrix: by order, or by its name where some are missing."""
+    if len(images) == len(matrices):
+        return dict(zip(images, matrices, strict=True))
+    ends = [re.search(r"(\d+)$", image.stem) for image in images]
+    numbers = [int(found[1]) for found in ends if found]
+    told = len(set(numbers)) == len(images) > 0 and set(numbers) < set(matrices)
+    # Names that begin at 1 could be those of matrices that begin at 0.
+    if not told or min(numbers) != min(matrices):
+        raise InputError(
+            f"{path}: expected one world_mat a photograph, or photographs numbered as they are "
+            f"from the first on, got {len(matrices)} for {len(images)} photographs."
+        )
+    return dict(zip(images, numbers, strict=True))
+
+
+def _missing(folder: Path, index: int) -> RawView:
+    """A photograph that only its matrix tells of; its size is not known and not needed."""
+    return RawView(
+        image=folder / _IMAGE_FOLDERS[0] / f"world_mat_{index}",
+        relative=f"world_mat_{index}",
+        intrinsics=Intrinsics(fx=1, fy=1, cx=0.5, cy=0.5, width=1, height=1),
+        cam_from_world=np.eye(4),
+    )
+
+
+def _matrices(path: Path) -> dict[int, NDArray[np.float64]]:
     with open_npz(path) as archive:
         names = sorted(
             (int(found[1]), key)
             for key in archive.names
             if (found := re.fullmatch(r"world_mat_([0-9]{1,9})", key))
         )
-        matrices = [archive.array(key) for _, key in names]
-    for (index, _), matrix in zip(names, matrices, strict=True):
+        matrices = {index: archive.array(key) for index, key in names}
+    for index, matrix in matrices.items():
         if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "iuf":
             raise FileFormatError(
                 f"{path}: expected world_mat_{index} of 4 x 4 numbers, got shape {matrix.shape}."
             )
-    return [matrix.astype(np.float64) for matrix in matrices]
+    return {index: matrix.astype(np.float64) for index, matrix in matrices.items()}
 
 
 def _scale(ks: list[NDArray[np.float64]], sizes: list[tuple[int, int]], path: Path) -> float:

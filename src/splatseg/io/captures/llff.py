@@ -16,7 +16,7 @@ FILE = "poses_bounds.npy"
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", ".")
 
 
-def read_llff(folder: Path) -> Capture:
+def read_llff(folder: Path, *, strict: bool = False) -> Capture:
     """Read an LLFF capture; see `read_capture`.
 
     A row of poses_bounds.npy is a 3 x 5 matrix, row-major, and the near and far bound. Its
@@ -34,7 +34,7 @@ def read_llff(folder: Path) -> Capture:
     if len(images) != len(rows):
         raise InputError(
             f"{folder / FILE}: expected one row a photograph, got {len(rows)} rows for "
-            f"{len(images)} photographs."
+            f"{len(images)} photographs, and rows do not say of which photograph they are."
         )
     raw = [
         RawView(
@@ -45,7 +45,7 @@ def read_llff(folder: Path) -> Capture:
         )
         for i, (image, row) in enumerate(zip(images, rows, strict=True))
     ]
-    return build_capture(folder, raw, format="llff", points=points_beside(folder))
+    return build_capture(folder, raw, format="llff", points=points_beside(folder), strict=strict)
 
 
 def _rows(path: Path) -> NDArray[np.float64]:

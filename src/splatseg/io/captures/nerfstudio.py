@@ -42,7 +42,7 @@ _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 
 
-def read_nerfstudio(folder: Path, *, file: str = FILE) -> Capture:
+def read_nerfstudio(folder: Path, *, file: str = FILE, strict: bool = False) -> Capture:
     """Read a capture with a transforms.json; see `read_capture`.
 
     Intrinsics stand at the top or in a frame, which wins: ``fl_x fl_y cx cy w h`` in pixels
@@ -65,7 +65,9 @@ def read_nerfstudio(folder: Path, *, file: str = FILE) -> Capture:
         for i, (frame, split) in enumerate(zip(frames, splits, strict=True))
     ]
     points, splats = _points(content, folder)
-    return build_capture(folder, raw, format="nerfstudio", points=points, splats=splats)
+    return build_capture(
+        folder, raw, format="nerfstudio", points=points, splats=splats, strict=strict
+    )
 
 
 def frame_matrix(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]:

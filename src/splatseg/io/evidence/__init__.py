@@ -11,6 +11,7 @@ A folder of evidence holds one of
 In files 0 is void; in memory it is -1. See ``docs/formats.md`` for every byte.
 """
 
+from splatseg.io.evidence._base import RENDERS_FOLDER as RENDERS_FOLDER
 from splatseg.io.evidence._base import Evidence as Evidence
 from splatseg.io.evidence._base import EvidenceKind as EvidenceKind
 from splatseg.io.evidence._base import view_files as view_files
@@ -34,5 +35,6 @@ from splatseg.io.evidence._write import create_evidence as create_evidence
 from splatseg.io.evidence._write import save_features as save_features
 from splatseg.io.evidence._write import save_label_map as save_label_map
 from splatseg.io.evidence._write import save_masks as save_masks
+from splatseg.io.evidence._write import save_render as save_render
 from splatseg.io.evidence._write import save_segments as save_segments
 from splatseg.io.evidence._write import save_tracks as save_tracks

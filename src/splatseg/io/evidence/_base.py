@@ -16,10 +16,14 @@ EvidenceKind = Literal["labels", "panoptic", "tracked", "masks", "features"]
 HEADER_FILE = "evidence.json"
 CONFIDENCE_FOLDER = "_confidence"
 
+RENDERS_FOLDER = "_renders"
+"""Pictures of views without photographs, as the model saw them."""
+
 MAX_FILE_ID = 65535
 """Highest id that a label map of 16 bits holds."""
 
-# Files of a folder of evidence that are not of a view.
+# What a folder of evidence holds beside the files of its views.
+_BESIDE = frozenset({CONFIDENCE_FOLDER, RENDERS_FOLDER})
 _TABLES = frozenset({HEADER_FILE, "segments.json", "tracks.json", "legend.json"})
 _SHARED_ARRAYS = frozenset({"quant.npz", "basis.npz", "text_embeddings.npz"})
 
@@ -78,6 +82,11 @@ class Evidence(ABC):
             InputError: If this kind of evidence has none, or there is no such view.
             FileFormatError: If the file cannot be read as one.
         """
+
+    def render(self, name: str) -> Path | None:
+        """The picture that the model saw of a view without a photograph, where it was kept."""
+        path = self.folder / RENDERS_FOLDER / f"{name}.png"
+        return path if path.is_file() else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -144,7 +153,7 @@ def view_files(folder: Path, suffix: str) -> dict[str, Path]:
         below = path.relative_to(folder)
         shared = len(below.parts) == 1 and below.name in _TABLES | _SHARED_ARRAYS
         hidden = any(part.startswith(".") for part in below.parts)
-        if path.is_file() and not shared and not hidden and below.parts[0] != CONFIDENCE_FOLDER:
+        if path.is_file() and not shared and not hidden and below.parts[0] not in _BESIDE:
             found[below.as_posix().removesuffix(suffix)] = path
     return dict(sorted(found.items()))
 

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_values
 from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Segment, Track
@@ -15,12 +17,17 @@ from splatseg.core.view_names import check_view_name
 from splatseg.errors import InputError, RangeError
 from splatseg.io.atomic import atomic_file, atomic_folder
 from splatseg.io.class_tables import class_rows
-from splatseg.io.evidence._base import CONFIDENCE_FOLDER, HEADER_FILE, EvidenceKind
+from splatseg.io.evidence._base import (
+    CONFIDENCE_FOLDER,
+    HEADER_FILE,
+    RENDERS_FOLDER,
+    EvidenceKind,
+)
 from splatseg.io.evidence._labels import CONFIDENCE_STEPS
 from splatseg.io.evidence._masks import masks_content
 from splatseg.io.evidence._open import FORMAT, VERSION
 from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE
-from splatseg.io.images import write_png
+from splatseg.io.images import save_png, write_png
 from splatseg.io.json_files import json_text, write_json
 from splatseg.io.paths import path_inside
 from splatseg.io.write_errors import write_failures_named
@@ -113,6 +120,17 @@ def save_masks(folder: Path | str, name: str, masks: MaskSet) -> None:
     path = _view_path(Path(folder), name, ".json")
     with atomic_file(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
+
+
+def save_render(folder: Path | str, name: str, image: UInt8[Tensor, "height width 3"]) -> Path:
+    """Keep the picture that a model saw of a view without a photograph, beside the evidence.
+
+    Returns:
+        The file, FOLDER/_renders/VIEW.png.
+    """
+    path = _view_path(Path(folder) / RENDERS_FOLDER, name, ".png")
+    save_png(image, path)
+    return path
 
 
 def save_segments(folder: Path | str, segments: Mapping[str, Sequence[Segment]]) -> None:

@@ -12,6 +12,9 @@ from splatseg.pose.doctor._matches import Matches, match_views
 from splatseg.pose.doctor._search import match_evidence
 from splatseg.pose.doctor._world import judge_points, judge_up
 
+# So many photographs that are not there are named.
+_NAMED = 5
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorOptions:
@@ -62,7 +65,8 @@ def diagnose(
         )
     examination = examine(capture, views, matches, seed=options.seed)
     faults = [*found, *examination.faults]
-    doubts, unchecked = list(examination.doubts), list(examination.unchecked)
+    doubts = [*_missing(capture), *examination.doubts]
+    unchecked = list(examination.unchecked)
     figures = dict(examination.figures)
     evidence = PointEvidence(
         photographs=examination.photographs,
@@ -87,6 +91,14 @@ def diagnose(
         figures=figures,
         corrected=upright.capture if faults and not helpless else None,
     )
+
+
+def _missing(capture: Capture) -> list[str]:
+    """A sentence on photographs that the capture lists and that are not there."""
+    if not capture.missing:
+        return []
+    first = ", ".join(capture.missing[:_NAMED]) + (", ..." if capture.missing[_NAMED:] else "")
+    return [f"{len(capture.missing)} photographs that the capture lists are not there ({first})."]
 
 
 def find_points(
