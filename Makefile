@@ -44,7 +44,7 @@ $(STAMPS)/torch: $(STAMPS)/venv
 # The build requirements are installed, not isolated: cmake then builds in place, and a second
 # run compiles only the kernels that changed.
 $(STAMPS)/build: $(STAMPS)/torch
-	$(PIP) install 'scikit-build-core>=0.10' 'nanobind>=2.4' 'cmake>=3.24' 'ninja>=1.11'
+	$(PIP) install 'scikit-build-core>=0.11.0' 'nanobind>=2.4.0' 'cmake>=3.24.0' 'ninja>=1.11.1'
 	@touch $@
 
 $(STAMPS)/splatseg: $(STAMPS)/build pyproject.toml $(NATIVE_SOURCES)

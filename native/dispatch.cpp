@@ -6,8 +6,20 @@
 
 #include "frame.h"
 
+#if defined(SPLATSEG_HAS_X86)
+#include <cpuid.h>
+#endif
+
 namespace splatseg {
 namespace {
+
+#if defined(SPLATSEG_HAS_X86)
+// Asked of the processor itself: __builtin_cpu_supports does not know "f16c" in clang 14.
+bool has_f16c() {
+  unsigned int eax = 0, ebx = 0, ecx = 0, edx = 0;
+  return __get_cpuid(1, &eax, &ebx, &ecx, &edx) != 0 && (ecx & bit_F16C) != 0;
+}
+#endif
 
 const Kernels* find(const char* name) {
 #if defined(SPLATSEG_HAS_X86)
@@ -18,8 +30,7 @@ const Kernels* find(const char* name) {
                ? &avx512::table()
                : nullptr;
   if (!std::strcmp(name, "avx2"))
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                   __builtin_cpu_supports("f16c")
+    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && has_f16c()
                ? &avx2::table()
                : nullptr;
 #endif

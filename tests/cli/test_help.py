@@ -21,6 +21,7 @@ from splatseg.errors import InputError
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.skipif(tyro.__version__.startswith("0."), reason="the pages have tyro 1's layout")
 def test_pages_are_what_the_parser_says() -> None:
     loader = importlib.machinery.SourceFileLoader("help_pages", str(ROOT / "scripts/help_pages"))
     spec = importlib.util.spec_from_loader("help_pages", loader)

@@ -64,16 +64,6 @@ def inside(scene, camera):
 # --- what it says -----------------------------------------------------------------------------
 
 
-def test_without_gsplat_it_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(cuda_module, "importlib", _NoModules)
-    with pytest.raises(MissingPackageError) as caught:
-        CudaBackend()
-    assert str(caught.value) == (
-        "backend 'cuda' needs a package that is not installed (gsplat). "
-        "Try: pip install 'splatseg[cuda]'."
-    )
-
-
 class _NoModules:
     """Stands for importlib where nothing is installed."""
 
@@ -102,8 +92,25 @@ def test_asking_for_cuda_never_gives_another(monkeypatch, scene, camera):
 def test_kernels_that_do_not_load_are_reported(monkeypatch):
     """gsplat without its compiled part imports well and fails at the first call."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    with pytest.raises(BackendError, match="kernels do not load"):
+    with pytest.raises(BackendError, match=r"kernels do not load .*needs nvcc of the CUDA toolkit"):
         cuda_module.load_gsplat(device="cpu")
+
+
+def test_without_gsplat_it_says_what_else_that_needs(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(cuda_module, "importlib", _NoModules)
+    with pytest.raises(MissingPackageError, match=r"pip install 'splatseg\[cuda\]'") as caught:
+        cuda_module.load_gsplat()
+    assert "nvcc of the CUDA toolkit 13.0" in str(caught.value)
+
+
+def test_without_a_gpu_it_does_not_send_for_gsplat(monkeypatch):
+    """It would be of no use there, so what is missing first is said first."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(cuda_module, "importlib", _NoModules)
+    with pytest.raises(MissingPackageError, match="NVIDIA GPU"):
+        cuda_module.load_gsplat()
 
 
 @pytest.mark.parametrize("alpha_max", [0.99, 0.5])

@@ -35,10 +35,10 @@ def save_arrays(
         OSError: If it cannot be written.
     """
     text = json_text(f"{name}: header", header)
+    named: dict[str, Any] = {HEADER: np.frombuffer(text.encode(), np.uint8), **arrays}
     with path.open("wb") as file:
-        np.savez(
-            file, allow_pickle=False, **{HEADER: np.frombuffer(text.encode(), np.uint8)}, **arrays
-        )
+        # Before numpy 2.1 allow_pickle=False would become an array of that name.
+        np.savez(file, **named)
 
 
 def write_checkpoint_file(

@@ -154,7 +154,7 @@ def _encode(answer: Answer, precision: Precision) -> bytes:
     header, arrays = pack(answer, precision)
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, header=text, **cast(dict[str, Any], arrays))
+    np.savez(buffer, header=text, **cast(dict[str, Any], arrays))
     payload = zstandard.ZstdCompressor(level=6).compress(buffer.getvalue())
     return _MAGIC + hashlib.sha256(payload).digest() + payload
 

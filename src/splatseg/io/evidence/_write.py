@@ -181,7 +181,6 @@ def save_features(folder: Path | str, name: str, features: FeatureMap) -> None:
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
-            allow_pickle=False,
             features=half.numpy(),
             stride=np.int64(features.stride),
             size=np.array([features.height, features.width], np.int64),

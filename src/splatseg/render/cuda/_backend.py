@@ -216,13 +216,6 @@ def load_gsplat(device: str = "cuda") -> ModuleType:
         MissingPackageError: If gsplat, or a GPU that torch can use, is missing.
         BackendError: If gsplat's kernels do not load.
     """
-    try:
-        gsplat = importlib.import_module("gsplat")
-    except ImportError as error:
-        raise MissingPackageError(
-            "backend 'cuda' needs a package that is not installed (gsplat). "
-            "Try: pip install 'splatseg[cuda]'."
-        ) from error
     if not torch.cuda.is_available():
         raise MissingPackageError(
             "backend 'cuda' needs an NVIDIA GPU and a torch that can use it, and torch sees "
@@ -230,13 +223,28 @@ def load_gsplat(device: str = "cuda") -> ModuleType:
             "backend."
         )
     try:
+        gsplat = importlib.import_module("gsplat")
+    except ImportError as error:
+        raise MissingPackageError(
+            f"backend 'cuda' needs a package that is not installed (gsplat). Try: pip install "
+            f"'splatseg[cuda]'. {_compiles()}"
+        ) from error
+    try:
         gsplat.quat_scale_to_covar_preci(
             torch.ones(1, 4, device=device), torch.ones(1, 3, device=device)
         )
     except (AttributeError, ImportError, OSError, RuntimeError) as error:
         raise BackendError(
-            f"backend 'cuda': gsplat is installed but its kernels do not load ({error}); it "
-            f"compiles them at first use, which needs the CUDA toolkit (nvcc), or install a "
-            f"wheel of gsplat with kernels for this torch."
+            f"backend 'cuda': gsplat is installed but its kernels do not load ({error}). "
+            f"{_compiles()}"
         ) from error
     return gsplat
+
+
+def _compiles() -> str:
+    """What gsplat needs beside itself: its wheels end at torch 2.4 and Python 3.10."""
+    toolkit = f" {torch.version.cuda}" if torch.version.cuda else ""
+    return (
+        f"gsplat 1.5.3 compiles its kernels at first use, in minutes: that needs nvcc of the CUDA "
+        f"toolkit{toolkit}, the version torch was built with, and a C++ compiler (docs/install.md)."
+    )
