@@ -121,5 +121,5 @@ def test_the_build_has_the_same_minimums_everywhere() -> None:
 
 def test_readme_says_what_to_install_before_the_first_command() -> None:
     before, _, _ = (ROOT / "README.md").read_text(encoding="utf-8").partition("```console")
-    assert "pip install torch --index-url" in before
+    assert "--torch-backend cpu torch" in before
     assert "pip install '.[sfm]'" in before, "what `fit PHOTOS` needs"
