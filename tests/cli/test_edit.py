@@ -55,14 +55,12 @@ def room(tmp_path):
     save_scene(Scene(gaussians=gaussians, views=views), root)
     folder = root / "evidence" / "truth"
     for name, label_map in maps.items():
-        save_label_map(folder, name, label_map)
+        save_label_map(label_map, folder, name)
     labels = uplift(
         gaussians, views, Maps(maps), options=UpliftOptions(candidates=2), backend="cpu"
     )
     info = replace(labels.info, evidence="truth", names={3: "thing", 8: "wall"})
     save_scene_layer(
-        root,
-        "objects",
         labels.__class__(
             **{
                 f: getattr(labels, f)
@@ -70,6 +68,8 @@ def room(tmp_path):
             },
             info=info,
         ),
+        root,
+        "objects",
     )
     return root
 

@@ -32,7 +32,7 @@ def made_room(small_room, tmp_path_factory) -> Path:
     make_scene(small_room, folder, fit_options=options, backend="cpu")
     asked = SegmentOptions(evidence="labels_semantic", layer="classes")
     made = segment(load_scene(folder), "uplift", options=asked, backend="cpu")
-    save_scene_layer(folder, "classes", made.layer)
+    save_scene_layer(made.layer, folder, "classes")
     return folder
 
 

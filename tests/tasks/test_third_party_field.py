@@ -232,8 +232,8 @@ def test_a_report_of_a_field_without_gaussians(scene, field, truth) -> None:
 
     def page(**words) -> str:
         write_segmentation_report(
+            scene,
             truth / "report.html",
-            scene=scene,
             field=field,
             layer="things",
             evidence=open_evidence(truth / "things"),

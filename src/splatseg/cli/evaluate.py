@@ -71,7 +71,7 @@ def run(command: Command) -> None:
     )
     figures["scene"] = str(command.scene)
     if command.json_file is not None:
-        write_json(command.json_file, figures)
+        write_json(figures, command.json_file)
     if command.json:
         print_result(figures, [], json=True)
     else:

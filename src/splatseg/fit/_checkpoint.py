@@ -43,7 +43,7 @@ class Checkpoint:
     """Data, options and backend; see `_identity`."""
 
 
-def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+def write_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     """Write a checkpoint; the previous one stays until the new one is complete.
 
     Raises:

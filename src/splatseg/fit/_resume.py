@@ -44,7 +44,7 @@ class CheckpointClock:
     def write(self, state: FitState) -> float:
         """Write a checkpoint. Returns the seconds it took."""
         begin = time.monotonic()
-        write_checkpoint(self._checkpoints.path, Checkpoint(state=state, identity=self._identity))
+        write_checkpoint(Checkpoint(state=state, identity=self._identity), self._checkpoints.path)
         seconds = time.monotonic() - begin
         self._schedule.written(seconds)
         return seconds

@@ -55,7 +55,7 @@ def json_text(name: str, value: Mapping[str, Any], *, indent: int | None = None)
     return json.dumps(plain_json(name, value), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
+def write_json(value: Mapping[str, Any], path: Path) -> None:
     """Write a JSON object for people to read; atomic.
 
     Raises:

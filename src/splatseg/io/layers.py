@@ -42,7 +42,7 @@ _HEADER = "header"
 _VOID = 0
 
 
-def save_layer(path: Path, layer: Layer) -> None:
+def save_layer(layer: Layer, path: Path) -> None:
     """Write a layer; atomic. Inverse of `load_layer`.
 
     In the file 0 is the id of what has no label, so -1 is written as 0.

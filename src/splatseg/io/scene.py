@@ -187,7 +187,7 @@ def load_scene_layer(root: Path | str, name: str) -> Layer:
     return layer
 
 
-def save_scene_layer(root: Path | str, name: str, layer: Layer) -> Path:
+def save_scene_layer(layer: Layer, root: Path | str, name: str) -> Path:
     """Write a layer into a scene folder; gives the file.
 
     Raises:
@@ -198,7 +198,7 @@ def save_scene_layer(root: Path | str, name: str, layer: Layer) -> Path:
     _check_layer(name, layer, _scene_content(root)["gaussians"])
     folder = root / "layers"
     folder.mkdir(exist_ok=True)
-    save_layer(folder / f"{name}.npz", layer)
+    save_layer(layer, folder / f"{name}.npz")
     return folder / f"{name}.npz"
 
 
@@ -227,12 +227,11 @@ def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Pa
     views = [_absolute(view) for view in scene.views]
     cameras = cameras_content(views, folder=final / "cameras", source=source)
     write_splats(scene.gaussians, folder / GAUSSIANS_FILE)
-    write_json(folder / CAMERAS_FILE, cameras)
+    write_json(cameras, folder / CAMERAS_FILE)
     for name, layer in layers.items():
-        save_layer(folder / "layers" / f"{name}.npz", layer)
+        save_layer(layer, folder / "layers" / f"{name}.npz")
     splits = sorted({view.split for view in scene.views})
     write_json(
-        folder / SCENE_FILE,
         {
             "format": FORMAT,
             "version": VERSION,
@@ -252,6 +251,7 @@ def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Pa
             "classes": None if scene.classes is None else class_rows(scene.classes),
             "provenance": dict(scene.provenance),
         },
+        folder / SCENE_FILE,
     )
 
 

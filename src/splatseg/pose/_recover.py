@@ -179,7 +179,7 @@ def _recover(
         seconds=seconds | result["seconds"],
         longest=options.longest,
     )
-    save_poses(folder, model=work / "model", made_of=made_of, report=report)
+    save_poses(work / "model", folder, made_of=made_of, report=report)
     shutil.rmtree(work)
     return report
 

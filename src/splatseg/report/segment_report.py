@@ -38,9 +38,9 @@ _IMAGE_SIZES = (448, 320, 224, 128)
 
 
 def write_segmentation_report(
+    scene: Scene,
     path: Path,
     *,
-    scene: Scene,
     field: Renderable,
     layer: str,
     evidence: LabelSource | None,
@@ -59,8 +59,8 @@ def write_segmentation_report(
     measured in at most 100. The file stays below 5 MB.
 
     Args:
-        path: The file to write. Its folder must exist.
         scene: The scene.
+        path: The file to write. Its folder must exist.
         field: What is rendered: its Gaussians, or another field of the same views.
         layer: Name of the field's layer.
         evidence: What it was made from; None leaves that out.

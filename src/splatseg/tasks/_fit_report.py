@@ -68,7 +68,7 @@ def score_and_report(
     with atomic_file(folder / "fit.html") as path:
         page = report_html(fit_report(data, pairs=pairs))
         path.write_text(page, encoding="utf-8", newline="\n")
-    write_json(folder / "fit.json", fit_record(data))
+    write_json(fit_record(data), folder / "fit.json")
     return scores, folder / "fit.html"
 
 

@@ -258,7 +258,7 @@ def _layers_to_scene(work: _Work) -> AttachedLayers:
     edited = _edited(work)
     found = _attached(work, scene.gaussians, edited)
     for name, layer in layers.items():
-        save_scene_layer(work.file, name, _carried(work, found, layer))
+        save_scene_layer(_carried(work, found, layer), work.file, name)
     return AttachedLayers(
         output=work.file, gaussians=len(edited), names=tuple(layers), table=None, attached=found
     )

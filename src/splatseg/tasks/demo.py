@@ -117,11 +117,11 @@ def make_demo(
         started=started,
     )
     write_report(
-        folder, figures, seed=options.seed, layer=_LAYER, evidence=_EVIDENCE, objects=_OBJECTS
+        figures, folder, seed=options.seed, layer=_LAYER, evidence=_EVIDENCE, objects=_OBJECTS
     )
     steps.append(("report", time.monotonic() - begin))
     record = _record(figures, steps, time.monotonic() - started)
-    write_json(folder / _RECORD, record)
+    write_json(record, folder / _RECORD)
     return Demo(folder=folder, figures=figures, record=record)
 
 
@@ -213,7 +213,7 @@ class _MainJob:
 
     def _segment(self, scene: Scene, method: str, options: SegmentOptions) -> Segmentation:
         made = segment(scene, method, options=options, backend=self.backend, observer=self.observer)
-        save_scene_layer(self.folder / "scene", made.name, made.layer)
+        save_scene_layer(made.layer, self.folder / "scene", made.name)
         return made
 
     def _evaluate(self, scene: Scene, layer: str, split: str, truth: Path, metric: Metric) -> None:
@@ -281,7 +281,7 @@ def _prepare(folder: Path, observer: Observer) -> None:
             )
         observer.info(f"Replacing the earlier demo in {folder}")
     folder.mkdir(exist_ok=True)
-    write_json(record, {"made_by": _MADE_BY, "finished": False})
+    write_json({"made_by": _MADE_BY, "finished": False}, record)
     for name in _FOLDERS:
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)

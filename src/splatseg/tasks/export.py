@@ -170,7 +170,7 @@ def _points(job: ExportJob) -> Exported:
         content: dict[str, Any] = {"gaussians": len(gaussians), "columns": meaning_of(job)}
         if classified:
             content["las_classification"] = {str(id): value for id, value in classified.items()}
-        write_column_table(beside, content)
+        write_column_table(content, beside)
     return Exported(output=job.output, summary=f"{len(gaussians)} points", table=beside)
 
 
@@ -206,8 +206,8 @@ def _coco(job: ExportJob) -> Exported:
     with job.observer.stage("export") as step:
         frames = panoptic_frames(scene, views, segments, backend=job.backend, progress=step)
         count = write_coco_panoptic(
-            job.output,
             frames,
+            job.output,
             segments=segments.infos,
             categories=segments.categories,
             about=job.about | {"split": options.split},

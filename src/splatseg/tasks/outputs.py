@@ -133,8 +133,8 @@ def report_layer(
     unit = 1 if sys.platform == "darwin" else 1024
     field = GaussianField(scene.gaussians, {result.name: result.layer}, backend=backend)
     write_segmentation_report(
+        scene,
         path,
-        scene=scene,
         field=field,
         labels=field.labels(result.name),
         layer=result.name,

@@ -139,13 +139,13 @@ def render_views(
         _render(scene, field, views, drawn, output, folders=folders, observer=observer)
         # Before the films, which take a while: what an interruption leaves can be replaced.
         entry = {"scene": str(scene.root), "split": options.split, "views": len(views)}
-        write_json(output / _RECORD, record | dict.fromkeys([*folders, *files], entry))
+        write_json(record | dict.fromkeys([*folders, *files], entry), output / _RECORD)
         if on_path:
-            write_path(output, views, pictures="rgb" in folders)
+            write_path(views, output, pictures="rgb" in folders)
         for name in films:
             write_film(
-                output / name,
                 views,
+                output / name,
                 fps=options.fps,
                 is_label_map=name in label_maps,
                 classes=scene.classes,
@@ -182,7 +182,7 @@ def _render(
         for layer in layers:
             if not layer.is_selection:
                 legend = legend_of(layer.summary, scene.classes)
-                write_json(into[layer.name] / "legend.json", legend)
+                write_json(legend, into[layer.name] / "legend.json")
 
 
 def _wanted(what: Sequence[str]) -> list[str]:
@@ -281,12 +281,12 @@ def _finish_depth(folder: Path, views: Sequence[View], scene: Scene) -> None:
     shutil.rmtree(held)
     metres = scene.metres_per_unit
     write_json(
-        folder / "depth.json",
         {
             "unit": unit,
             "unit_m": None if metres is None else unit * metres,
             "meaning": "value * unit = z-depth along the optical axis in scene units; 0 = none",
         },
+        folder / "depth.json",
     )
 
 

@@ -169,13 +169,13 @@ def segment(
     return _segmentation(layer, name, inputs, timings)
 
 
-def save_segmentation(root: Path, made: Segmentation) -> Path:
+def save_segmentation(made: Segmentation, root: Path) -> Path:
     """Write the layer into the scene's folder; then its training needs its checkpoint no more.
 
     Returns:
         The file of the layer.
     """
-    path = save_scene_layer(root, made.name, made.layer)
+    path = save_scene_layer(made.layer, root, made.name)
     if made.checkpoint is not None:
         discard_training(made.checkpoint)
     return path

@@ -61,11 +61,11 @@ def create_evidence(
     }
     json_text("metadata", header)
     folder.mkdir(exist_ok=True)
-    write_json(folder / HEADER_FILE, header)
+    write_json(header, folder / HEADER_FILE)
     return folder
 
 
-def save_label_map(folder: Path | str, name: str, label_map: LabelMap) -> None:
+def save_label_map(label_map: LabelMap, folder: Path | str, name: str) -> None:
     """Write a view's label map: 8 bit where all ids fit, else 16; -1 becomes 0.
 
     Its confidence, if any, goes into a 16 bit PNG of its own.
@@ -97,7 +97,7 @@ def save_label_map(folder: Path | str, name: str, label_map: LabelMap) -> None:
     write_png(values.astype(np.uint8) if highest <= 255 else values.astype(np.uint16), path)
 
 
-def save_masks(folder: Path | str, name: str, masks: MaskSet) -> None:
+def save_masks(masks: MaskSet, folder: Path | str, name: str) -> None:
     """Write a view's masks as compressed COCO run lengths.
 
     Raises:
@@ -110,7 +110,7 @@ def save_masks(folder: Path | str, name: str, masks: MaskSet) -> None:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
 
-def save_segments(folder: Path | str, segments: Mapping[str, Sequence[Segment]]) -> None:
+def save_segments(segments: Mapping[str, Sequence[Segment]], folder: Path | str) -> None:
     """Write the table of panoptic evidence: the segments of each view by its name.
 
     Raises:
@@ -133,19 +133,19 @@ def save_segments(folder: Path | str, segments: Mapping[str, Sequence[Segment]])
                 for segment in rows
             ]
         }
-    write_json(Path(folder) / SEGMENTS_FILE, content)
+    write_json(content, Path(folder) / SEGMENTS_FILE)
 
 
-def save_tracks(folder: Path | str, tracks: Sequence[Track], *, order: Sequence[str]) -> None:
+def save_tracks(tracks: Sequence[Track], folder: Path | str, *, order: Sequence[str]) -> None:
     """Write the table of tracked evidence: the tracks, and the views as they were gone through."""
     content = {
         "order": list(order),
         "tracks": {str(track.id): {"category_votes": dict(track.votes)} for track in tracks},
     }
-    write_json(Path(folder) / TRACKS_FILE, content)
+    write_json(content, Path(folder) / TRACKS_FILE)
 
 
-def save_features(folder: Path | str, name: str, features: FeatureMap) -> None:
+def save_features(features: FeatureMap, folder: Path | str, name: str) -> None:
     """Write a view's features as float16.
 
     Raises:

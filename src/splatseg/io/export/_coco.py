@@ -65,8 +65,8 @@ class Frame:
 
 
 def write_coco_panoptic(
-    folder: Path,
     frames: Iterable[Frame],
+    folder: Path,
     *,
     segments: Mapping[int, SegmentInfo],
     categories: Sequence[Category],
@@ -122,7 +122,7 @@ def write_coco_panoptic(
             "annotations": annotations,
             "categories": [_category_content(category) for category in categories],
         }
-        write_json(temporary / PANOPTIC_FILE, content)
+        write_json(content, temporary / PANOPTIC_FILE)
     return len(images)
 
 

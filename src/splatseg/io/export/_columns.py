@@ -76,7 +76,7 @@ def write_labelled_splats(
     with atomic_file(path) as temporary:
         with retold(temporary.parent, path.parent):
             write_splats(labelled, temporary, format=format)
-        write_column_table(beside, table)
+        write_column_table(table, beside)
     return beside
 
 
@@ -104,9 +104,9 @@ def column_table_of(path: Path) -> dict[str, Any]:
     return dict(cast("Mapping[str, Any]", columns)) if isinstance(columns, Mapping) else {}
 
 
-def write_column_table(path: Path, content: Mapping[str, Any]) -> None:
+def write_column_table(content: Mapping[str, Any], path: Path) -> None:
     """Write the table of what columns mean; atomic."""
-    write_json(path, {"made_by": MADE_BY} | dict(content))
+    write_json({"made_by": MADE_BY} | dict(content), path)
 
 
 def holds_columns(path: Path, format: WritableFormat | None) -> bool:

@@ -94,7 +94,7 @@ def write_object_splats(
         if rest is not None:
             write_splats(gaussians[left], temporary / rest, format=format)
         content["unlabelled"] = {"gaussians": len(left), "file": rest}
-        write_json(temporary / OBJECTS_FILE, content)
+        write_json(content, temporary / OBJECTS_FILE)
     return tuple(folder / file for file in files)
 
 

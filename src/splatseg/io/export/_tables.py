@@ -33,7 +33,7 @@ def write_object_table(
     match path.suffix.lower():
         case ".json":
             objects = [object_content(row) for row in rows]
-            write_json(path, {"made_by": MADE_BY} | dict(about or {}) | {"objects": objects})
+            write_json({"made_by": MADE_BY} | dict(about or {}) | {"objects": objects}, path)
         case ".csv":
             _write_csv(rows, path)
         case _:

@@ -46,7 +46,7 @@ def write_node_table(
     rows = node_rows(tree)
     match path.suffix.lower():
         case ".json":
-            write_json(path, dict(about or {}) | {"nodes": rows})
+            write_json(dict(about or {}) | {"nodes": rows}, path)
         case ".csv":
             with (
                 atomic_file(path) as temporary,

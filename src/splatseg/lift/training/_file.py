@@ -54,7 +54,7 @@ class TrainingFile:
         if self._written == state.step:
             return
         begin = time.monotonic()
-        write_state(self._checkpoints.path, state, self._identity)
+        write_state(state, self._checkpoints.path, self._identity)
         self._written = state.step
         self._schedule.written(time.monotonic() - begin)
 

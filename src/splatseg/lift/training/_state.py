@@ -93,7 +93,7 @@ class TrainingState:
         return found
 
 
-def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -> None:
+def write_state(state: TrainingState, path: Path, identity: Mapping[str, Any]) -> None:
     """Write a training; what is there before stays until the new file is complete.
 
     Args:

@@ -149,10 +149,10 @@ def write_corrected(diagnosis: Diagnosis, folder: Path) -> None:
         if capture.points is not None:
             content = {"ply_file_path": _POINTS, **content}
             (temporary / _POINTS).write_bytes(ply_bytes(capture.points))
-        write_json(temporary / _TRANSFORMS, content)
+        write_json(content, temporary / _TRANSFORMS)
         metadata = _metadata(capture)
         if metadata:
-            write_json(temporary / "metadata.json", metadata)
+            write_json(metadata, temporary / "metadata.json")
 
 
 def ply_bytes(cloud: PointCloud) -> bytes:
@@ -237,7 +237,7 @@ def _read_with_sizes(
     elif beside is not None:
         changed["ply_file_path"] = str(root / beside)
     with tempfile.TemporaryDirectory() as temporary:
-        write_json(Path(temporary) / _TRANSFORMS, changed)
+        write_json(changed, Path(temporary) / _TRANSFORMS)
         if (folder / "metadata.json").is_file():
             shutil.copy(folder / "metadata.json", temporary)
         capture = read_capture(Path(temporary), format="nerfstudio")
