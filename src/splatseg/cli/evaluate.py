@@ -13,7 +13,7 @@ from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Split
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Scene
 from splatseg.io.json_files import write_json
-from splatseg.tasks import EvaluationOptions, evaluate
+from splatseg.tasks import EvaluationOptions, evaluate_scene
 
 _PER_CLASS = {
     "per_class": "classes",
@@ -63,7 +63,7 @@ class Command:
 def run(command: Command) -> None:
     """Evaluate a scene."""
     scene = open_scene(command.scene, command.data)
-    figures = evaluate(
+    figures = evaluate_scene(
         scene,
         options=command.scoring,
         backend=command.backend,

@@ -10,7 +10,7 @@ import tyro
 from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Overwrite, Quiet, Seed
 from splatseg.cli._work import ConsoleObserver, print_result, typed
 from splatseg.fit import FitOptions, Preset, Strategy
-from splatseg.tasks import MadeScene, MakeSceneOptions, make_scene
+from splatseg.tasks import MadeScene, MakeSceneOptions, fit_capture
 
 _DEFAULT = FitOptions()
 _SCENE = MakeSceneOptions()
@@ -121,7 +121,7 @@ class Command:
 
 def run(command: Command) -> None:
     """Fit a scene and write it."""
-    made = make_scene(
+    made = fit_capture(
         command.data,
         command.output,
         options=MakeSceneOptions(

@@ -5,6 +5,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 
 # The pause is at least this many times the time that writing a checkpoint took.
@@ -37,6 +38,7 @@ class Checkpoints:
     can be done again."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if not (math.isfinite(self.seconds) and self.seconds > 0):
             raise RangeError(
                 f"checkpoints.seconds: expected a positive number, got {self.seconds}."

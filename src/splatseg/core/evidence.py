@@ -1,5 +1,6 @@
 """What 2D models see in one view: masks, label maps, feature maps."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.rle import Rle
 from splatseg.errors import RangeError, ShapeError
 
@@ -31,6 +33,7 @@ class MaskSet:
     """Granularity, 0 the finest; all 0 where the model has no levels."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("scores", self.scores, (len(self.masks),))
         check_shape("levels", self.levels, (len(self.masks),))
         for i, mask in enumerate(self.masks):
@@ -43,11 +46,13 @@ class MaskSet:
     def __len__(self) -> int:
         return len(self.masks)
 
+    @boundary
     def dense(self, index: int) -> Bool[Tensor, "height width"]:
         """One mask as booleans."""
         return self.masks[index].decode()
 
     @classmethod
+    @boundary
     def from_dense(
         cls,
         masks: Bool[Tensor, "m height width"],
@@ -82,6 +87,7 @@ class LabelMap:
     """Confidence of the id, in [0, 1]."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("ids", self.ids, (None, None))
         if self.ids.numel() and int(self.ids.min()) < UNLABELLED:
             raise RangeError(f"ids: expected -1 or more, got {int(self.ids.min())}.")
@@ -116,6 +122,7 @@ class FeatureMap:
     """Columns of the image that the grid covers, at least in part."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("features", self.features, (None, None, None))
         if self.stride < 1:
             raise RangeError(f"stride: expected at least 1, got {self.stride}.")
@@ -136,6 +143,9 @@ class Segment:
     score: float
     """Confidence of the model, in [0, 1]."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
@@ -145,12 +155,16 @@ class Track:
     votes: Mapping[str, int]
     """Pixels under the track by the name of the class that a segmenter gave them."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
     @property
     def category(self) -> str | None:
         """The class name with most votes; the first by name among equals."""
         return min(self.votes, key=lambda name: (-self.votes[name], name)) if self.votes else None
 
 
+@boundary
 def map_ids(
     ids: Int[Tensor, "height width"],
     values: Mapping[int, float],
@@ -169,10 +183,17 @@ def map_ids(
     Returns:
         (height, width), in `dtype`.
 
+    Raises:
+        RangeError: If a value is NaN or infinite and `dtype` holds integers.
+
     Example:
         >>> map_ids(torch.tensor([[7, -1]]), {7: 2}, default=None)
         tensor([[ 2, -1]])
     """
+    if not dtype.is_floating_point and not all(
+        math.isfinite(value) for value in (default or 0, *values.values())
+    ):
+        raise RangeError(f"values, default: expected finite numbers for {dtype}, got others.")
     present, index = torch.unique(ids, return_inverse=True)
     found = [values.get(id, id if default is None else default) for id in present.tolist()]
     return torch.tensor(found, dtype=dtype)[index]

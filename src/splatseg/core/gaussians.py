@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape, check_values
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
 from splatseg.core.sh import SH_C0, degree_of, rotate_sh
 from splatseg.errors import InputError, RangeError, ShapeError
@@ -66,6 +67,7 @@ class Gaussians:
     (`RenderOptions.low_pass`). Other than 3DGS's, it goes with them into PLY files."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         n = self.means.shape[0] if self.means.ndim else 0
         check_shape("means", self.means, (None, 3))
         check_shape("rotations", self.rotations, (n, 4))
@@ -83,6 +85,7 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    @boundary
     def __getitem__(self, index: slice | Tensor) -> "Gaussians":
         """Rows by slice, boolean mask (n,) or integer ids, extra columns included."""
         if isinstance(index, Tensor) and index.dtype == torch.bool:
@@ -122,6 +125,7 @@ class Gaussians:
         """The same Gaussians with some columns exchanged."""
         return _replace(self, **changes)
 
+    @boundary
     def to(
         self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> "Gaussians":
@@ -153,6 +157,7 @@ class Gaussians:
                 f"({int(zero.sum())} of {len(self)} rows)."
             )
 
+    @boundary
     def transformed(self, target_from_source: Similarity) -> "Gaussians":
         """The Gaussians moved by a similarity: centres, axes, scales and spherical harmonics.
 
@@ -167,6 +172,7 @@ class Gaussians:
         )
 
     @staticmethod
+    @boundary
     def concatenate(parts: "Sequence[Gaussians]") -> "Gaussians":
         """Join scenes row by row.
 

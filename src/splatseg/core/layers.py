@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import UNLABELLED
 from splatseg.core.layer_info import LayerInfo, check_layer_info
 from splatseg.errors import InputError, RangeError, ShapeError
@@ -46,6 +47,7 @@ class Labels:
     """How it was made, what its ids are called, and what was done to it since."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("ids", self.ids, (None,))
         check_layer_info("info", self.info)
         n = len(self.ids)
@@ -70,6 +72,7 @@ class Labels:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @boundary
     def __getitem__(self, index: slice | Tensor) -> "Labels":
         """Rows, in step with `Gaussians.__getitem__`."""
         return Labels(
@@ -106,6 +109,7 @@ class Features:
     """How it was made, and what was done to it since."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("values", self.values, (None, None))
         check_layer_info("info", self.info)
         if self.weights is not None:
@@ -114,6 +118,7 @@ class Features:
     def __len__(self) -> int:
         return len(self.values)
 
+    @boundary
     def __getitem__(self, index: slice | Tensor) -> "Features":
         """Rows, in step with `Gaussians.__getitem__`."""
         return Features(
@@ -140,6 +145,7 @@ class Selection:
     """How it was made. Algebra drops it."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("mask", self.mask, (None,))
         check_layer_info("info", self.info)
         if self.mask.dtype != torch.bool:
@@ -148,6 +154,7 @@ class Selection:
     def __len__(self) -> int:
         return len(self.mask)
 
+    @boundary
     def __getitem__(self, index: slice | Tensor) -> "Selection":
         """Rows, in step with `Gaussians.__getitem__`."""
         return Selection(mask=self.mask[index], info=self.info)
@@ -177,6 +184,7 @@ class Selection:
     def __invert__(self) -> "Selection":
         return Selection(mask=~self.mask)
 
+    @boundary
     def _same_length(self, other: "Selection") -> Tensor:
         if len(self) != len(other):
             raise ShapeError(

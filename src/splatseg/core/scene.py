@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
 from splatseg.errors import InputError, ShapeError
@@ -40,6 +41,9 @@ class View:
     depth_unit: float | None = None
     """Scene units of one step of the depth map."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointCloud:
@@ -51,6 +55,7 @@ class PointCloud:
     """Red, green, blue, 0 to 255."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("points", self.points, (None, 3))
         if self.colours is not None:
             check_shape("colours", self.colours, (len(self.points), 3))
@@ -72,6 +77,9 @@ class ClassInfo:
     colour: tuple[int, int, int] | None = None
     """Red, green, blue, 0 to 255, for images."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassTable:
@@ -80,15 +88,18 @@ class ClassTable:
     rows: tuple[ClassInfo, ...]
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         ids = [row.id for row in self.rows]
         if len(set(ids)) != len(ids):
             twice = sorted({i for i in ids if ids.count(i) > 1})
             raise InputError(f"classes: expected distinct ids, got {twice} more than once.")
 
+    @boundary
     def name_of(self, id: int) -> str:
         """Name of an id, or ``id N`` where the table does not know it."""
         return next((row.name for row in self.rows if row.id == id), f"id {id}")
 
+    @boundary
     def by_name(self, name: str) -> ClassInfo:
         """The row with this name.
 
@@ -109,6 +120,7 @@ class _WithViews(ABC):
     views: tuple[View, ...]
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         names = [view.name for view in self.views]
         if len(set(names)) != len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -183,6 +195,7 @@ class Scene(_WithViews):
     """How it was made, in values that JSON holds."""
 
 
+@boundary
 def camera_of_map(view: View, height: int, width: int) -> Camera:
     """The camera of a map's pixels: the view's own, or reduced in proportion.
 

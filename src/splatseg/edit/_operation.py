@@ -8,6 +8,7 @@ from typing import Any, Literal, cast
 import torch
 
 from splatseg.core import Similarity
+from splatseg.core.boundary import convert_fields
 from splatseg.edit._where import Where
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.boundaries.cut import CutOptions
@@ -83,6 +84,7 @@ class Operation:
     """How what straddles the boundary is split first; None splits nothing."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.kind not in _TAKES:
             raise InputError(f"operation: expected one of {', '.join(_TAKES)}, got {self.kind!r}.")
         must, may = _TAKES[self.kind]

@@ -17,6 +17,7 @@ from splatseg.core import (
     flat_layer,
     layer_address,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.boundaries.box import box_corners
 
@@ -45,6 +46,7 @@ class Where:
     """All others instead."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.layer is None and self.box is None:
             raise InputError("where: expected a layer or a box, got neither.")
         if self.ids and self.layer is None:
@@ -100,6 +102,7 @@ def _are_numbers(values: Any, kind: type) -> bool:
     )
 
 
+@boundary
 def select(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) -> Selection:
     """The Gaussians that a description means; it may be none of them.
 
@@ -123,6 +126,7 @@ def select(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) -> S
     return Selection(mask=~mask if where.invert else mask)
 
 
+@boundary
 def layer_called(layers: Mapping[str, Layer], address: str) -> FlatLayer:
     """The layer of this name; of a tree its objects, or the level after an @.
 
@@ -161,6 +165,7 @@ def _of_layer(layer: FlatLayer, where: Where) -> torch.Tensor:
             )
 
 
+@boundary
 def ids_named(
     labels: Labels, names: Sequence[str], *, classes: ClassTable | None = None
 ) -> tuple[int, ...]:

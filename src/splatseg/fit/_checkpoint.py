@@ -18,6 +18,7 @@ import torch
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
 from splatseg.fit._state import FitState
 from splatseg.io.json_files import json_text, parse_object
@@ -98,6 +99,7 @@ class CheckpointSummary:
     gaussians: int
 
 
+@boundary
 def checkpoint_summary(path: Path) -> CheckpointSummary:
     """Steps, progress and size of a checkpoint. Reads no tensors.
 
@@ -117,12 +119,15 @@ def checkpoint_summary(path: Path) -> CheckpointSummary:
     )
 
 
+@boundary
 def discard_checkpoint(path: Path) -> None:
     """Remove a checkpoint, and its folder if nothing else is in it."""
-    for file in (path, _unfinished(path)):
-        file.unlink(missing_ok=True)
-    if path.parent.is_dir() and not any(path.parent.iterdir()):
-        path.parent.rmdir()
+    files = [file for file in (path, _unfinished(path)) if file.is_file()]
+    for file in files:
+        file.unlink()
+    folder = path.absolute().parent
+    if files and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _unfinished(path: Path) -> Path:

@@ -27,6 +27,7 @@ from splatseg.core import (
     layer_info_to_json,
     node_row,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import json_text, parse_object
@@ -42,6 +43,7 @@ _HEADER = "header"
 _VOID = 0
 
 
+@boundary
 def save_layer(layer: Layer, path: Path) -> None:
     """Write a layer; atomic. Inverse of `load_layer`.
 
@@ -96,6 +98,7 @@ def save_layer(layer: Layer, path: Path) -> None:
         np.savez(file, allow_pickle=False, **arrays)
 
 
+@boundary
 def load_layer(path: Path) -> Layer:
     """Read a layer. Inverse of `save_layer`.
 

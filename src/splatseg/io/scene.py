@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core import Layer, Scene, View
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.atomic import TEMPORARY, atomic_folder
 from splatseg.io.cameras import (
@@ -55,11 +56,13 @@ FOLDERS = ("cameras", "evidence", "layers", "reports")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*")
 
 
+@boundary
 def is_scene(path: Path) -> bool:
     """Whether a folder is a scene folder."""
     return (path / SCENE_FILE).is_file()
 
 
+@boundary
 def is_unfinished(path: Path) -> bool:
     """Whether a folder holds a fit that has not become a scene yet, and nothing else."""
     checkpoint, poses = path / CHECKPOINT_FILE, path / POSES_FOLDER
@@ -73,11 +76,13 @@ def is_unfinished(path: Path) -> bool:
     )
 
 
+@boundary
 def training_file(root: Path, layer: str) -> Path:
     """Where the training of a layer keeps its state."""
     return root / TRAINING_FOLDER / f"{layer}.npz"
 
 
+@boundary
 def training_files(root: Path) -> tuple[Path, ...]:
     """States of all trainings that were stopped, by the names of their layers."""
     return tuple(sorted((root / TRAINING_FOLDER).glob("*.npz")))
@@ -91,6 +96,7 @@ def _holds_only(folder: Path, names: Sequence[str]) -> bool:
     )
 
 
+@boundary
 def save_scene(
     scene: Scene, root: Path | str, *, layers: Mapping[str, Layer] | None = None
 ) -> Scene:
@@ -122,6 +128,7 @@ def save_scene(
     return replace(scene, root=root)
 
 
+@boundary
 def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
     """Read a scene folder. Inverse of `save_scene`.
 
@@ -161,11 +168,13 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
     )
 
 
+@boundary
 def scene_layer_names(root: Path | str) -> tuple[str, ...]:
     """Names of the layers of a scene folder, sorted."""
     return tuple(sorted(path.stem for path in (Path(root) / "layers").glob("*.npz")))
 
 
+@boundary
 def load_scene_layer(root: Path | str, name: str) -> Layer:
     """A layer of a scene folder.
 
@@ -187,6 +196,7 @@ def load_scene_layer(root: Path | str, name: str) -> Layer:
     return layer
 
 
+@boundary
 def save_scene_layer(layer: Layer, root: Path | str, name: str) -> Path:
     """Write a layer into a scene folder; gives the file.
 
@@ -202,6 +212,7 @@ def save_scene_layer(layer: Layer, root: Path | str, name: str) -> Path:
     return folder / f"{name}.npz"
 
 
+@boundary
 def check_name(what: str, name: str) -> None:
     """Raise `InputError` unless `name` can be that of a layer or of evidence."""
     if not _NAME.fullmatch(name):

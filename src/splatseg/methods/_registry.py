@@ -7,6 +7,7 @@ the method's, its value a `Method`. ``docs/methods.md`` has one of ten lines.
 import difflib
 from importlib.metadata import EntryPoint, entry_points
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingPackageError
 from splatseg.methods._method import Method
 
@@ -20,6 +21,7 @@ def method_names() -> tuple[str, ...]:
     return tuple(_known())
 
 
+@boundary
 def find_method(name: str) -> Method:
     """The method of this name.
 
@@ -56,6 +58,7 @@ def methods() -> tuple[Method, ...]:
     return tuple(find_method(name) for name in method_names())
 
 
+@boundary
 def keeps_ids(method: object) -> bool:
     """Whether layers of this method have the ids of the evidence that they were made from.
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatseg.core import ClassTable, LabelMap, View
+from splatseg.core.boundary import boundary
 from splatseg.core.models import Image, Panoptic
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -90,6 +91,7 @@ AnyRecorded = (
 """What `recorded_model` gives, by the kind of evidence."""
 
 
+@boundary
 def recorded_model(
     folder: Path | str,
     *,

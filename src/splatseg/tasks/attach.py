@@ -18,6 +18,7 @@ from splatseg.core import (
     View,
     with_info,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import is_scene, load_scene, save_scene, save_scene_layer, scene_layer_names
@@ -53,6 +54,7 @@ class AttachLayersOptions:
     """Replace layers of the same name in a scene folder that the edited file is."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if not 0 <= self.min_found <= 1:
             raise RangeError(f"min_found: expected 0 to 1, got {self.min_found}.")
 
@@ -87,6 +89,7 @@ class _Work:
     observer: Observer
 
 
+@boundary
 def attach_layers(
     source: Path,
     file: Path,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Scene
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
 from splatseg.io.json_files import read_json, write_json
@@ -17,10 +18,10 @@ from splatseg.render import BackendName
 from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.synthetic import cameras, room, write_capture
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate
-from splatseg.tasks.export import export
+from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate_scene
+from splatseg.tasks.export import export_scene
 from splatseg.tasks.export_options import ExportOptions
-from splatseg.tasks.make_scene import MadeScene, make_scene
+from splatseg.tasks.make_scene import MadeScene, fit_capture
 from splatseg.tasks.new_scene import check_parent
 from splatseg.tasks.outputs import export_layer, report_layer
 from splatseg.tasks.render import RenderingOptions, render_views
@@ -62,6 +63,7 @@ class DemoOptions:
     """Which room, and every other choice."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.train_views < 4:
             raise RangeError(f"train_views: expected at least 4, got {self.train_views}.")
         if self.width < 32:
@@ -78,6 +80,7 @@ class Demo:
     """What its demo.json holds: scores, seconds by step, commands that do the same."""
 
 
+@boundary
 def make_demo(
     folder: Path,
     *,
@@ -193,13 +196,13 @@ class _MainJob:
         self._evaluate(scene, _OBJECTS, "test", capture / "instance", "instances")
         labelled = folder / "labelled.ply"
         with self._step("export", root, "--layer", _LAYER, "--instances", _OBJECTS, "-o", labelled):
-            export(scene, labelled, options=ExportOptions(layer=_LAYER, instances=_OBJECTS))
+            export_scene(scene, labelled, options=ExportOptions(layer=_LAYER, instances=_OBJECTS))
 
     def _fit(self, capture: Path, root: Path) -> None:
         options = replace(FitOptions.preset("default"), seed=self.options.seed)
         options = options.with_length(minutes=self._minutes(), steps=self.options.steps)
         options = replace(options, max_gaussians=self.options.max_gaussians)
-        made = make_scene(
+        made = fit_capture(
             capture,
             root,
             fit_options=options,
@@ -221,7 +224,7 @@ class _MainJob:
             *("evaluate", self.folder / "scene", "--layer", layer, "--truth", truth),
             *("--split", split, "--metric", metric),
         ):
-            found = evaluate(
+            found = evaluate_scene(
                 scene,
                 options=EvaluationOptions(layer=layer, truth=truth, split=split, metric=metric),
                 backend=self.backend,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+from splatseg.core.boundary import boundary
 from splatseg.edit import (
     Document,
     Operation,
@@ -37,6 +38,7 @@ class EditedScene:
     """One a step: its kind, how many Gaussians were selected and split, what was measured."""
 
 
+@boundary
 def edit_scene(
     document: Document,
     folder: Path,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Gaussians, Layer, Scene
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import (
     check_beside,
@@ -51,7 +52,8 @@ class Exported:
     """The file beside it that says what the ids mean."""
 
 
-def export(
+@boundary
+def export_scene(
     scene: Scene,
     output: Path,
     what: What = "splat",
@@ -94,7 +96,7 @@ def export(
 
 
 def check_export(scene: Scene, output: Path, what: What) -> None:
-    """Refuse, before long work, a place that `export` could not write to after it.
+    """Refuse, before long work, a place that `export_scene` could not write to after it.
 
     Raises:
         InputError: If something else is there, or there is no folder to write in.

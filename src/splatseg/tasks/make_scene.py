@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture, Scene
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.interrupts import deferred_interrupts
 from splatseg.errors import InputError
 from splatseg.evaluate import PhotographReport
@@ -50,6 +51,7 @@ class MakeSceneOptions(CheckpointOptions):
     """Name of the preset that the fit's options came from; it is recorded."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         CheckpointOptions.__post_init__(self)
         if self.frames < 1:
             raise InputError(f"frames: expected at least 1, got {self.frames}.")
@@ -80,7 +82,8 @@ class MadeScene:
     """How poses were found; None where they came with the capture."""
 
 
-def make_scene(
+@boundary
+def fit_capture(
     data: Path,
     folder: Path,
     *,

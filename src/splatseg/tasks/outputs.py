@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.io.export import write_node_table
@@ -13,7 +14,7 @@ from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.segment_report import write_segmentation_report
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.export import Exported, check_export, export
+from splatseg.tasks.export import Exported, check_export, export_scene
 from splatseg.tasks.export_options import ExportOptions, What
 from splatseg.tasks.render import Rendering, RenderingOptions, render_views
 from splatseg.tasks.segment import Segmentation
@@ -30,6 +31,7 @@ _LABEL_MAPS = "label_maps"
 _NODES = "nodes.csv"
 
 
+@boundary
 def check_layer_exports(scene: Scene, root: Path, layer: str) -> None:
     """Refuse, before the work, a folder that `export_layer` could not write to.
 
@@ -44,6 +46,7 @@ def check_layer_exports(scene: Scene, root: Path, layer: str) -> None:
             check_export(scene, root / EXPORTS_FOLDER / layer / name, what)
 
 
+@boundary
 def export_layer(
     scene: Scene,
     root: Path,
@@ -70,7 +73,7 @@ def export_layer(
     folder.mkdir(parents=True, exist_ok=True)
     layers: Mapping[str, Layer] = {name: of_files}
     files = tuple(
-        export(
+        export_scene(
             scene,
             folder / file,
             what,
@@ -106,6 +109,7 @@ def _drawn(name: str, layer: Layer) -> tuple[str, ...]:
     return (name, *(f"{name}@{level}" for level in TREE_LEVELS if level != "object"))
 
 
+@boundary
 def report_layer(
     scene: Scene,
     root: Path,

@@ -23,6 +23,7 @@ from splatseg.core import (
     View,
     ViewSignals,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.atomic import atomic_folder
@@ -65,6 +66,9 @@ class RenderingOptions:
     fps: float = 24.0
     """Frames a second of the films."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rendering:
@@ -88,6 +92,7 @@ class _Layer:
         return self.summary.kind == "selection"
 
 
+@boundary
 def render_views(
     scene: Scene,
     output: Path,

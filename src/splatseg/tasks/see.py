@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from splatseg.core import Model, Scene
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.scene import check_name
 from splatseg.models import ModelCache, SeenEvidence, find_model, record_evidence
@@ -48,7 +49,11 @@ class SeeOptions:
     overwrite: bool = False
     """Delete evidence of this name first."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
 
+
+@boundary
 def see(
     scene: Scene,
     model: str | Model,

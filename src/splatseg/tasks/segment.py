@@ -20,6 +20,7 @@ from splatseg.core import (
     View,
     with_info,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
     Evidence,
@@ -75,6 +76,9 @@ class SegmentOptions:
     seed: int = 0
     """Seed of random choices, recorded in the layer."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Segmentation:
@@ -108,6 +112,7 @@ class Segmentation:
         return self.layer
 
 
+@boundary
 def segment(
     scene: Scene,
     method: str | Method = "uplift",
@@ -169,6 +174,7 @@ def segment(
     return _segmentation(layer, name, inputs, timings)
 
 
+@boundary
 def save_segmentation(made: Segmentation, root: Path) -> Path:
     """Write the layer into the scene's folder; then its training needs its checkpoint no more.
 

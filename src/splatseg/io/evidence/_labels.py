@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Rle
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
@@ -58,6 +59,7 @@ class IdRule:
         return {id + 1: id for id in range(MAX_FILE_ID + 1) if id != self.void}
 
 
+@boundary
 def read_id_map(path: Path) -> NDArray[np.int32]:
     """The ids of a single-channel image as they stand in the file.
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from splatseg.core import ClassTable
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_metadata
 from splatseg.io.class_tables import class_table
@@ -37,6 +38,7 @@ _SUFFIX = "_reference"
 _TRUTH_TABLES = {"instance": "instances", "part": "parts", "depth": ""}
 
 
+@boundary
 def open_evidence(
     folder: Path | str,
     *,
@@ -99,6 +101,7 @@ def open_evidence(
     )
 
 
+@boundary
 def evidence_header(folder: Path | str) -> dict[str, Any] | None:
     """The evidence.json of a folder that splatseg wrote, None where there is none.
 
@@ -111,6 +114,7 @@ def evidence_header(folder: Path | str) -> dict[str, Any] | None:
     return _header(Path(folder)) or None
 
 
+@boundary
 def find_evidence(folders: Iterable[Path], name: str) -> Path:
     """The folder of evidence of this name: in a scene's ``evidence``, or in a capture.
 
@@ -130,6 +134,7 @@ def find_evidence(folders: Iterable[Path], name: str) -> Path:
     raise InputError(f"evidence: expected one of those at hand ({known}), got {name!r}.")
 
 
+@boundary
 def evidence_names(folders: Iterable[Path]) -> tuple[str, ...]:
     """Names of the evidence of scenes and captures, sorted.
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from splatseg._check import check_choice, check_finite, check_values
 from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Segment, Track
-from splatseg.errors import InputError, RangeError
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.io.atomic import atomic_file, atomic_folder
 from splatseg.io.class_tables import class_rows
 from splatseg.io.evidence._base import CONFIDENCE_FOLDER, HEADER_FILE, EvidenceKind
@@ -26,6 +27,7 @@ _WRITTEN = ("labels", "panoptic", "tracked", "masks", "features")
 _MAX_ID = 65535
 
 
+@boundary
 def create_evidence(
     folder: Path | str,
     *,
@@ -48,6 +50,7 @@ def create_evidence(
 
     Raises:
         InputError: If the kind is another, or a value has no place in JSON.
+        MissingFileError: If the parent of `folder` does not exist.
     """
     check_choice("kind", kind, _WRITTEN)
     folder = Path(folder)
@@ -60,11 +63,14 @@ def create_evidence(
         "metadata": dict(metadata or {}),
     }
     json_text("metadata", header)
+    if not folder.parent.is_dir():
+        raise MissingFileError(f"{folder}: expected an existing folder to write in.")
     folder.mkdir(exist_ok=True)
     write_json(header, folder / HEADER_FILE)
     return folder
 
 
+@boundary
 def save_label_map(label_map: LabelMap, folder: Path | str, name: str) -> None:
     """Write a view's label map: 8 bit where all ids fit, else 16; -1 becomes 0.
 
@@ -97,6 +103,7 @@ def save_label_map(label_map: LabelMap, folder: Path | str, name: str) -> None:
     write_png(values.astype(np.uint8) if highest <= 255 else values.astype(np.uint16), path)
 
 
+@boundary
 def save_masks(masks: MaskSet, folder: Path | str, name: str) -> None:
     """Write a view's masks as compressed COCO run lengths.
 
@@ -110,6 +117,7 @@ def save_masks(masks: MaskSet, folder: Path | str, name: str) -> None:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
 
+@boundary
 def save_segments(segments: Mapping[str, Sequence[Segment]], folder: Path | str) -> None:
     """Write the table of panoptic evidence: the segments of each view by its name.
 
@@ -136,6 +144,7 @@ def save_segments(segments: Mapping[str, Sequence[Segment]], folder: Path | str)
     write_json(content, Path(folder) / SEGMENTS_FILE)
 
 
+@boundary
 def save_tracks(tracks: Sequence[Track], folder: Path | str, *, order: Sequence[str]) -> None:
     """Write the table of tracked evidence: the tracks, and the views as they were gone through."""
     content = {
@@ -145,6 +154,7 @@ def save_tracks(tracks: Sequence[Track], folder: Path | str, *, order: Sequence[
     write_json(content, Path(folder) / TRACKS_FILE)
 
 
+@boundary
 def save_features(features: FeatureMap, folder: Path | str, name: str) -> None:
     """Write a view's features as float16.
 
@@ -175,6 +185,7 @@ def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Pa
     return path
 
 
+@boundary
 def copy_evidence(folder: Path | str, scene: Path | str) -> Path:
     """Give a scene the evidence of another one of the same photographs, whole or not at all.
 

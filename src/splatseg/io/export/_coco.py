@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import UNLABELLED
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.export._folders import check_replaceable
@@ -64,6 +65,7 @@ class Frame:
     """Segment ids, -1 for none."""
 
 
+@boundary
 def write_coco_panoptic(
     frames: Iterable[Frame],
     folder: Path,

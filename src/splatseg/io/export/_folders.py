@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.export._tables import MADE_BY
 from splatseg.io.json_files import read_json
 
 
+@boundary
 def check_replaceable(path: Path, record: str) -> None:
     """Refuse a target that holds something other than an earlier export.
 

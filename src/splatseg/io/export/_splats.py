@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.core import UNLABELLED, Gaussians, Labels
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.export._columns import holds_columns
@@ -34,6 +35,7 @@ _ENDINGS: dict[WritableFormat, str] = {
 }
 
 
+@boundary
 def write_object_splats(
     gaussians: Gaussians,
     labels: Labels,

@@ -6,12 +6,14 @@ import torch
 from torch import Tensor
 
 from splatseg.core import Camera, Edited, Gaussians, Selection
+from splatseg.core.boundary import boundary
 from splatseg.errors import RangeError, ShapeError
 from splatseg.lift.boundaries.cut import Cut, CutOptions
 from splatseg.lift.boundaries.geometry import axes_of, directions_of_normals, line_extent
 from splatseg.lift.boundaries.split import split_along
 
 
+@boundary
 def cut_box(
     gaussians: Gaussians,
     low: Sequence[float],

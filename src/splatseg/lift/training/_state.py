@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg.core.boundary import boundary
 from splatseg.core.recorded_options import differing_names, option_differences
 from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
 from splatseg.lift.training._adam import RowMoments
@@ -129,12 +130,15 @@ def write_state(state: TrainingState, path: Path, identity: Mapping[str, Any]) -
         raise SplatsegError(f"{path}: the checkpoint cannot be written ({error}).") from error
 
 
+@boundary
 def discard_training(path: Path) -> None:
     """Remove a training's checkpoint, and its folder if nothing else is in it."""
-    for file in (path, path.with_name(f"{path.name}.new")):
-        file.unlink(missing_ok=True)
-    if path.parent.is_dir() and not any(path.parent.iterdir()):
-        path.parent.rmdir()
+    files = [file for file in (path, path.with_name(f"{path.name}.new")) if file.is_file()]
+    for file in files:
+        file.unlink()
+    folder = path.absolute().parent
+    if files and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,6 +152,7 @@ class TrainingSummary:
     """Steps at most."""
 
 
+@boundary
 def training_summary(path: Path) -> TrainingSummary:
     """Steps of a checkpoint. Reads nothing else.
 

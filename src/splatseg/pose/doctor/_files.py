@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import Capture, PointCloud
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.cameras import cameras_content
@@ -37,6 +38,7 @@ class Read:
     """Transforms of points that files of the capture mention."""
 
 
+@boundary
 def read_for_doctor(path: Path, *, format: str = "auto") -> Read:
     """Read a capture, one whose image sizes contradict its intrinsics included.
 
@@ -65,6 +67,7 @@ def read_for_doctor(path: Path, *, format: str = "auto") -> Read:
     return Read(capture=read_capture(path, format=format), declared=declared)
 
 
+@boundary
 def declared_transforms(folder: Path) -> tuple[PointCorrection, ...]:
     """Transforms that transforms.json and dataparser_transforms.json mention, and their inverses.
 
@@ -120,6 +123,7 @@ def similarity_from(matrix: object, scale: object, *, where: str) -> PointCorrec
     return PointCorrection(matrix=rotation, scale=factor * stretch, offset=(x, y, z))
 
 
+@boundary
 def write_corrected(diagnosis: Diagnosis, folder: Path) -> None:
     """Write the corrected capture as a new folder with a transforms.json.
 
