@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.late import preview
 from splatseg.core.rle import Rle
 from splatseg.errors import RangeError, ShapeError
 
@@ -45,6 +46,14 @@ class MaskSet:
 
     def __len__(self) -> int:
         return len(self.masks)
+
+    def __repr__(self) -> str:
+        levels = len(set(self.levels.tolist()))
+        of = f", {levels} levels" if levels > 1 else ""
+        return f"MaskSet({len(self)} masks of {self.width}x{self.height} pixels{of})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
 
     @boundary
     def dense(self, index: int) -> Bool[Tensor, "height width"]:
@@ -95,6 +104,14 @@ class LabelMap:
         if self.confidence is not None:
             check_shape("confidence", self.confidence, tuple(self.ids.shape))
 
+    def __repr__(self) -> str:
+        present = torch.unique(self.ids)
+        count = int((present != UNLABELLED).sum())
+        return f"LabelMap({self.width}x{self.height} pixels, {count} ids)"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
     @property
     def height(self) -> int:
         """Rows."""
@@ -126,6 +143,10 @@ class FeatureMap:
         check_shape("features", self.features, (None, None, None))
         if self.stride < 1:
             raise RangeError(f"stride: expected at least 1, got {self.stride}.")
+
+    def __repr__(self) -> str:
+        rows, columns, channels = self.features.shape
+        return f"FeatureMap({rows}x{columns} cells of {self.stride} pixels, {channels} channels)"
 
     @property
     def channels(self) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.late import preview
 from splatseg.core.layer_info import InstanceFacts, LayerInfo
 from splatseg.core.layers import Features, Labels, Selection
 from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
@@ -101,7 +102,14 @@ class InstanceTree:
     def __len__(self) -> int:
         return len(self.labels)
 
-    @boundary
+    def __repr__(self) -> str:
+        counts = {level: sum(n.level == level for n in self.nodes) for level in TREE_LEVELS}
+        words = ", ".join(f"{n} {level}{'s'[: n != 1]}" for level, n in counts.items())
+        return f"InstanceTree({len(self):,} rows; {words})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
     def __getitem__(self, index: slice | Tensor) -> "InstanceTree":
         """Rows, in step with `Gaussians.__getitem__`; all nodes stay."""
         return replace(self, labels=self.labels[index])

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.late import preview
 from splatseg.core.layer_info import LayerInfo, check_layer_info
 from splatseg.errors import InputError, RangeError, ShapeError
 
@@ -72,9 +74,17 @@ class Labels:
     def __len__(self) -> int:
         return len(self.ids)
 
-    @boundary
+    def __repr__(self) -> str:
+        none = int((self.ids == UNLABELLED).sum())
+        made = "" if self.info.method is None else f", method={self.info.method!r}"
+        return f"Labels({len(self):,} rows, {len(self.present)} ids, {none:,} unlabelled{made})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
     def __getitem__(self, index: slice | Tensor) -> "Labels":
         """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
         return Labels(
             ids=self.ids[index],
             confidence=self.confidence[index],
@@ -118,9 +128,12 @@ class Features:
     def __len__(self) -> int:
         return len(self.values)
 
-    @boundary
+    def __repr__(self) -> str:
+        return f"Features({len(self):,} rows, {self.values.shape[1]} channels)"
+
     def __getitem__(self, index: slice | Tensor) -> "Features":
         """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
         return Features(
             values=self.values[index],
             weights=None if self.weights is None else self.weights[index],
@@ -154,9 +167,12 @@ class Selection:
     def __len__(self) -> int:
         return len(self.mask)
 
-    @boundary
+    def __repr__(self) -> str:
+        return f"Selection({self.count:,} of {len(self):,})"
+
     def __getitem__(self, index: slice | Tensor) -> "Selection":
         """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
         return Selection(mask=self.mask[index], info=self.info)
 
     @property

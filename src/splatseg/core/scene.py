@@ -13,6 +13,8 @@ from splatseg._check import check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
+from splatseg.core.late import late, preview
+from splatseg.core.scene_layers import SceneLayers
 from splatseg.errors import InputError, ShapeError
 
 
@@ -44,6 +46,26 @@ class View:
     def __post_init__(self) -> None:
         convert_fields(self)
 
+    def __repr__(self) -> str:
+        size = f"{self.camera.width}x{self.camera.height}"
+        photograph = "" if self.image is not None else ", no photograph"
+        return f"View({self.name!r}, {self.split}, {size} pixels{photograph})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
+    def read_image(self, *, longest: int | None = None) -> UInt8[Tensor, "height width 3"]:
+        """The photograph, upright, 8 bit sRGB; see `io.images.load_image`.
+
+        Args:
+            longest: Longest side in pixels; a larger photograph is reduced to it.
+
+        Raises:
+            InputError: If the view has no photograph.
+            MissingFileError: If the photograph is not where it was.
+        """
+        return late("io.images", "load_image")(self, longest=longest)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointCloud:
@@ -62,6 +84,10 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        colours = "" if self.colours is None else ", with colours"
+        return f"PointCloud({len(self):,} points{colours})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,6 +200,13 @@ class Capture(_WithViews):
     notes: tuple[str, ...] = ()
     """What a person should know of how it was read."""
 
+    def __repr__(self) -> str:
+        points = "no points" if self.points is None else f"{len(self.points):,} points"
+        return f"Capture({str(self.path)!r}, {self.format}: {_counted(self)}, {points})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene(_WithViews):
@@ -193,6 +226,25 @@ class Scene(_WithViews):
 
     provenance: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """How it was made, in values that JSON holds."""
+
+    def __repr__(self) -> str:
+        where = "not saved" if self.root is None else repr(str(self.root))
+        return f"Scene({where}: {len(self.gaussians):,} Gaussians, {_counted(self)})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
+    @property
+    def layers(self) -> SceneLayers:
+        """The layers of its folder by name, read when asked for."""
+        return SceneLayers(self.root)
+
+
+def _counted(views: _WithViews) -> str:
+    """How many views of which split."""
+    splits = [view.split for view in views.views]
+    counts = ", ".join(f"{splits.count(s)} {s}" for s in dict.fromkeys(splits))
+    return f"{len(splits)} views" + (f" ({counts})" if counts else "")
 
 
 @boundary
