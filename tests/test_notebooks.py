@@ -42,5 +42,5 @@ def test_notebook(
             assert not cell["outputs"], "outputs are not committed"
             run_cell("".join(cell["source"]), names, f"{notebook.name}, cell {i}")
     if "figures" in names:
-        assert names["figures"]["miou"] > 0.2
+        assert names["figures"]["mIoU"] > 0.2
         assert "%" in capsys.readouterr().out

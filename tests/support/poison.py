@@ -387,6 +387,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "methods.Method.run": method.run,
         "methods.Method.evidence": ("labels",),
         "methods.keeps_ids.method": "uplift",
+        "methods.register_method.method": method,
         "methods.methods_table.methods": methods(),
         "models.record_evidence.model": find_model("classical"),
         "models.record_evidence.folder": world.path(),

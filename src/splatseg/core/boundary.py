@@ -26,11 +26,13 @@ from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, Union, cast
 
 import numpy as np
+import torch
 from jaxtyping import AbstractArray
 from torch import Tensor
 
 from splatseg.core.coerce import (
     Kind,
+    as_any_tensor,
     as_array,
     as_bool,
     as_integer,
@@ -51,7 +53,7 @@ _SCALARS: dict[Any, Converter] = {
     bool: as_bool,
     str: as_text,
     Path: as_path,
-    Tensor: as_tensor,
+    Tensor: as_any_tensor,
 }
 _IMAGE = ("height", "width", "3")
 _MAPPINGS = (collections.abc.Mapping, dict)
@@ -178,7 +180,8 @@ def _called(annotation: Any) -> str:
         return f"one of {', '.join(str(word) for word in typing.get_args(annotation))}"
     if isinstance(annotation, type) and issubclass(annotation, AbstractArray):
         return "a tensor"
-    return str(getattr(annotation, "__name__", annotation))
+    word = str(getattr(annotation, "__name__", annotation))
+    return f"{'an' if word[0] in 'AEIOU' else 'a'} {word}"
 
 
 def _one_of(members: tuple[Any, ...]) -> Converter | None:
@@ -201,12 +204,17 @@ def _one_of(members: tuple[Any, ...]) -> Converter | None:
             if Path in members:
                 as_path(name, value)
             return as_text(name, value)
+        if all(isinstance(m, type) and issubclass(m, AbstractArray) for m, _ in attempts):
+            value = as_tensor(name, value)
         errors: list[InputError] = []
+        made: list[Any] = []
         for _, attempt in attempts:
             try:
-                return cast(Converter, attempt)(name, value)
+                made.append(cast(Converter, attempt)(name, value))
             except InputError as error:
                 errors.append(error)
+        if made:
+            return next((one for one in made if one is value), made[0])
         words = " or ".join(dict.fromkeys(_called(member) for member, _ in attempts))
         raise InputError(f"{name}: expected {words}, got {describe(value)}.") from errors[0]
 
@@ -313,19 +321,29 @@ def _tensor_of(annotation: Any) -> Converter | None:
         return None
     kind = _kind_of(annotation.dtypes)
     axes = tuple(annotation.dim_str.split())
+    is_image = axes == _IMAGE and kind == "byte"
+    signal = kind == "float" and axes[-1:] == ("channels",)
     fixed = not any(axis.startswith(("*", "#", "...")) for axis in axes)
 
     def convert(name: str, value: Any) -> Tensor:
-        tensor = as_tensor(name, value, kind)
+        tensor = as_tensor(name, value, "any" if signal else kind)
+        if signal:
+            # Blended ids would be ids of other things.
+            if tensor.numel() and not tensor.is_floating_point() and tensor.dtype != torch.bool:
+                raise InputError(
+                    f"{name}: expected floating-point values, got {tensor.dtype}; pass x.float() "
+                    "if these are no ids, x / 255 for pixels."
+                )
+            tensor = as_tensor(name, tensor, kind)
         if axes and fixed and not tensor.ndim:
             shown = ", ".join(axis if axis.isdecimal() else "any" for axis in axes)
             raise ShapeError(f"{name}: expected shape ({shown}), got ().")
         if fixed and axes and tensor.ndim == len(axes) - 1 > 0:
             if axes[-1] == "channels":
                 return tensor.unsqueeze(-1)
-            if axes == _IMAGE:
+            if is_image:
                 tensor = tensor.unsqueeze(-1).expand(*tensor.shape, 3)
-        if axes == _IMAGE and (tensor.ndim != 3 or tensor.shape[2] != 3 or not tensor.numel()):
+        if is_image and (tensor.ndim != 3 or tensor.shape[2] != 3 or not tensor.numel()):
             raise ShapeError(
                 f"{name}: expected an image (height, width, 3) of at least a pixel, "
                 f"got {tuple(tensor.shape)}."

@@ -75,11 +75,11 @@ def as_tensor(name: str, value: object, kind: Kind = "any") -> Tensor:
             f"{name}: expected {_WANTED[kind]}, got complex ones ({_dtype_name(tensor)}); pass "
             "x.real or x.abs()."
         )
-    if tensor.dtype == torch.uint64:
+    if tensor.dtype == torch.uint64 and kind != "any":
         tensor = _signed(name, tensor)
-    tensor = tensor.to(_WIDENED.get(tensor.dtype, tensor.dtype))
     if kind == "any":
         return tensor
+    tensor = tensor.to(_WIDENED.get(tensor.dtype, tensor.dtype))
     if tensor.is_floating_point():
         # 16 bit of torch's own and 8 bit floats have hardly any operations on a CPU.
         own = tensor.dtype not in (torch.float16, torch.float32, torch.float64)
@@ -97,6 +97,10 @@ def _of_kind(name: str, tensor: Tensor, kind: Kind, found: str) -> Tensor:
         return tensor.to(types.get(kind, torch.uint8))
     if kind == "float" and found in ("integer", "bool"):
         return tensor.to(torch.float32)
+    if (kind, found) == ("integer", "float") and bool((tensor == tensor.round()).all()):
+        if not bool((tensor.abs() < _MAX_INTEGER).all()):
+            raise RangeError(f"{name}: expected integers of 64 bits, got larger ones.")
+        return tensor.to(torch.int64)
     if (kind, found) == ("bool", "byte"):
         return tensor != 0
     if (kind, found) == ("byte", "integer"):
@@ -108,6 +112,14 @@ def _of_kind(name: str, tensor: Tensor, kind: Kind, found: str) -> Tensor:
         f"{name}: expected {_WANTED[kind]}, got {_dtype_name(tensor)}"
         f"{_REMEDIES.get((kind, found), '')}."
     )
+
+
+def as_any_tensor(name: str, value: object) -> Tensor:
+    """A dense tensor of any type, complex numbers included; arrays as `as_tensor` has them."""
+    if not isinstance(value, Tensor):
+        return as_tensor(name, value)
+    _check_dense(name, value)
+    return value
 
 
 def as_array(name: str, value: object, dtype: "np.dtype[Any] | None") -> "np.ndarray[Any, Any]":
@@ -276,6 +288,10 @@ def _from_array(name: str, value: object, kind: Kind) -> Tensor:
     if array.dtype.kind == "f" and (array.dtype.itemsize > 8 or not isinstance(value, np.ndarray)):
         lists = isinstance(value, (list, tuple))
         array = array.astype(np.float32 if lists else np.float64)
+    if array.dtype.kind == "u" and array.dtype.itemsize == 8:
+        if array.size and int(array.max()) > _MAX_INTEGER:
+            raise RangeError(f"{name}: expected integers below 2^63, got larger ones.")
+        array = array.astype(np.int64)
     native = array.dtype.newbyteorder("=")
     if array.dtype.itemsize > 16:
         native = np.dtype(np.complex128)

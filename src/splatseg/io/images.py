@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
@@ -185,7 +185,9 @@ def image_camera(view: View, longest: int | None = None) -> Camera:
 
 @boundary
 def save_png(
-    image: Float[Tensor, "height width *channels"] | UInt8[Tensor, "height width *channels"],
+    image: Int[Tensor, "height width"]
+    | UInt8[Tensor, "height width *channels"]
+    | Float[Tensor, "height width *channels"],
     path: Path,
 ) -> None:
     """Write a picture: (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA; atomic.

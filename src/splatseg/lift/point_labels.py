@@ -87,7 +87,7 @@ def labels_of_points(
         InputError: If no Gaussian is opaque enough.
     """
     check_shape("points", points, (None, 3))
-    if len(ids) != len(gaussians):
+    if ids.ndim != 1 or len(ids) != len(gaussians):
         raise ShapeError(f"ids: expected {len(gaussians)} rows, one a Gaussian, got {len(ids)}.")
     known = ids.cpu().int()
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)
