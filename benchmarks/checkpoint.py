@@ -40,7 +40,7 @@ def main() -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(3):
         wall, cpu = time.monotonic(), time.process_time()
-        write_checkpoint(path, checkpoint)
+        write_checkpoint(checkpoint, path)
         wall, cpu = time.monotonic() - wall, time.process_time() - cpu
         megabytes = path.stat().st_size / 1e6
         print(f"write: {megabytes:.0f} MB in {wall:.2f} s, {cpu:.2f} s of them CPU", flush=True)

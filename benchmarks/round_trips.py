@@ -350,7 +350,7 @@ def prepared(arguments: argparse.Namespace, folder: Path) -> Bench:
     )
     n = len(scene.gaussians)
     numbered = Labels(ids=torch.arange(1, n + 1, dtype=torch.int32), confidence=torch.ones(n))
-    save_scene_layer(root, _ROW, numbered)
+    save_scene_layer(numbered, root, _ROW)
     bare = scene.gaussians.replace(extra={}, antialiased=False, low_pass=0.3)
     write_splats(bare, folder / "plain.ply")
     tagged = bare.replace(extra={_ROW: torch.arange(n, dtype=torch.int32)})

@@ -5,9 +5,11 @@ With the geometry frozen, a view is a sparse linear map W from Gaussians to pixe
 is built on those two.
 
 The names below are the public surface. They load at first use, so that ``import splatseg`` costs
-no torch; the packages do too. `render` and `fit` share their names with the packages that hold
-them and are reached there, as ``splatseg.render.render`` and ``splatseg.fit.fit``; a name that is
-now a package and now a function, depending on what was imported first, would be a trap.
+no torch; the packages do too. Every task has a verb that is no package's name: `fit_capture`,
+`import_scene`, `see`, `segment`, `render_views`, `evaluate_scene`, `edit_scene`, `export_scene`. A
+single image is ``splatseg.render.render``, and photographs become Gaussians without a folder by
+``splatseg.fit.fit``; a name that is now a package and now a function, depending on what was
+imported first, would be a trap.
 
 Conventions (frames, pixel centres, units, ids): docs/conventions.md.
 """
@@ -46,36 +48,78 @@ if TYPE_CHECKING:
     from splatseg.core import Selection as Selection
     from splatseg.core import Similarity as Similarity
     from splatseg.core import View as View
+    from splatseg.fit import FitOptions as FitOptions
     from splatseg.io.captures import read_capture as read_capture
+    from splatseg.io.evidence import create_evidence as create_evidence
     from splatseg.io.evidence import open_evidence as open_evidence
+    from splatseg.io.evidence import save_label_map as save_label_map
+    from splatseg.io.evidence import save_masks as save_masks
     from splatseg.io.layers import load_layer as load_layer
     from splatseg.io.layers import save_layer as save_layer
     from splatseg.io.scene import load_scene as load_scene
+    from splatseg.io.scene import load_scene_layer as load_scene_layer
     from splatseg.io.scene import save_scene as save_scene
+    from splatseg.io.scene import save_scene_layer as save_scene_layer
     from splatseg.io.splats import read_splats as read_splats
     from splatseg.io.splats import write_splats as write_splats
+    from splatseg.lift import label_map as label_map
     from splatseg.lift import uplift as uplift
+    from splatseg.methods import Method as Method
+    from splatseg.methods import MethodInputs as MethodInputs
+    from splatseg.methods import find_method as find_method
+    from splatseg.methods import register_method as register_method
     from splatseg.render import RenderOptions as RenderOptions
     from splatseg.render import back_project as back_project
     from splatseg.render import contributors as contributors
     from splatseg.render import get_backend as get_backend
     from splatseg.render import weights as weights
+    from splatseg.synthetic import write_capture as write_capture
+    from splatseg.tasks import CheckpointOptions as CheckpointOptions
+    from splatseg.tasks import EditOptions as EditOptions
+    from splatseg.tasks import EvaluationOptions as EvaluationOptions
+    from splatseg.tasks import ExportOptions as ExportOptions
+    from splatseg.tasks import ImportOptions as ImportOptions
+    from splatseg.tasks import MakeSceneOptions as MakeSceneOptions
+    from splatseg.tasks import RenderingOptions as RenderingOptions
+    from splatseg.tasks import SeeOptions as SeeOptions
+    from splatseg.tasks import SegmentOptions as SegmentOptions
+    from splatseg.tasks import attach_layers as attach_layers
+    from splatseg.tasks import describe as describe
+    from splatseg.tasks import edit_scene as edit_scene
+    from splatseg.tasks import evaluate_scene as evaluate_scene
+    from splatseg.tasks import examine_capture as examine_capture
+    from splatseg.tasks import export_scene as export_scene
+    from splatseg.tasks import fit_capture as fit_capture
+    from splatseg.tasks import import_scene as import_scene
+    from splatseg.tasks import make_demo as make_demo
+    from splatseg.tasks import render_views as render_views
+    from splatseg.tasks import save_segmentation as save_segmentation
+    from splatseg.tasks import see as see
     from splatseg.tasks import segment as segment
+    from splatseg.tasks import sharpen_scene as sharpen_scene
 
 # What the block above says to type checkers, for the interpreter; a test holds the two equal.
 _HOMES = {
     "splatseg.core": (
-        "Camera Capture FeatureMap Features Gaussians LabelMap Labels MaskSet Scene Selection "
-        "Similarity View"
+        "Camera Capture FeatureMap Features Gaussians LabelMap Labels MaskSet Scene "
+        "Selection Similarity View"
     ),
+    "splatseg.fit": "FitOptions",
     "splatseg.io.captures": "read_capture",
-    "splatseg.io.evidence": "open_evidence",
+    "splatseg.io.evidence": "create_evidence open_evidence save_label_map save_masks",
     "splatseg.io.layers": "load_layer save_layer",
-    "splatseg.io.scene": "load_scene save_scene",
+    "splatseg.io.scene": "load_scene load_scene_layer save_scene save_scene_layer",
     "splatseg.io.splats": "read_splats write_splats",
-    "splatseg.lift": "uplift",
+    "splatseg.lift": "label_map uplift",
+    "splatseg.methods": "Method MethodInputs find_method register_method",
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
-    "splatseg.tasks": "segment",
+    "splatseg.synthetic": "write_capture",
+    "splatseg.tasks": (
+        "CheckpointOptions EditOptions EvaluationOptions ExportOptions ImportOptions "
+        "MakeSceneOptions RenderingOptions SeeOptions SegmentOptions attach_layers "
+        "describe edit_scene evaluate_scene examine_capture export_scene fit_capture "
+        "import_scene make_demo render_views save_segmentation see segment sharpen_scene"
+    ),
 }
 _PACKAGES = frozenset(
     {

@@ -40,16 +40,16 @@ def labelled(small, rng):
     save_scene(replace(scene, gaussians=gaussians, up=(0.0, -1.0, 0.0)), small.scene)
     ids = torch.arange(n) % 5
     save_scene_layer(
-        small.scene,
-        "fifths",
         Labels(
             ids=torch.where(ids == 0, -1, ids),
             confidence=noise[:, 7].abs().clamp(0, 1),
             info=LayerInfo(names={3: "third"}),
         ),
+        small.scene,
+        "fifths",
     )
-    save_scene_layer(small.scene, "high", Selection(mask=noise[:, 8] > 0))
-    save_scene_layer(small.scene, "vectors", Features(values=noise[:, :2]))
+    save_scene_layer(Selection(mask=noise[:, 8] > 0), small.scene, "high")
+    save_scene_layer(Features(values=noise[:, :2]), small.scene, "vectors")
     return small
 
 

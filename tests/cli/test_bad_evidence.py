@@ -65,7 +65,7 @@ def masks(small) -> Path:
     """Two masks a view."""
     folder = small.capture / "masks_two"
     for name in TRAIN:
-        save_masks(folder, name, MaskSet.from_dense(two()))
+        save_masks(MaskSet.from_dense(two()), folder, name)
     return folder
 
 
@@ -83,13 +83,13 @@ def segments(small) -> Path:
 @pytest.fixture
 def panoptic(segments) -> Path:
     rows = [Segment(id=i, category=i, isthing=True, score=0.9) for i in (1, 2)]
-    save_segments(segments, dict.fromkeys(TRAIN, rows))
+    save_segments(dict.fromkeys(TRAIN, rows), segments)
     return segments
 
 
 @pytest.fixture
 def tracked(segments) -> Path:
-    save_tracks(segments, [Track(id=i, votes={"sky": 4}) for i in (1, 2)], order=TRAIN)
+    save_tracks([Track(id=i, votes={"sky": 4}) for i in (1, 2)], segments, order=TRAIN)
     return segments
 
 
@@ -295,11 +295,11 @@ def test_masks_of_the_wrong_size(refused, masks, height, width) -> None:
 @pytest.mark.parametrize("count", [0, 2])
 def test_empty_masks(refused, splatseg, small, masks, count) -> None:
     nothing = MaskSet.from_dense(torch.zeros(count, HEIGHT, WIDTH, dtype=torch.bool))
-    save_masks(masks, "train_1", nothing)
+    save_masks(nothing, masks, "train_1")
     command = ("--method", "associate", "--evidence", masks.name)
     assert splatseg("segment", small.scene, *command, "--layer", "rest")[0] == 0
     for name in TRAIN:
-        save_masks(masks, name, nothing)
+        save_masks(nothing, masks, name)
     assert "expected a segment in 3 views, found none" in refused("segment", *command)
 
 
@@ -382,7 +382,7 @@ def test_features_that_are_nan(small, splatseg, refused) -> None:
     folder = small.capture / "features_x"
     grid = FeatureMap(features=torch.ones(3, 4, 2), stride=8, height=HEIGHT, width=WIDTH)
     for name in TRAIN:
-        save_features(folder, name, grid)
+        save_features(grid, folder, name)
     values = np.ones((3, 4, 2), np.float16)
     values[1, 2, 0] = np.nan
     np.savez(folder / "train_1.npz", features=values, stride=8, size=[HEIGHT, WIDTH])

@@ -56,14 +56,12 @@ def room(tmp_path):
     save_scene(Scene(gaussians=gaussians, views=views), root)
     folder = root / "evidence" / "truth"
     for name, label_map in maps.items():
-        save_label_map(folder, name, label_map)
+        save_label_map(label_map, folder, name)
     labels = uplift(
         gaussians, views, Maps(maps), options=UpliftOptions(candidates=2), backend="cpu"
     )
     info = replace(labels.info, evidence="truth", names={3: "thing", 8: "wall"})
     save_scene_layer(
-        root,
-        "objects",
         labels.__class__(
             **{
                 f: getattr(labels, f)
@@ -71,6 +69,8 @@ def room(tmp_path):
             },
             info=info,
         ),
+        root,
+        "objects",
     )
     return root
 
@@ -396,7 +396,7 @@ def test_specks_go_along(room, tmp_path, capsys) -> None:
     specks = away.argsort()[:3]
     ids = labels.ids.clone()
     ids[specks] = 8
-    save_scene_layer(room, "objects", replace(labels, ids=ids, candidates=None, shares=None))
+    save_scene_layer(replace(labels, ids=ids, candidates=None, shares=None), room, "objects")
     thing = ["--remove", "--layer", "objects", "--ids", 3, "--cut", "off", "--pictures", 0]
     assert run(room, tmp_path / "clean", *thing) == 0
     assert "3 of them specks" in " ".join(capsys.readouterr().out.split())

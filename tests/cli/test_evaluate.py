@@ -44,8 +44,8 @@ def labelled(small):
     classes[(x > 1.2) & (y > 0.5)] = -1
     classes[(x < -1.4) & (y > 0.9)] = 7
     instances = torch.where(x < -0.3, 4, torch.where(x < 0.7, 5, 600))
-    save_scene_layer(small.scene, "classes", labels_of(classes, background=1))
-    save_scene_layer(small.scene, "objects", labels_of(instances))
+    save_scene_layer(labels_of(classes, background=1), small.scene, "classes")
+    save_scene_layer(labels_of(instances), small.scene, "objects")
     (small.capture / "instance").mkdir()
     for path in sorted((small.capture / "semantic").iterdir()):
         truth = np.array(Image.open(path))
@@ -117,7 +117,7 @@ def test_a_layer_that_tells_the_classes_of_its_instances(labelled, both) -> None
     layer = load_scene_layer(labelled.scene, "objects")
     # Of the instance 600 no class is known.
     info = replace(layer.info, class_of={4: 2, 5: 7}, instances={600: InstanceFacts(segments=2)})
-    save_scene_layer(labelled.scene, "objects", replace(layer, info=info))
+    save_scene_layer(replace(layer, info=info), labelled.scene, "objects")
     (both.out / "named").mkdir()
     for path in (both.out / "objects").glob("*.png"):
         ids = np.array(Image.open(path))
@@ -193,7 +193,7 @@ def test_tables_and_a_file(labelled, splatseg, tmp_path) -> None:
 
 def test_boundaries_of_a_mask(labelled, splatseg) -> None:
     ids = load_scene(labelled.scene).gaussians.means[:, 0]
-    save_scene_layer(labelled.scene, "right", Selection(mask=ids > 0.2))
+    save_scene_layer(Selection(mask=ids > 0.2), labelled.scene, "right")
     words = ("--truth", labelled.capture / "semantic", "--metric", "binary", "--id", 7, "--json")
     status, text, err = splatseg("evaluate", labelled.scene, "--layer", "right", *words, *CPU)
     assert status == 0, err

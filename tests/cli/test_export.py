@@ -29,21 +29,21 @@ def labelled(small):
     wall = torch.where(x < 0, LEFT, RIGHT)
     wall[0] = -1
     save_scene_layer(
+        Labels(ids=wall, confidence=torch.where(y > 1, 0.3, 0.9), background=SKY),
         small.scene,
         "walls",
-        Labels(ids=wall, confidence=torch.where(y > 1, 0.3, 0.9), background=SKY),
     )
     piece = torch.where(x < 0, -1, torch.where(x < 1, 11, 300))
     save_scene_layer(
-        small.scene,
-        "pieces",
         Labels(
             ids=piece,
             confidence=torch.full((len(x),), 0.5),
             info=LayerInfo(names={11: "near piece", 300: "far piece"}),
         ),
+        small.scene,
+        "pieces",
     )
-    save_scene_layer(small.scene, "chosen", Selection(mask=x > 0))
+    save_scene_layer(Selection(mask=x > 0), small.scene, "chosen")
     return small
 
 
@@ -195,7 +195,7 @@ def test_coco_of_instances_alone(labelled, splatseg, tmp_path) -> None:
     said = Labels(
         ids=piece.ids, confidence=piece.confidence, info=LayerInfo(class_of={11: 2, 300: 7})
     )
-    save_scene_layer(labelled.scene, "said", said)
+    save_scene_layer(said, labelled.scene, "said")
     arguments = ("--what", "coco", "--instances", "said", "-o", out, "--backend", "cpu")
     assert splatseg("export", labelled.scene, *arguments)[0] == 0
     content = json.loads((out / "panoptic.json").read_text())
@@ -222,7 +222,7 @@ def test_mistakes_get_one_sentence(labelled, splatseg, tmp_path) -> None:
         ids=torch.full((len(load_scene(scene).gaussians),), -1),
         confidence=torch.zeros(len(load_scene(scene).gaussians)),
     )
-    save_scene_layer(scene, "empty", empty)
+    save_scene_layer(empty, scene, "empty")
     out = ("-o", tmp_path / "out")
     cases = [
         (("--what", "objects", *out), "--layer, --instances: expected the labels"),

@@ -119,7 +119,7 @@ def test_bad_input_is_one_sentence(small, splat_file, splatseg, tmp_path) -> Non
     layered = small.scene
     n = len(load_scene(layered).gaussians)
     labels = Labels(ids=torch.ones(n, dtype=torch.int32), confidence=torch.ones(n))
-    save_scene_layer(layered, "mine", labels)
+    save_scene_layer(labels, layered, "mine")
     out = ("-o", tmp_path / "s")
     for words, sentence in [
         ((tmp_path / "none.ply", *out), "none.ply: no such file"),

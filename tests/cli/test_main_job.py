@@ -149,7 +149,7 @@ def test_render_writes_what_was_asked(segmented, splatseg, tmp_path) -> None:
 
 def test_render_draws_a_selection_as_a_mask(small, splatseg, tmp_path) -> None:
     scene = load_scene(small.scene)
-    save_scene_layer(small.scene, "blue", Selection(mask=scene.gaussians.means[:, 0] > 0))
+    save_scene_layer(Selection(mask=scene.gaussians.means[:, 0] > 0), small.scene, "blue")
     arguments = ("--what", "blue", "-o", tmp_path / "out", "--backend", "cpu")
     assert splatseg("render", small.scene, *arguments)[0] == 0
     mask = pixels(tmp_path / "out" / "blue" / "test_2.png")
@@ -278,7 +278,7 @@ def test_evaluate_binary(segmented, splatseg) -> None:
     assert one["IoU_pooled"] > 0.7
     scene = load_scene(segmented.scene)
     layer = load_scene_layer(segmented.scene, "semantic")
-    save_scene_layer(segmented.scene, "right", Selection(mask=layer.ids == 7))
+    save_scene_layer(Selection(mask=layer.ids == 7), segmented.scene, "right")
     assert len(scene.gaussians) == len(layer)
     status, text, err = splatseg(
         "evaluate", segmented.scene, "--layer", "right", "--id", 7, *arguments
@@ -322,7 +322,7 @@ def test_export_writes_columns_and_a_table(segmented, splatseg, tmp_path) -> Non
 
 def test_export_of_a_selection_and_without_a_layer(small, splatseg, tmp_path) -> None:
     scene = load_scene(small.scene)
-    save_scene_layer(small.scene, "blue", Selection(mask=scene.gaussians.means[:, 0] > 0))
+    save_scene_layer(Selection(mask=scene.gaussians.means[:, 0] > 0), small.scene, "blue")
     assert splatseg("export", small.scene, "--layer", "blue", "-o", tmp_path / "b.ply")[0] == 0
     selected = read_splats(tmp_path / "b.ply").extra["selected"].reshape(-1)
     assert torch.equal(selected.bool(), scene.gaussians.means[:, 0] > 0)
@@ -335,7 +335,7 @@ def test_mistakes_get_one_sentence(segmented, splatseg, tmp_path) -> None:
     """Status 2, a sentence that names what is there, no traceback and nothing written."""
     scene, truth = segmented.scene, segmented.capture / "semantic"
     save_scene_layer(
-        scene, "vectors", Features(values=torch.zeros(len(load_scene(scene).gaussians), 2))
+        Features(values=torch.zeros(len(load_scene(scene).gaussians), 2)), scene, "vectors"
     )
     stretched = tmp_path / "stretched"
     stretched.mkdir()

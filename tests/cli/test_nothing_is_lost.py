@@ -72,7 +72,7 @@ def test_a_header_without_views_bars_nobody(small, splatseg) -> None:
     for path in folder.glob("train_*"):
         path.unlink()
     header["metadata"]["complete"] = False
-    write_json(folder / "evidence.json", header)
+    write_json(header, folder / "evidence.json")
     status, _, err = splatseg("see", small.scene, *SEE, "--least-area", "0.02")
     assert status == 0, err
     found = evidence_header(folder)

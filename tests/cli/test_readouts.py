@@ -134,7 +134,7 @@ def test_segment_exports_and_reports_rendered_readouts(small, splatseg) -> None:
 
 def test_what_has_no_labels_is_refused(small, splatseg, tmp_path) -> None:
     count = len(load_scene(small.scene).gaussians)
-    save_scene_layer(small.scene, "plain", Features(values=torch.zeros(count, 3)))
+    save_scene_layer(Features(values=torch.zeros(count, 3)), small.scene, "plain")
     status, _, err = splatseg("render", small.scene, "--what", "plain", "-o", tmp_path / "o")
     assert status == 2
     assert "plain holds features without a classifier, which are no image" in err

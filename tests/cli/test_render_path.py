@@ -30,8 +30,8 @@ def layered(small):
     """With a layer of labels, left and right, and a selection, right."""
     means = load_scene(small.scene).gaussians.means
     ids = torch.where(means[:, 0] < 0, 2, 7).int()
-    save_scene_layer(small.scene, "sides", Labels(ids=ids, confidence=torch.ones(len(ids))))
-    save_scene_layer(small.scene, "right", Selection(mask=ids == 7))
+    save_scene_layer(Labels(ids=ids, confidence=torch.ones(len(ids))), small.scene, "sides")
+    save_scene_layer(Selection(mask=ids == 7), small.scene, "right")
     return small
 
 

@@ -43,7 +43,7 @@ def recorded(tmp_path) -> Path:
     folder = tmp_path / "masks_other"
     folder.mkdir()
     for name in TRAIN:
-        save_masks(folder, name, MaskSet.from_dense(half(), scores=[0.75]))
+        save_masks(MaskSet.from_dense(half(), scores=[0.75]), folder, name)
     return folder
 
 
@@ -421,7 +421,7 @@ def see(splatseg, small, folder, *more):
 
 
 def test_masks_of_the_wrong_size(small, splatseg, recorded) -> None:
-    save_masks(recorded, "train_1", MaskSet.from_dense(half(5, 10, 14)))
+    save_masks(MaskSet.from_dense(half(5, 10, 14)), recorded, "train_1")
     sentence = refused(see(splatseg, small, recorded))
     assert "view 'train_1': expected 28x20 pixels as the photograph has, got 14x10." in sentence
 
@@ -463,8 +463,8 @@ def test_views_that_are_missing(small, splatseg, recorded) -> None:
 
 def test_empty_masks(small, splatseg, recorded) -> None:
     nothing = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
-    save_masks(recorded, "train_0", MaskSet.from_dense(torch.cat((nothing, half()))))
-    save_masks(recorded, "train_1", MaskSet.from_dense(nothing))
+    save_masks(MaskSet.from_dense(torch.cat((nothing, half()))), recorded, "train_0")
+    save_masks(MaskSet.from_dense(nothing), recorded, "train_1")
     status, _, err = see(splatseg, small, recorded)
     assert status == 0
     assert "note: 2 masks without a pixel were left out (in train_0, train_1)." in err
@@ -478,7 +478,7 @@ def test_features_that_are_nan_or_do_not_cover_the_photograph(small, splatseg, t
     folder.mkdir()
     for name in TRAIN:
         cells = torch.zeros(3, 4, 2)
-        save_features(folder, name, FeatureMap(features=cells, stride=8, height=20, width=28))
+        save_features(FeatureMap(features=cells, stride=8, height=20, width=28), folder, name)
     values = np.zeros((3, 4, 2), np.float16)
     values[0, 0, 0] = np.nan
     np.savez(folder / "train_1.npz", features=values, stride=8, size=[HEIGHT, WIDTH])
@@ -486,7 +486,7 @@ def test_features_that_are_nan_or_do_not_cover_the_photograph(small, splatseg, t
         see(splatseg, small, folder)
     )
     cells = torch.zeros(3, 9, 2)
-    save_features(folder, "train_1", FeatureMap(features=cells, stride=8, height=20, width=72))
+    save_features(FeatureMap(features=cells, stride=8, height=20, width=72), folder, "train_1")
     sentence = refused(see(splatseg, small, folder))
     assert "cells of 8 pixels that cover a photograph of 28x20, got 9x3 cells" in sentence
 

@@ -169,7 +169,7 @@ def test_masks_made_elsewhere_come_in_by_folder(imported, splatseg, tmp_path) ->
     for view in load_scene(imported).train_views:
         mask = torch.zeros(1, 48, 64, dtype=torch.bool)
         mask[:, :, :32] = True
-        save_masks(folder, view.name, MaskSet.from_dense(mask, scores=[0.5]))
+        save_masks(MaskSet.from_dense(mask, scores=[0.5]), folder, view.name)
     status, out, err = splatseg("see", imported, "--model", folder, "--evidence", "mine")
     assert status == 0, err
     assert out.startswith("masks of 11 views by mine")

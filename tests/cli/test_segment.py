@@ -45,7 +45,7 @@ def masks(small):
             scores=torch.ones(2),
             levels=torch.zeros(2, dtype=torch.int64),
         )
-        save_masks(small.scene / "evidence" / "masks", name, found)
+        save_masks(found, small.scene / "evidence" / "masks", name)
     return small
 
 
@@ -65,7 +65,7 @@ def panoptic(small):
             rows.append(Segment(id=own, category=kind, isthing=True, score=0.9))
         Image.fromarray(out).save(folder / f"{name}.png")
         table[name] = rows
-    save_segments(folder, table)
+    save_segments(table, folder)
     return small
 
 

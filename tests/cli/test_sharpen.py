@@ -33,7 +33,7 @@ def labelled(small, splatseg):
     )  # fmt: skip
     assert status == 0, said
     count = len(load_scene(small.scene).gaussians)
-    save_scene_layer(small.scene, "picked", Selection(mask=torch.arange(count) < 5))
+    save_scene_layer(Selection(mask=torch.arange(count) < 5), small.scene, "picked")
     return small
 
 
@@ -264,7 +264,7 @@ def test_refused_in_one_sentence(labelled, splatseg, tmp_path, arguments, says) 
 def test_a_layer_of_unknown_origin_needs_evidence(labelled, splatseg, tmp_path) -> None:
     count = len(load_scene(labelled.scene).gaussians)
     ids = torch.ones(count, dtype=torch.int32)
-    save_scene_layer(labelled.scene, "hand", Labels(ids=ids, confidence=torch.ones(count)))
+    save_scene_layer(Labels(ids=ids, confidence=torch.ones(count)), labelled.scene, "hand")
     arguments = ("sharpen", labelled.scene, "-o", tmp_path / "new", "--layer", "hand")
     status, _, said = splatseg(*arguments, "--data", labelled.capture)
     assert status == 2

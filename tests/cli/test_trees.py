@@ -55,8 +55,8 @@ def treed(small):
     ids = torch.where(x > 0, 2, torch.where(y < HALF, 5, 6)).int()
     ids[0] = -1
     labels = Labels(ids=ids, confidence=torch.full((len(ids),), 0.75))
-    save_scene_layer(small.scene, "things", InstanceTree(nodes=NODES, labels=labels))
-    save_scene_layer(small.scene, "flat", labels)
+    save_scene_layer(InstanceTree(nodes=NODES, labels=labels), small.scene, "things")
+    save_scene_layer(labels, small.scene, "flat")
     return small
 
 
@@ -69,7 +69,7 @@ def nested(small):
         walls = [ids == LEFT, ids == RIGHT]
         halves = [wall & half for wall in walls for half in (upper, ~upper)]
         masks = torch.from_numpy(np.stack([*walls, *halves, walls[0] | walls[1]]))
-        save_masks(small.scene / "evidence" / "masks", name, MaskSet.from_dense(masks))
+        save_masks(MaskSet.from_dense(masks), small.scene / "evidence" / "masks", name)
     return small
 
 
@@ -159,7 +159,7 @@ def test_evaluate_scores_the_level_that_is_asked_for(treed, run, tmp_path) -> No
         Image.fromarray(np.where(ids > 1, 1, 0).astype(np.uint8)).save(truth / path.name)
     figures = {}
     for level in ("group", "object", "part"):
-        save_scene_layer(treed.scene, f"cut_{level}", tree.cut(level))
+        save_scene_layer(tree.cut(level), treed.scene, f"cut_{level}")
         scored = [
             json.loads(
                 run(

@@ -212,7 +212,7 @@ def test_layers_take_records_only(make) -> None:
     assert layer.info is info
     assert layer[:1].info is info
     assert with_info(layer, LayerInfo()).info == LayerInfo()
-    with pytest.raises(InputError, match="^info: expected a LayerInfo, got dict"):
+    with pytest.raises(InputError, match="^info: expected a LayerInfo, got a dict"):
         make({"method": "by hand"})
 
 

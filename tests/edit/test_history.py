@@ -309,7 +309,7 @@ def test_masks_are_refused_after_things_moved(document) -> None:
 @pytest.mark.parametrize(
     ("content", "error", "message"),
     [
-        ({"kind": "explode"}, InputError, "operation: expected one of extract, remove"),
+        ({"kind": "explode"}, InputError, "expected one of extract, remove"),
         ({"kind": "remove"}, InputError, "remove: expected where, got none"),
         ({"kind": "merge", "other": 3}, InputError, "other: expected a folder, got 3"),
         ({"kind": "remove", "where": {"layer": "a"}, "other": "b"}, InputError, "takes no other"),

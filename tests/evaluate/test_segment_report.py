@@ -136,8 +136,8 @@ def write(tmp_path):
         given |= words
         labels = layer_of(scene) if labels is None else labels
         write_segmentation_report(
+            scene,
             tmp_path / name,
-            scene=scene,
             field=GaussianField(scene.gaussians, {"walls & sky": labels}, backend="cpu"),
             labels=labels,
             layer="walls & sky",
@@ -304,7 +304,7 @@ def test_masks_are_painted_from_large_to_small(write) -> None:
     dense[1, 15:] = True
     folder = write.folder / "masks"
     create_evidence(folder, kind="masks")
-    save_masks(folder, "v0", MaskSet.from_dense(dense))
+    save_masks(MaskSet.from_dense(dense), folder, "v0")
     evidence = open_evidence(folder)
     assert isinstance(evidence, MaskEvidence)
     ids = _segment_panels._evidence_ids(evidence, "v0")
@@ -319,7 +319,7 @@ def test_masks_are_painted_from_large_to_small(write) -> None:
 def test_ids_agree_by_their_names(write) -> None:
     folder = write.folder / "named"
     create_evidence(folder, kind="labels", classes=CLASSES)
-    save_label_map(folder, "v0", LabelMap(ids=torch.ones(HEIGHT, WIDTH, dtype=torch.int32)))
+    save_label_map(LabelMap(ids=torch.ones(HEIGHT, WIDTH, dtype=torch.int32)), folder, "v0")
     source = open_evidence(folder)
     named = layer_of(write.scene)
     assert _segment_ids.ids_agree(RenderableLayer.of(named), source, otherwise=False)

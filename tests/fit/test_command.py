@@ -152,7 +152,7 @@ def test_a_scene_without_layers_is_replaced(folder: Path, tmp_path: Path, capsys
         ids=torch.ones(len(scene.gaussians), dtype=torch.int32),
         confidence=torch.ones(len(scene.gaussians)),
     )
-    save_scene_layer(tmp_path / "scene", "semantic", labels)
+    save_scene_layer(labels, tmp_path / "scene", "semantic")
     capsys.readouterr()
     assert main([*words, "4"]) == 2
     assert "got a scene with layers (semantic)" in capsys.readouterr().err

@@ -224,7 +224,7 @@ def _recorded_otherwise(path: Path, **changes: object) -> None:
     for group in ("options", "defaults"):
         table = {**identity[group], **changes.get(group, {})}
         identity[group] = {name: value for name, value in table.items() if value != "absent"}
-    write_checkpoint(path, replace(found, identity=identity))
+    write_checkpoint(replace(found, identity=identity), path)
 
 
 def test_options_that_came_later_count_as_their_defaults(capture: Capture, path: Path) -> None:
@@ -348,7 +348,7 @@ def test_states_that_do_not_fit_are_refused(capture: Capture, path: Path) -> Non
             },
             content=dict(good.state.content) | content,
         )
-        write_checkpoint(path, replace(good, state=state))
+        write_checkpoint(replace(good, state=state), path)
         with pytest.raises(FileFormatError) as caught:
             fit(capture, options=OPTIONS, checkpoints=checkpoints)
         return str(caught.value)
@@ -412,7 +412,7 @@ def test_the_old_one_stays_until_the_new_one_is_whole(
     with monkeypatch.context() as patch:
         patch.setattr(np, "savez", broken)
         with pytest.raises(KeyboardInterrupt):
-            write_checkpoint(path, read_checkpoint(path))
+            write_checkpoint(read_checkpoint(path), path)
     assert path.read_bytes() == good
     assert fit(capture, options=OPTIONS, checkpoints=checkpoints).steps == 60
     discard_checkpoint_file(path)

@@ -203,7 +203,7 @@ def main() -> None:
     if not LAYERS.exists():
         LAYERS.mkdir()
         for name, layer in golden_layers_of_version_3().items():
-            save_layer(LAYERS / f"{name}.npz", layer)
+            save_layer(layer, LAYERS / f"{name}.npz")
 
 
 def make_scene() -> None:
@@ -215,15 +215,15 @@ def make_scene() -> None:
     path.write_text(json.dumps(content, indent=1) + "\n")
     assert str(ROOT.parent) not in (ROOT / CAMERAS_FILE).read_text()
     for name, layer in golden_layers().items():
-        save_scene_layer(ROOT, name, layer)
+        save_scene_layer(layer, ROOT, name)
     labels, masks, features = golden_evidence()
     evidence = ROOT / "evidence"
     create_evidence(evidence / "labels", kind="labels", classes=CLASSES, metadata={"model": "a"})
-    save_label_map(evidence / "labels", "left/1", labels)
+    save_label_map(labels, evidence / "labels", "left/1")
     create_evidence(evidence / "masks", kind="masks")
-    save_masks(evidence / "masks", "left/1", masks)
+    save_masks(masks, evidence / "masks", "left/1")
     create_evidence(evidence / "features", kind="features")
-    save_features(evidence / "features", "left/1", features)
+    save_features(features, evidence / "features", "left/1")
     # Git does not keep empty folders; readers must not need them.
     (ROOT / "reports").rmdir()
 

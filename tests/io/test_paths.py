@@ -31,7 +31,7 @@ def test_no_view_has_a_name_that_no_file_may_have(name: str) -> None:
         View(name=name, camera=CAMERA)
     assert view_name_fault(clean_view_names([name])[0]) is None
     with pytest.raises(InputError):
-        save_masks(Path("nowhere"), name, MaskSet.from_dense(torch.ones(1, 2, 2, dtype=torch.bool)))
+        save_masks(MaskSet.from_dense(torch.ones(1, 2, 2, dtype=torch.bool)), Path("nowhere"), name)
 
 
 @pytest.mark.parametrize("name", ["0001", "left/0001", "IMG 1 (2)", "été", "a.b", "_x", "日本/1"])
@@ -101,7 +101,7 @@ def test_links_do_not_lead_out(tmp_path: Path, link: str) -> None:
     name = "a" if link == "file" else "d/a"
     ids = LabelMap(ids=torch.ones(2, 2, dtype=torch.int64))
     with pytest.raises(InputError, match=r"a link leads out|cannot be followed"):
-        save_label_map(inside, name, ids)
+        save_label_map(ids, inside, name)
     assert (outside / "a.png").read_bytes() == b"precious"
     assert len(list(outside.iterdir())) == 1
 

@@ -35,20 +35,20 @@ def test_each_reason_says_what_to_do(number: int) -> None:
 def test_a_full_disk_leaves_the_old_layer(tmp_path: Path, small_files: None) -> None:
     path = tmp_path / "classes.npz"
     old = Labels(ids=torch.ones(9, dtype=torch.int64), confidence=torch.ones(9))
-    save_layer(path, old)
+    save_layer(old, path)
     new = Labels(ids=torch.ones(9000, dtype=torch.int64), confidence=torch.ones(9000))
     with pytest.raises(OutputError, match=r"classes.npz: cannot be written: the file would be"):
-        save_layer(path, new)
+        save_layer(new, path)
     assert len(load_layer(path)) == 9
     assert [entry.name for entry in tmp_path.iterdir()] == ["classes.npz"]
 
 
 def test_a_full_disk_leaves_the_old_checkpoint(tmp_path: Path, small_files: None) -> None:
     path = tmp_path / "fit" / "checkpoint.npz"
-    write_checkpoint_file(path, {"steps": 1}, {"a": np.zeros(3)})
+    write_checkpoint_file({"steps": 1}, {"a": np.zeros(3)}, path)
     before = path.read_bytes()
     with pytest.raises(OutputError, match=r"checkpoint.npz: cannot be written"):
-        write_checkpoint_file(path, {"steps": 2}, {"a": np.zeros(9000)})
+        write_checkpoint_file({"steps": 2}, {"a": np.zeros(9000)}, path)
     assert path.read_bytes() == before
     assert not unfinished(path).exists(), "a full disk needs the space"
 
@@ -88,12 +88,12 @@ def test_scenes_layers_and_checkpoints_wait_for_the_disk(
     monkeypatch.setattr(os, "fsync", watched_fsync)
     monkeypatch.setattr(os, "replace", watched_replace)
     save_layer(
-        tmp_path / "a.npz", Labels(ids=torch.ones(2, dtype=torch.int64), confidence=torch.ones(2))
+        Labels(ids=torch.ones(2, dtype=torch.int64), confidence=torch.ones(2)), tmp_path / "a.npz"
     )
     here = f"sync {tmp_path.name}"
     assert done == ["sync a.npz", "rename a.npz", here]
     done.clear()
-    write_checkpoint_file(tmp_path / "c.npz", {}, {})
+    write_checkpoint_file({}, {}, tmp_path / "c.npz")
     assert done == ["sync c.npz.new", "rename c.npz", here]
     done.clear()
     with atomic_folder(tmp_path / "scene", durable=True) as temporary:

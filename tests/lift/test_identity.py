@@ -207,7 +207,7 @@ def test_the_rendered_readout_and_its_file(tmp_path, blend) -> None:
     options = IdentityOptions(**FAST, blend=blend)
     context = TrainingContext(backend=BACKEND, seed=5)
     trained = train_identity(gaussians, views, maps, options=options, context=context)
-    save_layer(tmp_path / "identity.npz", trained)
+    save_layer(trained, tmp_path / "identity.npz")
     layer = load_layer(tmp_path / "identity.npz")
     head = ClassifierHead.of(layer)
     assert head.blend == blend

@@ -298,7 +298,7 @@ def test_a_step_is_written_once(sampler, tmp_path, monkeypatch) -> None:
     """The checkpoint that is due after the last step is that of the end."""
     written, write = [], _file.write_state
     monkeypatch.setattr(
-        _file, "write_state", lambda *args: written.append(args[1].step) or write(*args)
+        _file, "write_state", lambda *args: written.append(args[0].step) or write(*args)
     )
     checkpoints = Checkpoints(path=tmp_path / "training.npz", steps=6, at_end=True)
     train(Regression(), sampler, options=TrainingOptions(**SHORT), checkpoints=checkpoints)

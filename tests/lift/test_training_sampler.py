@@ -40,7 +40,7 @@ class Masks:
     def view_names(self) -> tuple[str, ...]:
         return tuple(self._masks)
 
-    def mask_set(self, name: str) -> MaskSet:
+    def masks(self, name: str) -> MaskSet:
         return self._masks[name]
 
 
@@ -282,7 +282,7 @@ def test_masks_of_a_pixel(rng, views) -> None:
     found = set()
     for p in range(len(batch)):
         name = views[int(batch.views[p])].name
-        dense_masks = torch.stack([evidence.mask_set(name).dense(i) for i in range(5)])
+        dense_masks = torch.stack([evidence.masks(name).dense(i) for i in range(5)])
         inside = torch.nonzero(dense_masks.reshape(5, -1)[:, int(batch.pixels[p])]).squeeze(1)
         assert members.row(p).tolist() == inside.tolist()
         found |= {(name, m) for m in inside.tolist()}

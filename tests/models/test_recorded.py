@@ -59,9 +59,9 @@ def masks_folder(tmp_path, views):
     folder = create_evidence(tmp_path / "masks_x", kind="masks")
     for view in views[:2]:
         save_masks(
+            MaskSet.from_dense(torch.stack((TABLE, MUG, WALL)), scores=[0.9, 0.9, 0.5]),
             folder,
             view.name,
-            MaskSet.from_dense(torch.stack((TABLE, MUG, WALL)), scores=[0.9, 0.9, 0.5]),
         )
     return folder
 
@@ -147,7 +147,7 @@ def test_label_maps_are_a_semantic_model(tmp_path) -> None:
     ids = torch.full((H, W), -1, dtype=torch.int32)
     ids[MUG] = 4
     folder = create_evidence(tmp_path / "labels", kind="labels")
-    save_label_map(folder, "v0", LabelMap(ids=ids))
+    save_label_map(LabelMap(ids=ids), folder, "v0")
     model = find_model(folder)
     assert isinstance(model, SemanticLabels)
     assert not isinstance(model, PanopticSegments)
@@ -164,20 +164,20 @@ def test_panoptic_and_tracked_folders_are_written_read_and_asked(tmp_path) -> No
         Segment(id=2, category=-1, isthing=True, score=1.0),
     )
     folder = create_evidence(tmp_path / "p", kind="panoptic")
-    save_segments(folder, {"v0": segments})
-    save_label_map(folder, "v0", LabelMap(ids=ids))
+    save_segments({"v0": segments}, folder)
+    save_label_map(LabelMap(ids=ids), folder, "v0")
     model = find_model(folder)
     assert isinstance(model, PanopticSegments)
     given = model.panoptic(image(), view="v0")
     assert given.segments == segments
     assert torch.equal(given.ids.ids, ids)
     with pytest.raises(InputError, match="ids of their own"):
-        save_segments(folder, {"v0": (segments[0], segments[0])})
+        save_segments({"v0": (segments[0], segments[0])}, folder)
 
     folder = create_evidence(tmp_path / "t", kind="tracked")
-    save_tracks(folder, (Track(id=1, votes={"wall": 3}), Track(id=2, votes={})), order=("v1", "v0"))
+    save_tracks((Track(id=1, votes={"wall": 3}), Track(id=2, votes={})), folder, order=("v1", "v0"))
     for name in ("v0", "v1"):
-        save_label_map(folder, name, LabelMap(ids=ids))
+        save_label_map(LabelMap(ids=ids), folder, name)
     model = find_model(folder)
     assert isinstance(model, MaskTracker)
     frames = iter([("v1", image()), ("v0", image())])
@@ -241,7 +241,7 @@ def test_own_features_with_words_of_their_width_are_text_features(tmp_path) -> N
     folder = create_evidence(tmp_path / "f", kind="features")
     cells = torch.zeros(6, 8, 2)
     cells[..., 0] = 3.0
-    save_features(folder, "v0", FeatureMap(features=cells, stride=8, height=H, width=W))
+    save_features(FeatureMap(features=cells, stride=8, height=H, width=W), folder, "v0")
     assert isinstance(find_model(folder), DenseFeatures)
     words = {"labels": ["a"], "vectors": np.eye(2)[:1], "kind": ["class"], "target_id": [1]}
     np.savez(folder / "text_embeddings.npz", **words)

@@ -25,14 +25,14 @@ def made_room(small_room, tmp_path_factory) -> Path:
     """A scene of it, with a layer of its classes."""
     from splatseg.fit import FitOptions
     from splatseg.io.scene import save_scene_layer
-    from splatseg.tasks import SegmentOptions, make_scene, segment
+    from splatseg.tasks import SegmentOptions, fit_capture, segment
 
     folder = tmp_path_factory.mktemp("made") / "scene"
     options = FitOptions(minutes=None, steps=30, max_gaussians=600)
-    make_scene(small_room, folder, fit_options=options, backend="cpu")
+    fit_capture(small_room, folder, fit_options=options, backend="cpu")
     asked = SegmentOptions(evidence="labels_semantic", layer="classes")
     made = segment(load_scene(folder), "uplift", options=asked, backend="cpu")
-    save_scene_layer(folder, "classes", made.layer)
+    save_scene_layer(made.layer, folder, "classes")
     return folder
 
 

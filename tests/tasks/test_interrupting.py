@@ -16,9 +16,9 @@ from splatseg.tasks import (
     SeeOptions,
     SharpenSceneOptions,
     edit_scene,
+    fit_capture,
     import_scene,
     make_demo,
-    make_scene,
     see,
     sharpen_scene,
 )
@@ -37,7 +37,7 @@ def gaussians(folder) -> bytes:
 def straight(small_room, tmp_path_factory) -> bytes:
     """The Gaussians of a scene whose making nobody stopped."""
     folder = tmp_path_factory.mktemp("straight") / "scene"
-    made = make_scene(small_room, folder, fit_options=FIT, options=OFTEN, backend="cpu")
+    made = fit_capture(small_room, folder, fit_options=FIT, options=OFTEN, backend="cpu")
     assert not made.interrupted
     assert made.scores is not None
     assert made.held_out == len(made.scores.views) == 2
@@ -48,14 +48,14 @@ def straight(small_room, tmp_path_factory) -> bytes:
 def test_a_cancelled_fit_goes_on_from_its_last_checkpoint(small_room, straight, tmp_path) -> None:
     folder, stopping = tmp_path / "scene", Stopping("fit", after=17)
     with pytest.raises(Cancelled):
-        make_scene(
+        fit_capture(
             small_room, folder, fit_options=FIT, options=OFTEN, backend="cpu", observer=stopping
         )
     assert stopping.heard[-2:] == ["started fit", "finished fit"]
     assert not is_scene(folder), "no scene that is half of one"
     assert (folder / CHECKPOINT_FILE).is_file()
     hearing = Stopping()
-    made = make_scene(
+    made = fit_capture(
         small_room, folder, fit_options=FIT, options=GOING_ON, backend="cpu", observer=hearing
     )
     assert any("going on from step 15" in line for line in hearing.heard)
@@ -66,14 +66,14 @@ def test_a_cancelled_fit_goes_on_from_its_last_checkpoint(small_room, straight, 
 
 def test_a_fit_that_is_asked_to_end_leaves_a_scene(small_room, straight, tmp_path) -> None:
     folder, stopping = tmp_path / "scene", Stopping("fit", after=17, error=KeyboardInterrupt)
-    made = make_scene(
+    made = fit_capture(
         small_room, folder, fit_options=FIT, options=OFTEN, backend="cpu", observer=stopping
     )
     assert made.interrupted
     assert made.scores is None
     assert made.result.steps == 18
     assert load_scene(folder).provenance["interrupted"] is True
-    make_scene(small_room, folder, fit_options=FIT, options=GOING_ON, backend="cpu")
+    fit_capture(small_room, folder, fit_options=FIT, options=GOING_ON, backend="cpu")
     assert gaussians(folder) == straight
 
 
@@ -155,7 +155,7 @@ def test_a_cancelled_demo_can_be_made_again(tmp_path) -> None:
 def test_tasks_print_nothing(small_room, made, tmp_path, capsys) -> None:
     options = MakeSceneOptions(checkpoint_steps=10)
     quick = replace(FIT, steps=4)
-    make_scene(small_room, tmp_path / "s", fit_options=quick, options=options, backend="cpu")
+    fit_capture(small_room, tmp_path / "s", fit_options=quick, options=options, backend="cpu")
     see(load_scene(made), "classical", "masks")
     edit_scene(load_document(made), tmp_path / "e", options=EditOptions(scale=2.0), backend="cpu")
     assert capsys.readouterr() == ("", "")

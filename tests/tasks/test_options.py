@@ -19,8 +19,8 @@ from splatseg.tasks import (
     SharpenSceneOptions,
     attach_layers,
     edit_scene,
+    fit_capture,
     import_scene,
-    make_scene,
     see,
     sharpen_scene,
 )
@@ -61,7 +61,7 @@ def test_what_cannot_be_is_refused_before_the_work(kind, values, says) -> None:
 
 def test_options_of_making_a_scene(small_room, tmp_path) -> None:
     options = MakeSceneOptions(keep_checkpoint=True, preset="quick", format="nerfstudio")
-    made = make_scene(
+    made = fit_capture(
         small_room,
         tmp_path / "scene",
         options=options,
@@ -74,23 +74,23 @@ def test_options_of_making_a_scene(small_room, tmp_path) -> None:
     assert load_scene(tmp_path / "scene").provenance["preset"] == "quick"
     assert "splatseg fit words" in made.report.read_text(encoding="utf-8")
     with pytest.raises(InputError, match="expected a COLMAP model"):
-        make_scene(small_room, tmp_path / "other", options=MakeSceneOptions(format="colmap"))
+        fit_capture(small_room, tmp_path / "other", options=MakeSceneOptions(format="colmap"))
     both = MakeSceneOptions(resume=True, overwrite=True)
     with pytest.raises(InputError, match="resume, overwrite: expected one of the two"):
-        make_scene(small_room, tmp_path / "other", options=both)
+        fit_capture(small_room, tmp_path / "other", options=both)
     sfm = MakeSceneOptions(format="colmap", poses="sfm")
     with pytest.raises(InputError, match="format: expected none with `poses` sfm"):
-        make_scene(small_room, tmp_path / "other", options=sfm)
+        fit_capture(small_room, tmp_path / "other", options=sfm)
 
 
 def test_a_stopped_fit_is_not_lost_by_accident(small_room, tmp_path) -> None:
     folder = tmp_path / "scene"
     stopping = Stopping("fit", after=3, error=KeyboardInterrupt)
-    assert make_scene(small_room, folder, fit_options=QUICK, observer=stopping).interrupted
+    assert fit_capture(small_room, folder, fit_options=QUICK, observer=stopping).interrupted
     with pytest.raises(InputError, match="`resume` continues it, `overwrite` begins again"):
-        make_scene(small_room, folder, fit_options=QUICK)
+        fit_capture(small_room, folder, fit_options=QUICK)
     again = MakeSceneOptions(overwrite=True)
-    assert make_scene(small_room, folder, fit_options=QUICK, options=again).result.steps == 6
+    assert fit_capture(small_room, folder, fit_options=QUICK, options=again).result.steps == 6
 
 
 def test_where_a_scene_may_be_written(made, tmp_path) -> None:

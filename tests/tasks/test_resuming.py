@@ -57,7 +57,7 @@ def run(scene, method="identity", *, asked=ASKED, checkpoints=OFTEN, observer=No
 
 
 def saved(scene, made) -> bytes:
-    return save_segmentation(scene.root, made).read_bytes()
+    return save_segmentation(made, scene.root).read_bytes()
 
 
 @pytest.fixture(scope="module")

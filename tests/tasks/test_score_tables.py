@@ -12,7 +12,7 @@ FIGURES = {
 
 def test_names_are_escaped(tmp_path) -> None:
     for name in ("t.csv", "t.md", "t.tex"):
-        write_class_table(tmp_path / name, FIGURES)
+        write_class_table(FIGURES, tmp_path / name)
     assert "| 3 | salt & 50 % \\| a_b\\c ~ | 10 | 0.5000 |\n" in (tmp_path / "t.md").read_text()
     latex = (tmp_path / "t.tex").read_text()
     name = r"salt \& 50 \% | a\_b\textbackslash{}c \textasciitilde{}"

@@ -13,7 +13,7 @@ from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate import evaluate_semantic
 from splatseg.io.images import save_png
 from splatseg.report.segment_report import write_segmentation_report
-from splatseg.tasks import EvaluationOptions, RenderingOptions, evaluate, render_views
+from splatseg.tasks import EvaluationOptions, RenderingOptions, evaluate_scene, render_views
 from support.analytic import BALL, BALL_COLOUR, FLOOR, BallOverFloor
 
 WIDTH, HEIGHT = 48, 36
@@ -157,7 +157,7 @@ def test_scores_are_those_of_the_files(scene, field, truth, score, metric) -> No
     options = EvaluationOptions(
         layer=layer, truth=truth / "things", split="all", metric=metric, id=id
     )
-    ours = evaluate(scene, options=options, field=field)
+    ours = evaluate_scene(scene, options=options, field=field)
     where = truth / "things"
     if metric == "binary":
         where = truth / "mask"
@@ -179,7 +179,7 @@ def test_scores_are_those_of_the_files(scene, field, truth, score, metric) -> No
 def test_panoptic_scores_by_the_classes_that_the_layer_tells(scene, field, truth, score) -> None:
     options = RenderingOptions(split="all", what=("things",))
     render_views(scene, truth / "out", options=options, field=field)
-    ours = evaluate(
+    ours = evaluate_scene(
         scene,
         options=EvaluationOptions(
             layer="things", truth=truth / "classes", truth_instances=truth / "things",
@@ -206,22 +206,22 @@ def test_points_and_photographs(scene, field, tmp_path) -> None:
     xyz = np.array([[0, 0, 3], [0, 0.49, 3], [0, 0.7, 3], [0, 0, 1]], np.float32)
     np.savez(tmp_path / "points.npz", xyz=xyz, semantic=np.array([BALL, BALL, FLOOR, FLOOR]))
     given = EvaluationOptions(layer="things", points=tmp_path / "points.npz")
-    figures = evaluate(scene, options=given, field=field)
+    figures = evaluate_scene(scene, options=given, field=field)
     assert figures["points_accuracy"] == pytest.approx(3 / 4)
     assert figures["points_unlabelled"] == pytest.approx(1 / 4)
     assert "points_rule" not in figures
     with pytest.raises(InputError, match="points_rule: goes with the scene's Gaussians"):
-        evaluate(scene, options=replace(given, points_rule="nearest"), field=field)
+        evaluate_scene(scene, options=replace(given, points_rule="nearest"), field=field)
     photographed = []
     for view in scene.views:
         with field.view(view.camera) as looked_at:
             save_png(looked_at.signals().colour, tmp_path / f"{view.name}.png")
         photographed.append(replace(view, image=tmp_path / f"{view.name}.png"))
     seen = replace(scene, views=tuple(photographed))
-    figures = evaluate(seen, options=EvaluationOptions(split="all"), field=field)
+    figures = evaluate_scene(seen, options=EvaluationOptions(split="all"), field=field)
     assert figures["PSNR"] > 60
     assert figures["photographs"] == 4
-    smaller = evaluate(
+    smaller = evaluate_scene(
         seen, options=EvaluationOptions(split="all"), field=BallOverFloor(radius=0.3)
     )
     assert smaller["PSNR"] < 30
@@ -232,8 +232,8 @@ def test_a_report_of_a_field_without_gaussians(scene, field, truth) -> None:
 
     def page(**words) -> str:
         write_segmentation_report(
+            scene,
             truth / "report.html",
-            scene=scene,
             field=field,
             layer="things",
             evidence=open_evidence(truth / "things"),
@@ -258,7 +258,7 @@ def test_a_report_of_a_field_without_gaussians(scene, field, truth) -> None:
 def test_what_fields_must_not_do_is_refused(scene, field, truth, tmp_path) -> None:
     options = EvaluationOptions(layer="marks", truth=truth / "things")
     with pytest.raises(InputError, match="features without a classifier"):
-        evaluate(scene, options=options, field=field)
+        evaluate_scene(scene, options=options, field=field)
     with pytest.raises(InputError, match="no image"):
         render_views(scene, tmp_path / "o", options=RenderingOptions(what=("marks",)), field=field)
     with pytest.raises(InputError, match=r"a layer of the scene \(marks, selected, things\)"):

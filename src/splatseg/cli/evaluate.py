@@ -13,7 +13,7 @@ from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Split
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Scene
 from splatseg.io.json_files import write_json
-from splatseg.tasks import EvaluationOptions, evaluate
+from splatseg.tasks import EvaluationOptions, evaluate_scene
 from splatseg.tasks.new_scene import check_parent
 from splatseg.tasks.score_tables import check_table_file, write_class_table, write_confusion
 
@@ -78,7 +78,7 @@ def run(command: Command) -> None:
     check_table_file("table", command.table)
     check_table_file("confusion", command.confusion)
     scene = open_scene(command.scene, command.data)
-    figures = evaluate(
+    figures = evaluate_scene(
         scene,
         options=command.scoring,
         backend=command.backend,
@@ -86,11 +86,11 @@ def run(command: Command) -> None:
     )
     figures["scene"] = str(command.scene)
     if command.table is not None:
-        write_class_table(command.table, figures)
+        write_class_table(figures, command.table)
     if command.confusion is not None:
-        write_confusion(command.confusion, figures)
+        write_confusion(figures, command.confusion)
     if command.json_file is not None:
-        write_json(command.json_file, figures)
+        write_json(figures, command.json_file)
     if command.json:
         print_result(figures, [], json=True)
     else:

@@ -9,7 +9,7 @@ import tyro
 
 from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder, SplitOrPath
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
-from splatseg.tasks import ExportOptions, export
+from splatseg.tasks import ExportOptions, export_scene
 from splatseg.tasks.export_options import What
 
 
@@ -62,7 +62,7 @@ class Command:
 def run(command: Command) -> None:
     """Export a scene."""
     started = time.monotonic()
-    done = export(
+    done = export_scene(
         open_scene(command.scene, command.data),
         command.output,
         command.what,

@@ -20,7 +20,7 @@ from splatseg.cli._types import (
 from splatseg.cli._work import ConsoleObserver, print_result, typed
 from splatseg.fit import FitOptions, Preset, Strategy
 from splatseg.report.fit_verdict import scored_of
-from splatseg.tasks import MadeScene, MakeSceneOptions, make_scene
+from splatseg.tasks import MadeScene, MakeSceneOptions, fit_capture
 
 _DEFAULT = FitOptions()
 _SCENE = MakeSceneOptions()
@@ -133,7 +133,7 @@ class Command:
 
 def run(command: Command) -> None:
     """Fit a scene and write it."""
-    made = make_scene(
+    made = fit_capture(
         command.data,
         command.output,
         options=MakeSceneOptions(

@@ -175,7 +175,7 @@ def run(command: Command) -> None:
         )
         if command.export:
             check_layer_exports(scene, command.scene, result.name)
-        path = save_segmentation(command.scene, result)
+        path = save_segmentation(result, command.scene)
         lines = [_summary(result, time.monotonic() - started), str(path)]
         made = _facts(result, path)
         timings = {"load": opened}

@@ -17,6 +17,7 @@ from splatseg.core._distortion import (
     undistort_fisheye,
     undistort_opencv,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.rigid import Similarity, check_rotation
 from splatseg.errors import InputError, RangeError
 
@@ -61,6 +62,7 @@ class Camera:
     trailing values are 0."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.width < 1 or self.height < 1:
             raise RangeError(
                 f"width, height: expected at least 1, got {self.width} and {self.height}."
@@ -121,6 +123,7 @@ class Camera:
         """Centre of projection in the world."""
         return self.world_from_cam[:3, 3]
 
+    @boundary
     def project(
         self, points_world: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
@@ -135,6 +138,7 @@ class Camera:
         plane = points_cam[..., :2] / safe.unsqueeze(-1)
         return self._pixels_from_plane(plane, distorted=False), depth
 
+    @boundary
     def unproject(
         self, pixels: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch 3"]:
@@ -154,6 +158,7 @@ class Camera:
         pose = self.world_from_cam.to(points_cam)
         return points_cam @ pose[:3, :3].T + pose[:3, 3]
 
+    @boundary
     def rays(
         self, pixels: Float[Tensor, "*batch 2"] | None = None
     ) -> tuple[Float[Tensor, "3"], Float[Tensor, "*batch 3"]]:
@@ -175,10 +180,12 @@ class Camera:
         )
         return torch.stack((u, v), dim=-1)
 
+    @boundary
     def undistort_pixels(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Where pixels would lie without distortion, same intrinsics."""
         return self._pixels_from_plane(self._plane_from_pixels(pixels), distorted=True)
 
+    @boundary
     def distort_pixels(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Where undistorted pixels lie in the photograph. Inverse of `undistort_pixels`."""
         return self._pixels_from_plane((pixels - self._offset(pixels)) / self._focal(pixels))
@@ -226,6 +233,7 @@ class Camera:
             distortion=(),
         )
 
+    @boundary
     def resized(self, width: int, height: int) -> "Camera":
         """The same view on another pixel grid: all intrinsics scale, distortion stays."""
         sx, sy = width / self.width, height / self.height
@@ -239,6 +247,7 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    @boundary
     def moved(self, new_from_old: Similarity) -> "Camera":
         """The camera in a world that was moved by `new_from_old`; its image is the same."""
         old_from_new = new_from_old.inverse()

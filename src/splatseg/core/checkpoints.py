@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 
 # The pause is at least this many times the time that writing a checkpoint took.
@@ -58,6 +59,7 @@ class Checkpoints:
     and the work goes on. The default is a `CheckpointWarning`."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if not (math.isfinite(self.seconds) and self.seconds > 0):
             raise RangeError(
                 f"checkpoints.seconds: expected a positive number, got {self.seconds}."

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape, check_values
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import UNLABELLED
 from splatseg.core.gaussians import Gaussians
 from splatseg.core.instance_tree import InstanceTree, Layer
@@ -38,6 +39,7 @@ class Edited:
     was split share it. None is 1 everywhere."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("rows", self.rows, (len(self.gaussians),))
         if len(self.rows) and int(self.rows.min()) < NEW:
             raise RangeError(f"rows: expected -1 or more, got {int(self.rows.min())}.")
@@ -96,6 +98,7 @@ def apply_rows(layer: Selection, edited: Edited) -> Selection: ...
 def apply_rows(layer: InstanceTree, edited: Edited) -> InstanceTree: ...
 @overload
 def apply_rows(layer: Layer, edited: Edited) -> Layer: ...
+@boundary
 def apply_rows(layer: Layer, edited: Edited) -> Layer:
     """Make a layer follow an edit: row j of the result is row ``edited.rows[j]`` of `layer`.
 

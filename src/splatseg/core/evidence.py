@@ -1,5 +1,6 @@
 """What 2D models see in one view: masks, label maps, feature maps."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.late import preview
 from splatseg.core.rle import Rle
 from splatseg.errors import RangeError, ShapeError
 
@@ -31,6 +34,7 @@ class MaskSet:
     """Granularity, 0 the finest; all 0 where the model has no levels."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("scores", self.scores, (len(self.masks),))
         check_shape("levels", self.levels, (len(self.masks),))
         for i, mask in enumerate(self.masks):
@@ -43,11 +47,21 @@ class MaskSet:
     def __len__(self) -> int:
         return len(self.masks)
 
+    def __repr__(self) -> str:
+        levels = len(set(self.levels.tolist()))
+        of = f", {levels} levels" if levels > 1 else ""
+        return f"MaskSet({len(self)} masks of {self.width}x{self.height} pixels{of})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
+    @boundary
     def dense(self, index: int) -> Bool[Tensor, "height width"]:
         """One mask as booleans."""
         return self.masks[index].decode()
 
     @classmethod
+    @boundary
     def from_dense(
         cls,
         masks: Bool[Tensor, "m height width"],
@@ -82,12 +96,21 @@ class LabelMap:
     """Confidence of the id, in [0, 1]."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("ids", self.ids, (None, None))
         if self.ids.numel() and int(self.ids.min()) < UNLABELLED:
             raise RangeError(f"ids: expected -1 or more, got {int(self.ids.min())}.")
         object.__setattr__(self, "ids", self.ids.to(torch.int32))
         if self.confidence is not None:
             check_shape("confidence", self.confidence, tuple(self.ids.shape))
+
+    def __repr__(self) -> str:
+        present = torch.unique(self.ids)
+        count = int((present != UNLABELLED).sum())
+        return f"LabelMap({self.width}x{self.height} pixels, {count} ids)"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
 
     @property
     def height(self) -> int:
@@ -116,9 +139,14 @@ class FeatureMap:
     """Columns of the image that the grid covers, at least in part."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("features", self.features, (None, None, None))
         if self.stride < 1:
             raise RangeError(f"stride: expected at least 1, got {self.stride}.")
+
+    def __repr__(self) -> str:
+        rows, columns, channels = self.features.shape
+        return f"FeatureMap({rows}x{columns} cells of {self.stride} pixels, {channels} channels)"
 
     @property
     def channels(self) -> int:
@@ -136,6 +164,9 @@ class Segment:
     score: float
     """Confidence of the model, in [0, 1]."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
@@ -145,12 +176,16 @@ class Track:
     votes: Mapping[str, int]
     """Pixels under the track by the name of the class that a segmenter gave them."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
     @property
     def category(self) -> str | None:
         """The class name with most votes; the first by name among equals."""
         return min(self.votes, key=lambda name: (-self.votes[name], name)) if self.votes else None
 
 
+@boundary
 def map_ids(
     ids: Int[Tensor, "height width"],
     values: Mapping[int, float],
@@ -169,10 +204,17 @@ def map_ids(
     Returns:
         (height, width), in `dtype`.
 
+    Raises:
+        RangeError: If a value is NaN or infinite and `dtype` holds integers.
+
     Example:
         >>> map_ids(torch.tensor([[7, -1]]), {7: 2}, default=None)
         tensor([[ 2, -1]])
     """
+    if not dtype.is_floating_point and not all(
+        math.isfinite(value) for value in (default or 0, *values.values())
+    ):
+        raise RangeError(f"values, default: expected finite numbers for {dtype}, got others.")
     present, index = torch.unique(ids, return_inverse=True)
     found = [values.get(id, id if default is None else default) for id in present.tolist()]
     return torch.tensor(found, dtype=dtype)[index]

@@ -11,6 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape, check_values
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.coerce import as_rows
+from splatseg.core.late import preview
 from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
 from splatseg.core.sh import SH_C0, degree_of, rotate_sh
 from splatseg.errors import InputError, RangeError, ShapeError
@@ -66,6 +69,7 @@ class Gaussians:
     (`RenderOptions.low_pass`). Other than 3DGS's, it goes with them into PLY files."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         n = self.means.shape[0] if self.means.ndim else 0
         check_shape("means", self.means, (None, 3))
         check_shape("rotations", self.rotations, (n, 4))
@@ -83,10 +87,17 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __repr__(self) -> str:
+        extra = f", extra={sorted(self.extra)}" if self.extra else ""
+        where = "" if self.device.type == "cpu" else f", device={str(self.device)!r}"
+        return f"Gaussians({len(self):,}, sh_degree={self.sh_degree}{extra}{where})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
     def __getitem__(self, index: slice | Tensor) -> "Gaussians":
         """Rows by slice, boolean mask (n,) or integer ids, extra columns included."""
-        if isinstance(index, Tensor) and index.dtype == torch.bool:
-            check_shape("index", index, (len(self),))
+        index = as_rows("index", index, len(self))
         return Gaussians(
             means=self.means[index],
             rotations=self.rotations[index],
@@ -122,10 +133,27 @@ class Gaussians:
         """The same Gaussians with some columns exchanged."""
         return _replace(self, **changes)
 
+    @boundary
     def to(
-        self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+        self,
+        target: torch.device | torch.dtype | str | None = None,
+        /,
+        *,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
     ) -> "Gaussians":
-        """Move to a device, or change the floating-point type (extra columns keep theirs)."""
+        """Move to a device, or change the floating-point type (extra columns keep theirs).
+
+        ``to("cuda")`` and ``to(torch.float64)`` are short for ``device=`` and ``dtype=``.
+
+        Raises:
+            InputError: If the device is not here, or is no place for values.
+        """
+        if isinstance(target, torch.dtype):
+            dtype = target
+        elif target is not None:
+            device = target
+        device = _device(device)
         core = {
             f.name: getattr(self, f.name).to(device=device, dtype=dtype)
             for f in fields(self)
@@ -153,6 +181,7 @@ class Gaussians:
                 f"({int(zero.sum())} of {len(self)} rows)."
             )
 
+    @boundary
     def transformed(self, target_from_source: Similarity) -> "Gaussians":
         """The Gaussians moved by a similarity: centres, axes, scales and spherical harmonics.
 
@@ -167,6 +196,7 @@ class Gaussians:
         )
 
     @staticmethod
+    @boundary
     def concatenate(parts: "Sequence[Gaussians]") -> "Gaussians":
         """Join scenes row by row.
 
@@ -205,3 +235,17 @@ class Gaussians:
             antialiased=parts[0].antialiased,
             low_pass=parts[0].low_pass,
         )
+
+
+def _device(device: torch.device | str | None) -> torch.device | None:
+    """A device that is here and holds values."""
+    if device is None:
+        return None
+    try:
+        found = torch.device(device)
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"device: expected one that is here, got {str(device)!r}.") from error
+    if found.type == "meta":
+        raise InputError("device: expected one that holds values, got 'meta'.")
+    return found

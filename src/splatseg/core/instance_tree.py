@@ -8,7 +8,9 @@ from typing import Any, overload
 import torch
 from torch import Tensor
 
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.late import preview
 from splatseg.core.layer_info import InstanceFacts, LayerInfo
 from splatseg.core.layers import Features, Labels, Selection
 from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
@@ -54,6 +56,9 @@ class TreeNode:
     views: int = 0
     """Views that these come from."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InstanceTree:
@@ -84,6 +89,7 @@ class InstanceTree:
     """Of each Gaussian the id of its deepest node, -1 for none, and how sure it is."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         by_id = {node.id: node for node in self.nodes}
         if len(by_id) != len(self.nodes):
             raise InputError("nodes: expected ids that differ, got one twice.")
@@ -95,6 +101,14 @@ class InstanceTree:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    def __repr__(self) -> str:
+        counts = {level: sum(n.level == level for n in self.nodes) for level in TREE_LEVELS}
+        words = ", ".join(f"{n} {level}{'s'[: n != 1]}" for level, n in counts.items())
+        return f"InstanceTree({len(self):,} rows; {words})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
 
     def __getitem__(self, index: slice | Tensor) -> "InstanceTree":
         """Rows, in step with `Gaussians.__getitem__`; all nodes stay."""
@@ -110,6 +124,7 @@ class InstanceTree:
         """Nodes on the longest path from a root."""
         return max((len(self.path(node.id)) for node in self.nodes), default=0)
 
+    @boundary
     def node(self, id: int) -> TreeNode:
         """The node of an id.
 
@@ -121,6 +136,7 @@ class InstanceTree:
                 return node
         raise InputError(f"node: expected an id of the tree's, got {id}.")
 
+    @boundary
     def path(self, id: int) -> tuple[int, ...]:
         """Ids of the nodes from the root to a node, the node included."""
         parents = {node.id: node.parent for node in self.nodes}
@@ -155,6 +171,7 @@ class InstanceTree:
                     found[id] = _OBJECT_GRANULARITY * (1 - 1 / steps)
         return found
 
+    @boundary
     def cut(self, level: TreeLevel | float = "object") -> Labels:
         """One id a Gaussian, at a level or a granularity.
 
@@ -270,6 +287,7 @@ Layer = FlatLayer | InstanceTree
 """What a scene keeps of its Gaussians under a name."""
 
 
+@boundary
 def layer_address(text: str) -> tuple[str, TreeLevel | float | None]:
     """The name of a layer and the level of it that is meant, None for all of it.
 
@@ -284,6 +302,7 @@ def layer_address(text: str) -> tuple[str, TreeLevel | float | None]:
     return name, tree_level(level) if at else None
 
 
+@boundary
 def flat_layer(layer: Layer, level: TreeLevel | float | None, *, name: str) -> FlatLayer:
     """The layer, or of a tree the cut that is asked for; None asks for objects.
 
@@ -301,6 +320,7 @@ def flat_layer(layer: Layer, level: TreeLevel | float | None, *, name: str) -> F
 def with_info(layer: InstanceTree, info: LayerInfo) -> InstanceTree: ...
 @overload
 def with_info(layer: Layer, info: LayerInfo) -> Layer: ...
+@boundary
 def with_info(layer: Layer, info: LayerInfo) -> Layer:
     """The layer with another record of how it was made."""
     if isinstance(layer, InstanceTree):
@@ -308,6 +328,7 @@ def with_info(layer: Layer, info: LayerInfo) -> Layer:
     return replace(layer, info=info)
 
 
+@boundary
 def node_row(node: TreeNode) -> dict[str, Any]:
     """A node as JSON holds it."""
     return {
@@ -322,6 +343,7 @@ def node_row(node: TreeNode) -> dict[str, Any]:
     }
 
 
+@boundary
 def tree_level(text: str) -> TreeLevel | float:
     """A level by name, or a granularity, as people write them.
 

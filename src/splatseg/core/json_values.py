@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias, cast
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, quoted
 
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
@@ -17,6 +18,7 @@ _MAX_DIGITS = 18
 """Of an id, which has 64 bits at most."""
 
 
+@boundary
 def plain_json(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> JSON:
     """A copy in the types that JSON gives back: dicts, and lists for tuples.
 
@@ -36,6 +38,7 @@ def plain_json(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> JSON:
     return _plain(name, value, max_depth, max_depth)
 
 
+@boundary
 def plain_object(name: str, value: object, *, max_depth: int = MAX_DEPTH) -> dict[str, JSON]:
     """A copy of a mapping as JSON holds it, see `plain_json`.
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, cast
 
+from splatseg.core.boundary import boundary
 from splatseg.core.json_values import JSON, id_of_key, plain_object
 from splatseg.core.layer_info import InstanceFacts, LayerEdit, LayerInfo
 from splatseg.core.layer_info_version_0 import layer_info_from_metadata
@@ -21,6 +22,7 @@ _BY_ID = ("names", "source_ids", "class_of", "instances")
 _KNOWN = tuple(field.name for field in fields(LayerInfo))
 
 
+@boundary
 def layer_info_to_json(info: LayerInfo) -> dict[str, JSON]:
     """The record in values that JSON holds. Inverse of `layer_info_from_json`.
 
@@ -51,6 +53,7 @@ def layer_info_to_json(info: LayerInfo) -> dict[str, JSON]:
     return plain_object("info", record)
 
 
+@boundary
 def layer_info_from_json(record: Mapping[str, Any], *, where: str) -> LayerInfo:
     """The record that a JSON object holds. Inverse of `layer_info_to_json`.
 

@@ -7,6 +7,7 @@ becomes of each.
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
+from splatseg.core.boundary import boundary
 from splatseg.core.json_values import id_of_key
 from splatseg.core.layer_info import InstanceFacts, LayerEdit, LayerEditName, LayerInfo
 from splatseg.core.tree_levels import TREE_LEVELS
@@ -22,6 +23,7 @@ _EDITS_OF_VERSION_0: dict[str, LayerEditName] = {
 """Keys of version 0 that became edits, in the order in which these are usually done."""
 
 
+@boundary
 def layer_info_from_metadata(metadata: Mapping[str, Any], *, where: str) -> LayerInfo:
     """The record of a file of version 0, a flat object of any keys.
 

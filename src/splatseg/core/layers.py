@@ -7,7 +7,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.late import preview
 from splatseg.core.layer_info import LayerInfo, check_layer_info
 from splatseg.errors import InputError, RangeError, ShapeError
 
@@ -46,6 +49,7 @@ class Labels:
     """How it was made, what its ids are called, and what was done to it since."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("ids", self.ids, (None,))
         check_layer_info("info", self.info)
         n = len(self.ids)
@@ -70,8 +74,17 @@ class Labels:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def __repr__(self) -> str:
+        none = int((self.ids == UNLABELLED).sum())
+        made = "" if self.info.method is None else f", method={self.info.method!r}"
+        return f"Labels({len(self):,} rows, {len(self.present)} ids, {none:,} unlabelled{made})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
     def __getitem__(self, index: slice | Tensor) -> "Labels":
         """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
         return Labels(
             ids=self.ids[index],
             confidence=self.confidence[index],
@@ -106,6 +119,7 @@ class Features:
     """How it was made, and what was done to it since."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("values", self.values, (None, None))
         check_layer_info("info", self.info)
         if self.weights is not None:
@@ -114,8 +128,12 @@ class Features:
     def __len__(self) -> int:
         return len(self.values)
 
+    def __repr__(self) -> str:
+        return f"Features({len(self):,} rows, {self.values.shape[1]} channels)"
+
     def __getitem__(self, index: slice | Tensor) -> "Features":
         """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
         return Features(
             values=self.values[index],
             weights=None if self.weights is None else self.weights[index],
@@ -140,6 +158,7 @@ class Selection:
     """How it was made. Algebra drops it."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("mask", self.mask, (None,))
         check_layer_info("info", self.info)
         if self.mask.dtype != torch.bool:
@@ -148,8 +167,12 @@ class Selection:
     def __len__(self) -> int:
         return len(self.mask)
 
+    def __repr__(self) -> str:
+        return f"Selection({self.count:,} of {len(self):,})"
+
     def __getitem__(self, index: slice | Tensor) -> "Selection":
         """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
         return Selection(mask=self.mask[index], info=self.info)
 
     @property
@@ -177,6 +200,7 @@ class Selection:
     def __invert__(self) -> "Selection":
         return Selection(mask=~self.mask)
 
+    @boundary
     def _same_length(self, other: "Selection") -> Tensor:
         if len(self) != len(other):
             raise ShapeError(

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import FeatureMap, LabelMap, MaskSet, Segment
 from splatseg.core.scene import ClassTable
 from splatseg.errors import InputError, RangeError
@@ -80,6 +81,7 @@ class Prompt:
     """A rough mask of the thing, of the image's size."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("points", self.points, (None, 2))
         check_finite("points", self.points)
         count = len(self.points)
@@ -108,6 +110,7 @@ class Prompt:
             else (self.positive)
         )
 
+    @boundary
     def check_size(self, height: int, width: int) -> None:
         """Raise `InputError` unless the prompt lies in an image of this size.
 
@@ -222,6 +225,7 @@ class DeepFeatures:
     """One vector of the whole image, where the network has one."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if not self.maps or len(self.maps) != len(self.depths):
             raise InputError(
                 f"depths: expected one name a map, at least one, got {len(self.depths)} names of "
@@ -265,6 +269,7 @@ class Boxes:
     """Index of the word that each box was found for."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("boxes", self.boxes, (len(self.words), 4))
         check_shape("scores", self.scores, (len(self.words),))
 

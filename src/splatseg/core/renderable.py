@@ -8,12 +8,13 @@ cameras, views and points, but no rows.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import Literal, Protocol, Self, runtime_checkable
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg._check import check_choice, check_shape
+from splatseg.core.boundary import convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.evidence import UNLABELLED, LabelMap
 from splatseg.core.layer_info import LayerInfo
@@ -41,6 +42,7 @@ class ViewSignals:
     knows the expected depth alone."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("alpha", self.alpha, (None, None))
         size = tuple(self.alpha.shape)
         check_shape("depth", self.depth, size)
@@ -61,6 +63,7 @@ class PointLabels:
     """How sure they are, in [0, 1]."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("ids", self.ids, (None,))
         check_shape("confidence", self.confidence, (len(self.ids),))
 
@@ -83,6 +86,7 @@ class RenderableLayer:
     """How it was made, as of layers of Gaussians: views it learned from, names of ids, method."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_choice("kind", self.kind, _KINDS)
         if list(self.ids) != sorted({id for id in self.ids if id != UNLABELLED}):
             raise InputError(f"ids: expected distinct ids, ascending, without -1, got {self.ids}.")
@@ -99,6 +103,7 @@ class RenderableLayer:
         )
 
 
+@runtime_checkable
 class RenderableView(Protocol):
     """One view of a field, a context: it may hold memory until it is left.
 
@@ -147,6 +152,7 @@ class RenderableView(Protocol):
         ...
 
 
+@runtime_checkable
 class Renderable(Protocol):
     """A field: signals and labels of any view, and labels of points.
 

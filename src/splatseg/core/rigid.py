@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import RangeError
 
 
@@ -130,6 +131,7 @@ class Similarity:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_rotation("rotation", self.rotation)
         check_shape("translation", self.translation, (3,))
         check_finite("translation", self.translation)
@@ -152,6 +154,7 @@ class Similarity:
         out[:3, 3] = self.translation.double()
         return out
 
+    @boundary
     def apply(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Move points from the source frame to the target frame, in their own dtype."""
         rotation = self.rotation.to(points)
@@ -166,6 +169,7 @@ class Similarity:
             scale=1 / self.scale,
         )
 
+    @boundary
     def compose(self, inner: "Similarity") -> "Similarity":
         """``target_from_source @ source_from_inner``: first `inner`, then this."""
         return Similarity(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 
 _MAX_BITS = 35
@@ -24,6 +25,7 @@ class Rle:
     counts: NDArray[np.uint32]
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         total = int(self.counts.sum(dtype=np.uint64))
         if total != self.height * self.width:
             raise RangeError(
@@ -53,6 +55,7 @@ class Rle:
         return (x0, y0, x1 - x0 + 1, y1 - y0 + 1)
 
     @classmethod
+    @boundary
     def encode(cls, mask: Bool[Tensor, "height width"]) -> "Rle":
         """Run lengths of a boolean mask."""
         check_shape("mask", mask, (None, None))
@@ -72,6 +75,7 @@ class Rle:
         return torch.from_numpy(np.ascontiguousarray(flat.reshape(self.width, self.height).T))
 
     @classmethod
+    @boundary
     def from_coco(cls, text: str | bytes, *, height: int, width: int) -> "Rle":
         """Read COCO's compressed counts: 5 bits a character, least significant first.
 

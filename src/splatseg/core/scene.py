@@ -10,8 +10,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
+from splatseg.core.late import late, preview
+from splatseg.core.scene_layers import SceneLayers
 from splatseg.core.view_names import check_view_name
 from splatseg.errors import InputError, ShapeError
 
@@ -43,7 +46,28 @@ class View:
     """Scene units of one step of the depth map."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_view_name(self.name)
+
+    def __repr__(self) -> str:
+        size = f"{self.camera.width}x{self.camera.height}"
+        photograph = "" if self.image is not None else ", no photograph"
+        return f"View({self.name!r}, {self.split}, {size} pixels{photograph})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
+    def read_image(self, *, longest: int | None = None) -> UInt8[Tensor, "height width 3"]:
+        """The photograph, upright, 8 bit sRGB; see `io.images.load_image`.
+
+        Args:
+            longest: Longest side in pixels; a larger photograph is reduced to it.
+
+        Raises:
+            InputError: If the view has no photograph.
+            MissingFileError: If the photograph is not where it was.
+        """
+        return late("io.images", "load_image")(self, longest=longest)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,12 +80,17 @@ class PointCloud:
     """Red, green, blue, 0 to 255."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("points", self.points, (None, 3))
         if self.colours is not None:
             check_shape("colours", self.colours, (len(self.points), 3))
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        colours = "" if self.colours is None else ", with colours"
+        return f"PointCloud({len(self):,} points{colours})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +106,9 @@ class ClassInfo:
     colour: tuple[int, int, int] | None = None
     """Red, green, blue, 0 to 255, for images."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassTable:
@@ -85,15 +117,18 @@ class ClassTable:
     rows: tuple[ClassInfo, ...]
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         ids = [row.id for row in self.rows]
         if len(set(ids)) != len(ids):
             twice = sorted({i for i in ids if ids.count(i) > 1})
             raise InputError(f"classes: expected distinct ids, got {twice} more than once.")
 
+    @boundary
     def name_of(self, id: int) -> str:
         """Name of an id, or ``id N`` where the table does not know it."""
         return next((row.name for row in self.rows if row.id == id), f"id {id}")
 
+    @boundary
     def by_name(self, name: str) -> ClassInfo:
         """The row with this name.
 
@@ -114,6 +149,7 @@ class _WithViews(ABC):
     views: tuple[View, ...]
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         names = [view.name for view in self.views]
         if len(set(names)) != len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -170,6 +206,13 @@ class Capture(_WithViews):
     missing: tuple[str, ...] = ()
     """Photographs that it lists and that are not there, as it calls them; no view is of them."""
 
+    def __repr__(self) -> str:
+        points = "no points" if self.points is None else f"{len(self.points):,} points"
+        return f"Capture({str(self.path)!r}, {self.format}: {_counted(self)}, {points})"
+
+    def _repr_html_(self) -> str:
+        return preview(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene(_WithViews):
@@ -190,7 +233,27 @@ class Scene(_WithViews):
     provenance: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """How it was made, in values that JSON holds."""
 
+    def __repr__(self) -> str:
+        where = "not saved" if self.root is None else repr(str(self.root))
+        return f"Scene({where}: {len(self.gaussians):,} Gaussians, {_counted(self)})"
 
+    def _repr_html_(self) -> str:
+        return preview(self)
+
+    @property
+    def layers(self) -> SceneLayers:
+        """The layers of its folder by name, read when asked for."""
+        return SceneLayers(self.root)
+
+
+def _counted(views: _WithViews) -> str:
+    """How many views of which split."""
+    splits = [view.split for view in views.views]
+    counts = ", ".join(f"{splits.count(s)} {s}" for s in dict.fromkeys(splits))
+    return f"{len(splits)} views" + (f" ({counts})" if counts else "")
+
+
+@boundary
 def camera_of_map(view: View, height: int, width: int) -> Camera:
     """The camera of a map's pixels: the view's own, or reduced in proportion.
 

@@ -1,11 +1,12 @@
 """Where evidence of views comes from: files, dictionaries, or what is computed when asked for."""
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from splatseg.core.evidence import FeatureMap, LabelMap, MaskSet
 
 
+@runtime_checkable
 class ViewNames(Protocol):
     """Something recorded of views."""
 
@@ -15,6 +16,7 @@ class ViewNames(Protocol):
         ...
 
 
+@runtime_checkable
 class LabelSource(Protocol):
     """Label maps by view name, read when asked for: recorded evidence, or a dictionary's."""
 
@@ -28,6 +30,7 @@ class LabelSource(Protocol):
         ...
 
 
+@runtime_checkable
 class SegmentSource(Protocol):
     """Segments of views, each view with ids of its own."""
 
@@ -55,6 +58,7 @@ class SegmentSource(Protocol):
         ...
 
 
+@runtime_checkable
 class FeatureSource(Protocol):
     """Feature maps by view name, read when asked for."""
 

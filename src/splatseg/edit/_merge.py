@@ -17,9 +17,11 @@ from splatseg.core import (
     Selection,
     apply_rows,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 
 
+@boundary
 def merged_layers(
     layers: Mapping[str, Layer], others: Mapping[str, Layer], edited: Edited
 ) -> dict[str, Layer]:

@@ -8,6 +8,7 @@ from typing import Any, Literal, cast
 import torch
 
 from splatseg.core import Similarity
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.boundaries.cut import CutOptions
 from splatseg.selection import Where
@@ -87,6 +88,7 @@ class Operation:
     None leaves all pieces."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.kind not in _TAKES:
             raise InputError(f"operation: expected one of {', '.join(_TAKES)}, got {self.kind!r}.")
         must, may = _TAKES[self.kind]

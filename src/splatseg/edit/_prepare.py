@@ -18,6 +18,7 @@ from splatseg.core import (
     View,
     layer_address,
 )
+from splatseg.core.boundary import boundary
 from splatseg.edit._operation import CutBy, Operation
 from splatseg.edit.document import Document
 from splatseg.errors import InputError
@@ -68,6 +69,7 @@ class _Drawn:
         return label_map(self.gaussians, self.views[name].camera, labels, backend=self.backend)
 
 
+@boundary
 def prepare(
     document: Document,
     operation: Operation,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Edited, Layer, Scene, apply_rows
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene, scene_layer_names
@@ -25,6 +26,7 @@ class Document:
     layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         count = len(self.scene.gaussians)
         for name, layer in self.layers.items():
             if len(layer) != count:
@@ -45,6 +47,7 @@ class Document:
         )
 
 
+@boundary
 def load_document(root: Path | str, *, data: Path | str | None = None) -> Document:
     """Read a scene folder with all its layers.
 
@@ -57,6 +60,7 @@ def load_document(root: Path | str, *, data: Path | str | None = None) -> Docume
     return Document(scene=scene, layers={name: load_scene_layer(root, name) for name in names})
 
 
+@boundary
 def save_document(document: Document, root: Path | str) -> Document:
     """Write a new scene folder with its layers, whole or not at all.
 

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from splatseg.core import Edited, Gaussians, Scene, Selection, Similarity
+from splatseg.core.boundary import boundary
 from splatseg.edit._merge import merged_layers
 from splatseg.edit._operation import Operation
 from splatseg.edit._prepare import Prepared, Progress, prepare
@@ -20,6 +21,7 @@ from splatseg.edit.operations import duplicate, extract, merge, recolour, remove
 from splatseg.errors import InputError
 
 
+@boundary
 def apply(
     document: Document,
     operation: Operation,
@@ -135,6 +137,7 @@ def _moved_scene(scene: Scene, new_from_old: Similarity) -> Scene:
     )
 
 
+@boundary
 def replay(
     document: Document,
     history: Sequence[Mapping[str, Any]],
@@ -166,6 +169,7 @@ def replay(
     return document
 
 
+@boundary
 def undo(
     base: Document,
     edited: Document,

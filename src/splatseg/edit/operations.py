@@ -12,11 +12,13 @@ from torch import Tensor
 
 from splatseg._check import check_finite
 from splatseg.core import Edited, Gaussians, Selection, Similarity
+from splatseg.core.boundary import boundary
 from splatseg.core.edited import NEW
 from splatseg.core.sh import SH_C0, degree_of
 from splatseg.errors import InputError, RangeError, ShapeError
 
 
+@boundary
 def extract(gaussians: Gaussians, selection: Selection) -> Edited:
     """Keep what is selected, and nothing else.
 
@@ -28,6 +30,7 @@ def extract(gaussians: Gaussians, selection: Selection) -> Edited:
     return Edited(gaussians=gaussians[rows], rows=rows)
 
 
+@boundary
 def remove(gaussians: Gaussians, selection: Selection) -> Edited:
     """Leave out what is selected.
 
@@ -41,6 +44,7 @@ def remove(gaussians: Gaussians, selection: Selection) -> Edited:
     return Edited(gaussians=gaussians[rows], rows=rows)
 
 
+@boundary
 def duplicate(
     gaussians: Gaussians,
     selection: Selection,
@@ -60,6 +64,7 @@ def duplicate(
     )
 
 
+@boundary
 def transform(
     gaussians: Gaussians,
     target_from_source: Similarity,
@@ -90,6 +95,7 @@ def transform(
     )
 
 
+@boundary
 def recolour(
     gaussians: Gaussians,
     selection: Selection | None = None,
@@ -138,6 +144,7 @@ def recolour(
     )
 
 
+@boundary
 def merge(
     gaussians: Gaussians,
     other: Gaussians,

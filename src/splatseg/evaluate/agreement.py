@@ -12,6 +12,7 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, Gaussians, Labels, View
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.evaluate.metrics import id_pair
 from splatseg.evaluate.overlaps import Overlaps
@@ -26,6 +27,7 @@ SEEN_LONGEST = 512
 """Longest side, in pixels, of the pictures in which that is measured."""
 
 
+@boundary
 def views_that_show(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -61,6 +63,7 @@ def views_that_show(
     return counts
 
 
+@boundary
 def contested(labels: Labels, *, ratio: float) -> Bool[Tensor, "n"]:
     """Which Gaussians have a second candidate with at least this share of the first one's votes.
 

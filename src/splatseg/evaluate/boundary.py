@@ -25,6 +25,7 @@ from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core import UNLABELLED
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError
 from splatseg.evaluate.metrics import id_pair
 
@@ -148,6 +149,7 @@ class BoundaryScore:
     """Boundary IoU of each class present in the truth, pooled over views, by id."""
 
 
+@boundary
 def boundary_score(counts: BoundaryCounts) -> BoundaryScore:
     """Score pooled counts.
 
@@ -166,6 +168,7 @@ def boundary_score(counts: BoundaryCounts) -> BoundaryScore:
     )
 
 
+@boundary
 def boundary_overlap(
     predicted: Bool[Tensor, "height width"],
     truth: Bool[Tensor, "height width"],

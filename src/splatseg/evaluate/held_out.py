@@ -22,6 +22,7 @@ from splatseg.core import (
     View,
     camera_of_map,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.boundary import (
     BoundaryCounts,
@@ -81,6 +82,7 @@ class BinaryReport(ViewsReport):
     """Boundary IoU of all views' pixels together; 0 where there are none."""
 
 
+@boundary
 def evaluate_semantic(
     field: Renderable,
     views: Sequence[View],
@@ -119,6 +121,7 @@ def evaluate_semantic(
     )
 
 
+@boundary
 def evaluate_binary(
     field: Renderable,
     views: Sequence[View],

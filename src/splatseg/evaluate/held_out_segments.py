@@ -22,6 +22,7 @@ from splatseg.core import (
     View,
     map_ids,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.held_out import (
     Progress,
@@ -81,6 +82,7 @@ class PointReport:
     """Share of them that got no label."""
 
 
+@boundary
 def evaluate_instances(
     field: Renderable,
     views: Sequence[View],
@@ -113,6 +115,7 @@ def evaluate_instances(
     )
 
 
+@boundary
 def evaluate_panoptic(
     field: Renderable,
     views: Sequence[View],
@@ -216,6 +219,7 @@ def classes_of_instances(instances: RenderableLayer) -> dict[int, int]:
     return found
 
 
+@boundary
 def evaluate_points(
     field: Renderable,
     layer: str,

@@ -20,11 +20,12 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import torch
-from jaxtyping import Bool, Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num, UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape, check_values
 from splatseg.core import UNLABELLED
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
 
 SSIM_WINDOW = 11
@@ -54,6 +55,7 @@ class Confusion:
     Row 0 is all zero, for void pixels do not count. int64, or float64 sums of weights."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         size = int(self.counts.shape[0]) if self.counts.ndim else 0
         check_shape("counts", self.counts, (size, size))
 
@@ -129,6 +131,7 @@ class SemanticScore:
     """IoU of each class present in the truth, by id."""
 
 
+@boundary
 def semantic_score(confusion: Confusion) -> SemanticScore:
     r"""Score a pooled confusion matrix.
 
@@ -186,6 +189,7 @@ def matched_miou(confusion: Confusion) -> float:
     return float(iou[rows, columns].sum()) / int(present.sum())
 
 
+@boundary
 def per_image_miou(confusions: Iterable[Confusion]) -> float:
     """Mean over views of each view's own mean IoU over the classes its truth has.
 
@@ -215,6 +219,7 @@ class BinaryScore:
     """Mean over views of the share of pixels that agree."""
 
 
+@boundary
 def binary_score(
     pairs: Iterable[tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]],
 ) -> BinaryScore:
@@ -247,9 +252,10 @@ def binary_score(
     )
 
 
+@boundary
 def psnr(
-    image: Float[Tensor, "height width channels"],
-    truth: Float[Tensor, "height width channels"],
+    image: Float[Tensor, "height width channels"] | UInt8[Tensor, "height width channels"],
+    truth: Float[Tensor, "height width channels"] | UInt8[Tensor, "height width channels"],
     keep: Bool[Tensor, "height width"] | None = None,
 ) -> float:
     r"""Peak signal-to-noise ratio in decibels, :math:`-10 \log_{10} \mathrm{MSE}`.
@@ -277,9 +283,10 @@ def psnr(
     return -10 * math.log10(max(float(squares.mean()), _MIN_ERROR))
 
 
+@boundary
 def ssim(
-    image: Float[Tensor, "height width channels"],
-    truth: Float[Tensor, "height width channels"],
+    image: Float[Tensor, "height width channels"] | UInt8[Tensor, "height width channels"],
+    truth: Float[Tensor, "height width channels"] | UInt8[Tensor, "height width channels"],
     keep: Bool[Tensor, "height width"] | None = None,
 ) -> float:
     r"""Structural similarity, mean over pixels and channels, at most 1.

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core import UNLABELLED
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.metrics import id_pair
 
@@ -45,6 +46,7 @@ class Overlaps:
     """Pixels of each pair, 1 or more."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("pairs", self.pairs, (None, 2))
         check_shape("counts", self.counts, (len(self.pairs),))
 
@@ -123,6 +125,7 @@ class InstanceScore:
     """Predicted id and IoU by true id; only pairs that overlap."""
 
 
+@boundary
 def instance_score(overlaps: Overlaps) -> InstanceScore:
     """Match instances one to one so that the sum of IoU is largest, over the whole scene.
 

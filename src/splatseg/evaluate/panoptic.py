@@ -32,6 +32,7 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.evaluate.overlaps import Overlaps
 
@@ -41,6 +42,7 @@ MATCH_IOU = 0.5
 _INSTANCE_BITS = 32
 
 
+@boundary
 def segment_keys(
     classes: Int[Tensor, "*shape"], instances: Int[Tensor, "*shape"], *, things: Collection[int]
 ) -> Int[Tensor, "*shape"]:
@@ -126,6 +128,7 @@ class PanopticScore:
         return sum(one.fn for one in self.per_class.values())
 
 
+@boundary
 def panoptic_score(overlaps: Overlaps, *, things: Collection[int]) -> PanopticScore:
     """Score segments counted over all views.
 
@@ -244,6 +247,7 @@ class PrecisionScore:
     per_class: Mapping[int, float]
 
 
+@boundary
 def average_precision(detections: Detections, *, iou: float = MATCH_IOU) -> PrecisionScore:
     """Average precision at one IoU; AP50 unless told otherwise.
 

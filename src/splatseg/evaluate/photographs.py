@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from splatseg.core import Renderable, View
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import Progress
 from splatseg.evaluate.metrics import SSIM_WINDOW, psnr, ssim
@@ -58,6 +59,7 @@ class PhotographReport:
     """Mean over views; None where no network was given."""
 
 
+@boundary
 def evaluate_photographs(
     field: Renderable,
     views: Sequence[View],
@@ -140,6 +142,7 @@ def _view_score(
     )
 
 
+@boundary
 def render_and_photograph(
     field: Renderable,
     view: View,

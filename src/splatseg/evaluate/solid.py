@@ -20,6 +20,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_shape
 from splatseg.core import UNLABELLED, Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError
 from splatseg.evaluate.metrics import Confusion, SemanticScore, semantic_score
 from splatseg.neighbours import NeighbourIndex
@@ -28,6 +29,7 @@ GaussianWeight = Literal["count", "opacity", "volume"]
 """What a Gaussian counts in a score."""
 
 
+@boundary
 def gaussian_weights(gaussians: Gaussians, *, by: GaussianWeight) -> Float[Tensor, "n"]:
     """What each Gaussian counts, float64: 1, its opacity, or its opacity times its volume."""
     check_choice("by", by, ("count", "opacity", "volume"))
@@ -39,6 +41,7 @@ def gaussian_weights(gaussians: Gaussians, *, by: GaussianWeight) -> Float[Tenso
     return opacities * 4 / 3 * math.pi * gaussians.scales.detach().double().cpu().prod(dim=1)
 
 
+@boundary
 def gaussian_score(
     predicted: Int[Tensor, "n"],
     truth: Int[Tensor, "n"],
@@ -60,6 +63,7 @@ def gaussian_score(
     return semantic_score(Confusion.of(predicted, truth, weights))
 
 
+@boundary
 def labels_from_points(
     gaussians: Gaussians,
     points: Float[Tensor, "p 3"],

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, quoted
 from splatseg.fit._state import FitState
 from splatseg.io.json_files import parse_object
@@ -41,7 +42,7 @@ class Checkpoint:
     """Data, options and backend; see `_identity`."""
 
 
-def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+def write_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     """Write a checkpoint; the previous one stays until the new one is complete.
 
     Raises:
@@ -55,7 +56,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     }
     tensors = checkpoint.state.tensors
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-    write_checkpoint_file(path, header, arrays)
+    write_checkpoint_file(header, arrays, path)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -88,6 +89,7 @@ class CheckpointSummary:
     gaussians: int
 
 
+@boundary
 def checkpoint_summary(path: Path) -> CheckpointSummary:
     """Steps, progress and size of a checkpoint. Reads no tensors.
 

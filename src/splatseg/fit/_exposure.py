@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 from splatseg.fit._options import FitOptions
 from splatseg.fit._view_adam import ViewAdam
@@ -37,6 +38,7 @@ class Exposure:
     """Offset of red, green and blue, in [0, 1] units of the colour."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if not all(math.isfinite(value) and value > 0 for value in self.gain):
             raise RangeError(f"gain: expected positive numbers, got {self.gain}.")
         if not all(math.isfinite(value) for value in self.bias):

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from splatseg.core import Capture
+from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.interrupts import Interrupts, deferred_interrupts
 from splatseg.core.threads import one_torch_thread
@@ -17,6 +18,7 @@ from splatseg.fit._run import FitRun
 from splatseg.render import get_backend
 
 
+@boundary
 def fit(
     capture: Capture,
     *,

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 from splatseg._check import check_choice, check_range
+from splatseg.core.boundary import convert_fields
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import InputError, RangeError
 from splatseg.fit._background import Background, fixed_colour
@@ -226,6 +227,7 @@ class FitOptions:
     front of one or two cameras. An interrupted fit keeps them."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         self._check_length()
         check_choice("start", self.start, ("auto", "points", "random"))
         check_choice("strategy", self.strategy, ("mcmc", "classic"))

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg.core import Camera, View
+from splatseg.core.boundary import boundary
 from splatseg.fit._background import fixed_colour
 from splatseg.fit._options import FitOptions
 from splatseg.io.images import image_camera, load_alpha, load_image, load_mask, reduced_size
@@ -183,6 +184,7 @@ def reduced_camera(camera: Camera, reduction: int) -> Camera:
     )
 
 
+@boundary
 def reduction_note(views: Sequence[View], *, longest: int) -> str | None:
     """One sentence on photographs that are downsampled for the fit; None if none is."""
     sizes = [(view.camera.width, view.camera.height) for view in views]

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, cast
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.fit._exposure import Exposure
 from splatseg.fit._options import FitOptions
@@ -25,6 +26,7 @@ _COMPARISON_OPTIONS = (
 refinement's own; refined poses are in the scene's cameras already."""
 
 
+@boundary
 def refinement_options(provenance: Mapping[str, Any]) -> FitOptions:
     """Options to refine a scene with: photographs are compared as in its fit.
 
@@ -53,11 +55,13 @@ def refinement_options(provenance: Mapping[str, Any]) -> FitOptions:
         ) from error
 
 
+@boundary
 def exposures_record(exposures: Mapping[str, Exposure]) -> dict[str, Any]:
     """Exposures as JSON values, for the key `EXPOSURES`."""
     return {name: asdict(exposure) for name, exposure in exposures.items()}
 
 
+@boundary
 def recorded_exposures(provenance: Mapping[str, Any]) -> dict[str, Exposure]:
     """The exposures of a scene's training views; empty where its fit had none.
 

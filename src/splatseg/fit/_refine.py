@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import Gaussians, View
+from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit._exposure import Exposure
@@ -57,6 +58,7 @@ class Refinement:
         RangeError: If `start` is outside [0, 1].
     """
 
+    @boundary
     def __init__(
         self,
         gaussians: Gaussians,
@@ -190,6 +192,7 @@ def _parameters(gaussians: Gaussians) -> Parameters:
     )
 
 
+@boundary
 def refine(
     gaussians: Gaussians,
     views: Sequence[View],

@@ -48,7 +48,7 @@ class CheckpointClock:
         begin = time.monotonic()
         checkpoint = Checkpoint(state=state, identity=self._identity)
         try:
-            write_checkpoint(self._checkpoints.path, checkpoint)
+            write_checkpoint(checkpoint, self._checkpoints.path)
         except OutputError as error:
             self._checkpoints.failed(without_checkpoint(error))
         seconds = time.monotonic() - begin

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import Camera, Capture, PointCloud
+from splatseg.core.boundary import boundary
 from splatseg.fit._options import FitOptions
 from splatseg.fit._photographs import Example, Photographs
 
@@ -89,6 +90,7 @@ def with_start_points(
     return replace(capture, points=_joined(own, more))
 
 
+@boundary
 def random_point_count(capture: Capture, options: FitOptions) -> int:
     """Number of start points that a fit of this capture adds to the capture's own."""
     own = 0 if capture.points is None else len(capture.points)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int64
@@ -25,6 +25,7 @@ from splatseg.fit._view_modules import ViewModules
 from splatseg.render import Backend, Rendered, RenderOptions
 
 
+@runtime_checkable
 class ExtraLoss(Protocol):
     """A loss besides that of the photograph of a view."""
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Camera, Capture, Gaussians, PointCloud, Similarity, View
+from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.io.images import image_camera, load_image
@@ -62,6 +63,7 @@ class Alignment:
 
 
 @one_torch_thread()  # its sums would round differently with the number of threads
+@boundary
 def align(
     gaussians: Gaussians,
     capture: Capture,

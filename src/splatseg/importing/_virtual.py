@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import Camera, Gaussians, View
+from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.importing._candidates import VIEWS_A_PLACE, Frame, inside, outside
@@ -63,6 +64,7 @@ class VirtualViews:
 
 
 @one_torch_thread()  # its sums would round differently with the number of threads
+@boundary
 def place_cameras(
     gaussians: Gaussians,
     *,

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from torch import Tensor
 
 from splatseg.core import Camera, View
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError, ShapeError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import is_file, reading
@@ -35,6 +36,7 @@ _BYTES_OF_PIXEL = 4
 _TURNED = frozenset({5, 6, 7, 8})
 
 
+@boundary
 def find_images(folder: Path) -> tuple[Path, ...]:
     """Image files directly inside a folder, sorted by name; empty where there is no folder."""
     if not folder.is_dir():
@@ -44,6 +46,7 @@ def find_images(folder: Path) -> tuple[Path, ...]:
     )
 
 
+@boundary
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels after the EXIF orientation, from the header alone.
 
@@ -59,6 +62,7 @@ def image_size(path: Path) -> tuple[int, int]:
         return (height, width) if _orientation(image, path) in _TURNED else (width, height)
 
 
+@boundary
 def reduced_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
     """Width and height once the longest side is at most `longest`; never enlarged.
 
@@ -76,6 +80,7 @@ def reduced_size(width: int, height: int, longest: int | None) -> tuple[int, int
     return max(1, math.floor(width * scale + 0.5)), max(1, math.floor(height * scale + 0.5))
 
 
+@boundary
 def load_image(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width 3"]:
     """The photograph of a view, upright, 8 bit sRGB.
 
@@ -106,6 +111,7 @@ def load_image(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heig
     return torch.from_numpy(np.array(pixels, dtype=np.uint8))
 
 
+@boundary
 def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width"] | None:
     """The mask of a view as 0 (ignore) and 1 (use); None where the view has none.
 
@@ -136,6 +142,7 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
     return torch.from_numpy((np.asarray(keep) == 255).astype(np.uint8))
 
 
+@boundary
 def load_alpha(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width"] | None:
     """How opaque each pixel of a view is, 0 to 255; None where the view does not say.
 
@@ -175,6 +182,7 @@ def load_alpha(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heig
     return torch.from_numpy(np.array(opaque, dtype=np.uint8))
 
 
+@boundary
 def image_camera(view: View, longest: int | None = None) -> Camera:
     """The camera of the pixels that `load_image` returns for the same `longest`."""
     camera = view.camera
@@ -182,8 +190,11 @@ def image_camera(view: View, longest: int | None = None) -> Camera:
     return camera if target == (camera.width, camera.height) else camera.resized(*target)
 
 
+@boundary
 def save_png(
-    image: Float[Tensor, "height width *channels"] | UInt8[Tensor, "height width *channels"],
+    image: Int[Tensor, "height width"]
+    | UInt8[Tensor, "height width *channels"]
+    | Float[Tensor, "height width *channels"],
     path: Path,
 ) -> None:
     """Write a picture: (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA; atomic.
@@ -205,12 +216,16 @@ def save_png(
     write_png(_to_integers(array), path)
 
 
+@boundary
 def write_png(array: NDArray[np.uint8] | NDArray[np.uint16], path: Path) -> None:
     """Write an 8 bit picture or a 16 bit single-channel one as it stands; atomic."""
+    if array.ndim not in (2, 3) or not array.size:
+        raise ShapeError(f"array: expected an image of at least a pixel, got {array.shape}.")
     with atomic_file(path) as temporary:
         Image.fromarray(array).save(temporary, format="PNG")
 
 
+@boundary
 def open_image(path: Path) -> Image.Image:
     """Open an image for reading, its pixels undecoded; the caller closes it.
 

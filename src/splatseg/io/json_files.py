@@ -80,7 +80,7 @@ def json_text(name: str, value: Mapping[str, Any], *, indent: int | None = None)
     return text
 
 
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
+def write_json(value: Mapping[str, Any], path: Path) -> None:
     """Write a JSON object for people to read; atomic.
 
     Raises:

@@ -26,6 +26,7 @@ from splatseg.core import (
     layer_info_to_json,
     node_row,
 )
+from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
@@ -52,7 +53,8 @@ _VOID = 0
 _MAX_ID = 2**31 - 1
 
 
-def save_layer(path: Path, layer: Layer) -> None:
+@boundary
+def save_layer(layer: Layer, path: Path) -> None:
     """Write a layer; atomic. Inverse of `load_layer`.
 
     In the file 0 is the id of what has no label, so -1 is written as 0.
@@ -101,9 +103,10 @@ def save_layer(path: Path, layer: Layer) -> None:
             arrays = {"mask": layer.mask.cpu().numpy()}
     header["info"] = layer_info_to_json(layer.info)
     with atomic_file(path, durable=True) as temporary:
-        save_arrays(temporary, header, arrays, name=path)
+        save_arrays(header, arrays, temporary, name=path)
 
 
+@boundary
 def load_layer(path: Path) -> Layer:
     """Read a layer. Inverse of `save_layer`.
 

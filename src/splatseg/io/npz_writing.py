@@ -20,14 +20,14 @@ HEADER = "header"
 
 
 def save_arrays(
-    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, name: Path
+    header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], path: Path, *, name: Path
 ) -> None:
     """Write a header and arrays to a file as they come.
 
     Args:
-        path: The file.
         header: Values that JSON holds.
         arrays: By name.
+        path: The file.
         name: What the file is to be called, for messages.
 
     Raises:
@@ -42,7 +42,7 @@ def save_arrays(
 
 
 def write_checkpoint_file(
-    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+    header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], path: Path
 ) -> None:
     """Write a checkpoint; the one before stays until the disk has the new one.
 
@@ -56,7 +56,7 @@ def write_checkpoint_file(
     with write_failures_named(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            save_arrays(new, header, arrays, name=path)
+            save_arrays(header, arrays, new, name=path)
             sync(new)
             new.replace(path)
             sync(path.parent)

@@ -25,16 +25,10 @@ from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core import Layer, Scene, View
+from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.atomic import (
-    TEMPORARY,
-    atomic_folder,
-    hidden_folder,
-    is_vacant,
-    sync,
-    sync_tree,
-)
+from splatseg.io.atomic import TEMPORARY, atomic_folder, hidden_folder, is_vacant, sync, sync_tree
 from splatseg.io.cameras import (
     cameras_content,
     relative_path,
@@ -74,11 +68,13 @@ _POSES_ENTRIES = ("poses.json", "sparse", "frames", "frames.txt", "work")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 
 
+@boundary
 def is_scene(path: Path) -> bool:
     """Whether a folder is a scene folder."""
     return current_file(path, SCENE_FILE).is_file()
 
 
+@boundary
 def is_unfinished(path: Path) -> bool:
     """Whether a folder holds a fit that has not become a scene yet, and nothing else."""
     checkpoint, poses = path / CHECKPOINT_FILE, path / POSES_FOLDER
@@ -92,6 +88,7 @@ def is_unfinished(path: Path) -> bool:
     )
 
 
+@boundary
 def training_file(root: Path, layer: str) -> Path:
     """Where the training of a layer keeps its state.
 
@@ -101,6 +98,7 @@ def training_file(root: Path, layer: str) -> Path:
     return path_inside(root, TRAINING_FOLDER, f"{layer}.npz", make=False)
 
 
+@boundary
 def training_files(root: Path) -> tuple[Path, ...]:
     """States of all trainings that were stopped, by the names of their layers."""
     return tuple(sorted((root / TRAINING_FOLDER).glob("*.npz")))
@@ -114,6 +112,7 @@ def _holds_only(folder: Path, names: Sequence[str]) -> bool:
     )
 
 
+@boundary
 def save_scene(
     scene: Scene, root: Path | str, *, layers: Mapping[str, Layer] | None = None
 ) -> Scene:
@@ -147,6 +146,7 @@ def save_scene(
     return replace(scene, root=root)
 
 
+@boundary
 def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
     """Read a scene folder. Inverse of `save_scene`.
 
@@ -189,12 +189,14 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
         )
 
 
+@boundary
 def scene_layer_names(root: Path | str) -> tuple[str, ...]:
     """Names of the layers of a scene folder, sorted. Other files in their folder are none."""
     names = (path.stem for path in (Path(root) / "layers").glob("*.npz"))
     return tuple(sorted(name for name in names if _NAME.fullmatch(name)))
 
 
+@boundary
 def load_scene_layer(root: Path | str, name: str) -> Layer:
     """A layer of a scene folder.
 
@@ -216,7 +218,8 @@ def load_scene_layer(root: Path | str, name: str) -> Layer:
     return layer
 
 
-def save_scene_layer(root: Path | str, name: str, layer: Layer) -> Path:
+@boundary
+def save_scene_layer(layer: Layer, root: Path | str, name: str) -> Path:
     """Write a layer into a scene folder; gives the file.
 
     Raises:
@@ -229,10 +232,11 @@ def save_scene_layer(root: Path | str, name: str, layer: Layer) -> Path:
     _check_layer(name, layer, _scene_content(root)["gaussians"])
     with scene_lock(root, "saving"):
         path = scene_path(root, "layers", f"{name}.npz")
-        save_layer(path, layer)
+        save_layer(layer, path)
     return path
 
 
+@boundary
 def check_name(what: str, name: str) -> None:
     """Raise `InputError` unless `name` can be that of a layer or of evidence."""
     if not _NAME.fullmatch(name):
@@ -272,12 +276,11 @@ def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Pa
     views = [_absolute(view) for view in scene.views]
     cameras = cameras_content(views, folder=final / "cameras", source=source)
     write_splats(scene.gaussians, folder / GAUSSIANS_FILE)
-    write_json(folder / CAMERAS_FILE, cameras)
+    write_json(cameras, folder / CAMERAS_FILE)
     for name, layer in layers.items():
-        save_layer(folder / "layers" / f"{name}.npz", layer)
+        save_layer(layer, folder / "layers" / f"{name}.npz")
     splits = sorted({view.split for view in scene.views})
     write_json(
-        folder / SCENE_FILE,
         {
             "format": FORMAT,
             "version": VERSION,
@@ -297,6 +300,7 @@ def _write(scene: Scene, folder: Path, layers: Mapping[str, Layer], *, final: Pa
             "classes": None if scene.classes is None else class_rows(scene.classes),
             "provenance": dict(scene.provenance),
         },
+        folder / SCENE_FILE,
     )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import boundary
 from splatseg.errors import BackendError, InputError, MissingPackageError, RangeError
 from splatseg.io.atomic import atomic_file
 
@@ -19,6 +20,7 @@ from splatseg.io.atomic import atomic_file
 _CRF = 18
 
 
+@boundary
 def write_video(
     frames: Iterable[UInt8[Tensor, "height width 3"]],
     path: str | os.PathLike[str],
@@ -110,6 +112,7 @@ def _bytes(frame: Tensor, shape: tuple[int, ...], height: int, width: int) -> by
     return frame[:height, :width].contiguous().cpu().numpy().tobytes()
 
 
+@boundary
 def check_encoder(fps: float) -> Any:
     """The module that encodes, after a check that it can: for commands that film at their end.
 

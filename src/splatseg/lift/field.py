@@ -22,6 +22,7 @@ from splatseg.core import (
     RenderableLayer,
     ViewSignals,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import ShapeError
 from splatseg.lift.field_layers import FieldLayer, field_layer
 from splatseg.lift.point_labels import PointLabelOptions
@@ -65,6 +66,7 @@ class GaussianField:
         [7]
     """
 
+    @boundary
     def __init__(
         self,
         gaussians: Gaussians,
@@ -122,6 +124,7 @@ class GaussianField:
 class GaussianView:
     """One view of a `GaussianField`, a context; images are on the CPU. `GaussianField.view`."""
 
+    @boundary
     def __init__(
         self, gaussians: Gaussians, prepared: PreparedView, find: Callable[[str], FieldLayer]
     ) -> None:

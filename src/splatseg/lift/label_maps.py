@@ -16,10 +16,12 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Camera, Gaussians, LabelMap, Labels
+from splatseg.core.boundary import boundary
 from splatseg.errors import ShapeError
 from splatseg.render import PreparedView, RenderOptions, SparseSignal, prepare
 
 
+@boundary
 def label_map(
     gaussians: Gaussians,
     camera: Camera,

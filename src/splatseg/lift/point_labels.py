@@ -25,6 +25,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_range, check_shape
 from splatseg.core import UNLABELLED, Features, Gaussians, PointLabels
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.heads import ClassifierHead
@@ -51,12 +52,14 @@ class PointLabelOptions:
     """Fainter Gaussians are not there, in [0, 1]; as in OpenGaussian's protocol on ScanNet."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_choice("rule", self.rule, get_args(PointRule))
         check_range("min_opacity", self.min_opacity, 0.0, 1.0)
         if self.neighbours < 1:
             raise RangeError(f"neighbours: expected at least 1, got {self.neighbours}.")
 
 
+@boundary
 def labels_of_points(
     gaussians: Gaussians,
     ids: Int[Tensor, "n"],
@@ -84,7 +87,7 @@ def labels_of_points(
         InputError: If no Gaussian is opaque enough.
     """
     check_shape("points", points, (None, 3))
-    if len(ids) != len(gaussians):
+    if ids.ndim != 1 or len(ids) != len(gaussians):
         raise ShapeError(f"ids: expected {len(gaussians)} rows, one a Gaussian, got {len(ids)}.")
     known = ids.cpu().int()
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)

@@ -7,5 +7,6 @@ from splatseg.methods._registry import find_method as find_method
 from splatseg.methods._registry import keeps_ids as keeps_ids
 from splatseg.methods._registry import method_names as method_names
 from splatseg.methods._registry import methods as methods
+from splatseg.methods._registry import register_method as register_method
 from splatseg.methods._table import methods_table as methods_table
 from splatseg.methods._table import with_table as with_table

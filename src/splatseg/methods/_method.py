@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Literal
 
 from splatseg.core import ClassTable, Gaussians, Layer, View
+from splatseg.core.boundary import convert_fields
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, EvidenceKind, TrackedEvidence
@@ -104,6 +105,7 @@ class Method:
     """Whether Gaussians that no view explains take the labels of their neighbours by default."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         parameters = getattr(self.options, "__dataclass_params__", None)
         if not (is_dataclass(self.options) and parameters is not None and parameters.frozen):
             raise InputError(f"method {self.name!r}: expected options in a frozen dataclass.")

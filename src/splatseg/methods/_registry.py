@@ -7,19 +7,22 @@ the method's, its value a `Method`. ``docs/methods.md`` has one of ten lines.
 import difflib
 from importlib.metadata import EntryPoint, entry_points
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingPackageError
 from splatseg.methods._method import Method
 
 ENTRY_POINT_GROUP = "splatseg.methods"
 
 _OWN = ("uplift", "features", "vote", "associate", "identity", "logits", "probabilities")
+_REGISTERED: dict[str, Method] = {}
 
 
 def method_names() -> tuple[str, ...]:
     """Names that `find_method` knows: ours in the order of the documentation, then others'."""
-    return tuple(_known())
+    return (*_known(), *_REGISTERED)
 
 
+@boundary
 def find_method(name: str) -> Method:
     """The method of this name.
 
@@ -27,6 +30,8 @@ def find_method(name: str) -> Method:
         InputError: If there is none, or what another package brings is no method.
         MissingPackageError: If the package that brings it, or one it needs, cannot be imported.
     """
+    if name in _REGISTERED:
+        return _REGISTERED[name]
     known = _known()
     if name not in known:
         close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
@@ -51,18 +56,35 @@ def find_method(name: str) -> Method:
     return found
 
 
+@boundary
+def register_method(method: Method) -> Method:
+    """Make a method known by its name for as long as this process runs.
+
+    A notebook tries a method so; a package that brings one for good has an entry point. One that
+    was registered before under the name is replaced, which a cell that runs twice does.
+
+    Raises:
+        InputError: If the name is that of a method of ours or of an installed package.
+    """
+    if method.name in _known():
+        raise InputError(f"method: expected a name that is free, got {method.name!r}.")
+    _REGISTERED[method.name] = method
+    return method
+
+
 def methods() -> tuple[Method, ...]:
     """All methods, in the order of `method_names`."""
     return tuple(find_method(name) for name in method_names())
 
 
+@boundary
 def keeps_ids(method: object) -> bool:
     """Whether layers of this method have the ids of the evidence that they were made from.
 
     Args:
         method: Its name, as the info of a layer has it; no method keeps no ids.
     """
-    return isinstance(method, str) and method in _known() and find_method(method).keeps_ids
+    return isinstance(method, str) and method in method_names() and find_method(method).keeps_ids
 
 
 def _known() -> dict[str, EntryPoint]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError
 from splatseg.methods._method import Method
 
@@ -9,6 +10,7 @@ BEGIN = "<!-- methods: made by scripts/methods_table -->"
 END = "<!-- end of methods -->"
 
 
+@boundary
 def methods_table(methods: Sequence[Method]) -> str:
     """A Markdown table, a row a method."""
     rows = [
@@ -20,6 +22,7 @@ def methods_table(methods: Sequence[Method]) -> str:
     return "\n".join([*head, *rows])
 
 
+@boundary
 def with_table(text: str, table: str) -> str:
     """A page with the table between its two marks.
 

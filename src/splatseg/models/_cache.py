@@ -18,6 +18,7 @@ import numpy as np
 
 from splatseg._check import check_choice
 from splatseg.core import FeatureMap, LabelMap, MaskSet
+from splatseg.core.boundary import convert_fields
 from splatseg.core.models import (
     AutomaticMasks,
     DeepFeatures,
@@ -80,6 +81,7 @@ class ModelCache:
     """Told in a sentence when an entry is damaged and is computed again."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_choice("precision", self.precision, ("float16", "int8"))
         if self.folder.exists() and not self.folder.is_dir():
             raise InputError(f"{self.folder}: expected a folder for the cache, got a file.")

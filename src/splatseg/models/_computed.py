@@ -136,13 +136,13 @@ class _Computed(Source):
         if self.asked == "masks":
             masks = without_empty(self._ask(ModelCache.masks, self.model.masks, image))
             self._check_size(view, masks.height, masks.width)
-            save_masks(folder, view.name, masks)
+            save_masks(masks, folder, view.name)
             self.counts[view.name] = len(masks)
             return len(masks)
         if self.asked == "labels":
             ids = self._ask(ModelCache.label_map, self.model.label_map, image)
             self._check_size(view, ids.height, ids.width)
-            save_label_map(folder, view.name, ids)
+            save_label_map(ids, folder, view.name)
         elif self.asked == "panoptic":
             self._write_panoptic(folder, view, image)
         elif self.asked == "features":
@@ -161,7 +161,7 @@ class _Computed(Source):
         table = read_json(path) if path.is_file() else {}
         for part in sorted(parts.rglob(SEGMENTS_FILE)):
             table |= read_json(part)
-        write_json(path_inside(folder, SEGMENTS_FILE), table)
+        write_json(table, path_inside(folder, SEGMENTS_FILE))
         shutil.rmtree(parts, ignore_errors=True)
 
     @override
@@ -184,7 +184,7 @@ class _Computed(Source):
 
     def _write_features(self, folder: Path, view: View, features: FeatureMap) -> None:
         self._check_size(view, features.height, features.width)
-        save_features(folder, view.name, features)
+        save_features(features, folder, view.name)
 
     def _write_panoptic(self, folder: Path, view: View, image: Image) -> None:
         found = self._ask(ModelCache.panoptic, self.model.panoptic, image)
@@ -192,5 +192,5 @@ class _Computed(Source):
         part = path_inside(folder, SEGMENT_PARTS, view.name)
         part.mkdir(exist_ok=True)
         # Before the label map, which is what tells that the view is done.
-        save_segments(part, {view.name: found.segments})
-        save_label_map(folder, view.name, LabelMap(ids=found.ids.ids))
+        save_segments({view.name: found.segments}, part)
+        save_label_map(LabelMap(ids=found.ids.ids), folder, view.name)

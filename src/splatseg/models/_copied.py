@@ -148,9 +148,9 @@ class _Copied(Source):
             there = view_files(folder, ".png").values()
             self.highest.extend(int(read_id_map(path).max(initial=0)) for path in there)
         if isinstance(evidence, PanopticEvidence):
-            save_segments(folder, {view.name: evidence.segments(view.name) for view in views})
+            save_segments({view.name: evidence.segments(view.name) for view in views}, folder)
         elif isinstance(evidence, TrackedEvidence):
-            save_tracks(folder, evidence.tracks, order=evidence.order)
+            save_tracks(evidence.tracks, folder, order=evidence.order)
         elif isinstance(evidence, FeatureEvidence):
             for name in _SHARED:
                 _copy(evidence.folder / name, path_inside(folder, name))
@@ -170,7 +170,7 @@ class _Copied(Source):
             self.empty.extend([name] * (len(masks) - len(whole)))
             if not len(whole):
                 self.bare.append(name)
-            save_masks(folder, name, whole)
+            save_masks(whole, folder, name)
             return len(whole)
         if isinstance(evidence, FeatureEvidence):
             self._write_features(evidence, folder, view)
@@ -184,7 +184,7 @@ class _Copied(Source):
         self.highest.append(int(ids.ids.max()))
         if not bool((ids.ids != UNLABELLED).any()):
             self.bare.append(name)
-        save_label_map(folder, name, ids)
+        save_label_map(ids, folder, name)
         return 0
 
     @override
@@ -243,7 +243,7 @@ class _Copied(Source):
         features = evidence.features(view.name)
         check_grid(evidence, view.name, features, (view.camera.height, view.camera.width))
         if evidence.scale is None:
-            save_features(folder, view.name, features)
+            save_features(features, folder, view.name)
             return
         # Quantised features stay as they are: all depths, at their size.
         _copy(evidence.files[view.name], path_inside(folder, f"{view.name}.npz"))

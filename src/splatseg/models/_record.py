@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from splatseg.core import View
+from splatseg.core.boundary import boundary
 from splatseg.core.models import Image, Model, ModelWithDefaults
 from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
 from splatseg.errors import InputError
@@ -58,6 +59,7 @@ class SeenEvidence:
     """What the user should know of the evidence, a sentence each."""
 
 
+@boundary
 def record_evidence(
     model: Model,
     views: Sequence[View],

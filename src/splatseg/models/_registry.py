@@ -10,6 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, cast
 
+from splatseg.core.boundary import boundary
 from splatseg.core.models import Model
 from splatseg.errors import InputError, MissingPackageError
 
@@ -23,6 +24,7 @@ def model_names() -> tuple[str, ...]:
     return tuple(sorted(_known()))
 
 
+@boundary
 def find_model(name: str | Path) -> Model:
     """The model of this name, or the recorded one of this folder.
 

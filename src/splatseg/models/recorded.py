@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import ClassTable, LabelMap, View
+from splatseg.core.boundary import boundary
 from splatseg.core.models import Image, Panoptic
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -91,6 +92,7 @@ AnyRecorded = (
 """What `recorded_model` gives, by the kind of evidence."""
 
 
+@boundary
 def recorded_model(
     folder: Path | str,
     *,

@@ -9,6 +9,7 @@ from torch import Tensor
 from splatseg._check import check_shape, check_values
 from splatseg._native import NeighbourIndex as NativeIndex
 from splatseg.core import Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
 
@@ -55,6 +56,7 @@ class NeighbourIndex:
         tensor([2, 2, 2, 0])
     """
 
+    @boundary
     def __init__(self, points: Float[Tensor, "n d"] | Gaussians) -> None:
         given = points.means if isinstance(points, Gaussians) else points
         if given.ndim != 2 or not 1 <= given.shape[1] <= MAX_DIMENSIONS:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from splatseg._check import check_choice
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 
 Matching = Literal["auto", "exhaustive", "retrieval"]
@@ -59,6 +60,7 @@ class PoseOptions:
     same to the bit in every run."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_choice("matching", self.matching, ("auto", "exhaustive", "retrieval"))
         check_choice("mapper", self.mapper, ("auto", "global", "incremental"))
         check_choice("cameras", self.cameras, ("auto", "shared", "per-image"))

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import Camera, View
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import bare_photographs
 from splatseg.io.foreign import reading
@@ -96,6 +97,7 @@ def find_photographs(folder: Path) -> tuple[Path, ...]:
     return found
 
 
+@boundary
 def holds_photographs(folder: Path) -> bool:
     """Whether a folder, or its folder ``images``, holds photographs, be they HEIC or RAW."""
     folders = [path for path in (folder, folder / "images") if path.is_dir()]

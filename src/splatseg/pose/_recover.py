@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.pose._options import PoseOptions
 from splatseg.pose._photographs import (
@@ -57,6 +58,7 @@ class PoseResult:
     """Whether all of it was there from an earlier run."""
 
 
+@boundary
 def recover_poses(
     photographs: Path | str,
     *,
@@ -179,7 +181,7 @@ def _recover(
         seconds=seconds | result["seconds"],
         longest=options.longest,
     )
-    save_poses(folder, model=work / "model", made_of=made_of, report=report)
+    save_poses(work / "model", folder, made_of=made_of, report=report)
     shutil.rmtree(work)
     return report
 

@@ -50,15 +50,15 @@ def fingerprint(files: Sequence[Path], options: PoseOptions) -> str:
     return digest.hexdigest()
 
 
-def save_poses(folder: Path, *, model: Path, made_of: str, report: PoseReport) -> None:
+def save_poses(model: Path, folder: Path, *, made_of: str, report: PoseReport) -> None:
     """Move a model into a folder of poses and write the report."""
     target = folder / MODEL
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(target, ignore_errors=True)
     model.replace(target)
     write_json(
-        folder / FILE,
         {"format": FORMAT, "version": VERSION, "made_of": made_of, "report": report.as_json()},
+        folder / FILE,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, MissingFileError, MissingPackageError
 from splatseg.io.atomic import atomic_folder
 
@@ -24,6 +25,7 @@ _JUDGED = 480
 _QUALITY = 95
 
 
+@boundary
 def is_video(path: Path) -> bool:
     """Whether a path has the suffix of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES

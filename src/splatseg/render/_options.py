@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from splatseg.core.boundary import convert_fields
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import RangeError
 
@@ -27,6 +28,7 @@ class RenderOptions:
     """Maximum degree of the spherical harmonics in use; None is all."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if not (math.isfinite(self.near) and self.near > 0):
             raise RangeError(f"near: expected a positive depth, got {self.near}.")
         if not 1 / 255 < self.alpha_max < 1:

@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import Camera, Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.render._backend import Layout
 from splatseg.render._options import RenderOptions
 from splatseg.render._rows import SparseWeights
@@ -15,6 +16,7 @@ from splatseg.render.prepared import prepare
 from splatseg.render.warp import WarpMode
 
 
+@boundary
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -68,6 +70,7 @@ def render(
         return view.render(signal, warp=warp)
 
 
+@boundary
 def back_project(
     gaussians: Gaussians,
     camera: Camera,
@@ -101,6 +104,7 @@ def back_project(
         return view.back_project(image, warp=warp)
 
 
+@boundary
 def contributors(
     gaussians: Gaussians,
     camera: Camera,
@@ -150,6 +154,7 @@ def weights(
     options: RenderOptions | None = None,
     backend: str = "auto",
 ) -> ViewWeights: ...
+@boundary
 def weights(
     gaussians: Gaussians,
     camera: Camera,

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.core import Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.core.gaussians import LOW_PASS
 from splatseg.render._backend import Backend
 from splatseg.render._options import RenderOptions
@@ -15,6 +16,7 @@ BackendName = Literal["auto", "cpu", "cuda", "reference"]
 BACKENDS: tuple[BackendName, ...] = ("auto", "cpu", "cuda", "reference")
 
 
+@boundary
 def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
     """The backend of this name.
 
@@ -35,6 +37,7 @@ def get_backend(name: str = "auto", *, like: Tensor | None = None) -> Backend:
     return _backend(cast(BackendName, name))
 
 
+@boundary
 def options_for(gaussians: Gaussians, backend: str = "auto") -> RenderOptions:
     """The default options for Gaussians.
 
@@ -48,6 +51,7 @@ def options_for(gaussians: Gaussians, backend: str = "auto") -> RenderOptions:
     )
 
 
+@boundary
 def default_options(
     name: str = "auto",
     *,

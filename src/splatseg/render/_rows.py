@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, Int32, Int64
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.render._products import Csr, LinearMap, on_cpu, starts_of, strong_entries
 from splatseg.render._view_weights import ViewWeights
@@ -40,6 +41,7 @@ class SparseWeights(ViewWeights):
     """Columns of W: Gaussians of the scene."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         for name, dtypes in (
             ("indptr", (torch.int64,)),
             ("ids", (torch.int32,)),

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError
 
 
@@ -57,6 +58,7 @@ class SparseSignal:
     """Number of channels."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("channels", self.channels, (None, None))
         if self.channels.dtype != torch.int32:
             raise InputError(f"channels: expected int32, got {self.channels.dtype}.")
@@ -119,6 +121,7 @@ class SparseImage:
     """Number of channels."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_shape("indptr", self.indptr, (None,))
         check_shape("channels", self.channels, (None,))
         check_shape("values", self.values, (len(self.channels),))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.core import Camera, Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render._backend import Backend, Layout
 from splatseg.render._checks import check_columns, check_k, check_pixels, check_scene
@@ -32,6 +33,7 @@ from splatseg.render._view_weights import ViewWeights
 from splatseg.render.warp import WarpMode, undistorted_camera, warp_into_photograph
 
 
+@boundary
 def prepare(
     gaussians: Gaussians,
     camera: Camera,
@@ -76,6 +78,7 @@ def prepare(
 class PreparedView:
     """Products with W of one view; `prepare` makes it."""
 
+    @boundary
     def __init__(
         self, gaussians: Gaussians, camera: Camera, *, options: RenderOptions, backend: Backend
     ) -> None:
@@ -100,6 +103,7 @@ class PreparedView:
         """The camera of the view's pixels."""
         return self._camera
 
+    @boundary
     def render(
         self,
         signal: Float[Tensor, "n channels"] | None = None,
@@ -137,6 +141,7 @@ class PreparedView:
             median_depth=nearest.apply(drawn.median_depth.unsqueeze(-1)).squeeze(-1),
         )
 
+    @boundary
     def back_project(
         self, image: Float[Tensor, "height width channels"], *, warp: WarpMode = "bilinear"
     ) -> BackProjected:
@@ -216,6 +221,7 @@ class PreparedView:
         channels = torch.where(warp.valid, both[..., 0].to(torch.int32), background)
         return StrongestChannels(channels=channels, values=both[..., 1].float())
 
+    @boundary
     def contributors(self, pixels: Int[Tensor, "p 2"], k: int) -> Contributors:
         """The k strongest Gaussians of pixels (column, row), the front-most and the median one.
 
@@ -241,6 +247,7 @@ class PreparedView:
         *,
         layout: Layout,
     ) -> ViewWeights: ...
+    @boundary
     def weights(
         self,
         pixels: Int[Tensor, "p 2"] | None = None,

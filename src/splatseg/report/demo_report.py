@@ -79,7 +79,7 @@ def machine_score(capture: Path, evidence: str) -> SemanticScore:
 
 
 def write_report(
-    folder: Path, figures: DemoFigures, *, seed: int, layer: str, evidence: str, objects: str
+    figures: DemoFigures, folder: Path, *, seed: int, layer: str, evidence: str, objects: str
 ) -> None:
     """Write contact_sheet.png and report.html of a demo's folder."""
     scene = load_scene(folder / "scene")

@@ -69,9 +69,9 @@ class SegmentationRun:
 
 
 def write_segmentation_report(
+    scene: Scene,
     path: Path,
     *,
-    scene: Scene,
     field: Renderable,
     layer: str,
     evidence: LabelSource | None,
@@ -88,8 +88,8 @@ def write_segmentation_report(
     shown, the JSON has all. The page stays below 10 MB.
 
     Args:
-        path: The file to write, NAME.html; NAME.json comes beside it. Its folder must exist.
         scene: The scene.
+        path: The file to write. Its folder must exist.
         field: What is rendered: its Gaussians, or another field of the same views.
         layer: Name of the field's layer.
         evidence: What it was made from; None leaves that out.
@@ -112,7 +112,7 @@ def write_segmentation_report(
     page = _small_page(data)
     with atomic_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8", newline="\n")
-    write_json(path.with_suffix(".json"), segmentation_record(data))
+    write_json(segmentation_record(data), path.with_suffix(".json"))
 
 
 def _gathered(

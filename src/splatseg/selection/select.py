@@ -15,12 +15,14 @@ from splatseg.core import (
     flat_layer,
     layer_address,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.selection.components import components
 from splatseg.selection.shapes import box_corners
 from splatseg.selection.where import Where
 
 
+@boundary
 def select(
     gaussians: Gaussians,
     layers: Mapping[str, Layer],
@@ -99,6 +101,7 @@ def _one_piece(gaussians: Gaussians, mask: Tensor, where: Where) -> Tensor:
     return piece_of == wanted
 
 
+@boundary
 def layer_called(layers: Mapping[str, Layer], address: str) -> FlatLayer:
     """The layer of this name; of a tree its objects, or the level after an @.
 
@@ -137,6 +140,7 @@ def _of_layer(layer: FlatLayer, where: Where) -> Tensor:
             )
 
 
+@boundary
 def ids_named(
     labels: Labels, names: Sequence[str], *, classes: ClassTable | None = None
 ) -> tuple[int, ...]:

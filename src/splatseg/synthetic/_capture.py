@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatseg.core import Camera, PointCloud, View
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
 from splatseg.synthetic._labels import machine_labels
@@ -30,6 +31,7 @@ _COEFFICIENTS = {
 }
 
 
+@boundary
 def write_capture(
     scene: SyntheticScene,
     folder: str | Path,

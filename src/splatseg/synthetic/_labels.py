@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatseg._check import check_range
+from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
 from splatseg.synthetic._raycast import Truth
 from splatseg.synthetic._scene import SyntheticScene
@@ -36,6 +37,7 @@ class _Tendency:
     fragment_rate: float
 
 
+@boundary
 def machine_labels(
     scene: SyntheticScene,
     truths: Mapping[str, Truth],
@@ -62,6 +64,7 @@ def machine_labels(
         int32 maps, -1 where the truth has no class.
     """
     check_range("severity", severity, 0.0, 2.0)
+    check_range("seed", seed, 0, 2**63 - 1)
     tendencies = _tendencies(scene, np.random.default_rng([seed, 3]), severity)
     return {
         name: _one_view(scene, truth, tendencies, np.random.default_rng([seed, 5, i]), severity)

@@ -7,7 +7,9 @@ import torch
 from jaxtyping import Float, Int, Int64, UInt8
 from torch import Tensor
 
+from splatseg._check import check_shape
 from splatseg.core import Camera
+from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
 from splatseg.synthetic._light import light_volume
 from splatseg.synthetic._scene import SyntheticScene
@@ -64,6 +66,7 @@ def _tables(scene: SyntheticScene) -> _Tables:
     )
 
 
+@boundary
 def cast(
     scene: SyntheticScene, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n"], Int64[Tensor, "n"]]:
@@ -81,6 +84,8 @@ def cast(
         The distance along each ray in metres (inf where nothing is met), and the index of the
         solid in ``scene.primitives`` (-1).
     """
+    check_shape("origin", origin, (3,))
+    check_shape("directions", directions, (None, 3))
     tables = _tables(scene)
     count = len(directions)
     distance = directions.new_full((count,), torch.inf)
@@ -115,6 +120,7 @@ def cast(
     return distance, which
 
 
+@boundary
 def render_truth(scene: SyntheticScene, camera: Camera) -> Truth:
     """What `camera` sees: ids and depth exact through pixel centres, colour over four rays.
 

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 
+from splatseg._check import check_range
+from splatseg.core.boundary import boundary
 from splatseg.synthetic._builder import RELATED, ROOM_CLASSES, WOODS, Builder, shades
 from splatseg.synthetic._scene import SyntheticScene
 from splatseg.synthetic._shapes import Texture, TextureName, Vector
@@ -11,12 +13,14 @@ from splatseg.synthetic._shapes import Texture, TextureName, Vector
 _HALF_X, _HALF_Y, _HEIGHT = 2.6, 2.1, 2.5
 
 
+@boundary
 def room(seed: int = 0, *, name: str = "room") -> SyntheticScene:
     """A living room of 5.2 x 4.2 x 2.5 m with 30 objects of 16 classes.
 
     The plan is fixed (sofa in the south, window in the north, shelf in the west); places,
     turns, colours and patterns are drawn from the seed.
     """
+    check_range("seed", seed, 0, 2**63 - 1)
     b = Builder(rng=np.random.default_rng(seed))
     _shell(b)
     _sitting_corner(b)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from splatseg._check import check_range
 from splatseg.core import ClassTable
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError
 from splatseg.synthetic._shapes import Primitive, Vector
 
@@ -46,6 +47,7 @@ class SyntheticScene:
     """Brightness of the light that comes from everywhere; 1 suits a room with a window."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_range("ambient", self.ambient, 0.0, 100.0)
         ids = [item.id for item in self.objects]
         if len(set(ids)) != len(ids):

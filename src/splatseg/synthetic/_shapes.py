@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_choice, check_range
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 
 ShapeName = Literal["box", "cylinder", "sphere", "plane"]
@@ -64,6 +65,7 @@ class Texture:
     have some, and cast no shadow."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_choice("kind", self.kind, TEXTURES)
         if self.scale <= 0:
             raise RangeError(f"scale: expected a positive size in metres, got {self.scale:g}.")
@@ -96,6 +98,7 @@ class Primitive:
     texture: Texture = Texture()
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_choice("shape", self.shape, SHAPES)
         check_range("taper", self.taper, 0.0, 1.0)
         if min(self.half_size) <= 0:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import Camera, PointCloud, View
-from splatseg.errors import InputError, RangeError
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.synthetic._raycast import Truth
 from splatseg.synthetic._scene import SyntheticScene
 
@@ -22,6 +23,7 @@ _POINT_SPREAD = 0.012
 _SAME_SURFACE = 0.03
 
 
+@boundary
 def look_at(
     eye: Sequence[float],
     target: Sequence[float],
@@ -40,6 +42,9 @@ def look_at(
         field_of_view: Horizontal, degrees.
     """
     check_range("field_of_view", field_of_view, 1.0, 170.0)
+    for name, point in (("eye", eye), ("target", target)):
+        if len(point) != 3:
+            raise ShapeError(f"{name}: expected 3 coordinates, got {len(point)}.")
     centre = torch.tensor([float(v) for v in eye], dtype=torch.float64)
     forward = torch.tensor([float(v) for v in target], dtype=torch.float64) - centre
     right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
@@ -65,6 +70,7 @@ def look_at(
     )
 
 
+@boundary
 def cameras(
     scene: SyntheticScene,
     *,
@@ -131,6 +137,7 @@ def _stand(
     raise InputError(f"scene: no free place for a camera near the angle {turn:.2f} rad was found.")
 
 
+@boundary
 def start_points(
     views: Sequence[View],
     truths: Mapping[str, Truth],
@@ -155,6 +162,7 @@ def start_points(
     train = [view for view in views if view.split == "train"]
     if not train:
         raise InputError("views: expected at least one train view, got none.")
+    check_range("seed", seed, 0, 2**63 - 1)
     rng = np.random.default_rng([seed, 11])
     # Some are lost again because too few views see them.
     each = math.ceil(1.6 * count / len(train))

@@ -87,8 +87,8 @@ def _image(scene: Scene, name: str, longest: int, backend: BackendName) -> Tenso
 
 
 def write_edit_report(
-    folder: Path,
     pictures: EditPictures,
+    folder: Path,
     *,
     counts: tuple[int, int],
     operations: Sequence[Mapping[str, Any]],
@@ -125,7 +125,7 @@ def write_edit_report(
         "operations": [dict(operation) for operation in operations],
         "views": list(pictures.views),
     }
-    write_json(folder / "edit.json", content)
+    write_json(content, folder / "edit.json")
 
 
 def edit_sentence(operation: Mapping[str, Any]) -> str:

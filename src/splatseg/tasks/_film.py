@@ -60,7 +60,7 @@ def _focus(field: Renderable, views: Sequence[View]) -> float | None:
     return sorted(depths)[len(depths) // 2] if depths else None
 
 
-def write_path(folder: Path, views: Sequence[View], *, pictures: bool) -> None:
+def write_path(views: Sequence[View], folder: Path, *, pictures: bool) -> None:
     """The cameras of a path as nerfstudio's transforms.json, with the pictures if there are."""
     shown = [
         View(
@@ -72,7 +72,7 @@ def write_path(folder: Path, views: Sequence[View], *, pictures: bool) -> None:
         for view in views
     ]
     write_json(
-        folder / "transforms.json", cameras_content(shown, folder=folder.absolute(), source=None)
+        cameras_content(shown, folder=folder.absolute(), source=None), folder / "transforms.json"
     )
 
 
@@ -92,8 +92,8 @@ def check_film(views: Sequence[View], *, fps: float) -> None:
 
 
 def write_film(
-    folder: Path,
     views: Sequence[View],
+    folder: Path,
     *,
     fps: float,
     is_label_map: bool,

@@ -98,7 +98,7 @@ def score_and_report(
     with atomic_file(where) as path:
         page = report_html(fit_report(data, pairs=pairs, cameras=cameras))
         path.write_text(page, encoding="utf-8", newline="\n")
-    write_json(scene_path(root, "reports", "fit.json"), fit_record(data))
+    write_json(fit_record(data), scene_path(root, "reports", "fit.json"))
     return FittedScene(scores=scores, report=where, verdict=verdict_of(data), timings=spent)
 
 

@@ -61,7 +61,7 @@ class ViewImages:
         colour, alpha = _drawn(self._field, view)
         over = (colour + (1 - alpha)[..., None] * self._background).clamp(0, 1)
         image = (over * 255 + 0.5).to(torch.uint8)
-        save_render(folder, view.name, image)
+        save_render(image, folder, view.name)
         self.drawn += 1
         return image
 

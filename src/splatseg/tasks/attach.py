@@ -18,6 +18,7 @@ from splatseg.core import (
     View,
     with_info,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
@@ -55,6 +56,7 @@ class AttachLayersOptions:
     """Replace layers of the same name in a scene folder that the edited file is."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if not 0 <= self.min_found <= 1:
             raise RangeError(f"min_found: expected 0 to 1, got {self.min_found}.")
 
@@ -89,6 +91,7 @@ class _Work:
     observer: Observer
 
 
+@boundary
 def attach_layers(
     source: Path,
     file: Path,
@@ -260,7 +263,7 @@ def _layers_to_scene(work: _Work) -> AttachedLayers:
         edited = _edited(work)
         found = _attached(work, scene.gaussians, edited)
         for name, layer in layers.items():
-            save_scene_layer(work.file, name, _carried(work, found, layer))
+            save_scene_layer(_carried(work, found, layer), work.file, name)
     return AttachedLayers(
         output=work.file, gaussians=len(edited), names=tuple(layers), table=None, attached=found
     )

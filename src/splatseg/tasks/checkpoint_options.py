@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from splatseg.core.boundary import convert_fields
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
 from splatseg.tasks._observer import Observer
@@ -28,6 +29,7 @@ class CheckpointOptions:
     """Steps between two checkpoints, instead of seconds."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         every = self.checkpoint_every
         if not (math.isfinite(every) and every > 0):
             raise InputError(f"checkpoint_every: expected a positive number, got {every}.")

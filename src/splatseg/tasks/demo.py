@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Scene
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
 from splatseg.io.atomic import is_vacant
@@ -22,10 +23,10 @@ from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.report.fit_verdict import scored_of
 from splatseg.synthetic import cameras, room, write_capture
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate
-from splatseg.tasks.export import export
+from splatseg.tasks.evaluate import EvaluationOptions, Metric, evaluate_scene
+from splatseg.tasks.export import export_scene
 from splatseg.tasks.export_options import ExportOptions
-from splatseg.tasks.make_scene import MadeScene, make_scene
+from splatseg.tasks.make_scene import MadeScene, fit_capture
 from splatseg.tasks.new_scene import check_parent
 from splatseg.tasks.outputs import export_layer, report_layer
 from splatseg.tasks.render import RenderingOptions, render_views
@@ -67,6 +68,7 @@ class DemoOptions:
     """Which room, and every other choice."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.train_views < 4:
             raise RangeError(f"train_views: expected at least 4, got {self.train_views}.")
         if self.width < 32:
@@ -83,6 +85,7 @@ class Demo:
     """What its demo.json holds: scores, seconds by step, commands that do the same."""
 
 
+@boundary
 def make_demo(
     folder: Path,
     *,
@@ -131,11 +134,11 @@ def _made(
         started=started,
     )
     write_report(
-        folder, figures, seed=options.seed, layer=_LAYER, evidence=_EVIDENCE, objects=_OBJECTS
+        figures, folder, seed=options.seed, layer=_LAYER, evidence=_EVIDENCE, objects=_OBJECTS
     )
     steps.append(("report", time.monotonic() - begin))
     record = _record(figures, steps, time.monotonic() - started)
-    write_json(folder / _RECORD, record)
+    write_json(record, folder / _RECORD)
     return Demo(folder=folder, figures=figures, record=record)
 
 
@@ -212,13 +215,13 @@ class _MainJob:
         self._evaluate(scene, _OBJECTS, "test", capture / "instance", "instances")
         labelled = folder / "labelled.ply"
         with self._step("export", root, "--layer", _LAYER, "--instances", _OBJECTS, "-o", labelled):
-            export(scene, labelled, options=ExportOptions(layer=_LAYER, instances=_OBJECTS))
+            export_scene(scene, labelled, options=ExportOptions(layer=_LAYER, instances=_OBJECTS))
 
     def _fit(self, capture: Path, root: Path) -> None:
         options = replace(FitOptions.preset("default"), seed=self.options.seed)
         options = options.with_length(minutes=self._minutes(), steps=self.options.steps)
         options = replace(options, max_gaussians=self.options.max_gaussians)
-        made = make_scene(
+        made = fit_capture(
             capture,
             root,
             fit_options=options,
@@ -232,7 +235,7 @@ class _MainJob:
 
     def _segment(self, scene: Scene, method: str, options: SegmentOptions) -> Segmentation:
         made = segment(scene, method, options=options, backend=self.backend, observer=self.observer)
-        save_scene_layer(self.folder / "scene", made.name, made.layer)
+        save_scene_layer(made.layer, self.folder / "scene", made.name)
         return made
 
     def _evaluate(self, scene: Scene, layer: str, split: str, truth: Path, metric: Metric) -> None:
@@ -241,7 +244,7 @@ class _MainJob:
             *("--split", split, "--metric", metric),
             what=f"{layer}, {split}",
         ):
-            found = evaluate(
+            found = evaluate_scene(
                 scene,
                 options=EvaluationOptions(layer=layer, truth=truth, split=split, metric=metric),
                 backend=self.backend,
@@ -307,7 +310,7 @@ def _prepare(folder: Path, observer: Observer) -> None:
     record = folder / _RECORD
     if record.is_file():
         observer.info(f"Replacing the earlier demo in {folder}")
-    write_json(record, {"made_by": _MADE_BY, "finished": False})
+    write_json({"made_by": _MADE_BY, "finished": False}, record)
     for name in _FOLDERS:
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)

@@ -18,6 +18,7 @@ from splatseg.core import (
     Scene,
     View,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import CheckpointSummary, checkpoint_summary
 from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_capture
@@ -49,6 +50,7 @@ _CAPTURE_FILES = (
 _SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".gltf", ".glb")
 
 
+@boundary
 def describe(path: Path, *, format: str = "auto") -> dict[str, Any]:
     """What is at a path, in values that JSON holds.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+from splatseg.core.boundary import boundary
 from splatseg.edit import (
     Document,
     Operation,
@@ -43,6 +44,7 @@ class EditedScene:
     """The page of pictures before and after; None where none were wanted or there are no views."""
 
 
+@boundary
 def edit_scene(
     document: Document,
     folder: Path,
@@ -89,7 +91,7 @@ def edit_scene(
     if pictures is not None:
         counts = (len(document.scene.gaussians), len(after.scene.gaussians))
         reports = folder / REPORTS_FOLDER
-        write_edit_report(reports, pictures, counts=counts, operations=done)
+        write_edit_report(pictures, reports, counts=counts, operations=done)
         report = reports / "edit.html"
     return EditedScene(folder=folder, document=saved, operations=tuple(done), report=report)
 

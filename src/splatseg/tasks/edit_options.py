@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError
 
 Triple = tuple[float, float, float]
@@ -118,6 +119,7 @@ class EditOptions:
     """Training views in which the change by the cut alone is measured. 0 skips it."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         action = self._action()
         selecting = bool(self.conditions)
         if action in ("extract", "remove", "duplicate") and not selecting:

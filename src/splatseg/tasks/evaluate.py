@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatseg.core import ClassTable, Layer, Renderable, Scene, View
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     SemanticReport,
@@ -112,8 +113,12 @@ class EvaluationOptions:
     """Also score LPIPS with your weights: AlexNet's or VGG-16's, and the heads', as .safetensors
     or .npz with the names of torchvision and of the lpips package."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
 
-def evaluate(
+
+@boundary
+def evaluate_scene(
     scene: Scene,
     *,
     options: EvaluationOptions | None = None,

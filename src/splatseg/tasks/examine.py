@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import is_vacant
 from splatseg.pose.doctor import (
@@ -24,6 +25,7 @@ class Examination:
     """None where nothing was to be corrected, or no correction helps, or none was asked for."""
 
 
+@boundary
 def examine_capture(
     data: Path,
     *,

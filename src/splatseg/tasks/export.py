@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Gaussians, Layer, Scene
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError
 from splatseg.io.export import (
     check_beside,
@@ -56,7 +57,8 @@ class Exported:
     """With objects: the name of each object's file in the folder, by id."""
 
 
-def export(
+@boundary
+def export_scene(
     scene: Scene,
     output: Path,
     what: What = "splat",
@@ -110,7 +112,7 @@ def export(
 
 
 def check_export(scene: Scene, output: Path, what: What) -> None:
-    """Refuse, before long work, a place that `export` could not write to after it.
+    """Refuse, before long work, a place that `export_scene` could not write to after it.
 
     Raises:
         InputError: If something else is there, or there is no folder to write in.
@@ -190,7 +192,7 @@ def _points(job: ExportJob) -> Exported:
         content: dict[str, Any] = {"gaussians": len(gaussians), "columns": meaning_of(job)}
         if classified:
             content["las_classification"] = {str(id): value for id, value in classified.items()}
-        write_column_table(beside, content)
+        write_column_table(content, beside)
     return Exported(output=job.output, summary=f"{len(gaussians)} points", table=beside)
 
 
@@ -226,8 +228,8 @@ def _coco(job: ExportJob) -> Exported:
     with job.observer.stage("export") as step:
         frames = panoptic_frames(scene, views, segments, backend=job.backend, progress=step)
         count = write_coco_panoptic(
-            job.output,
             frames,
+            job.output,
             segments=segments.infos,
             categories=segments.categories,
             about=job.about | {"split": options.split},

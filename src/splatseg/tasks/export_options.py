@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from splatseg.core.boundary import convert_fields
 from splatseg.io.export import (
     BoxMethod,
 )
@@ -48,3 +49,6 @@ class ExportOptions:
 
     frames: int = 360
     """Views of split path."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)

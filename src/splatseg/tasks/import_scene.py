@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatseg.core import Capture, Gaussians, Scene
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.importing import Alignment, VirtualViews, align, place_cameras
 from splatseg.io.captures import read_capture
@@ -55,6 +56,7 @@ class ImportOptions:
     scene surrounds them."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.max_views is not None and self.max_views < 1:
             raise InputError(f"max_views: expected at least 1, got {self.max_views}.")
         if min(self.width, self.height) < 16:
@@ -79,6 +81,7 @@ class ImportedScene:
     """Virtual cameras; None with a capture."""
 
 
+@boundary
 def import_scene(
     file: Path,
     folder: Path,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture, Scene
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.interrupts import deferred_interrupts
 from splatseg.errors import InputError
@@ -57,6 +58,7 @@ class MakeSceneOptions(CheckpointOptions):
     """Name of the preset that the fit's options came from; it is recorded."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         CheckpointOptions.__post_init__(self)
         if self.frames < 1:
             raise InputError(f"frames: expected at least 1, got {self.frames}.")
@@ -93,7 +95,8 @@ class MadeScene:
     """Seconds by part: photographs and poses, optimisation, what follows it."""
 
 
-def make_scene(
+@boundary
+def fit_capture(
     data: Path,
     folder: Path,
     *,

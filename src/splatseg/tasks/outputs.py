@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.io.export import write_node_table
@@ -15,7 +16,7 @@ from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.segment_report import SegmentationRun, write_segmentation_report
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks.export import Exported, check_export, export
+from splatseg.tasks.export import Exported, check_export, export_scene
 from splatseg.tasks.export_options import ExportOptions, What
 from splatseg.tasks.render import Rendering, RenderingOptions, render_views
 from splatseg.tasks.segment import Segmentation
@@ -32,6 +33,7 @@ _LABEL_MAPS = "label_maps"
 _NODES = "nodes.csv"
 
 
+@boundary
 def check_layer_exports(scene: Scene, root: Path, layer: str) -> None:
     """Refuse, before the work, a folder that `export_layer` could not write to.
 
@@ -46,6 +48,7 @@ def check_layer_exports(scene: Scene, root: Path, layer: str) -> None:
             check_export(scene, root / EXPORTS_FOLDER / layer / name, what)
 
 
+@boundary
 def export_layer(
     scene: Scene,
     root: Path,
@@ -75,7 +78,7 @@ def export_layer(
     files: list[Exported] = []
     names: dict[int, str] = {}
     for what, file in _FILES:
-        made = export(
+        made = export_scene(
             scene,
             folder / file,
             what,
@@ -110,6 +113,7 @@ def _drawn(name: str, layer: Layer) -> tuple[str, ...]:
     return (name, *(f"{name}@{level}" for level in TREE_LEVELS if level != "object"))
 
 
+@boundary
 def report_layer(
     scene: Scene,
     root: Path,
@@ -138,8 +142,8 @@ def report_layer(
     unit = 1 if sys.platform == "darwin" else 1024
     field = GaussianField(scene.gaussians, {result.name: result.layer}, backend=backend)
     write_segmentation_report(
+        scene,
         path,
-        scene=scene,
         field=field,
         labels=field.labels(result.name),
         layer=result.name,

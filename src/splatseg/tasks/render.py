@@ -23,6 +23,7 @@ from splatseg.core import (
     View,
     ViewSignals,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import label_map_in
 from splatseg.io.atomic import atomic_folder, sweep
@@ -70,6 +71,9 @@ class RenderingOptions:
     fps: float = 24.0
     """Frames a second of the films."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rendering:
@@ -94,6 +98,7 @@ class _Layer:
         return self.summary.kind == "selection"
 
 
+@boundary
 def render_views(
     scene: Scene,
     output: Path,
@@ -145,14 +150,14 @@ def render_views(
         _render(scene, field, views, drawn, output, folders=folders, observer=observer)
         # Before the films, which take a while: what an interruption leaves can be replaced.
         entry = {"scene": str(scene.root), "split": options.split, "views": len(views)}
-        write_json(path_inside(output, _RECORD), record | dict.fromkeys([*folders, *files], entry))
+        write_json(record | dict.fromkeys([*folders, *files], entry), path_inside(output, _RECORD))
         if on_path:
-            write_path(output, views, pictures="rgb" in folders)
+            write_path(views, output, pictures="rgb" in folders)
         coloured = {layer.name: layer.colours for layer in drawn}
         for name in films:
             write_film(
-                output / name,
                 views,
+                output / name,
                 fps=options.fps,
                 is_label_map=name in label_maps,
                 classes=coloured.get(name),
@@ -191,7 +196,7 @@ def _render(
         for layer in layers:
             if not layer.is_selection:
                 legend = legend_of(layer.summary, scene.classes, colours=layer.colours)
-                write_json(into[layer.name] / "legend.json", legend)
+                write_json(legend, into[layer.name] / "legend.json")
 
 
 def _wanted(what: Sequence[str]) -> list[str]:
@@ -299,12 +304,12 @@ def _finish_depth(folder: Path, views: Sequence[View], scene: Scene) -> None:
     shutil.rmtree(held)
     metres = scene.metres_per_unit
     write_json(
-        folder / "depth.json",
         {
             "unit": unit,
             "unit_m": None if metres is None else unit * metres,
             "meaning": "value * unit = z-depth along the optical axis in scene units; 0 = none",
         },
+        folder / "depth.json",
     )
 
 

@@ -32,7 +32,7 @@ def check_table_file(name: str, path: Path | None) -> None:
         raise InputError(f"{name}: expected an existing folder to write {path} in.")
 
 
-def write_class_table(path: Path, figures: Mapping[str, Any]) -> None:
+def write_class_table(figures: Mapping[str, Any], path: Path) -> None:
     """Write one row a class (id, name, pixels of the truth, IoU), and the mean.
 
     Args:
@@ -52,7 +52,7 @@ def write_class_table(path: Path, figures: Mapping[str, Any]) -> None:
     _write(path, ["id", "class", "pixels", "IoU"], rows)
 
 
-def write_confusion(path: Path, figures: Mapping[str, Any]) -> None:
+def write_confusion(figures: Mapping[str, Any], path: Path) -> None:
     """Write the confusion matrix: pixels, one row a true class, one column a class of the layer.
 
     Raises:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from splatseg.core import Model, Scene
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.evidence import RENDERS_FOLDER
 from splatseg.io.scene import check_name
@@ -62,7 +63,11 @@ class SeeOptions:
     overwrite: bool = False
     """Replace evidence of this name, once the new one is complete."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
 
+
+@boundary
 def see(
     scene: Scene,
     model: str | Model,

@@ -20,6 +20,7 @@ from splatseg.core import (
     View,
     with_info,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
     Evidence,
@@ -77,6 +78,9 @@ class SegmentOptions:
     seed: int = 0
     """Seed of random choices, recorded in the layer."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Segmentation:
@@ -113,6 +117,7 @@ class Segmentation:
         return self.layer
 
 
+@boundary
 def segment(
     scene: Scene,
     method: str | Method = "uplift",
@@ -193,13 +198,14 @@ def _checked_fit(
     return (f"{quality.warning}.",)
 
 
-def save_segmentation(root: Path, made: Segmentation) -> Path:
+@boundary
+def save_segmentation(made: Segmentation, root: Path) -> Path:
     """Write the layer into the scene's folder; then its training needs its checkpoint no more.
 
     Returns:
         The file of the layer.
     """
-    path = save_scene_layer(root, made.name, made.layer)
+    path = save_scene_layer(made.layer, root, made.name)
     if made.checkpoint is not None:
         discard_checkpoint_file(made.checkpoint)
     return path

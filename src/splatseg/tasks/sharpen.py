@@ -16,6 +16,7 @@ from splatseg.core import (
     View,
     layer_address,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.edit import Document, save_document
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError
@@ -70,6 +71,7 @@ class SharpenSceneOptions:
     """Seed of the order of views and of random codes."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.measure < 0:
             raise InputError(f"measure: expected 0 or more, got {self.measure}.")
 
@@ -91,6 +93,7 @@ class SharpenedScene:
     """Views of the PSNR."""
 
 
+@boundary
 def sharpen_scene(
     document: Document,
     folder: Path,

@@ -254,7 +254,7 @@ def test_label_maps_round_trip(tmp_path, rng, highest) -> None:
     ids[0, 0], ids[0, 1] = -1, highest
     confidence = torch.from_numpy(rng.random((5, 7)))
     folder = create_evidence(tmp_path / "e", kind="labels")
-    save_label_map(folder, "sub/a.jpg", LabelMap(ids=ids, confidence=confidence))
+    save_label_map(LabelMap(ids=ids, confidence=confidence), folder, "sub/a.jpg")
     evidence = open_evidence(folder)
     assert evidence.view_names == ("sub/a.jpg",)
     read = evidence.label_map("sub/a.jpg")
@@ -262,14 +262,14 @@ def test_label_maps_round_trip(tmp_path, rng, highest) -> None:
     np.testing.assert_allclose(read.confidence, confidence, atol=0.5 / 65535 + 1e-7)
     with Image.open(folder / "sub/a.jpg.png") as image:
         assert image.mode == ("L" if highest == 255 else "I;16")
-    save_label_map(folder, "sub/a.jpg", LabelMap(ids=ids))
+    save_label_map(LabelMap(ids=ids), folder, "sub/a.jpg")
     assert open_evidence(folder).label_map("sub/a.jpg").confidence is None
 
 
 def test_the_score_of_a_label_mask_is_its_mean_confidence(tmp_path) -> None:
     folder = create_evidence(tmp_path / "e", kind="labels")
     ids, confidence = torch.tensor([[2, 2, -1]]), torch.tensor([[0.5, 1.0, 0.0]])
-    save_label_map(folder, "a", LabelMap(ids=ids, confidence=confidence))
+    save_label_map(LabelMap(ids=ids, confidence=confidence), folder, "a")
     assert open_evidence(folder).masks("a").scores.tolist() == pytest.approx([0.75], abs=1e-4)
 
 
@@ -322,14 +322,14 @@ def test_a_palette_gives_its_indices(tmp_path) -> None:
 )
 def test_label_maps_that_have_no_place_in_a_file(tmp_path, ids, error, message) -> None:
     with pytest.raises(error, match=message):
-        save_label_map(tmp_path, "a", LabelMap(ids=ids))
+        save_label_map(LabelMap(ids=ids), tmp_path, "a")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["", "../a", "/a", "a//b", ".a", "a/../../b"])
 def test_names_stay_inside_the_folder(tmp_path, name) -> None:
     with pytest.raises(InputError, match="expected a view.s name"):
-        save_label_map(tmp_path, name, LabelMap(ids=torch.ones(1, 1)))
+        save_label_map(LabelMap(ids=torch.ones(1, 1)), tmp_path, name)
 
 
 # Masks
@@ -347,7 +347,7 @@ def test_masks_round_trip(tmp_path_factory, seed, count, height, width) -> None:
     scores = generator.random(count).astype(np.float32).tolist()
     levels = generator.integers(0, 3, count).tolist()
     folder = create_evidence(tmp_path_factory.mktemp("m") / "e", kind="masks")
-    save_masks(folder, "a", MaskSet.from_dense(dense, scores=scores, levels=levels))
+    save_masks(MaskSet.from_dense(dense, scores=scores, levels=levels), folder, "a")
     read = open_evidence(folder).masks("a")
     assert (read.height, read.width, len(read)) == (height, width, count)
     assert read.scores.tolist() == scores
@@ -399,7 +399,7 @@ def test_masks_that_are_broken(tmp_path, change, message) -> None:
 def test_features_round_trip_as_float16(tmp_path, rng) -> None:
     values = torch.from_numpy(rng.normal(size=(3, 4, 5))).float()
     folder = create_evidence(tmp_path / "e", kind="features", metadata={"model": "dino"})
-    save_features(folder, "a", FeatureMap(features=values, stride=14, height=42, width=50))
+    save_features(FeatureMap(features=values, stride=14, height=42, width=50), folder, "a")
     read = open_evidence(folder).features("a")
     assert (read.stride, read.height, read.width) == (14, 42, 50)
     assert read.features.dtype == torch.float32
@@ -410,7 +410,7 @@ def test_features_round_trip_as_float16(tmp_path, rng) -> None:
 def test_features_beyond_float16_are_refused(tmp_path, value) -> None:
     features = FeatureMap(features=torch.full((1, 1, 1), value), stride=1, height=1, width=1)
     with pytest.raises(RangeError, match="a: features"):
-        save_features(tmp_path, "a", features)
+        save_features(features, tmp_path, "a")
 
 
 def test_features_that_are_broken(tmp_path) -> None:

@@ -30,7 +30,7 @@ def test_what_is_written(tmp_path) -> None:
     empty = torch.full((2, 3), -1)
     frames = (frame(*x) for x in (("left/a", IDS), ("b", empty)))
     folder = tmp_path / "coco"
-    assert write_coco_panoptic(folder, frames, segments=SEGMENTS, categories=CATEGORIES) == 2
+    assert write_coco_panoptic(frames, folder, segments=SEGMENTS, categories=CATEGORIES) == 2
     content = json.loads((folder / "panoptic.json").read_text())
     assert content["images"] == [
         {"id": 1, "file_name": "left/a.jpg", "width": 4, "height": 3},
@@ -60,12 +60,12 @@ def test_what_is_written(tmp_path) -> None:
 def test_an_earlier_export_is_replaced(tmp_path) -> None:
     folder = tmp_path / "coco"
     for name in ("a", "b"):
-        write_coco_panoptic(folder, [frame(name)], segments=SEGMENTS, categories=CATEGORIES)
+        write_coco_panoptic([frame(name)], folder, segments=SEGMENTS, categories=CATEGORIES)
     assert [p.name for p in (folder / "panoptic").iterdir()] == ["b.png"]
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "x").touch()
     with pytest.raises(InputError, match="other files"):
-        write_coco_panoptic(tmp_path / "mine", [frame()], segments=SEGMENTS, categories=CATEGORIES)
+        write_coco_panoptic([frame()], tmp_path / "mine", segments=SEGMENTS, categories=CATEGORIES)
 
 
 @pytest.mark.parametrize(
@@ -81,5 +81,5 @@ def test_an_earlier_export_is_replaced(tmp_path) -> None:
 )
 def test_refusals(tmp_path, frames, segments, categories, word) -> None:
     with pytest.raises(InputError, match=word):
-        write_coco_panoptic(tmp_path / "c", frames, segments=segments, categories=categories)
+        write_coco_panoptic(frames, tmp_path / "c", segments=segments, categories=categories)
     assert list(tmp_path.iterdir()) == []

@@ -78,10 +78,10 @@ LAYERS = {
 
 @pytest.mark.parametrize("name", LAYERS)
 def test_round_trip_and_same_bytes(tmp_path, name) -> None:
-    save_layer(tmp_path / "a.npz", LAYERS[name])
+    save_layer(LAYERS[name], tmp_path / "a.npz")
     read = load_layer(tmp_path / "a.npz")
     same(LAYERS[name], read)
-    save_layer(tmp_path / "b.npz", read)
+    save_layer(read, tmp_path / "b.npz")
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
@@ -119,7 +119,7 @@ def test_layers_of_version_3_are_read_and_written_as_they_were(
     path = project_root / f"tests/golden/layers-v3/{name}.npz"
     layer = load_layer(path)
     same(golden.golden_layers_of_version_3()[name], layer)
-    save_layer(tmp_path / "again.npz", layer)
+    save_layer(layer, tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
 
 
@@ -129,13 +129,13 @@ def test_records_as_deep_as_they_may_be_have_a_place_in_files(tmp_path) -> None:
         deep = [deep]
     facts = {1: InstanceFacts(details={"a": deep})}
     info = LayerInfo(instances=facts, details={"a": deep}).with_edit("merge", {"a": deep})
-    save_layer(tmp_path / "a.npz", Selection(mask=torch.ones(1).bool(), info=info))
+    save_layer(Selection(mask=torch.ones(1).bool(), info=info), tmp_path / "a.npz")
     assert load_layer(tmp_path / "a.npz").info == info
 
 
 def test_a_number_of_more_digits_than_python_reads_is_refused(tmp_path) -> None:
     path = tmp_path / "a.npz"
-    save_layer(path, LAYERS["labels"])
+    save_layer(LAYERS["labels"], path)
     text = '{"format": "splatseg-layer", "count": ' + "1" * 5000 + "}"
     np.savez(path, header=np.frombuffer(text.encode(), np.uint8))
     with pytest.raises(FileFormatError, match=f"^{path}: expected JSON"):
@@ -178,7 +178,7 @@ def test_files_that_hold_no_tree(tmp_path, change, message) -> None:
 
 
 def test_none_is_0_in_the_file(tmp_path) -> None:
-    save_layer(tmp_path / "a.npz", LAYERS["soft"])
+    save_layer(LAYERS["soft"], tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
         assert archive["ids"].tolist() == [0, 3, 70000, 1, 2**31 - 1]
         assert archive["candidates"][0].tolist() == [0, 0]
@@ -202,14 +202,14 @@ def test_none_is_0_in_the_file(tmp_path) -> None:
 )
 def test_layers_that_have_no_place_in_a_file(tmp_path, layer, message) -> None:
     with pytest.raises(InputError, match=message):
-        save_layer(tmp_path / "a.npz", layer)
+        save_layer(layer, tmp_path / "a.npz")
     assert not list(tmp_path.iterdir())
 
 
 def changed(tmp_path, change, layer="soft"):
     """The file of a layer after a change of its entries; header as a dict."""
     path = tmp_path / "a.npz"
-    save_layer(path, LAYERS[layer])
+    save_layer(LAYERS[layer], path)
     with np.load(path, allow_pickle=False) as archive:
         arrays = dict(archive)
     header = json.loads(arrays.pop("header").tobytes())
@@ -250,7 +250,7 @@ def test_files_that_are_no_layers(tmp_path) -> None:
     path = tmp_path / "a.npz"
     with pytest.raises(MissingFileError, match="there is no such file"):
         load_layer(path)
-    save_layer(path, LAYERS["labels"])
+    save_layer(LAYERS["labels"], path)
     whole = path.read_bytes()
     for length in range(0, len(whole), 37):
         path.write_bytes(whole[:length])
@@ -263,7 +263,7 @@ def test_files_that_are_no_layers(tmp_path) -> None:
 
 def test_a_damaged_byte_is_noticed(tmp_path) -> None:
     path = tmp_path / "a.npz"
-    save_layer(path, LAYERS["features"])
+    save_layer(LAYERS["features"], path)
     data = bytearray(path.read_bytes())
     data[data.index(b"values.npy") + 200] ^= 1
     path.write_bytes(data)
@@ -274,7 +274,7 @@ def test_a_damaged_byte_is_noticed(tmp_path) -> None:
 def test_nothing_is_unpickled(tmp_path) -> None:
     """A layer that would run code when it is opened is refused."""
     path = tmp_path / "a.npz"
-    save_layer(path, LAYERS["labels"])
+    save_layer(LAYERS["labels"], path)
     entry = io.BytesIO()
     np.save(entry, np.array([print], dtype=object), allow_pickle=True)
     with zipfile.ZipFile(path, "a") as archive:

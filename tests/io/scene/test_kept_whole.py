@@ -84,7 +84,7 @@ def test_a_climbing_view_name_of_a_scene_file_is_refused(tmp_path: Path) -> None
         for file in (root / "cameras" / "transforms.json",):
             content = read_json(file)
             content["frames"][0]["name"] = name
-            write_json(file, content)
+            write_json(content, file)
         with pytest.raises(FileFormatError, match=r"transforms.json: frames\[0\]: expected a view"):
             load_scene(root)
 
@@ -98,7 +98,7 @@ def test_no_layer_is_written_through_a_link_that_leads_out(tmp_path: Path) -> No
         (root / name).symlink_to(outside)
     layer = Labels(ids=torch.ones(2, dtype=torch.int64), confidence=torch.ones(2))
     with pytest.raises(InputError, match="a link leads out"):
-        save_scene_layer(root, "classes", layer)
+        save_scene_layer(layer, root, "classes")
     with pytest.raises(InputError, match="a link leads out"):
         training_file(root, "classes")
     assert not list(outside.iterdir())
@@ -108,7 +108,7 @@ def test_files_that_no_layer_is_called_like_are_none(tmp_path: Path) -> None:
     root = tmp_path / "scene"
     save_scene(scene_of(2, "a"), root)
     layer = Labels(ids=torch.ones(2, dtype=torch.int64), confidence=torch.ones(2))
-    path = save_scene_layer(root, "classes", layer)
+    path = save_scene_layer(layer, root, "classes")
     shutil.copy(path, root / "layers" / "...npz")  # a layer called ".."
     assert scene_layer_names(root) == ("classes",)
     with pytest.raises(InputError, match="expected one of"):

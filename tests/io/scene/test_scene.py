@@ -219,7 +219,7 @@ def test_a_scene_without_photographs(tmp_path, golden) -> None:
 def test_saving_again_keeps_layers_and_says_when_they_are_stale(tmp_path, golden) -> None:
     scene = golden.golden_scene()
     save_scene(scene, tmp_path / "s")
-    save_scene_layer(tmp_path / "s", "a.b-1", Selection(mask=torch.ones(3).bool()))
+    save_scene_layer(Selection(mask=torch.ones(3).bool()), tmp_path / "s", "a.b-1")
     save_scene(replace(scene, up=(1.0, 0.0, 0.0)), tmp_path / "s")
     assert load_scene_layer(tmp_path / "s", "a.b-1").count == 3
     assert load_scene(tmp_path / "s").up == (1, 0, 0)
@@ -353,11 +353,11 @@ def test_nothing_half_written_stays(tmp_path, golden) -> None:
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "-x", "a b"])
 def test_layer_names_are_file_names(version_1, name) -> None:
     with pytest.raises(InputError, match="layer: expected a name of letters"):
-        save_scene_layer(version_1, name, Selection(mask=torch.ones(3).bool()))
+        save_scene_layer(Selection(mask=torch.ones(3).bool()), version_1, name)
 
 
 def test_layers_that_are_not_of_the_scene(version_1) -> None:
     with pytest.raises(InputError, match=r"\(chosen, features, semantic\), got 'gone'"):
         load_scene_layer(version_1, "gone")
     with pytest.raises(InputError, match="layer 'l': expected 3 rows .* got 2"):
-        save_scene_layer(version_1, "l", Labels(ids=torch.ones(2), confidence=torch.ones(2)))
+        save_scene_layer(Labels(ids=torch.ones(2), confidence=torch.ones(2)), version_1, "l")

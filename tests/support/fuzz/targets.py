@@ -276,7 +276,7 @@ def _layer(name: str, make_layer: Callable[[], Any]) -> None:
     @target(name)
     def make(folder: Path) -> Target:
         file = folder / "a.npz"
-        save_layer(file, make_layer())
+        save_layer(make_layer(), file)
         return Target(file=file, read=lambda: load_layer(file))
 
 
@@ -494,7 +494,7 @@ def fit_checkpoint(folder: Path) -> Target:
     file = folder / "checkpoint.npz"
     content = {"steps": 3, "progress": 0.5, "seconds": 1.0, "gaussians": 4}
     state = FitState(tensors={"a/b": torch.ones(3)}, content=content)
-    write_checkpoint(file, Checkpoint(state=state, identity={"data": {}}))
+    write_checkpoint(Checkpoint(state=state, identity={"data": {}}), file)
     return Target(file=file, read=lambda: read_checkpoint(file))
 
 
@@ -507,7 +507,7 @@ def training_state(folder: Path) -> Target:
         return training.TrainingState.started({"rows": torch.ones(4, 2)}, {"w": torch.ones(3)}, 4)
 
     identity = {"data": {"rows": "x"}, "options": {"steps": 9}, "defaults": {}}
-    training.write_state(file, start(), identity)
+    training.write_state(start(), file, identity)
 
     def read() -> None:
         training.training_summary(file)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from splatseg._check import check_choice
 from splatseg.core import Capture
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import Metadata as Metadata
 from splatseg.io.captures._metadata import read_metadata as read_metadata
@@ -25,6 +26,7 @@ FORMATS = ("nerfstudio", "blender", "colmap", "llff", "idr")
 """Layouts that are read, in the order in which they are looked for."""
 
 
+@boundary
 def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False) -> Capture:
     """Read a capture: cameras, split, start points and classes, not the photographs themselves.
 
@@ -73,6 +75,7 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             return read_idr(folder, strict=strict)
 
 
+@boundary
 def find_formats(folder: Path) -> tuple[str, ...]:
     """Layouts that a folder has, the one that would be read first."""
     found = {
@@ -85,6 +88,7 @@ def find_formats(folder: Path) -> tuple[str, ...]:
     return tuple(format for format in FORMATS if found[format])
 
 
+@boundary
 def bare_photographs(folder: Path) -> tuple[Path, ...]:
     """Photographs of a folder that has no poses: in it, or in its folder ``images``."""
     return find_images(folder) or find_images(folder / "images")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import ClassTable
+from splatseg.core.boundary import boundary
 from splatseg.io.class_tables import class_table
 from splatseg.io.json_files import read_json
 
@@ -40,6 +41,7 @@ class Metadata:
     metres_per_unit: float | None = None
 
 
+@boundary
 def read_metadata(folder: Path) -> Metadata:
     """Metadata of a capture; all None where there is no metadata.json.
 

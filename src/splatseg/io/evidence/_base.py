@@ -9,6 +9,7 @@ from typing import Literal, NoReturn, TypeGuard
 from typing_extensions import override
 
 from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 
 EvidenceKind = Literal["labels", "panoptic", "tracked", "masks", "features"]
@@ -146,6 +147,7 @@ def refuse(evidence: Evidence, wanted: str) -> NoReturn:
     raise InputError(f"{evidence.folder}: expected evidence of {wanted}, got {evidence.kind}.")
 
 
+@boundary
 def view_files(folder: Path, suffix: str) -> dict[str, Path]:
     """Files of views by view name: the path below the folder without its last suffix."""
     found: dict[str, Path] = {}

@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from splatseg._check import check_shape
 from splatseg.core import FeatureMap, MaskSet
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.npz import npz_names, read_npz
@@ -140,6 +141,7 @@ class TextEmbeddings:
         return self.vectors[self.labels.index(label)]
 
 
+@boundary
 def load_text_embeddings(path: Path) -> TextEmbeddings:
     """Read text_embeddings.npz, or the one in a folder.
 

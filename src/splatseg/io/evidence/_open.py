@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from splatseg.core import ClassTable
+from splatseg.core.boundary import boundary
 from splatseg.core.json_values import id_of_key
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.captures import read_metadata
@@ -41,6 +42,7 @@ _SUFFIX = "_reference"
 _TRUTH_TABLES = {"instance": "instances", "part": "parts", "depth": ""}
 
 
+@boundary
 def open_evidence(
     folder: Path | str,
     *,
@@ -146,6 +148,7 @@ def _rule(rule: IdRule, table: LabelTable | None, *, soft: bool) -> IdRule:
     return IdRule(zero_is_class=zero, void=void)
 
 
+@boundary
 def evidence_header(folder: Path | str) -> dict[str, Any] | None:
     """The evidence.json of a folder that splatseg wrote, None where there is none.
 
@@ -158,6 +161,7 @@ def evidence_header(folder: Path | str) -> dict[str, Any] | None:
     return _header(Path(folder)) or None
 
 
+@boundary
 def find_evidence(folders: Iterable[Path], name: str) -> Path:
     """The folder of evidence of this name: in a scene's ``evidence``, or in a capture.
 
@@ -177,6 +181,7 @@ def find_evidence(folders: Iterable[Path], name: str) -> Path:
     raise InputError(f"evidence: expected one of those at hand ({known}), got {name!r}.")
 
 
+@boundary
 def evidence_names(folders: Iterable[Path]) -> tuple[str, ...]:
     """Names of the evidence of scenes and captures, sorted.
 

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_values
 from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Segment, Track
+from splatseg.core.boundary import boundary
 from splatseg.core.view_names import check_view_name
-from splatseg.errors import InputError, RangeError
+from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.io.atomic import atomic_file, atomic_folder
 from splatseg.io.class_tables import class_rows
 from splatseg.io.evidence._base import (
@@ -36,6 +37,7 @@ _WRITTEN = ("labels", "panoptic", "tracked", "masks", "features")
 _MAX_ID = 65535
 
 
+@boundary
 def create_evidence(
     folder: Path | str,
     *,
@@ -58,6 +60,7 @@ def create_evidence(
 
     Raises:
         InputError: If the kind is another, or a value has no place in JSON.
+        MissingFileError: If the parent of `folder` does not exist.
     """
     check_choice("kind", kind, _WRITTEN)
     folder = Path(folder)
@@ -70,13 +73,16 @@ def create_evidence(
         "metadata": dict(metadata or {}),
     }
     json_text("metadata", header)
+    if not folder.parent.is_dir():
+        raise MissingFileError(f"{folder}: expected an existing folder to write in.")
     with write_failures_named(folder):
         folder.mkdir(exist_ok=True)
-    write_json(path_inside(folder, HEADER_FILE), header)
+    write_json(header, path_inside(folder, HEADER_FILE))
     return folder
 
 
-def save_label_map(folder: Path | str, name: str, label_map: LabelMap) -> None:
+@boundary
+def save_label_map(label_map: LabelMap, folder: Path | str, name: str) -> None:
     """Write a view's label map: 8 bit where all ids fit, else 16; -1 becomes 0.
 
     Its confidence, if any, goes into a 16 bit PNG of its own.
@@ -109,7 +115,8 @@ def save_label_map(folder: Path | str, name: str, label_map: LabelMap) -> None:
     write_png(values.astype(np.uint8) if highest <= 255 else values.astype(np.uint16), path)
 
 
-def save_masks(folder: Path | str, name: str, masks: MaskSet) -> None:
+@boundary
+def save_masks(masks: MaskSet, folder: Path | str, name: str) -> None:
     """Write a view's masks as compressed COCO run lengths.
 
     Raises:
@@ -122,7 +129,8 @@ def save_masks(folder: Path | str, name: str, masks: MaskSet) -> None:
         temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
 
-def save_render(folder: Path | str, name: str, image: UInt8[Tensor, "height width 3"]) -> Path:
+@boundary
+def save_render(image: UInt8[Tensor, "height width 3"], folder: Path | str, name: str) -> Path:
     """Keep the picture that a model saw of a view without a photograph, beside the evidence.
 
     Returns:
@@ -133,7 +141,8 @@ def save_render(folder: Path | str, name: str, image: UInt8[Tensor, "height widt
     return path
 
 
-def save_segments(folder: Path | str, segments: Mapping[str, Sequence[Segment]]) -> None:
+@boundary
+def save_segments(segments: Mapping[str, Sequence[Segment]], folder: Path | str) -> None:
     """Write the table of panoptic evidence: the segments of each view by its name.
 
     Raises:
@@ -156,19 +165,21 @@ def save_segments(folder: Path | str, segments: Mapping[str, Sequence[Segment]])
                 for segment in rows
             ]
         }
-    write_json(path_inside(Path(folder), SEGMENTS_FILE), content)
+    write_json(content, path_inside(Path(folder), SEGMENTS_FILE))
 
 
-def save_tracks(folder: Path | str, tracks: Sequence[Track], *, order: Sequence[str]) -> None:
+@boundary
+def save_tracks(tracks: Sequence[Track], folder: Path | str, *, order: Sequence[str]) -> None:
     """Write the table of tracked evidence: the tracks, and the views as they were gone through."""
     content = {
         "order": list(order),
         "tracks": {str(track.id): {"category_votes": dict(track.votes)} for track in tracks},
     }
-    write_json(path_inside(Path(folder), TRACKS_FILE), content)
+    write_json(content, path_inside(Path(folder), TRACKS_FILE))
 
 
-def save_features(folder: Path | str, name: str, features: FeatureMap) -> None:
+@boundary
+def save_features(features: FeatureMap, folder: Path | str, name: str) -> None:
     """Write a view's features as float16.
 
     Raises:
@@ -194,6 +205,7 @@ def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Pa
         return path_inside(folder, f"{name}{suffix}", make=make)
 
 
+@boundary
 def copy_evidence(folder: Path | str, scene: Path | str) -> Path:
     """Give a scene the evidence of another one of the same photographs, whole or not at all.
 

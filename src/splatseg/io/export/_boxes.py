@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.core import Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError
 
@@ -46,6 +47,7 @@ class OrientedBox:
         return float(self.size.prod())
 
 
+@boundary
 def oriented_box(
     gaussians: Gaussians,
     *,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import UNLABELLED
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.export._folders import check_replaceable
@@ -65,9 +66,10 @@ class Frame:
     """Segment ids, -1 for none."""
 
 
+@boundary
 def write_coco_panoptic(
-    folder: Path,
     frames: Iterable[Frame],
+    folder: Path,
     *,
     segments: Mapping[int, SegmentInfo],
     categories: Sequence[Category],
@@ -121,7 +123,7 @@ def write_coco_panoptic(
             "annotations": annotations,
             "categories": [_category_content(category) for category in categories],
         }
-        write_json(temporary / PANOPTIC_FILE, content)
+        write_json(content, temporary / PANOPTIC_FILE)
     return len(images)
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Gaussians, Labels, Selection
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.export._folders import check_parent, is_ours
@@ -20,6 +21,7 @@ NONE = 0
 """The id of no label, in files."""
 
 
+@boundary
 def label_columns(
     layer: Labels | Selection, kind: Literal["class", "instance"] = "class"
 ) -> dict[str, Tensor]:
@@ -37,6 +39,7 @@ def label_columns(
     }
 
 
+@boundary
 def write_labelled_splats(
     gaussians: Gaussians,
     path: Path,
@@ -76,10 +79,11 @@ def write_labelled_splats(
     with atomic_file(path) as temporary:
         with retold(temporary.parent, path.parent):
             write_splats(labelled, temporary, format=format)
-        write_column_table(beside, table)
+        write_column_table(table, beside)
     return beside
 
 
+@boundary
 def check_beside(path: Path) -> Path:
     """Where the table of what columns mean goes: ``FILE.json`` beside ``FILE.ply``.
 
@@ -95,6 +99,7 @@ def check_beside(path: Path) -> Path:
     return beside
 
 
+@boundary
 def column_table_of(path: Path) -> dict[str, Any]:
     """What the columns of a splat file mean, as the table beside it says; empty without one."""
     beside = path.with_suffix(".json")
@@ -104,9 +109,10 @@ def column_table_of(path: Path) -> dict[str, Any]:
     return dict(cast("Mapping[str, Any]", columns)) if isinstance(columns, Mapping) else {}
 
 
-def write_column_table(path: Path, content: Mapping[str, Any]) -> None:
+@boundary
+def write_column_table(content: Mapping[str, Any], path: Path) -> None:
     """Write the table of what columns mean; atomic."""
-    write_json(path, {"made_by": MADE_BY} | dict(content))
+    write_json({"made_by": MADE_BY} | dict(content), path)
 
 
 def holds_columns(path: Path, format: WritableFormat | None) -> bool:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import check_writable, is_vacant, sweep
 from splatseg.io.export._tables import MADE_BY
@@ -9,6 +10,7 @@ from splatseg.io.json_files import read_json
 from splatseg.io.paths import check_utf8
 
 
+@boundary
 def check_replaceable(path: Path, record: str) -> None:
     """Refuse a target that holds something other than an earlier export.
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Gaussians, Labels
+from splatseg.core.boundary import boundary
 from splatseg.errors import ShapeError
 from splatseg.io.export._boxes import BoxMethod, OrientedBox, oriented_box
 
@@ -46,6 +47,7 @@ class ObjectRow:
     say."""
 
 
+@boundary
 def objects_of(
     gaussians: Gaussians,
     labels: Labels,
@@ -99,6 +101,7 @@ def objects_of(
     return tuple(rows)
 
 
+@boundary
 def classes_of(gaussians: Gaussians, labels: Labels, classes: Labels) -> dict[int, int]:
     """The class of each object of a layer, as in `objects_of`; -1 where it has none."""
     return {id: _class(gaussians, classes, members) for id, members in _members(labels)}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingPackageError, RangeError
 from splatseg.io.atomic import atomic_file
 
@@ -32,6 +33,7 @@ _DESCRIPTIONS = {
 }
 
 
+@boundary
 def write_points(
     gaussians: Gaussians, path: Path, *, columns: Mapping[str, Tensor] | None = None
 ) -> Mapping[int, int]:

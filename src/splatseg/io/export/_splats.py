@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice
 from splatseg.core import UNLABELLED, Gaussians, Labels
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.atomic import atomic_folder
 from splatseg.io.export._columns import holds_columns
@@ -35,6 +36,7 @@ _ENDINGS: dict[WritableFormat, str] = {
 }
 
 
+@boundary
 def write_object_splats(
     gaussians: Gaussians,
     labels: Labels,
@@ -95,7 +97,7 @@ def write_object_splats(
         if rest is not None:
             write_splats(gaussians[left], temporary / rest, format=format)
         content["unlabelled"] = {"gaussians": len(left), "file": rest}
-        write_json(temporary / OBJECTS_FILE, content)
+        write_json(content, temporary / OBJECTS_FILE)
     return tuple(folder / file for file in files)
 
 

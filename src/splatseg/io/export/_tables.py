@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import UNLABELLED
+from splatseg.core.boundary import boundary
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file
@@ -16,6 +17,7 @@ MADE_BY = "splatseg export"
 _DIGITS = 6
 
 
+@boundary
 def write_object_table(
     rows: Sequence[ObjectRow],
     path: Path,
@@ -42,13 +44,14 @@ def write_object_table(
                 object_content(row) | ({"file": files[row.id]} if row.id in files else {})
                 for row in rows
             ]
-            write_json(path, {"made_by": MADE_BY} | dict(about or {}) | {"objects": objects})
+            write_json({"made_by": MADE_BY} | dict(about or {}) | {"objects": objects}, path)
         case ".csv":
             _write_csv(rows, path, files)
         case _:
             raise InputError(f"{path}: expected a table's name to end in .csv or .json.")
 
 
+@boundary
 def object_content(row: ObjectRow) -> dict[str, Any]:
     """A row as JSON: lengths in scene units, quaternion (w, x, y, z) world_from_box."""
     return {

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from splatseg.core import InstanceTree, node_row
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import write_json
@@ -26,6 +27,7 @@ _COLUMNS = (
 )
 
 
+@boundary
 def write_node_table(
     tree: InstanceTree, path: Path, *, about: Mapping[str, Any] | None = None
 ) -> None:
@@ -46,7 +48,7 @@ def write_node_table(
     rows = node_rows(tree)
     match path.suffix.lower():
         case ".json":
-            write_json(path, dict(about or {}) | {"nodes": rows})
+            write_json(dict(about or {}) | {"nodes": rows}, path)
         case ".csv":
             with (
                 atomic_file(path) as temporary,
@@ -60,6 +62,7 @@ def write_node_table(
             raise InputError(f"{path}: expected a table's name to end in .csv or .json.")
 
 
+@boundary
 def node_rows(tree: InstanceTree) -> list[dict[str, Any]]:
     """One row a node: what the file of the layer says of it, its granularity, its Gaussians."""
     ids, counts = torch.unique(tree.labels.ids, return_counts=True)

@@ -11,6 +11,7 @@ from typing import Literal
 
 from splatseg._check import check_choice
 from splatseg.core import Gaussians
+from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import is_folder
@@ -32,6 +33,7 @@ _WRITABLE: dict[WritableFormat, str] = {
 _PEEK = 4096
 
 
+@boundary
 def read_splats(path: StrPath) -> Gaussians:
     """Read Gaussians from a splat file of any known format.
 
@@ -74,6 +76,7 @@ def read_splats(path: StrPath) -> Gaussians:
     return read(source)
 
 
+@boundary
 def write_splats(
     gaussians: Gaussians, path: StrPath, *, format: WritableFormat | None = None
 ) -> None:
@@ -148,6 +151,7 @@ def _format_of_name(path: Path) -> WritableFormat:
     )
 
 
+@boundary
 def splat_format(path: StrPath) -> SplatFormat:
     """Tell the format of a splat file by its first bytes, or by its name where those say nothing.
 

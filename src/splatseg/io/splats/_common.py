@@ -46,8 +46,8 @@ class SplatWarning(UserWarning):
 
 
 def warn(path: Path, sentence: str) -> None:
-    """Warn with the file's path in front, at the line outside this package that led here."""
-    here = str(Path(__file__).parent)
+    """Warn with the file's path in front, at the line outside splatseg that led here."""
+    here = str(Path(__file__).parents[2])
     level = 1
     frame = inspect.currentframe()
     while frame is not None and frame.f_code.co_filename.startswith(here):

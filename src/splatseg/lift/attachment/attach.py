@@ -25,6 +25,7 @@ from splatseg.core import (
     Selection,
     Similarity,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import RangeError, ShapeError
 from splatseg.lift.attachment.match import Matches, keep_order, match
 from splatseg.lift.attachment.move import Hypothesis, find_move, fit_similarity
@@ -53,6 +54,7 @@ class AttachOptions:
     """Of the random triples that moves are found from."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.moves < 0:
             raise RangeError(f"moves: expected 0 or more, got {self.moves}.")
         if self.min_part < 3:
@@ -127,6 +129,7 @@ class Attached:
         return {name: _gathered(column, self.rows, 0) for name, column in columns.items()}
 
 
+@boundary
 def attach(
     source: Gaussians, edited: Gaussians, *, options: AttachOptions | None = None
 ) -> Attached:

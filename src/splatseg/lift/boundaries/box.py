@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from splatseg.core import Camera, Edited, Gaussians, Selection
+from splatseg.core.boundary import boundary
 from splatseg.errors import ShapeError
 from splatseg.lift.boundaries.cut import Cut, CutOptions
 from splatseg.lift.boundaries.geometry import axes_of, directions_of_normals, line_extent
@@ -13,6 +14,7 @@ from splatseg.lift.boundaries.split import split_along
 from splatseg.selection import box_corners
 
 
+@boundary
 def cut_box(
     gaussians: Gaussians,
     low: Sequence[float],

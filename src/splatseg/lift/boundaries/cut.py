@@ -29,6 +29,7 @@ from splatseg.core import (
     View,
     apply_rows,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.boundaries.geometry import (
     line_extent,
@@ -71,6 +72,7 @@ class CutOptions:
     Less takes more of what is near the boundary."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.parts not in MIXTURES:
             known = ", ".join(map(str, MIXTURES))
             raise RangeError(f"parts: expected one of {known}, got {self.parts}.")
@@ -125,6 +127,7 @@ class _InsideOutsideMaps:
         )
 
 
+@boundary
 def cut_masks(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -181,6 +184,7 @@ def cut_masks(
     )
 
 
+@boundary
 def cut_labels(
     gaussians: Gaussians,
     labels: Labels,

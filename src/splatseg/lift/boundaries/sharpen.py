@@ -42,6 +42,7 @@ from torch import Tensor
 
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, Gaussians, LabelMap, Labels, LabelSource, View, camera_of_map
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.fit import Exposure, FitOptions, Refinement
 from splatseg.lift.label_maps import label_map
@@ -81,6 +82,7 @@ class SharpenOptions:
     of a fit's end."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.sharpen_steps < 0:
             raise RangeError(f"sharpen_steps: expected 0 or more, got {self.sharpen_steps}.")
         if not (math.isfinite(self.label_weight) and self.label_weight >= 0):
@@ -111,6 +113,7 @@ class Sharpened:
     """Of the views that were learned from; empty without `FitOptions.exposure`."""
 
 
+@boundary
 def sharpen(
     gaussians: Gaussians,
     views: Sequence[View],

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core import Camera, Edited, Gaussians, Selection
+from splatseg.core.boundary import boundary
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.boundaries.geometry import (
@@ -39,6 +40,7 @@ _AXIS_TOLERANCE = 1e-9
 """Deviation from an axis, below which a direction is that axis."""
 
 
+@boundary
 def split(
     gaussians: Gaussians,
     selection: Selection,

@@ -34,6 +34,7 @@ from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_range
 from splatseg.core import UNLABELLED, Features, Gaussians, Labels
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.completion.graph import (
     NodeAttributes,
@@ -87,6 +88,7 @@ class CompletionOptions:
     winners are kept."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         for name in ("neighbours", "spread_steps", "smoothing_steps"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
@@ -102,6 +104,7 @@ class CompletionOptions:
         check_choice("completed_layer", self.completed_layer, ("as_given", "hard"))
 
 
+@boundary
 def complete(
     gaussians: Gaussians,
     labels: Labels,

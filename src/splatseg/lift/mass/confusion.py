@@ -43,6 +43,7 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_range
 from splatseg.core import UNLABELLED, Labels
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.completion.graph import ranked
 
@@ -77,6 +78,7 @@ class ConfusionOptions:
     pixels."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         for name in ("effective_views", "correlated_views", "diagonal_prior", "max_evidence"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -88,6 +90,7 @@ class ConfusionOptions:
 DEFAULT_CONFUSION = ConfusionOptions()
 
 
+@boundary
 def correct_confusion(
     labels: Labels,
     *,

@@ -37,6 +37,7 @@ from splatseg.core import (
     View,
     camera_of_map,
 )
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import LabelMass, RenderAdjoint, near_an_edge, voting_views
 from splatseg.lift.mass.decision import LabelRule, decide
@@ -101,6 +102,7 @@ class UpliftOptions:
     lost."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.candidates < 1:
             raise RangeError(f"candidates: expected at least 1, got {self.candidates}.")
         if not (math.isfinite(self.min_weight) and self.min_weight >= 0):
@@ -123,6 +125,7 @@ class UpliftOptions:
             )
 
 
+@boundary
 def uplift(
     gaussians: Gaussians,
     views: Sequence[View],

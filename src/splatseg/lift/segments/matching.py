@@ -29,6 +29,7 @@ from splatseg.core import (
     View,
     camera_of_map,
 )
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.label_maps import label_map
 from splatseg.lift.segments.table import reduced_segments
@@ -64,6 +65,7 @@ class MatchedMaps:
     backend: str = "auto"
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         check_range("min_overlap", self.min_overlap, 0.0, 1.0)
         if len(self.labels) != len(self.gaussians):
             raise ShapeError(

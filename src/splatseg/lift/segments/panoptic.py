@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, ClassTable, Gaussians, InstanceFacts, Labels, LayerInfo
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.neighbours import NeighbourIndex
 
@@ -31,6 +32,7 @@ _NEIGHBOURS = 12
 """Labelled Gaussians that a stray one asks."""
 
 
+@boundary
 def merge_panoptic(
     gaussians: Gaussians, instances: Labels, classes: Labels, table: ClassTable
 ) -> Labels:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from splatseg.core import LabelMap, MaskSet
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, PanopticEvidence, TrackedEvidence
 
@@ -19,6 +20,7 @@ class EvidenceSegments:
     evidence: Evidence
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.evidence.kind not in ("masks", "panoptic", "tracked"):
             raise InputError(
                 f"{self.evidence.folder}: expected segments of objects (masks, panoptic, "

@@ -7,7 +7,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg import _native
-from splatseg.errors import ShapeError
+from splatseg.core.boundary import boundary
+from splatseg.errors import RangeError, ShapeError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +62,10 @@ class RowAdam:
         max_steps: Steps that corrections are made for; later ones take those of the last.
     """
 
+    @boundary
     def __init__(self, constants: AdamConstants, *, max_steps: int) -> None:
+        if max_steps < 1:
+            raise RangeError(f"max_steps: expected at least 1, got {max_steps}.")
         self._constants = constants
         t = torch.arange(max_steps + 1, dtype=torch.float64).clamp_min(1)
         self._correction1 = (1 / (1 - constants.beta1**t)).float()

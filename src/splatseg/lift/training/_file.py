@@ -57,7 +57,7 @@ class TrainingFile:
             return
         begin = time.monotonic()
         try:
-            write_state(self._checkpoints.path, state, self._identity)
+            write_state(state, self._checkpoints.path, self._identity)
             self._written = state.step
         except OutputError as error:
             self._checkpoints.failed(without_checkpoint(error))

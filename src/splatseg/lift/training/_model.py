@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from splatseg.core.boundary import boundary
 from splatseg.lift.training._sampler import Batch
 
 
@@ -23,6 +24,7 @@ class Parameter:
     """Adam's learning rate, before the schedule."""
 
 
+@runtime_checkable
 class Model(Protocol):
     """What can be trained on rows of W.
 
@@ -62,6 +64,7 @@ class Values:
         differentiable: Whether gradients will be asked for.
     """
 
+    @boundary
     def __init__(
         self,
         row_values: Mapping[str, Tensor],

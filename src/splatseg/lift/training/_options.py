@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from splatseg._check import check_choice
+from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 
 Schedule = Literal["constant", "exponential", "cosine"]
@@ -60,6 +61,7 @@ class TrainingOptions:
     """What a score must exceed the best by to be better."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         for name in ("steps", "batch", "held_out_pixels", "score_every"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg._check import check_choice
+from splatseg._check import check_choice, check_range
 from splatseg.core import Camera, Gaussians, View, camera_of_map
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training._pixels import Sampling, draw_by_group, draw_uniformly
@@ -51,6 +52,7 @@ class SamplingOptions:
     """Where those files go; None is the system's folder for temporary files."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.pixels < 1:
             raise RangeError(f"pixels: expected at least 1, got {self.pixels}.")
         check_choice("sampling", self.sampling, get_args(Sampling))
@@ -116,6 +118,7 @@ class DrawnRows:
     lie in files.
     """
 
+    @boundary
     def __init__(self, store: RowStore, offsets: Sequence[int], count: int) -> None:
         self._store = store
         self._offsets = tuple(offsets)
@@ -213,6 +216,7 @@ class RowSampler:
         InputError: If there are no views, one comes twice, or one has nothing to learn.
     """
 
+    @boundary
     def __init__(
         self,
         gaussians: Gaussians,
@@ -345,11 +349,16 @@ class RowSampler:
         return found.to("cpu", dtype=torch.float16)
 
 
+@boundary
 def held_out_views(views: Sequence[View], share: float) -> tuple[list[View], list[View]]:
     """Training views, and those of them that are held out: evenly spaced by name.
 
     Of n views ``round(share * n)`` are held out, at most n - 1.
+
+    Raises:
+        RangeError: If the share is not in [0, 1].
     """
+    check_range("share", share, 0.0, 1.0)
     ordered = sorted(views, key=lambda view: view.name)
     count = min(math.floor(share * len(ordered) + 0.5), len(ordered) - 1)
     chosen = {(2 * k + 1) * len(ordered) // (2 * count) for k in range(count)}

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.core.recorded_options import differing_names, option_differences
 from splatseg.errors import FileFormatError, InputError, quoted
@@ -94,7 +95,7 @@ class TrainingState:
         return found
 
 
-def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -> None:
+def write_state(state: TrainingState, path: Path, identity: Mapping[str, Any]) -> None:
     """Write a training; what is there before stays until the new file is complete.
 
     Args:
@@ -117,7 +118,7 @@ def write_state(path: Path, state: TrainingState, identity: Mapping[str, Any]) -
         "best": bool(state.best_rows or state.best_shared),
     }
     arrays = {name: tensor.cpu().numpy() for name, tensor in state.arrays().items()}
-    write_checkpoint_file(path, header, arrays)
+    write_checkpoint_file(header, arrays, path)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,6 +132,7 @@ class TrainingSummary:
     """Steps at most."""
 
 
+@boundary
 def training_summary(path: Path) -> TrainingSummary:
     """Steps of a checkpoint. Reads nothing else.
 

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, LabelMap, MaskSet
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, ShapeError
 
 
@@ -25,6 +26,9 @@ class Ragged:
     """The rows' values, rows along the first axis."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
+        if self.starts.ndim != 1 or not self.values.ndim:
+            raise ShapeError("starts, values: expected starts of one axis and rows of values.")
         if not len(self.starts) or int(self.starts[0]) or int(self.starts[-1]) != len(self.values):
             raise ShapeError(
                 f"starts: expected to begin with 0 and end with {len(self.values)}, the number "
@@ -72,6 +76,7 @@ class PixelChoice:
     """Pixels that may be drawn, distinct."""
 
 
+@runtime_checkable
 class TargetSource(Protocol):
     """What there is to learn from each view."""
 
@@ -101,6 +106,7 @@ class TargetSource(Protocol):
         ...
 
 
+@runtime_checkable
 class LabelMaps(Protocol):
     """A source of label maps, such as `splatseg.io.evidence.Evidence`."""
 
@@ -114,6 +120,7 @@ class LabelMaps(Protocol):
         ...
 
 
+@runtime_checkable
 class MaskSets(Protocol):
     """A source of masks, such as `splatseg.io.evidence.Evidence`."""
 
@@ -122,7 +129,7 @@ class MaskSets(Protocol):
         """Views that have masks."""
         ...
 
-    def mask_set(self, name: str) -> MaskSet:
+    def masks(self, name: str) -> MaskSet:
         """The masks of a view."""
         ...
 
@@ -141,6 +148,7 @@ class LabelTargets:
         InputError: If no pixel of these views has a label.
     """
 
+    @boundary
     def __init__(self, evidence: LabelMaps, names: Sequence[str]) -> None:
         self._evidence = evidence
         self._names = tuple(sorted(names))
@@ -224,12 +232,13 @@ class MaskTargets:
         InputError: If these views have no mask with a pixel.
     """
 
+    @boundary
     def __init__(self, evidence: MaskSets, names: Sequence[str]) -> None:
         self._evidence = evidence
         self._names = tuple(sorted(names))
         digest, some = hashlib.sha256(), False
         for name in self._names:
-            masks = evidence.mask_set(name)
+            masks = evidence.masks(name)
             digest.update(repr((name, masks.height, masks.width)).encode())
             for mask in masks.masks:
                 digest.update(np.asarray(mask.counts, dtype=np.int64).tobytes())
@@ -250,19 +259,19 @@ class MaskTargets:
 
     def choice(self, name: str) -> PixelChoice:
         """All pixels."""
-        masks = self._evidence.mask_set(name)
+        masks = self._evidence.masks(name)
         everything = torch.arange(masks.height * masks.width)
         return PixelChoice(height=masks.height, width=masks.width, pixels=everything)
 
     def groups(self, name: str) -> Ragged:
         """Pixels, by mask."""
-        masks = self._evidence.mask_set(name)
+        masks = self._evidence.masks(name)
         inside = [torch.nonzero(masks.dense(i).reshape(-1)).squeeze(1) for i in range(len(masks))]
         return Ragged.of([pixels for pixels in inside if len(pixels)])
 
     def targets(self, name: str, pixels: Int64[Tensor, "p"]) -> Targets:
         """``masks`` of some pixels."""
-        masks = self._evidence.mask_set(name)
+        masks = self._evidence.masks(name)
         rows, columns = [pixels[:0]], [pixels[:0]]
         for index in range(len(masks)):
             row = torch.nonzero(masks.dense(index).reshape(-1)[pixels]).squeeze(1)

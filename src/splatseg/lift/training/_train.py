@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.core.interrupts import Interrupts, deferred_interrupts
 from splatseg.core.threads import one_torch_thread
@@ -77,6 +78,7 @@ class TrainingResult:
     """Whether all steps were done, or scores had got no better for the stated patience."""
 
 
+@boundary
 def train(
     model: Model,
     sampler: RowSampler,

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import FeatureMap
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.models import DeepFeatures, Image
 from splatseg.errors import InputError
 from splatseg.models.classical._boundary import one_thread
@@ -30,12 +31,14 @@ class DescriptorOptions:
     last."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.cell_size < 1:
             raise InputError(f"cell_size: expected at least 1, got {self.cell_size}.")
         if not self.reaches or min(self.reaches) <= 0:
             raise InputError(f"reaches: expected positive widths, got {self.reaches}.")
 
 
+@boundary
 def colour_gradient_features(
     image: Image, options: DescriptorOptions | None = None
 ) -> DeepFeatures:

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import MaskSet
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.models import Prompt
-from splatseg.errors import InputError
+from splatseg.errors import InputError, ShapeError
 from splatseg.models.classical._boundary import one_thread
 
 _SEED = 20240817
@@ -27,6 +28,7 @@ class GrabCutOptions:
     """Radius of the disc that a point stands for, as a share of the image's longest side."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.cut_rounds < 1:
             raise InputError(f"cut_rounds: expected at least 1, got {self.cut_rounds}.")
         if not 0 < self.point_radius < 0.5:
@@ -35,6 +37,7 @@ class GrabCutOptions:
             )
 
 
+@boundary
 def grab_cut(
     image: NDArray[np.uint8],
     prompt: Prompt,
@@ -62,6 +65,8 @@ def grab_cut(
 
     options = GrabCutOptions() if options is None else options
     height, width = size
+    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise ShapeError(f"image: expected shape (any, any, 3), got {image.shape}.")
     prompt.check_size(height, width)
     trimap = _trimap(image.shape[:2], prompt, size=size, options=options)
     sure = np.isin(trimap, (cv2.GC_FGD, cv2.GC_PR_FGD))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from splatseg._check import check_range
 from splatseg.core import UNLABELLED, LabelMap, MaskSet, Rle
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.models import Image
 from splatseg.errors import InputError
 from splatseg.io.images import reduced_size
@@ -37,6 +38,7 @@ class RegionOptions:
     """Masks smaller than this share of the image are dropped."""
 
     def __post_init__(self) -> None:
+        convert_fields(self)
         if self.working_size < 16:
             raise InputError(f"working_size: expected at least 16, got {self.working_size}.")
         if self.superpixel_size < 2:
@@ -47,6 +49,7 @@ class RegionOptions:
         check_range("min_area", self.min_area, 0.0, 1.0)
 
 
+@boundary
 def region_masks(image: Image, options: RegionOptions | None = None) -> MaskSet:
     r"""Nested masks of several granularities. A stand-in for a learned mask generator.
 
@@ -96,6 +99,7 @@ def region_masks(image: Image, options: RegionOptions | None = None) -> MaskSet:
     )
 
 
+@boundary
 def partition(masks: MaskSet, level: int) -> LabelMap:
     """The division of an image at one level of nested masks; an id is a mask's place plus 1.
 

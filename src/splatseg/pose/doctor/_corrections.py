@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core import Camera, PointCloud
+from splatseg.core.boundary import boundary
 
 Array = NDArray[np.float64]
 
@@ -18,6 +19,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 _SAME_FACTOR = 1e-6
 
 
+@boundary
 def axis_rotations(*, mirrored: bool = False) -> tuple[Array, ...]:
     """The 24 rotations that take axes to axes (or the 24 reflections), the simplest first."""
     found: list[Array] = []

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from splatseg.core import Capture, PointCloud
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.pose.doctor._corrections import CameraCorrection, PointCorrection, no_correction
 from splatseg.pose.doctor._diagnosis import Diagnosis, Fault
 from splatseg.pose.doctor._examine import MIN_MATCHES, examine, fits, photographs_of_points
@@ -29,7 +30,11 @@ class DoctorOptions:
     seed: int = 0
     """Of all drawing at random."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
 
+
+@boundary
 def diagnose(
     capture: Capture,
     *,
@@ -101,6 +106,7 @@ def _missing(capture: Capture) -> list[str]:
     return [f"{len(capture.missing)} photographs that the capture lists are not there ({first})."]
 
 
+@boundary
 def find_points(
     capture: Capture, cloud: PointCloud, *, options: DoctorOptions | None = None
 ) -> PointCorrection | None:

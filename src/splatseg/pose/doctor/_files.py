@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import Capture, PointCloud
+from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import is_json_number, json_matrix, json_number
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_folder, is_vacant
@@ -39,6 +40,7 @@ class Read:
     """Transforms of points that files of the capture mention."""
 
 
+@boundary
 def read_for_doctor(path: Path, *, format: str = "auto") -> Read:
     """Read a capture, one whose image sizes contradict its intrinsics included.
 
@@ -67,6 +69,7 @@ def read_for_doctor(path: Path, *, format: str = "auto") -> Read:
     return Read(capture=read_capture(path, format=format), declared=declared)
 
 
+@boundary
 def declared_transforms(folder: Path) -> tuple[PointCorrection, ...]:
     """Transforms that transforms.json and dataparser_transforms.json mention, and their inverses.
 
@@ -116,6 +119,7 @@ def similarity_from(matrix: object, scale: object, *, where: str) -> PointCorrec
     return PointCorrection(matrix=rotation, scale=factor * stretch, offset=(x, y, z))
 
 
+@boundary
 def write_corrected(diagnosis: Diagnosis, folder: Path) -> None:
     """Write the corrected capture as a new folder with a transforms.json.
 
@@ -145,10 +149,10 @@ def write_corrected(diagnosis: Diagnosis, folder: Path) -> None:
         if capture.points is not None:
             content = {"ply_file_path": _POINTS, **content}
             (temporary / _POINTS).write_bytes(ply_bytes(capture.points))
-        write_json(temporary / _TRANSFORMS, content)
+        write_json(content, temporary / _TRANSFORMS)
         metadata = _metadata(capture)
         if metadata:
-            write_json(temporary / "metadata.json", metadata)
+            write_json(metadata, temporary / "metadata.json")
 
 
 def ply_bytes(cloud: PointCloud) -> bytes:
@@ -234,7 +238,7 @@ def _read_with_sizes(
     elif beside is not None:
         changed["ply_file_path"] = str(root / beside)
     with tempfile.TemporaryDirectory() as temporary, made_from(folder):
-        write_json(Path(temporary) / _TRANSFORMS, changed)
+        write_json(changed, Path(temporary) / _TRANSFORMS)
         if (folder / "metadata.json").is_file():
             shutil.copy(folder / "metadata.json", temporary)
         capture = read_capture(Path(temporary), format="nerfstudio")

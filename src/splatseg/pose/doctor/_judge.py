@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import Capture
+from splatseg.core.boundary import boundary
 from splatseg.pose.doctor._corrections import (
     FLIP,
     CameraCorrection,
@@ -152,6 +153,7 @@ def point_fault(correction: PointCorrection, front: float) -> Fault:
     )
 
 
+@boundary
 def describe_move(correction: PointCorrection) -> str:
     """A correction of points in words, such as ``(x, y, z) -> (x, -z, y), times 0.001``."""
     parts: list[str] = []

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import View
+from splatseg.core.boundary import boundary
 from splatseg.io.images import load_image
 
 _FEATURES = 2500
@@ -77,6 +78,7 @@ def candidate_pairs(views: Sequence[View], chosen: Sequence[int]) -> list[tuple[
     return sorted((chosen[i], chosen[j]) for i, j in pairs)
 
 
+@boundary
 def match_views(
     views: Sequence[View],
     *,

@@ -1,0 +1,364 @@
+"""Arguments converted and checked as their annotations say, where callers come in.
+
+Shape, type and meaning of an argument stand in its annotation already; `boundary` reads them once
+for each public function, and `convert_fields` for each public class. Private code calls private
+code without either.
+
+    tensors     Float[Tensor, "n 3"]: tensors, arrays, lists of numbers, see `coerce`. A last axis
+                called ``channels`` may be left out where there is one; (H, W) is taken for
+                ``height width 3``, three times the same
+    numbers     int, float, bool: Python's, NumPy's, tensors of one
+    paths       Path: paths and text
+    values      any class: an instance of it
+    many        tuple, Sequence, Mapping: each of them, lists and arrays included
+    words       Literal: one of them
+"""
+
+import collections.abc
+import functools
+import inspect
+import os
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Literal, ParamSpec, TypeVar, Union, cast
+
+import numpy as np
+import torch
+from jaxtyping import AbstractArray
+from torch import Tensor
+
+from splatseg.core.coerce import (
+    Kind,
+    as_any_tensor,
+    as_array,
+    as_bool,
+    as_integer,
+    as_number,
+    as_path,
+    as_tensor,
+    as_text,
+    describe,
+)
+from splatseg.errors import InputError, ShapeError
+
+Converter = Callable[[str, Any], Any]
+P = ParamSpec("P")
+R = TypeVar("R")
+_SCALARS: dict[Any, Converter] = {
+    int: as_integer,
+    float: as_number,
+    bool: as_bool,
+    str: as_text,
+    Path: as_path,
+    Tensor: as_any_tensor,
+}
+_IMAGE = ("height", "width", "3")
+_MAPPINGS = (collections.abc.Mapping, dict)
+_MANY = (collections.abc.Sequence, collections.abc.Collection, collections.abc.Iterable, list)
+
+
+def boundary(function: Callable[P, R]) -> Callable[P, R]:
+    """Convert the arguments of a public function as its annotations say.
+
+    Raises:
+        InputError: When the function is called with an argument that cannot be what it should
+            be; the sentence names the argument, what was expected and what came.
+    """
+    names = tuple(inspect.signature(function).parameters)
+    found: dict[str, Converter] = {}
+    resolved = False
+
+    @functools.wraps(function)
+    def converted(*args: P.args, **kwargs: P.kwargs) -> R:
+        nonlocal resolved
+        if not resolved:
+            found.update(converters(function, names))
+            resolved = True
+        given: list[Any] = list(args)
+        for i, name in enumerate(names[: len(given)]):
+            if name in found:
+                given[i] = found[name](name, given[i])
+        for name in kwargs:
+            if name in found:
+                kwargs[name] = found[name](name, kwargs[name])
+        return function(*given, **kwargs)  # pyright: ignore[reportCallIssue]
+
+    return converted
+
+
+def convert_fields(value: Any) -> None:
+    """Convert the fields of a dataclass as their annotations say; first in its `__post_init__`.
+
+    Raises:
+        InputError: If a field cannot be what it should be.
+    """
+    for name, convert in _field_converters(type(value)):
+        given = getattr(value, name)
+        made = convert(name, given)
+        if made is not given:
+            object.__setattr__(value, name, made)
+
+
+@functools.cache
+def _field_converters(owner: type[Any]) -> tuple[tuple[str, Converter], ...]:
+    names = tuple(field.name for field in fields(owner))
+    return tuple(converters(owner, names).items())
+
+
+def converters(owner: Any, names: tuple[str, ...]) -> dict[str, Converter]:
+    """What converts each of the named arguments of a function or fields of a dataclass.
+
+    A converter takes the name, for the error, and the value. Names that may be anything have none.
+    """
+    # JSON's alias is text that names what the module of the annotation may not import.
+    known = {"JSON": object, "Sequence": Sequence, "Mapping": Mapping}
+    hints = typing.get_type_hints(owner, localns=known)
+    found = {name: _converter(hints[name]) for name in names if name in hints}
+    return {name: convert for name, convert in found.items() if convert is not None}
+
+
+def _converter(annotation: Any) -> Converter | None:
+    """What makes a value of an annotation, None where anything will do."""
+    if annotation in _SCALARS:
+        return _SCALARS[annotation]
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return _one_of(args)
+    if origin is Literal:
+        return functools.partial(_word, args)
+    if origin is np.ndarray:
+        return functools.partial(_array, _dtype_of(args))
+    if origin is os.PathLike:
+        return as_path
+    if origin is tuple:
+        return _tuple_of(args)
+    if origin in _MAPPINGS:
+        return functools.partial(_mapping, _converter(args[1]))
+    if origin in _MANY:
+        item = _converter(args[0])
+        lazy = origin is collections.abc.Iterable
+        return functools.partial(_iterable if lazy else _sequence, item)
+    if origin is collections.abc.Callable:
+        return _callable
+    if isinstance(annotation, type) and origin is None:
+        if issubclass(annotation, AbstractArray):
+            return _tensor_of(annotation)
+        return functools.partial(_instance, annotation) if _is_checkable(annotation) else None
+    return None
+
+
+def _is_checkable(annotation: type[Any]) -> bool:
+    if annotation in (object, Any):
+        return False
+    is_protocol = getattr(annotation, "_is_protocol", False)
+    return not is_protocol or getattr(annotation, "_is_runtime_protocol", False)
+
+
+def _instance(wanted: type[Any], name: str, value: Any) -> Any:
+    if isinstance(value, wanted):
+        return value
+    raise InputError(f"{name}: expected {_called(wanted)}, got {describe(value)}.")
+
+
+def _called(annotation: Any) -> str:
+    """An annotation in words."""
+    words = {
+        int: "a whole number",
+        float: "a number",
+        bool: "True or False",
+        str: "text",
+        Path: "a path",
+        Tensor: "a tensor",
+        type(None): "None",
+    }
+    if annotation in words:
+        return words[annotation]
+    if typing.get_origin(annotation) is Literal:
+        return f"one of {', '.join(str(word) for word in typing.get_args(annotation))}"
+    if isinstance(annotation, type) and issubclass(annotation, AbstractArray):
+        return "a tensor"
+    word = str(getattr(annotation, "__name__", annotation))
+    return f"{'an' if word[0] in 'AEIOU' else 'a'} {word}"
+
+
+def _one_of(members: tuple[Any, ...]) -> Converter | None:
+    """The first member that takes the value as it stands, else the first that can convert it."""
+    attempts = [(member, _converter(member)) for member in members if member is not type(None)]
+    if any(convert is None for _, convert in attempts):
+        return None
+    optional = type(None) in members
+    exact = tuple(m for m in members if isinstance(m, type) and _is_checkable(m))
+
+    def convert(name: str, value: Any) -> Any:
+        if value is None and optional:
+            return None
+        if len(attempts) == 1:
+            return cast(Converter, attempts[0][1])(name, value)
+        plain = tuple(m for m in exact if not issubclass(m, AbstractArray))
+        if isinstance(value, plain) and not isinstance(value, (bool, int, str, Tensor)):
+            return value
+        if isinstance(value, str) and str in plain:
+            if Path in members:
+                as_path(name, value)
+            return as_text(name, value)
+        if all(isinstance(m, type) and issubclass(m, AbstractArray) for m, _ in attempts):
+            value = as_tensor(name, value)
+        errors: list[InputError] = []
+        made: list[Any] = []
+        for _, attempt in attempts:
+            try:
+                made.append(cast(Converter, attempt)(name, value))
+            except InputError as error:
+                errors.append(error)
+        if made:
+            return next((one for one in made if one is value), made[0])
+        words = " or ".join(dict.fromkeys(_called(member) for member, _ in attempts))
+        raise InputError(f"{name}: expected {words}, got {describe(value)}.") from errors[0]
+
+    return convert
+
+
+def _word(words: tuple[Any, ...], name: str, value: Any) -> Any:
+    if isinstance(value, (str, int)) and value in words:
+        return value
+    shown = repr(value) if isinstance(value, str) else describe(value)
+    raise InputError(f"{name}: expected one of {', '.join(map(str, words))}, got {shown:.60}.")
+
+
+def _callable(name: str, value: Any) -> Any:
+    if callable(value):
+        return value
+    raise InputError(f"{name}: expected a function, got {describe(value)}.")
+
+
+def _mapping(item: Converter | None, name: str, value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{name}: expected a mapping, got {describe(value)}.")
+    given = cast(Mapping[Any, Any], value)
+    if item is None:
+        return given
+    made = {key: item(f"{name}[{describe(key)}]", one) for key, one in given.items()}
+    return given if all(made[key] is one for key, one in given.items()) else made
+
+
+def _iterable(item: Converter | None, name: str, value: Any) -> Any:
+    if isinstance(value, (collections.abc.Collection, Tensor, np.ndarray)):
+        return _sequence(item, name, value)
+    if isinstance(value, (str, bytes)) or not isinstance(value, collections.abc.Iterable):
+        raise InputError(f"{name}: expected a sequence, got {describe(value)}.")
+    given = cast(Any, value)
+    if item is None:
+        return given
+    return (item(f"{name}[{i}]", one) for i, one in enumerate(given))
+
+
+def _sequence(item: Converter | None, name: str, value: Any) -> Any:
+    given = _listed(name, value)
+    if item is None:
+        return given
+    made = [item(f"{name}[{i}]", one) for i, one in enumerate(given)]
+    same = all(new is old for new, old in zip(made, given, strict=True))
+    return given if same else tuple(made)
+
+
+def _listed(name: str, value: Any) -> Any:
+    """A sequence of Python's; arrays and tensors of one axis give their numbers."""
+    if isinstance(value, (Tensor, np.ndarray)):
+        tensor = as_tensor(name, value)
+        if tensor.ndim == 0:
+            raise InputError(f"{name}: expected a sequence, got {describe(value)}.")
+        return tensor.tolist() if tensor.ndim == 1 else tuple(tensor)
+    if isinstance(value, (str, bytes)) or not isinstance(value, collections.abc.Collection):
+        raise InputError(f"{name}: expected a sequence, got {describe(value)}.")
+    return cast(Any, value)
+
+
+def _tuple_of(args: tuple[Any, ...]) -> Converter:
+    if len(args) == 2 and args[1] is Ellipsis:
+        item = _converter(args[0])
+
+        def many(name: str, value: Any) -> Any:
+            made = _sequence(item, name, value)
+            return made if isinstance(made, tuple) else tuple(made)
+
+        return many
+    items = tuple(_converter(arg) for arg in args)
+
+    def fixed(name: str, value: Any) -> Any:
+        given = _listed(name, value)
+        if len(given) != len(items):
+            raise ShapeError(f"{name}: expected {len(items)} values, got {len(given)}.")
+        made = tuple(
+            one if item is None else item(f"{name}[{i}]", one)
+            for i, (item, one) in enumerate(zip(items, given, strict=True))
+        )
+        same = isinstance(given, tuple) and all(
+            new is old for new, old in zip(made, cast(Any, given), strict=True)
+        )
+        return cast(Any, given) if same else made
+
+    return fixed
+
+
+def _array(dtype: "np.dtype[Any] | None", name: str, value: Any) -> Any:
+    if isinstance(value, np.ndarray) and (dtype is None or value.dtype == dtype):
+        return cast(Any, value)
+    return as_array(name, value, dtype)
+
+
+def _dtype_of(args: tuple[Any, ...]) -> "np.dtype[Any] | None":
+    """The element type of ``NDArray[X]``, None for any."""
+    inner: tuple[Any, ...] = typing.get_args(args[1]) if len(args) > 1 else ()
+    known = bool(inner) and isinstance(inner[0], type) and inner[0] is not np.generic
+    return np.dtype(inner[0]) if known else None
+
+
+def _tensor_of(annotation: Any) -> Converter | None:
+    if annotation.array_type is not Tensor:
+        return None
+    kind = _kind_of(annotation.dtypes)
+    axes = tuple(annotation.dim_str.split())
+    is_image = axes == _IMAGE and kind == "byte"
+    signal = kind == "float" and axes[-1:] == ("channels",)
+    fixed = not any(axis.startswith(("*", "#", "...")) for axis in axes)
+
+    def convert(name: str, value: Any) -> Tensor:
+        tensor = as_tensor(name, value, "any" if signal else kind)
+        if signal:
+            # Blended ids would be ids of other things.
+            if tensor.numel() and not tensor.is_floating_point() and tensor.dtype != torch.bool:
+                raise InputError(
+                    f"{name}: expected floating-point values, got {tensor.dtype}; pass x.float() "
+                    "if these are no ids, x / 255 for pixels."
+                )
+            tensor = as_tensor(name, tensor, kind)
+        if axes and fixed and not tensor.ndim:
+            shown = ", ".join(axis if axis.isdecimal() else "any" for axis in axes)
+            raise ShapeError(f"{name}: expected shape ({shown}), got ().")
+        if fixed and axes and tensor.ndim == len(axes) - 1 > 0:
+            if axes[-1] == "channels":
+                return tensor.unsqueeze(-1)
+            if is_image:
+                tensor = tensor.unsqueeze(-1).expand(*tensor.shape, 3)
+        if is_image and (tensor.ndim != 3 or tensor.shape[2] != 3 or not tensor.numel()):
+            raise ShapeError(
+                f"{name}: expected an image (height, width, 3) of at least a pixel, "
+                f"got {tuple(tensor.shape)}."
+            )
+        return tensor
+
+    return convert
+
+
+def _kind_of(dtypes: Any) -> Kind:
+    names = [str(dtype) for dtype in dtypes] if isinstance(dtypes, (list, tuple)) else []
+    if names == ["uint8"]:
+        return "byte"
+    for start, kind in (("float", "float"), ("bfloat", "float"), ("bool", "bool")):
+        if names and all(name.startswith((start, "bfloat")) for name in names):
+            return cast(Kind, kind)
+    whole = names and all(name.startswith(("int", "uint")) for name in names)
+    return "integer" if whole else "any"
