@@ -238,11 +238,11 @@ def test_compressed_ply_headers(golden: Path, tmp_path: Path) -> None:
     edited(b"uint packed_color", b"float packed_color", "'packed_color' of type uint32")
     edited(b"uint packed_scale", b"uint packed_size", "'packed_scale' of type uint32")
     edited(b"float min_x", b"float mix_x", "expected the columns 'min_x' of type float32")
-    edited(b"float max_b", b"int max_b", "expected the columns max_b of type float32")
+    edited(b"float max_b", b"int max_b", "expected the columns 'max_b' of type float32")
     edited(b"chunk 1\n", b"chunk 2\n", "expected 1 chunks for 3 Gaussians, got 2", b"\0" * 72)
     more_rows = "3 rows of 9, 24 or 45 harmonics, got 4 rows of 9"
     edited(b"element sh 3", b"element sh 4", more_rows, b"\0" * 9)
-    edited(b"uchar f_rest_8", b"uchar f_rest_9", "expected the columns f_rest_8 of type uint8")
+    edited(b"uchar f_rest_8", b"uchar f_rest_9", "expected the columns 'f_rest_8' of type uint8")
     swapped = whole.replace(b"f_rest_7", b"f_rest_X").replace(b"f_rest_8", b"f_rest_7")
     swapped = swapped.replace(b"f_rest_X", b"f_rest_8")
     refused(tmp_path / "a.ply", swapped, "expected the harmonics f_rest_0, ... in order")
