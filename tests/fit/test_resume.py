@@ -304,8 +304,8 @@ def test_a_file_that_is_no_whole_checkpoint_says_so(capture: Capture, path: Path
         assert str(caught.value).startswith(f"{path}: ")
         return str(caught.value)
 
-    assert "got a damaged file or another format" in refused(b"")
-    assert "got a damaged file or another format" in refused(b"not an archive")
+    assert "the checkpoint of a fit, but it cannot be read" in refused(b"")
+    assert "the checkpoint of a fit, but it cannot be read" in refused(b"not an archive")
     rng = np.random.default_rng(2)
     for cut in rng.integers(1, len(good), 12):
         refused(good[:cut])

@@ -258,8 +258,8 @@ def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         raise FileFormatError(f"{path}: expected a layer, got {quoted(header.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
-            f"{path}: expected a layer of version {VERSION} or less, got version "
-            f"{quoted(version)}; a later splatseg wrote it."
+            f"{path}: expected a layer of version {VERSION} or less, "
+            f"got version {quoted(version)}; a later splatseg wrote it."
         )
     header["count"] = json_integer(count, where=f"{path}: count")
     return header

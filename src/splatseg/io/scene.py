@@ -323,8 +323,8 @@ def _scene_content(root: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path}: expected a scene, got {quoted(content.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
-            f"{path}: expected a scene of version {VERSION} or less, got version "
-            f"{quoted(version)}; a later splatseg wrote it."
+            f"{path}: expected a scene of version {VERSION} or less, "
+            f"got version {quoted(version)}; a later splatseg wrote it."
         )
     json_integer(content.get("gaussians"), where=f"{path}: gaussians")
     return content

@@ -251,7 +251,7 @@ def test_buffers_in_files_beside(golden: Path, tmp_path: Path) -> None:
     document["buffers"][0]["uri"] = "a%20b.bin"
     assert len(read_splats(written(tmp_path, document))) == 3
     document["buffers"][0]["uri"] = "c.bin"
-    with pytest.raises(MissingFileError, match=r"c\.bin: no such file, but a\.gltf names it"):
+    with pytest.raises(MissingFileError, match=r"no such file as 'c\.bin', which a\.gltf names"):
         read_splats(written(tmp_path, document))
     for uri in ("../x.bin", "/etc/hostname", "file:///etc/hostname", "https://host/x", "C:x"):
         document["buffers"][0]["uri"] = uri
@@ -313,7 +313,10 @@ REST = "KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"
         (set_in("accessors", 0, "type", value="MAT4"), "SCALAR, VEC2, VEC3 or VEC4"),
         (set_in("accessors", 1, "type", value="VEC3"), r"shape \(3, 4\) of the attribute ROTATION"),
         (set_in("accessors", 0, "count", value=2), r"expected the shape \(2, 4\)"),
-        (set_in("accessors", 0, "count", value=10**12), "expected 12000000000000 bytes"),
+        (
+            set_in("accessors", 0, "count", value=10**12),
+            "1000000000000 Gaussians, which is 236000 GB",
+        ),
         (set_in("accessors", 0, "sparse", value={}), "got a sparse accessor"),
         (lambda d: d["accessors"][0].pop("bufferView"), "compressed or empty accessor"),
         (set_in("accessors", 0, "byteOffset", value=4), "expected 40 bytes for accessors.0."),

@@ -212,8 +212,8 @@ def _header(folder: Path) -> dict[str, Any]:
         raise FileFormatError(f"{path}: expected evidence, got {quoted(header.get('format'))}.")
     if not 1 <= version <= VERSION:
         raise FileFormatError(
-            f"{path}: expected evidence of version {VERSION} or less, got version "
-            f"{quoted(version)}; a later splatseg wrote it."
+            f"{path}: expected evidence of version {VERSION} or less, "
+            f"got version {quoted(version)}; a later splatseg wrote it."
         )
     return header
 
