@@ -2,6 +2,7 @@
 
 import inspect
 import typing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -387,7 +388,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "methods.Method.run": method.run,
         "methods.Method.evidence": ("labels",),
         "methods.keeps_ids.method": "uplift",
-        "methods.register_method.method": method,
+        "methods.register_method.method": replace(method, name="own"),
         "methods.methods_table.methods": methods(),
         "models.record_evidence.model": find_model("classical"),
         "models.record_evidence.folder": world.path(),
