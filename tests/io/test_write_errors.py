@@ -13,7 +13,7 @@ from splatseg.errors import InputError, OutputError
 from splatseg.io.atomic import atomic_file, atomic_folder
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.npz_writing import unfinished, write_checkpoint_file
-from splatseg.io.write_errors import write_failure
+from splatseg.io.write_errors import failure_to_write
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def small_files():
 
 @pytest.mark.parametrize("number", [28, 122, 13, 30, 36])
 def test_each_reason_says_what_to_do(number: int) -> None:
-    sentence = write_failure("a.ply", OSError(number, os.strerror(number)))
+    sentence = failure_to_write("a.ply", OSError(number, os.strerror(number)))
     assert sentence.startswith("a.ply: cannot be written: ")
     assert any(word in sentence for word in ("free some space", "choose a"))
 

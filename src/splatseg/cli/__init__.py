@@ -265,11 +265,11 @@ def _unknown(name: str) -> str:
 
 def _report_system(error: OSError, *, debug: bool) -> int:
     """An error of the system: one of writing says what to do."""
-    from splatseg.io.write_errors import is_write_failure, write_failure
+    from splatseg.io.write_errors import failure_to_write, is_write_failure
 
     sentence = f"{type(error).__name__}: {error} (add --debug for the traceback)"
     if is_write_failure(error):
-        sentence = write_failure(error.filename or "the standard output", error)
+        sentence = failure_to_write(error.filename or "the standard output", error)
     if error.filename is None:
         silence(sys.stdout)
     return _report(error, sentence, status=EXIT_FAILED, debug=debug)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.file_locks import try_lock
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 
 TEMPORARY = ".splatseg-"
 """How the names of files and folders begin that are ours and not the user's."""
@@ -57,7 +57,7 @@ def atomic_file(path: str | os.PathLike[str], *, durable: bool = False) -> Gener
     target = _checked_target(path)
     if target.is_dir():
         raise InputError(f"{target}: expected a file to write, got a folder.")
-    with hidden_folder(target) as holder, write_failures_named(target, within=holder):
+    with hidden_folder(target) as holder, named_write_failures(target, within=holder):
         temporary = holder / target.name
         yield temporary
         if not temporary.is_file():
@@ -90,7 +90,7 @@ def atomic_folder(path: str | os.PathLike[str], *, durable: bool = False) -> Gen
     target = _checked_target(path)
     if target.exists() and not target.is_dir():
         raise InputError(f"{target}: expected a folder to write, got a file.")
-    with hidden_folder(target) as holder, write_failures_named(target, within=holder):
+    with hidden_folder(target) as holder, named_write_failures(target, within=holder):
         temporary = holder / target.name
         temporary.mkdir()
         yield temporary
@@ -108,7 +108,7 @@ def hidden_folder(target: Path) -> Generator[Path]:
     Raises:
         OutputError: If none can be made there.
     """
-    with write_failures_named(target):
+    with named_write_failures(target):
         holder = Path(tempfile.mkdtemp(prefix=f"{TEMPORARY}{os.getpid()}-", dir=target.parent))
     handle = _locked(holder)
     try:

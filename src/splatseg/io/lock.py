@@ -19,7 +19,7 @@ from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import TEMPORARY, is_running
 from splatseg.io.file_locks import try_lock
 from splatseg.io.json_files import parse_object
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 
 LOCK_FILE = f"{TEMPORARY}lock"
 
@@ -76,7 +76,7 @@ def scene_lock(root: Path, work: str) -> Generator[None]:
         finally:
             _held[key] -= 1
         return
-    with write_failures_named(root):
+    with named_write_failures(root):
         handle = _taken(root / LOCK_FILE)
     _held[key] = 1
     try:

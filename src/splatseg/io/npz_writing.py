@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splatseg.io.atomic import sync
 from splatseg.io.json_files import json_text
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 
 HEADER = "header"
 """Name of the entry that holds the header, JSON as bytes of UTF-8."""
@@ -53,7 +53,7 @@ def write_checkpoint_file(
         OutputError: If it cannot be written; the one before is still there.
     """
     new = unfinished(path)
-    with write_failures_named(path):
+    with named_write_failures(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             save_arrays(header, arrays, new, name=path)

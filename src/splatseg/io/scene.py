@@ -53,7 +53,7 @@ from splatseg.io.scene_folder import (
     scene_path,
 )
 from splatseg.io.splats import read_splats, write_splats
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 
 FORMAT = "splatseg-scene"
 VERSION = 1
@@ -257,14 +257,14 @@ def _check_layer(name: str, layer: Layer, count: int) -> None:
 def _replace(scene: Scene, root: Path, layers: Mapping[str, Layer]) -> None:
     """Write over a scene: from one rename on, the new files count."""
     finish_pending(root)
-    with hidden_folder(root / PENDING) as holder, write_failures_named(root, within=holder):
+    with hidden_folder(root / PENDING) as holder, named_write_failures(root, within=holder):
         new = holder / "scene"
         new.mkdir()
         _write(scene, new, layers, final=root)
         sync_tree(new)
         new.replace(root / PENDING)
         sync(root)
-    with write_failures_named(root):
+    with named_write_failures(root):
         finish_pending(root)
 
 

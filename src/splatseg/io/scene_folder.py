@@ -9,7 +9,7 @@ from pathlib import Path
 from splatseg.io.atomic import TEMPORARY, check_writable, sweep
 from splatseg.io.lock import scene_lock
 from splatseg.io.paths import path_inside
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 
 SCENE_FILE = "scene.json"
 GAUSSIANS_FILE = "gaussians.ply"
@@ -33,7 +33,7 @@ def scene_path(root: Path, *names: str) -> Path:
         InputError: If a link leads out of the scene.
         OutputError: If there is no permission.
     """
-    with write_failures_named(root.joinpath(*names)):
+    with named_write_failures(root.joinpath(*names)):
         return path_inside(root, *names)
 
 
@@ -53,7 +53,7 @@ def work_on_scene(root: Path, work: str, *, writes: Sequence[str] = ()) -> Gener
         OutputError: If the folder cannot be written to.
     """
     with scene_lock(root, work):
-        with write_failures_named(root):
+        with named_write_failures(root):
             _clear(root)
         for name in writes:
             check_writable(scene_path(root, name, "file").parent)

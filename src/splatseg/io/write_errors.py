@@ -21,11 +21,11 @@ _WHAT_TO_DO = {
 _OF_NO_FILE = (ConnectionError, ChildProcessError, ProcessLookupError, TimeoutError)
 
 
-def write_failure(path: Path | str, error: OSError) -> str:
+def failure_to_write(path: Path | str, error: OSError) -> str:
     """The sentence: what cannot be written, why, and what to do.
 
     Example:
-        >>> write_failure("a.ply", OSError(28, "No space left on device"))
+        >>> failure_to_write("a.ply", OSError(28, "No space left on device"))
         'a.ply: cannot be written: the disk is full; free some space and give the command again.'
     """
     reason = _WHAT_TO_DO.get(error.errno or 0, error.strerror or str(error))
@@ -38,7 +38,7 @@ def is_write_failure(error: OSError) -> bool:
 
 
 @contextmanager
-def write_failures_named(path: Path, *, within: Path | None = None) -> Generator[None]:
+def named_write_failures(path: Path, *, within: Path | None = None) -> Generator[None]:
     """Turn what the system says of writing in the block into an `OutputError`.
 
     Errors about other files than those below `within`, and our own, go through as they are.
@@ -54,7 +54,7 @@ def write_failures_named(path: Path, *, within: Path | None = None) -> Generator
     except OSError as error:
         if not _is_of(error, path, within):
             raise
-        raise OutputError(write_failure(path, error)) from error
+        raise OutputError(failure_to_write(path, error)) from error
 
 
 def _is_of(error: OSError, path: Path, within: Path | None) -> bool:

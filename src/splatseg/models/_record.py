@@ -17,7 +17,7 @@ from splatseg.errors import InputError
 from splatseg.io.atomic import TEMPORARY, hidden_folder, is_vacant, replace_folder, sweep
 from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header, view_files
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 from splatseg.models._cache import ModelCache
 from splatseg.models._computed import computed
 from splatseg.models._copied import copied
@@ -184,7 +184,7 @@ def _work_folder(target: Path, source: Source, *, overwrite: bool) -> Generator[
             shutil.rmtree(folder, ignore_errors=True)
         raise
     if folder == beside:
-        with hidden_folder(target) as holder, write_failures_named(target):
+        with hidden_folder(target) as holder, named_write_failures(target):
             beside.replace(holder / target.name)
             replace_folder(holder / target.name, target, holder / "previous")
     shutil.rmtree(beside, ignore_errors=True)

@@ -11,7 +11,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.io.export import write_node_table
 from splatseg.io.scene_folder import scene_path
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.segment_report import SegmentationRun, write_segmentation_report
@@ -72,7 +72,7 @@ def export_layer(
     field = GaussianField(scene.gaussians, {name: layer}, backend=backend)
     of_files: Layer = field.labels(name) if isinstance(layer, Features) else layer
     folder = scene_path(root, EXPORTS_FOLDER, name)
-    with write_failures_named(folder):
+    with named_write_failures(folder):
         folder.mkdir(exist_ok=True)
     layers: Mapping[str, Layer] = {name: of_files}
     files: list[Exported] = []

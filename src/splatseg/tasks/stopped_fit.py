@@ -8,7 +8,7 @@ from splatseg.errors import FileFormatError, InputError
 from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
 from splatseg.io.scene import CHECKPOINT_FILE, is_scene
 from splatseg.io.scene_folder import work_on_scene
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.new_scene import check_replaceable_scene
 
@@ -52,11 +52,11 @@ def fit_folder(root: Path) -> Generator[None]:
         OutputError: If it cannot be made.
     """
     checkpoints = (root / CHECKPOINT_FILE).parent
-    with write_failures_named(root):
+    with named_write_failures(root):
         root.mkdir(exist_ok=True)
     try:
         with work_on_scene(root, "fit", writes=("reports",) if is_scene(root) else ()):
-            with write_failures_named(checkpoints):
+            with named_write_failures(checkpoints):
                 # It says that the folder is that of a fit, should this process be killed.
                 checkpoints.mkdir(exist_ok=True)
             yield

@@ -31,7 +31,7 @@ from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE
 from splatseg.io.images import save_png, write_png
 from splatseg.io.json_files import json_text, write_json
 from splatseg.io.paths import path_inside
-from splatseg.io.write_errors import write_failures_named
+from splatseg.io.write_errors import named_write_failures
 
 _WRITTEN = ("labels", "panoptic", "tracked", "masks", "features")
 _MAX_ID = 65535
@@ -75,7 +75,7 @@ def create_evidence(
     json_text("metadata", header)
     if not folder.parent.is_dir():
         raise MissingFileError(f"{folder}: expected an existing folder to write in.")
-    with write_failures_named(folder):
+    with named_write_failures(folder):
         folder.mkdir(exist_ok=True)
     write_json(header, path_inside(folder, HEADER_FILE))
     return folder
@@ -201,7 +201,7 @@ def save_features(features: FeatureMap, folder: Path | str, name: str) -> None:
 def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Path:
     check_view_name(name)
     path = folder / f"{name}{suffix}"
-    with write_failures_named(path):
+    with named_write_failures(path):
         return path_inside(folder, f"{name}{suffix}", make=make)
 
 
