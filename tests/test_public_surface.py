@@ -80,6 +80,7 @@ PACKAGES = {
     "core",
     "edit",
     "evaluate",
+    "selection",
     "fit",
     "importing",
     "io",

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from splatseg import pose as pose
     from splatseg import render as render
     from splatseg import report as report
+    from splatseg import selection as selection
     from splatseg import synthetic as synthetic
     from splatseg import tasks as tasks
     from splatseg.core import Camera as Camera
@@ -126,6 +127,7 @@ _PACKAGES = frozenset(
         "core",
         "edit",
         "evaluate",
+        "selection",
         "fit",
         "importing",
         "io",

@@ -46,7 +46,7 @@ def test_one_line_of_other_layouts(capsys, generated_room, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        (".", "splat files (1 compressed.ply, 2 gltf, 1 ply, 2 sog, 1 splat, 3 spz)"),
+        (".", "splat files (1 compressed.ply, 2 gltf, 1 ksplat, 1 ply, 2 sog, 1 splat, 3 spz)"),
         ("three.splat", "3 Gaussians, harmonics of degree 0"),
         ("three.ply", "ply splats, 3 Gaussians, harmonics of degree 1"),
         ("three.v2.sog", "sog splats, 3 Gaussians"),

@@ -73,11 +73,11 @@ def test_a_header_without_views_bars_nobody(small, splatseg) -> None:
         path.unlink()
     header["metadata"]["complete"] = False
     write_json(header, folder / "evidence.json")
-    status, _, err = splatseg("see", small.scene, *SEE, "--least-area", "0.02")
+    status, _, err = splatseg("see", small.scene, *SEE, "--min-area", "0.02")
     assert status == 0, err
     found = evidence_header(folder)
     assert found is not None
-    assert found["metadata"]["settings"]["regions"]["least_area"] == 0.02
+    assert found["metadata"]["settings"]["regions"]["min_area"] == 0.02
 
 
 @pytest.mark.parametrize("ending", [KeyboardInterrupt, FileFormatError])

@@ -193,7 +193,17 @@ def test_export_writes_the_level_that_is_asked_for(treed, run, tmp_path) -> None
 
 def test_edit_takes_a_part_and_the_tree_stays_in_step(treed, run, tmp_path) -> None:
     before = tree_in(treed.scene)
-    words = ("--remove", "--layer", "things@part", "--names", "upper", "--cut", "off")
+    words = (
+        "--remove",
+        "--layer",
+        "things@part",
+        "--names",
+        "upper",
+        "--cut",
+        "off",
+        "--specks",
+        0,
+    )
     run("edit", treed.scene, "-o", tmp_path / "bare", *words)
     after = tree_in(tmp_path / "bare")
     assert after.nodes == before.nodes

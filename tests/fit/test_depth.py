@@ -131,7 +131,7 @@ def test_what_a_depth_map_may_be(tmp_path: Path) -> None:
     with pytest.raises(MissingFileError):
         load_depth(replace(view, depth=tmp_path / "none.npy"))
     (tmp_path / "bad.npy").write_bytes(b"no array")
-    with pytest.raises(FileFormatError, match="cannot be read as an array"):
+    with pytest.raises(FileFormatError, match="expected an array of NumPy"):
         load_depth(replace(view, depth=tmp_path / "bad.npy"))
     with pytest.raises(InputError, match="a view with a depth map"):
         load_depth(replace(view, depth=None))

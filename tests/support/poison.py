@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
-from splatseg import core, edit, evaluate, synthetic
+from splatseg import core, edit, evaluate, selection, synthetic
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, Similarity, View
 from splatseg.lift import GaussianField
 
@@ -157,6 +158,7 @@ def valid(world: World) -> dict[str, Any]:
     info = core.LayerInfo()
     splat = world.folder / "scene" / "gaussians.ply"
     image = torch.zeros(HEIGHT, WIDTH, 3)
+    where = selection.Where(layer="things", ids=(1,))
     overlaps = evaluate.Overlaps(pairs=torch.tensor([[1, 1]]), counts=torch.tensor([4]))
     capture = core.Capture(path=world.folder, format="test", views=world.views)
     rle = core.Rle.encode(mask)
@@ -190,8 +192,10 @@ def valid(world: World) -> dict[str, Any]:
         evaluate.Overlaps: overlaps,
         evaluate.Confusion: evaluate.Confusion.of(ids, ids),
         edit.Document: edit.Document(scene=scene, layers={"things": world.labels}),
-        edit.Operation: edit.Operation(kind="remove", where=edit.Where(layer="things", ids=(1,))),
-        edit.Where: edit.Where(layer="things", ids=(1,)),
+        edit.Operation: edit.Operation(
+            kind="remove", where=selection.Where(layer="things", ids=(1,))
+        ),
+        selection.Where: where,
         synthetic.SyntheticScene: world.room,
         Path: splat,
         str: "things",
@@ -270,6 +274,9 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "render.contributors.k": 1,
         "io.images.write_png.array": np.zeros((3, 3), np.uint8),
         "io.images.write_png.path": world.folder / "made.png",
+        "io.evidence.save_render.image": torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8),
+        "io.images.check_pixels.where": "a.png",
+        "io.images.check_pixels.image": Image.new("RGB", (4, 4)),
         "io.images.save_png.path": world.folder / "made.png",
         "io.splats.write_splats.path": world.folder / "made.ply",
         "io.splats.write_splats.format": None,

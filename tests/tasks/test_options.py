@@ -45,7 +45,7 @@ QUICK = FitOptions(minutes=None, steps=6, max_gaussians=300)
         (DemoOptions, {"width": 31}, "width: expected at least 32"),
         (EditOptions, {}, "expected something to do"),
         (EditOptions, {"remove": True, "undo": True}, "remove, undo: expected one of the two"),
-        (EditOptions, {"remove": True}, "remove: expected `layer` or `box`"),
+        (EditOptions, {"remove": True}, "remove: expected `layer`, `box` or another condition"),
         (EditOptions, {"undo": True, "layer": "x"}, "undo: takes no selection"),
         (EditOptions, {"undo": True, "scale": 2.0}, "undo: takes no `move`"),
         (EditOptions, {"undo": True, "flat_colour": True}, "undo: takes no colours"),

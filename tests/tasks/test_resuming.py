@@ -23,7 +23,7 @@ from splatseg.tasks import (
     MakeSceneOptions,
     SegmentOptions,
     describe,
-    make_scene,
+    fit_capture,
     save_segmentation,
     segment,
 )
@@ -190,7 +190,7 @@ def test_a_stopped_training_is_not_lost_by_accident(scene, straight) -> None:
 def test_a_damaged_checkpoint(scene) -> None:
     path = stop(scene)
     path.write_bytes(b"none")
-    with pytest.raises(FileFormatError, match="damaged or none"):
+    with pytest.raises(FileFormatError, match="expected the checkpoint of a training"):
         run(scene, checkpoints=GOING_ON)
     with pytest.raises(InputError, match="cannot be read; `overwrite` begins again"):
         run(scene)
@@ -309,12 +309,12 @@ def test_what_is_refused_is_not_said_to_go_on(scene, small_room, tmp_path) -> No
     often = MakeSceneOptions(checkpoint_steps=5)
     stopping = Stopping("fit", after=8)
     with pytest.raises(Cancelled):
-        make_scene(
+        fit_capture(
             small_room, tmp_path / "new", fit_options=fit_options, options=often, observer=stopping
         )
     hearing = Stopping()
     with pytest.raises(InputError, match="seed 0 instead of 1"):
-        make_scene(
+        fit_capture(
             small_room,
             tmp_path / "new",
             fit_options=replace(fit_options, seed=1),

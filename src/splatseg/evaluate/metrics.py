@@ -164,6 +164,7 @@ def semantic_score(confusion: Confusion) -> SemanticScore:
     )
 
 
+@boundary
 def matched_miou(confusion: Confusion) -> float:
     """Mean IoU over the true classes once each was matched with another class of the layer.
 

@@ -1,9 +1,12 @@
 """How many steps make sense for a capture."""
 
+from splatseg.core.boundary import boundary
+
 _LEAST = 1000
 _A_VIEW = 20
 
 
+@boundary
 def sensible_steps(train_views: int) -> int:
     """Steps below which a fit of so many training views is too short to be judged.
 

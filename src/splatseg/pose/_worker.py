@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from splatseg.io.json_files import read_json
 from splatseg.pose._model import Model, finish_model, model_facts
 from splatseg.pose._pairs import (
     all_pairs,
@@ -51,7 +50,7 @@ def main() -> int:
     _end_with_parent()
     # Warnings of COLMAP go to the standard error stream, which the parent keeps in a file.
     pycolmap.logging.minloglevel = 1
-    job = read_json(Path(sys.argv[1]))
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
     result = Job(job).run()
     out = Path(job["result"])
     temporary = out.with_suffix(".tmp")

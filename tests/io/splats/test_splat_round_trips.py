@@ -268,8 +268,8 @@ def test_names_and_formats(make_splats: Make, tmp_path: Path) -> None:
     g = make_splats(2, degree=0)
     with pytest.raises(InputError, match=r"a\.obj: expected a name that ends in \.ply"):
         write_splats(g, tmp_path / "a.obj")
-    with pytest.raises(InputError, match=r"format: expected one of .*got 'sog'"):
-        write_splats(g, tmp_path / "a.sog", format="sog")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"format: expected one of .*got 'ksplat'"):
+        write_splats(g, tmp_path / "a.ksplat", format="ksplat")  # type: ignore[arg-type]
     with pytest.raises(MissingFileError, match="nowhere is missing"):
         write_splats(g, tmp_path / "nowhere" / "a.ply")
     write_splats(g, tmp_path / "a.COMPRESSED.PLY")

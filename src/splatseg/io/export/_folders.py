@@ -31,6 +31,7 @@ def check_replaceable(path: Path, record: str) -> None:
         )
 
 
+@boundary
 def check_parent(path: Path) -> None:
     """Raise `InputError` unless `path` can be written: its folder is there, and lets us.
 
