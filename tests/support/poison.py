@@ -275,8 +275,6 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "io.images.write_png.array": np.zeros((3, 3), np.uint8),
         "io.images.write_png.path": world.folder / "made.png",
         "io.evidence.save_render.image": torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8),
-        "io.images.check_pixels.where": "a.png",
-        "io.images.check_pixels.image": Image.new("RGB", (4, 4)),
         "io.images.save_png.path": world.folder / "made.png",
         "io.splats.write_splats.path": world.folder / "made.ply",
         "io.splats.write_splats.format": None,

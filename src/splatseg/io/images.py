@@ -246,14 +246,14 @@ def open_image(path: Path) -> Image.Image:
             f"{OPTION} with a larger size than {FREE} bytes reads it."
         ) from error
     try:
-        check_pixels(path, image, packed=size)
+        _check_pixels(path, image, packed=size)
     except FileFormatError:
         image.close()
         raise
     return image
 
 
-def check_pixels(where: object, image: Image.Image, *, packed: int) -> None:
+def _check_pixels(where: object, image: Image.Image, *, packed: int) -> None:
     """Refuse a picture whose pixels would take more than a file of its size may unpack to.
 
     Args:
