@@ -150,7 +150,7 @@ def test_after_ctrl_c_a_second_run_works(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(demo_task, "export", stop)
+        patch.setattr(demo_task, "export_scene", stop)
         assert main(["demo", "-o", str(earlier), *SMALL]) == 1
     assert "interrupted" in capsys.readouterr().err
     assert json.loads((earlier / "demo.json").read_text())["finished"] is False

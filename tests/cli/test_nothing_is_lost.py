@@ -153,8 +153,13 @@ def test_signals_end_a_see_half_way(small, splatseg, monkeypatch, number) -> Non
         return masks(self, image)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Classical, "masks", slow)
+    # What a shell starts in the background ignores Ctrl-C, and tests may run there.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     began = time.monotonic()
-    status, _, err = splatseg("see", small.scene, *SEE)
+    try:
+        status, _, err = splatseg("see", small.scene, *SEE)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert time.monotonic() - began < 15
     assert status == 1
     assert "interrupted" in err

@@ -286,7 +286,7 @@ def test_the_options_of_a_fit_that_compare_photographs_are_taken() -> None:
     assert refinement_options({"options": {"depth_weight": 0.3}}).masks == "off"
     with pytest.raises(InputError, match="masks: expected one of"):
         refinement_options({"options": {"masks": "cut"}})
-    with pytest.raises(InputError, match="scene: expected the options of a fit"):
+    with pytest.raises(InputError, match="longest: expected a whole number"):
         refinement_options({"options": {"longest": "long"}})
 
 

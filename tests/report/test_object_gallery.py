@@ -96,8 +96,8 @@ def test_views_without_photographs_are_rendered(scene, labels) -> None:
 
 def written(scene, labels, folder, **words) -> tuple[str, dict]:
     write_segmentation_report(
+        scene,
         folder / "things.html",
-        scene=scene,
         field=field_of(scene, labels),
         layer="things",
         evidence=None,
