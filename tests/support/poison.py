@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 
 from splatseg import core, edit, evaluate, selection, synthetic
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, Similarity, View
