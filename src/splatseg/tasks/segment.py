@@ -339,7 +339,7 @@ def _evidence(scene: Scene, method: Method, options: SegmentOptions) -> tuple[st
     if name is None:
         names = evidence_names(folders)
         if len(names) != 1:
-            known = ", ".join(names) or "there is none"
+            known = ", ".join(names) or "there is none; `splatseg see` makes some"
             raise InputError(f"evidence: expected a name ({known}), got none.")
         name = names[0]
     folder = find_evidence(folders, name)

@@ -480,3 +480,8 @@ def test_what_is_no_evidence(tmp_path) -> None:
         open_evidence(tmp_path)
     with pytest.raises(MissingFileError):
         load_text_embeddings(tmp_path)
+
+
+def test_where_there_is_no_evidence_the_command_that_makes_some_is_named(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"\(there is none; `splatseg see` makes some\), got 'm'"):
+        find_evidence([tmp_path], "m")

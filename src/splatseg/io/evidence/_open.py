@@ -177,7 +177,7 @@ def find_evidence(folders: Iterable[Path], name: str) -> Path:
         for folder in (parent / "evidence" / name, parent / name):
             if folder.is_dir():
                 return folder
-    known = ", ".join(evidence_names(folders)) or "there is none"
+    known = ", ".join(evidence_names(folders)) or "there is none; `splatseg see` makes some"
     raise InputError(f"evidence: expected one of those at hand ({known}), got {name!r}.")
 
 
