@@ -193,21 +193,15 @@ def test_export_writes_the_level_that_is_asked_for(treed, run, tmp_path) -> None
 
 def test_edit_takes_a_part_and_the_tree_stays_in_step(treed, run, tmp_path) -> None:
     before = tree_in(treed.scene)
-    words = (
-        "--remove",
-        "--layer",
-        "things@part",
-        "--names",
-        "upper",
-        "--cut",
-        "off",
-        "--specks",
-        0,
-    )
+    words = ("--remove", "--layer", "things@part", "--names", "upper", "--cut", "off")
     run("edit", treed.scene, "-o", tmp_path / "bare", *words)
     after = tree_in(tmp_path / "bare")
     assert after.nodes == before.nodes
-    assert torch.equal(after.labels.ids, before.labels.ids[before.labels.ids != 5])
+    # The Gaussian without a label touches the upper half alone: a speck that goes along.
+    stays = before.labels.ids != 5
+    assert torch.equal(after.labels.ids, before.labels.ids[stays & (before.labels.ids >= 0)])
+    run("edit", treed.scene, "-o", tmp_path / "all", *words, "--specks", 0)
+    assert torch.equal(tree_in(tmp_path / "all").labels.ids, before.labels.ids[stays])
 
     words = ("--extract", "--layer", "things", "--ids", 1, "--cut", "off")
     run("edit", treed.scene, "-o", tmp_path / "left", *words)

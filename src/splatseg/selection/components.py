@@ -85,12 +85,15 @@ def _own_things(
 ) -> Bool[Tensor, "n"]:
     """Which Gaussians are in a piece that holds half of an id's Gaussians or more."""
     own = torch.zeros(len(mask), dtype=torch.bool)
-    ids = labels.ids.long()
-    for id in torch.unique(ids[mask]).tolist():
-        if id < 0:
-            continue
-        pieces = torch.bincount(piece_of[mask & (ids == id)], minlength=len(own))
-        own |= 2 * pieces >= int((ids == id).sum())
+    named = labels.ids >= 0
+    _, index, sizes = torch.unique(
+        labels.ids[named].long(), return_inverse=True, return_counts=True
+    )
+    of = torch.full((len(mask),), -1, dtype=torch.int64)
+    of[named] = index
+    rows = named & mask
+    pairs, shares = torch.unique(torch.stack((piece_of[rows], of[rows])), dim=1, return_counts=True)
+    own[pairs[0, 2 * shares >= sizes[pairs[1]]]] = True
     return own[piece_of]
 
 

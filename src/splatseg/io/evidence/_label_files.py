@@ -83,7 +83,7 @@ def is_soft(path: Path) -> bool:
         FileFormatError: If it is damaged.
     """
     if path.suffix == ".npz":
-        return any(name in npz_names(path) for name in SOFT_NAMES)
+        return not npz_names(path).isdisjoint(SOFT_NAMES)
     return path.suffix == ".npy" and read_npy(path, mapped=True).ndim == 3
 
 
@@ -107,7 +107,8 @@ def read_label_file(
     if path.suffix == ".npy":
         return _from_array(path, read_npy(path), channels)
     if path.suffix == ".npz":
-        names = [name for name in LABEL_NAMES if name in npz_names(path)]
+        there = npz_names(path)
+        names = [name for name in LABEL_NAMES if name in there]
         if len(names) != 1:
             raise FileFormatError(
                 f"{path}: expected one array ids, probabilities or logits, got "
