@@ -12,7 +12,10 @@ import pytest
 
 from splatseg.errors import MissingFileError
 from splatseg.fit import checkpoint_summary
-from splatseg.io.scene import CHECKPOINT_FILE, is_scene, is_unfinished, load_scene
+from splatseg.io.scene import (
+    load_scene,
+)
+from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished
 from splatseg.synthetic import cameras, room, write_capture
 
 STEPS = 150

@@ -7,7 +7,11 @@ import pytest
 from splatseg.edit import load_document
 from splatseg.fit import FitOptions
 from splatseg.io.evidence import open_evidence
-from splatseg.io.scene import CHECKPOINT_FILE, is_scene, load_scene, scene_layer_names
+from splatseg.io.scene import (
+    load_scene,
+    scene_layer_names,
+)
+from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.tasks import (
     DemoOptions,
     EditOptions,

@@ -19,7 +19,7 @@ absolute one, and opens without it.
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -28,7 +28,7 @@ from splatseg.core import Layer, Scene, View
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.atomic import TEMPORARY, atomic_folder, hidden_folder, is_vacant, sync, sync_tree
+from splatseg.io.atomic import atomic_folder, hidden_folder, is_vacant, sync, sync_tree
 from splatseg.io.cameras import (
     cameras_content,
     relative_path,
@@ -40,16 +40,16 @@ from splatseg.io.foreign import is_file, is_folder, made_from
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.lock import scene_lock
-from splatseg.io.paths import path_inside
 from splatseg.io.scene_folder import (
     CAMERAS_FILE,
     FOLDERS,
     GAUSSIANS_FILE,
     PENDING,
     SCENE_FILE,
-    TRAINING_FOLDER,
     current_file,
     finish_pending,
+    is_scene,
+    is_unfinished,
     scene_path,
 )
 from splatseg.io.splats import read_splats, write_splats
@@ -59,57 +59,7 @@ FORMAT = "splatseg-scene"
 VERSION = 1
 """Version of the folders written; all versions up to it are read."""
 
-CHECKPOINT_FILE = "fit/checkpoint.npz"
-
-POSES_FOLDER = "capture"
-"""Where `fit` keeps the poses that it found for bare photographs."""
-
-_POSES_ENTRIES = ("poses.json", "sparse", "frames", "frames.txt", "work")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
-
-
-@boundary
-def is_scene(path: Path) -> bool:
-    """Whether a folder is a scene folder."""
-    return current_file(path, SCENE_FILE).is_file()
-
-
-@boundary
-def is_unfinished(path: Path) -> bool:
-    """Whether a folder holds a fit that has not become a scene yet, and nothing else."""
-    checkpoint, poses = path / CHECKPOINT_FILE, path / POSES_FOLDER
-    if is_scene(path) or not (checkpoint.parent.is_dir() or poses.is_dir()):
-        return False
-    own = (checkpoint.parent.name, poses.name, GAUSSIANS_FILE, *FOLDERS)
-    return (
-        _holds_only(path, own)
-        and _holds_only(checkpoint.parent, (checkpoint.name, f"{checkpoint.name}.new"))
-        and _holds_only(poses, _POSES_ENTRIES)
-    )
-
-
-@boundary
-def training_file(root: Path, layer: str) -> Path:
-    """Where the training of a layer keeps its state.
-
-    Raises:
-        InputError: If a link leads out of the scene.
-    """
-    return path_inside(root, TRAINING_FOLDER, f"{layer}.npz", make=False)
-
-
-@boundary
-def training_files(root: Path) -> tuple[Path, ...]:
-    """States of all trainings that were stopped, by the names of their layers."""
-    return tuple(sorted((root / TRAINING_FOLDER).glob("*.npz")))
-
-
-def _holds_only(folder: Path, names: Sequence[str]) -> bool:
-    """Whether a folder, where it is there, holds nothing but these, or what was being written."""
-    # What a process that was killed was about to write lies in hidden folders of this prefix.
-    return not folder.is_dir() or all(
-        entry.name in names or entry.name.startswith(TEMPORARY) for entry in folder.iterdir()
-    )
 
 
 @boundary

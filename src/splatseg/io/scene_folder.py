@@ -6,6 +6,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from splatseg.core.boundary import boundary
 from splatseg.io.atomic import TEMPORARY, check_writable, sweep
 from splatseg.io.lock import scene_lock
 from splatseg.io.paths import path_inside
@@ -14,8 +15,12 @@ from splatseg.io.write_errors import named_write_failures
 SCENE_FILE = "scene.json"
 GAUSSIANS_FILE = "gaussians.ply"
 CAMERAS_FILE = "cameras/transforms.json"
+CHECKPOINT_FILE = "fit/checkpoint.npz"
 TRAINING_FOLDER = "training"
 """Where methods that train keep their state until the layer is written."""
+
+POSES_FOLDER = "capture"
+"""Where `fit` keeps the poses that it found for bare photographs."""
 
 FOLDERS = ("cameras", "evidence", "layers", "reports")
 """Folders that every scene has."""
@@ -24,6 +29,43 @@ PENDING = f"{TEMPORARY}pending"
 """Folder of files of a new scene that count already, but are not in their places yet."""
 
 _WORK_FOLDERS = (*FOLDERS, "exports", "fit", TRAINING_FOLDER)
+_POSES_ENTRIES = ("poses.json", "sparse", "frames", "frames.txt", "work")
+
+
+@boundary
+def is_scene(path: Path) -> bool:
+    """Whether a folder is a scene folder."""
+    return current_file(path, SCENE_FILE).is_file()
+
+
+@boundary
+def is_unfinished(path: Path) -> bool:
+    """Whether a folder holds a fit that has not become a scene yet, and nothing else."""
+    checkpoint, poses = path / CHECKPOINT_FILE, path / POSES_FOLDER
+    if is_scene(path) or not (checkpoint.parent.is_dir() or poses.is_dir()):
+        return False
+    own = (checkpoint.parent.name, poses.name, GAUSSIANS_FILE, *FOLDERS)
+    return (
+        _holds_only(path, own)
+        and _holds_only(checkpoint.parent, (checkpoint.name, f"{checkpoint.name}.new"))
+        and _holds_only(poses, _POSES_ENTRIES)
+    )
+
+
+@boundary
+def training_file(root: Path, layer: str) -> Path:
+    """Where the training of a layer keeps its state.
+
+    Raises:
+        InputError: If a link leads out of the scene.
+    """
+    return path_inside(root, TRAINING_FOLDER, f"{layer}.npz", make=False)
+
+
+@boundary
+def training_files(root: Path) -> tuple[Path, ...]:
+    """States of all trainings that were stopped, by the names of their layers."""
+    return tuple(sorted((root / TRAINING_FOLDER).glob("*.npz")))
 
 
 def scene_path(root: Path, *names: str) -> Path:
@@ -91,3 +133,11 @@ def _clear(root: Path) -> None:
                 for file in files:
                     if file.endswith(".npz.new"):  # half a checkpoint
                         (Path(folder) / file).unlink(missing_ok=True)
+
+
+def _holds_only(folder: Path, names: Sequence[str]) -> bool:
+    """Whether a folder, where it is there, holds nothing but these, or what was being written."""
+    # What a process that was killed was about to write lies in hidden folders of this prefix.
+    return not folder.is_dir() or all(
+        entry.name in names or entry.name.startswith(TEMPORARY) for entry in folder.iterdir()
+    )

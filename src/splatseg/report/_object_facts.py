@@ -1,7 +1,7 @@
 """What a report says of each object of a layer, on its card and in its JSON."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -42,17 +42,15 @@ def object_facts(
     *,
     labels: Labels | None,
     classes: ClassTable | None,
-    seen: Mapping[int, Sighting],
     files: Mapping[int, str],
 ) -> tuple[ObjectFacts, ...]:
-    """What is known of each id, those with most Gaussians (or pixels) first.
+    """What is known of each id before any view is looked at, those with most Gaussians first.
 
     Args:
         layer: What is known of the layer.
         colours: Names and colours of its ids.
         labels: Of Gaussians, where the layer is one of Gaussians.
         classes: Of the scene; they name the classes of instances.
-        seen: Where each is seen best.
         files: Where each was exported to.
     """
     counts, means = ({}, {}) if labels is None else _counted(labels)
@@ -66,10 +64,19 @@ def object_facts(
             gaussians=None if labels is None else counts.get(row.id, 0),
             confidence=means.get(row.id),
             file=files.get(row.id),
-            seen=seen.get(row.id),
+            seen=None,
         )
         for row in colours.rows
     ]
+    found.sort(key=lambda one: (-(one.gaussians or 0), one.id))
+    return tuple(found)
+
+
+def with_sightings(
+    objects: Sequence[ObjectFacts], seen: Mapping[int, Sighting]
+) -> tuple[ObjectFacts, ...]:
+    """The same with where each is seen best; those with most Gaussians, then pixels, first."""
+    found = [replace(one, seen=seen.get(one.id)) for one in objects]
     found.sort(key=lambda one: (-(one.gaussians or 0), -_pixels(one), one.id))
     return tuple(found)
 

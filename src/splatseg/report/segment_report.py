@@ -23,7 +23,7 @@ from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import write_json
 from splatseg.methods import keeps_ids
 from splatseg.report._common import environment, spread
-from splatseg.report._object_facts import ObjectFacts, object_facts
+from splatseg.report._object_facts import ObjectFacts, object_facts, with_sightings
 from splatseg.report._segment_ids import ids_agree, ids_are_classes
 from splatseg.report._segment_page import SegmentationReportData, segmentation_page
 from splatseg.report._segment_panels import ViewPanel, rename_truth, view_panel
@@ -177,15 +177,12 @@ def _objects(
     files: Mapping[int, str],
 ) -> tuple[ObjectFacts, ...]:
     """Each object with the picture of it, where it is among those that are shown."""
-    summary = field.layer(layer)
     views = [view for view in scene.views if _at_hand(view)]
-    largest = object_facts(
-        summary, colours, labels=labels, classes=scene.classes, seen={}, files=files
-    )[:MAX_OBJECTS]
-    seen = sightings(field, layer, views, {one.id: one.colour for one in largest})
-    return object_facts(
-        summary, colours, labels=labels, classes=scene.classes, seen=seen, files=files
+    objects = object_facts(
+        field.layer(layer), colours, labels=labels, classes=scene.classes, files=files
     )
+    largest = {one.id: one.colour for one in objects[:MAX_OBJECTS]}
+    return with_sightings(objects, sightings(field, layer, views, largest))
 
 
 def _panels(

@@ -14,7 +14,7 @@ from splatseg.edit import (
     Recolour,
 )
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.scene import is_scene
+from splatseg.io.scene_folder import is_scene
 from splatseg.selection import Where, ids_named, layer_called, select
 from splatseg.tasks._edit_cut import Cut, cut_of
 from splatseg.tasks._observer import Observer

@@ -12,8 +12,7 @@ from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import FitOptions, FitResult
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.scene import GAUSSIANS_FILE, POSES_FOLDER
-from splatseg.io.scene_folder import scene_path
+from splatseg.io.scene_folder import GAUSSIANS_FILE, POSES_FOLDER, scene_path
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.camera_map import camera_map

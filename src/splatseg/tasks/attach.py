@@ -22,8 +22,13 @@ from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
-from splatseg.io.scene import is_scene, load_scene, save_scene, save_scene_layer, scene_layer_names
-from splatseg.io.scene_folder import work_on_scene
+from splatseg.io.scene import (
+    load_scene,
+    save_scene,
+    save_scene_layer,
+    scene_layer_names,
+)
+from splatseg.io.scene_folder import is_scene, work_on_scene
 from splatseg.lift import Attached, AttachOptions, attach
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.import_scene import read_with_notes

@@ -18,7 +18,7 @@ from splatseg.edit import (
 )
 from splatseg.edit.document import BASE, HISTORY
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.scene import is_scene
+from splatseg.io.scene_folder import is_scene
 from splatseg.lift import CutOptions
 from splatseg.render import BackendName
 from splatseg.tasks._edit_cut import Cut, measured_change

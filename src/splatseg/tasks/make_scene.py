@@ -23,7 +23,10 @@ from splatseg.fit import (
     reduction_note,
 )
 from splatseg.io.npz_writing import discard_checkpoint_file
-from splatseg.io.scene import CHECKPOINT_FILE, save_scene
+from splatseg.io.scene import (
+    save_scene,
+)
+from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.pose import PoseReport
 from splatseg.render import BackendName
 from splatseg.report.fit_verdict import FitVerdict

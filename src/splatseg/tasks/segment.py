@@ -26,7 +26,6 @@ from splatseg.io.evidence import (
     Evidence,
     TrackedEvidence,
     check_map_sizes,
-    evidence_names,
     find_evidence,
     open_evidence,
 )
@@ -335,17 +334,10 @@ def _classes_to_merge(
 
 def _evidence(scene: Scene, method: Method, options: SegmentOptions) -> tuple[str, Evidence]:
     folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
-    name = options.evidence
-    if name is None:
-        names = evidence_names(folders)
-        if len(names) != 1:
-            known = ", ".join(names) or "there is none; `splatseg see` makes some"
-            raise InputError(f"evidence: expected a name ({known}), got none.")
-        name = names[0]
-    folder = find_evidence(folders, name)
+    folder = find_evidence(folders, options.evidence)
     evidence = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
     method.check_evidence(evidence)
-    return name, evidence
+    return folder.name, evidence
 
 
 def _views(

@@ -11,7 +11,7 @@ from pathlib import Path
 from splatseg.core import Scene
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import FileFormatError, InputError, SplatsegError
-from splatseg.io.scene import training_file
+from splatseg.io.scene_folder import training_file
 from splatseg.lift.training import training_summary
 from splatseg.methods import Method
 from splatseg.tasks._observer import Observer

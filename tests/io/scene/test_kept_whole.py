@@ -16,9 +16,8 @@ from splatseg.io.scene import (
     save_scene,
     save_scene_layer,
     scene_layer_names,
-    training_file,
 )
-from splatseg.io.scene_folder import PENDING, work_on_scene
+from splatseg.io.scene_folder import PENDING, training_file, work_on_scene
 
 CAMERA = Camera(
     width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0, cam_from_world=torch.eye(4).double()

@@ -17,13 +17,13 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.images import load_image
 from splatseg.io.scene import (
-    is_scene,
     load_scene,
     load_scene_layer,
     save_scene,
     save_scene_layer,
     scene_layer_names,
 )
+from splatseg.io.scene_folder import is_scene
 
 
 @pytest.fixture(scope="module")

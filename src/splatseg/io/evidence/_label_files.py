@@ -83,7 +83,7 @@ def is_soft(path: Path) -> bool:
         FileFormatError: If it is damaged.
     """
     if path.suffix == ".npz":
-        return not npz_names(path).isdisjoint(SOFT_NAMES)
+        return not set(SOFT_NAMES).isdisjoint(npz_names(path))
     return path.suffix == ".npy" and read_npy(path, mapped=True).ndim == 3
 
 
