@@ -219,7 +219,10 @@ def refusals(labelled, tmp_path):
         (panoptic, "--truth-instances"),
         ((*panoptic, "--truth-instances", instance), "tells the class of each instance"),
         ((*layer, "--truth", semantic, "--instances", "objects"), "expected metric panoptic"),
-        ((*whole, "--scores", tmp_path / "bad.json"), "bad.json: expected scores"),
+        (
+            (*whole, "--scores", tmp_path / "bad.json"),
+            "bad.json: score of instance 4: expected a finite number",
+        ),
         ((*whole, "--instances", "nothing"), "nothing"),
         ((*whole, "--metadata", tmp_path / "no.json"), "no.json"),
         ((*whole, "--metadata", tmp_path / "bad.json"), "bad.json: expected a list of classes"),

@@ -10,8 +10,16 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.errors import InputError
-from splatseg.pose import PoseOptions, PoseProgress, PoseReport, PoseResult, recover_poses
+from splatseg.errors import FileFormatError, InputError
+from splatseg.pose import (
+    LeftOut,
+    PoseOptions,
+    PoseProgress,
+    PoseReport,
+    PoseResult,
+    load_pose_report,
+    recover_poses,
+)
 
 # Smaller than the photographs: intrinsics have to come back to the photographs' own pixels.
 OPTIONS = PoseOptions(longest=400, threads=1)
@@ -198,3 +206,24 @@ def test_all_pairs_are_compared_up_to_a_number_of_photographs(
     with pytest.raises(InputError, match="far enough"):
         recover_poses(folder, folder=tmp_path / "capture", options=options)
     assert compared == ["all" if everything else "likely"]
+
+
+@pytest.mark.parametrize(
+    "report",
+    [None, [], {}, {"error": "small"}, {"seconds": {"match": "long"}}, {"lenses": [{"width": 8}]}],
+)
+def test_a_damaged_report_of_poses_names_its_file(tmp_path, report) -> None:
+    sound = PoseReport(
+        photographs=2, registered=("a.jpg",), left_out=(LeftOut(name="b.jpg", why="dark"),),
+        mapper="glomap", tries=(), error=0.5, longest=1600, points=9, track_length=2.5, lenses=(),
+        seconds={"match": 1.5},
+    )  # fmt: skip
+    file = tmp_path / "poses.json"
+    content = {"format": "splatseg-poses", "version": 1, "made_of": "x", "report": sound.as_json()}
+    file.write_text(json.dumps(content))
+    assert load_pose_report(tmp_path) == load_pose_report(tmp_path, made_of="x") == sound
+    assert load_pose_report(tmp_path, made_of="y") is None
+    damaged = {**sound.as_json(), **report} if report else report
+    file.write_text(json.dumps({**content, "report": damaged}))
+    with pytest.raises(FileFormatError, match=r"poses\.json: expected the report of poses"):
+        load_pose_report(tmp_path)

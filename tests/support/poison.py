@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatseg import core, edit, evaluate, selection, synthetic
+from splatseg import core, edit, evaluate, pose, selection, synthetic
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, Similarity, View
 from splatseg.lift import GaussianField
 
@@ -325,6 +325,10 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "edit.replay.history": (),
         "edit.save_document.root": world.folder / "document",
         "neighbours.NeighbourIndex.points": torch.rand(9, 3),
+        "pose.PoseReport.left_out": (pose.LeftOut(name="c", why="dark"),),
+        "pose.PoseReport.tries": (),
+        "pose.PoseReport.lenses": (),
+        "pose.PoseReport.seconds": {"match": 1.5},
         "tasks.segment.method": "uplift",
         "tasks.segment.evidence": "labels",
         "io.evidence.open_evidence.kind": None,

@@ -53,7 +53,7 @@ def _class_info(row: object, *, where: str) -> ClassInfo:
         raise FileFormatError(f"{where}: expected an id up to {_MAX_ID}, got {quoted(id)}.")
     if colour is not None:
         values = cast(list[object], colour) if isinstance(colour, list) else []
-        if len(values) != 3 or not all(isinstance(v, int) and 0 <= v <= 255 for v in values):
+        if len(values) != 3 or not all(type(v) is int and 0 <= v <= 255 for v in values):
             raise FileFormatError(
                 f"{where}: expected a colour of three bytes, got {quoted(colour)}."
             )

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from splatseg.pose._report import LeftOut as LeftOut
     from splatseg.pose._report import MapperTry as MapperTry
     from splatseg.pose._report import PoseReport as PoseReport
+    from splatseg.pose._saved import load_pose_report as load_pose_report
     from splatseg.pose._video import is_video as is_video
 
 _HOMES = {
@@ -26,6 +27,7 @@ _HOMES = {
     "splatseg.pose._photographs": "holds_photographs",
     "splatseg.pose._recover": "PoseProgress PoseResult recover_poses",
     "splatseg.pose._report": "LeftOut MapperTry PoseReport",
+    "splatseg.pose._saved": "load_pose_report",
     "splatseg.pose._video": "is_video",
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}

@@ -28,7 +28,7 @@ from splatseg.pose._saved import (
     MODEL,
     fingerprint,
     load_capture,
-    load_report,
+    load_pose_report,
     save_poses,
 )
 from splatseg.pose._video import check_video, is_video, take_frames
@@ -107,7 +107,7 @@ def recover_poses(
         else:
             root, files = source, find_photographs(source)
         made_of = fingerprint(files, options)
-        report = load_report(kept, made_of=made_of)
+        report = load_pose_report(kept, made_of=made_of)
         reused = report is not None
         if report is None:
             report = _recover(

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from splatseg.core.boundary import convert_fields
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut:
@@ -13,6 +15,9 @@ class LeftOut:
     """Its file name."""
 
     why: str
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,6 +36,9 @@ class MapperTry:
     """Photographs of each model that it found, the largest first."""
 
     seconds: float
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
 
     @staticmethod
     def from_json(row: Mapping[str, Any]) -> "MapperTry":
@@ -55,6 +63,9 @@ class Lens:
     k1: float
     start: str
     """Where the search for the focal length began: ``EXIF`` or ``guess``."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,6 +100,9 @@ class PoseReport:
 
     notes: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
     def as_json(self) -> dict[str, Any]:
         """In values that JSON holds. Inverse of `from_json`."""
         return asdict(self)
@@ -98,7 +112,7 @@ class PoseReport:
         """The report of a JSON object.
 
         Raises:
-            KeyError, TypeError: If it is none.
+            KeyError, TypeError, InputError: If it is none.
         """
         values = {field.name: content[field.name] for field in fields(PoseReport)}
         values["registered"] = tuple(values["registered"])

@@ -20,7 +20,8 @@ from typing import Any, cast
 import numpy as np
 
 from splatseg.core import Capture
-from splatseg.errors import FileFormatError, quoted
+from splatseg.core.boundary import boundary
+from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.captures.build import RawView, build_capture
 from splatseg.io.captures.colmap import read_colmap_model
 from splatseg.io.captures.colmap_model import intrinsics_of, poses_of
@@ -62,8 +63,13 @@ def save_poses(model: Path, folder: Path, *, made_of: str, report: PoseReport) -
     )
 
 
-def load_report(folder: Path, *, made_of: str) -> PoseReport | None:
-    """The report of poses that were made of just this; None where there are none.
+@boundary
+def load_pose_report(folder: Path, *, made_of: str | None = None) -> PoseReport | None:
+    """The report of the poses in a folder; None where there are none.
+
+    Args:
+        folder: The folder of poses.
+        made_of: What they must have been made of, see `fingerprint`; None takes any.
 
     Raises:
         FileFormatError: If the file is damaged.
@@ -73,12 +79,12 @@ def load_report(folder: Path, *, made_of: str) -> PoseReport | None:
         return None
     content = read_json(path)
     current = content.get("format") == FORMAT and content.get("version") == VERSION
-    if not current or content.get("made_of") != made_of:
+    if not current or made_of not in (None, content.get("made_of")):
         return None
     report = content.get("report")
     try:
         return PoseReport.from_json(cast(dict[str, Any], report))
-    except (KeyError, TypeError, ValueError) as error:
+    except (InputError, KeyError, TypeError, ValueError) as error:
         raise FileFormatError(
             f"{path}: expected the report of poses, got {quoted(report)}."
         ) from error

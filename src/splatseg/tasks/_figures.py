@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.errors import FileFormatError
+from splatseg.core.json_numbers import json_number
+from splatseg.core.json_values import id_of_key
+from splatseg.errors import FileFormatError, quoted
 from splatseg.evaluate import (
     BinaryReport,
     Confusion,
@@ -140,9 +142,10 @@ def read_scores(path: Path) -> dict[int, float]:
     """
     scores: dict[int, float] = {}
     for key, value in read_json(path).items():
-        if not key.isdecimal() or isinstance(value, bool) or not isinstance(value, int | float):
-            raise FileFormatError(f"{path}: expected scores by instance id, got {key!r}: {value}.")
-        scores[int(key) or -1] = float(value)
+        id = id_of_key(key)
+        if id is None:
+            raise FileFormatError(f"{path}: expected scores by instance id, got {quoted(key)}.")
+        scores[id or -1] = json_number(value, where=f"{path}: score of instance {id}")
     return scores
 
 

@@ -11,9 +11,10 @@ from splatseg.evaluate import PhotographReport, evaluate_photographs, render_and
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.fit import FitOptions, FitResult
 from splatseg.io.atomic import atomic_file
-from splatseg.io.json_files import read_json, write_json
+from splatseg.io.json_files import write_json
 from splatseg.io.scene_folder import GAUSSIANS_FILE, POSES_FOLDER, scene_path
 from splatseg.lift import GaussianField
+from splatseg.pose import load_pose_report
 from splatseg.render import BackendName
 from splatseg.report.camera_map import camera_map
 from splatseg.report.fit_report import FitReportData, fit_record, fit_report, verdict_of
@@ -143,5 +144,5 @@ def _pairs(
 
 
 def _poses(root: Path) -> dict[str, Any] | None:
-    path = root / POSES_FOLDER / "poses.json"
-    return read_json(path).get("report") if path.is_file() else None
+    report = load_pose_report(root / POSES_FOLDER)
+    return None if report is None else report.as_json()

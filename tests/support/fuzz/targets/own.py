@@ -1,0 +1,164 @@
+"""Our own files: scenes, layers, states of what was stopped; and weights."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from splatseg.core import Features, InstanceTree, Labels, LayerInfo, Scene, Selection, TreeNode
+from splatseg.fit._checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from splatseg.fit._state import FitState
+from splatseg.io.export import column_table_of, write_column_table
+from splatseg.io.layers import load_layer, save_layer
+from splatseg.io.scene import load_scene, save_scene
+from splatseg.io.tensors import read_tensors
+from splatseg.lift.training import _state as training
+from splatseg.pose import _saved as saved
+from splatseg.pose._report import LeftOut, Lens, MapperTry, PoseReport
+from splatseg.tasks._figures import read_points, read_scores
+from support.fuzz.targets.base import (
+    Target,
+    gaussians,
+    photographs,
+    target,
+    view_of,
+    whole,
+)
+
+
+def _scene(name: str, file: str) -> None:
+    @target(name)
+    def make(folder: Path) -> Target:
+        view = view_of(photographs(folder / "capture", 1)[0])
+        scene = Scene(gaussians=gaussians(), views=(view,), source=folder / "capture", up=(0, 0, 1))
+        save_scene(scene, folder / "scene")
+        return Target(file=folder / "scene" / file, read=lambda: load_scene(folder / "scene"))
+
+
+_scene("scene.json", "scene.json")
+_scene("scene-cameras", "cameras/transforms.json")
+
+
+def _layer(name: str, make_layer: Callable[[], Any]) -> None:
+    @target(name)
+    def make(folder: Path) -> Target:
+        file = folder / "a.npz"
+        save_layer(make_layer(), file)
+        return Target(file=file, read=lambda: load_layer(file))
+
+
+def _labels() -> Labels:
+    info = LayerInfo(method="vote", names={1: "cup"}, class_of={1: 3}, views=("a",), seed=1)
+    return Labels(
+        ids=torch.tensor([1, 2, -1, 1], dtype=torch.int32),
+        confidence=torch.rand(4, generator=torch.Generator().manual_seed(0)),
+        evidence=torch.ones(4),
+        inferred=torch.zeros(4, dtype=torch.bool),
+        info=info.with_edit("complete", {"inferred": 2}),
+    )
+
+
+def _tree() -> InstanceTree:
+    nodes = (TreeNode(id=1, level="group"), TreeNode(id=2, parent=1, name="cup", support=0.5))
+    return InstanceTree(nodes=nodes, labels=_labels())
+
+
+_layer("layer-labels", _labels)
+_layer("layer-tree", _tree)
+_layer("layer-features", lambda: Features(values=torch.rand(4, 3), weights=torch.ones(4)))
+_layer("layer-selection", lambda: Selection(mask=torch.tensor([True, False, True, False])))
+
+
+@target("safetensors")
+def safetensors(folder: Path) -> Target:
+    """Weights."""
+    header = {"a": {"dtype": "F32", "shape": [2, 3], "data_offsets": [0, 24]}}
+    header |= {"b": {"dtype": "I64", "shape": [1], "data_offsets": [24, 32]}}
+    words = json.dumps(header).encode()
+    content = len(words).to_bytes(8, "little") + words + bytes(32)
+    return whole(folder / "a.safetensors", content, read_tensors)
+
+
+@target("weights.npz")
+def weights(folder: Path) -> Target:
+    """Weights of NumPy."""
+    np.savez(folder / "a.npz", **{"a.b": np.eye(3), "c": np.arange(4, dtype=np.float16)})
+    return Target(file=folder / "a.npz", read=lambda: read_tensors(folder / "a.npz"))
+
+
+@target("fit-checkpoint")
+def fit_checkpoint(folder: Path) -> Target:
+    """A fit that was stopped."""
+    file = folder / "checkpoint.npz"
+    content = {"steps": 3, "progress": 0.5, "seconds": 1.0, "gaussians": 4}
+    state = FitState(tensors={"a/b": torch.ones(3)}, content=content)
+    write_checkpoint(Checkpoint(state=state, identity={"data": {}}), file)
+    return Target(file=file, read=lambda: read_checkpoint(file))
+
+
+@target("training")
+def training_state(folder: Path) -> Target:
+    """A training that was stopped."""
+    file = folder / "a.npz"
+
+    def start() -> Any:
+        return training.TrainingState.started({"rows": torch.ones(4, 2)}, {"w": torch.ones(3)}, 4)
+
+    identity = {"data": {"rows": "x"}, "options": {"steps": 9}, "defaults": {}}
+    training.write_state(start(), file, identity)
+
+    def read() -> None:
+        training.training_summary(file)
+        training.read_state(file, start(), identity)
+
+    return Target(file=file, read=read)
+
+
+@target("poses.json")
+def poses(folder: Path) -> Target:
+    """The report of poses that were found."""
+    made = PoseReport(
+        photographs=3,
+        registered=("a", "b"),
+        left_out=(LeftOut(name="c", why="too dark"),),
+        mapper="glomap",
+        tries=(
+            MapperTry(mapper="glomap", registered=2, error=0.5, points=9, models=(2,), seconds=1.0),
+        ),
+        error=0.5,
+        longest=1600,
+        points=9,
+        track_length=2.5,
+        lenses=(Lens(width=8, height=6, photographs=2, focal=9.0, k1=0.01, start="EXIF"),),
+        seconds={"match": 1.5},
+    )
+    content = {"format": saved.FORMAT, "version": saved.VERSION, "made_of": "x"}
+    (folder / saved.FILE).write_text(json.dumps(content | {"report": made.as_json()}))
+    return Target(
+        file=folder / saved.FILE, read=lambda: saved.load_pose_report(folder, made_of="x")
+    )
+
+
+@target("columns.json")
+def columns(folder: Path) -> Target:
+    """What columns of an exported splat file mean."""
+    file = folder / "a.ply"
+    write_column_table({"columns": {"kind": {"names": {"1": "cup"}}}}, folder / "a.json")
+    return Target(file=folder / "a.json", read=lambda: column_table_of(file))
+
+
+@target("points.npz")
+def points(folder: Path) -> Target:
+    """Points with true ids."""
+    np.savez(folder / "a.npz", xyz=np.ones((5, 3), np.float32), instance=np.arange(5))
+    return Target(file=folder / "a.npz", read=lambda: read_points(folder / "a.npz", "instance"))
+
+
+@target("scores.json")
+def scores(folder: Path) -> Target:
+    """Scores of instances."""
+    content = json.dumps({"1": 0.5, "2": 1, "17": 0.25}).encode()
+    return whole(folder / "a.json", content, read_scores)
