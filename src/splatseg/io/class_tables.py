@@ -4,6 +4,7 @@ from typing import Any, cast
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import FileFormatError, quoted
+from splatseg.io.foreign import made_from
 
 _MAX_ID = 2**31 - 1
 """Ids are int32."""
@@ -58,4 +59,5 @@ def _class_info(row: object, *, where: str) -> ClassInfo:
                 f"{where}: expected a colour of three bytes, got {quoted(colour)}."
             )
         colour = cast(tuple[int, int, int], tuple(values))
-    return ClassInfo(id=id, name=name, isthing=bool(entry.get("isthing", True)), colour=colour)
+    with made_from(where):
+        return ClassInfo(id=id, name=name, isthing=bool(entry.get("isthing", True)), colour=colour)

@@ -153,13 +153,37 @@ def test_photographs_of_a_uniform_scale_are_taken_and_it_is_said(nerfstudio) -> 
         ({"cx": "left"}, "cx: expected a finite number, got 'left'"),
         ({"w": None}, "expected the image size as w and h"),
         ({"camera_model": "EQUIRECTANGULAR"}, "got 'EQUIRECTANGULAR'"),
-        ({"ply_file_path": "gone.ply"}, "gone.ply: the start points"),
+        ({"ply_file_path": "gone.ply"}, r"transforms.json: the start points .* \('gone.ply'\)"),
         ({"k1": float("nan")}, "k1: expected a finite number, got nan"),
     ],
 )
 def test_impossible_intrinsics_are_refused(nerfstudio, top, message) -> None:
     with pytest.raises(InputError, match=message):
         read_capture(nerfstudio(top=top))
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ({"split": "\0"}, "split: expected text that UTF-8 can hold"),
+        ({"file_path": "."}, "photographs: expected the path of a file, got '.'"),
+        ({"file_path": "images/\0.png"}, r"missing\[0\]: expected text"),
+    ],
+)
+def test_words_that_no_file_can_hold_are_refused_with_the_captures_name(
+    nerfstudio, frame, message
+) -> None:
+    folder = nerfstudio(frames={1: frame})
+    with pytest.raises(InputError, match=message) as caught:
+        read_capture(folder)
+    assert str(caught.value).startswith(str(folder))
+
+
+def test_a_long_name_of_start_points_is_cut(nerfstudio) -> None:
+    folder = nerfstudio(top={"ply_file_path": "x" * 5000})
+    with pytest.raises(MissingFileError, match=r"transforms\.json: the start points") as caught:
+        read_capture(folder)
+    assert len(str(caught.value)) < 300 + len(str(folder))
 
 
 def _changed(change) -> dict:

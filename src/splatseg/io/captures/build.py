@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
 from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.core.view_names import clean_view_names
-from splatseg.errors import InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures._metadata import read_metadata
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
@@ -126,31 +126,34 @@ def build_capture(
         if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
             before = f"{view.intrinsics.width}x{view.intrinsics.height}"
             scaled[f"intrinsics of {before} were scaled to photographs of {width}x{height}"] += 1
-        views.append(
-            View(
+        where = f"{path}: {view.relative}"
+        camera = _camera(view, intrinsics, width, height, where=where)
+        with made_from(where):
+            made = View(
                 name=name,
-                camera=_camera(view, intrinsics, width, height, where=f"{path}: {view.relative}"),
+                camera=camera,
                 image=view.image,
                 split=split,
                 mask=view.mask,
                 depth=view.depth,
                 depth_unit=view.depth_unit,
             )
-        )
+        views.append(made)
     metadata = read_metadata(path)
     found = (*left_out, *notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
-    return Capture(
-        path=path,
-        format=format,
-        views=tuple(views),
-        points=points,
-        classes=metadata.classes,
-        up=metadata.up,
-        metres_per_unit=metadata.metres_per_unit,
-        splats=splats,
-        notes=found,
-        missing=missing,
-    )
+    with made_from(path):
+        return Capture(
+            path=path,
+            format=format,
+            views=tuple(views),
+            points=points,
+            classes=metadata.classes,
+            up=metadata.up,
+            metres_per_unit=metadata.metres_per_unit,
+            splats=splats,
+            notes=found,
+            missing=missing,
+        )
 
 
 def view_names(relatives: Sequence[str]) -> list[str]:
@@ -161,13 +164,16 @@ def view_names(relatives: Sequence[str]) -> list[str]:
     that differ only in case get a number: files are called so, see `clean_view_names`.
 
     Raises:
-        InputError: If a photograph is listed twice.
+        InputError: If a photograph is listed twice, or a path is that of no file.
 
     Example:
         >>> view_names(["images/left/1.jpg", "images/right/1.jpg", "images/left/2.jpg"])
         ['left/1', 'right/1', '2']
     """
     paths = [PurePosixPath(relative) for relative in relatives]
+    for relative, path in zip(relatives, paths, strict=True):
+        if not path.name:
+            raise InputError(f"photographs: expected the path of a file, got {quoted(relative)}.")
     twice = [str(path) for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise InputError(

@@ -210,6 +210,8 @@ def _points(content: Mapping[str, Any], folder: Path) -> tuple[PointCloud | None
     if isinstance(name, str) and name:
         path = folder / name.replace("\\", "/")
         if not is_file(path):
-            raise MissingFileError(f"{path}: the start points that {FILE} names are not there.")
+            raise MissingFileError(
+                f"{folder / FILE}: the start points that it names are not there ({quoted(name)})."
+            )
         return read_ply_points(path), path if ply_holds_splats(path) else None
     return points_beside(folder), None
