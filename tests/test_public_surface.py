@@ -11,9 +11,11 @@ import pytest
 import splatseg
 
 SURFACE = {
+    "AttachLayersOptions",
     "Camera",
     "Capture",
     "CheckpointOptions",
+    "DemoOptions",
     "EditOptions",
     "EvaluationOptions",
     "ExportOptions",
@@ -33,6 +35,7 @@ SURFACE = {
     "RenderingOptions",
     "Scene",
     "SeeOptions",
+    "SharpenSceneOptions",
     "SegmentOptions",
     "Selection",
     "Similarity",

@@ -75,7 +75,9 @@ if TYPE_CHECKING:
     from splatseg.render import get_backend as get_backend
     from splatseg.render import weights as weights
     from splatseg.synthetic import write_capture as write_capture
+    from splatseg.tasks import AttachLayersOptions as AttachLayersOptions
     from splatseg.tasks import CheckpointOptions as CheckpointOptions
+    from splatseg.tasks import DemoOptions as DemoOptions
     from splatseg.tasks import EditOptions as EditOptions
     from splatseg.tasks import EvaluationOptions as EvaluationOptions
     from splatseg.tasks import ExportOptions as ExportOptions
@@ -84,6 +86,7 @@ if TYPE_CHECKING:
     from splatseg.tasks import RenderingOptions as RenderingOptions
     from splatseg.tasks import SeeOptions as SeeOptions
     from splatseg.tasks import SegmentOptions as SegmentOptions
+    from splatseg.tasks import SharpenSceneOptions as SharpenSceneOptions
     from splatseg.tasks import attach_layers as attach_layers
     from splatseg.tasks import describe as describe
     from splatseg.tasks import edit_scene as edit_scene
@@ -116,9 +119,10 @@ _HOMES = {
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
     "splatseg.synthetic": "write_capture",
     "splatseg.tasks": (
-        "CheckpointOptions EditOptions EvaluationOptions ExportOptions ImportOptions "
-        "MakeSceneOptions RenderingOptions SeeOptions SegmentOptions attach_layers "
-        "describe edit_scene evaluate_scene examine_capture export_scene fit_capture "
+        "AttachLayersOptions CheckpointOptions DemoOptions EditOptions EvaluationOptions "
+        "ExportOptions ImportOptions MakeSceneOptions RenderingOptions SeeOptions "
+        "SegmentOptions SharpenSceneOptions attach_layers describe edit_scene evaluate_scene "
+        "examine_capture export_scene fit_capture "
         "import_scene make_demo render_views save_segmentation see segment sharpen_scene"
     ),
 }
