@@ -118,27 +118,7 @@ def build_capture(
     _check_paths(path, raw)
     _check_files(path, raw)
     splits, split_note = _splits(raw)
-    scaled: Counter[str] = Counter()
-    views: list[View] = []
-    for view, name, split in zip(raw, names, splits, strict=True):
-        width, height = image_size(view.image)
-        intrinsics = scaled_to(view.intrinsics, (width, height), where=str(view.image))
-        if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
-            before = f"{view.intrinsics.width}x{view.intrinsics.height}"
-            scaled[f"intrinsics of {before} were scaled to photographs of {width}x{height}"] += 1
-        where = f"{path}: {view.relative}"
-        camera = _camera(view, intrinsics, width, height, where=where)
-        with made_from(where):
-            made = View(
-                name=name,
-                camera=camera,
-                image=view.image,
-                split=split,
-                mask=view.mask,
-                depth=view.depth,
-                depth_unit=view.depth_unit,
-            )
-        views.append(made)
+    views, scaled = _made_views(path, raw, names, splits)
     metadata = read_metadata(path)
     found = (*left_out, *notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
     with made_from(path):
@@ -154,6 +134,34 @@ def build_capture(
             notes=found,
             missing=missing,
         )
+
+
+def _made_views(
+    path: Path, raw: Sequence[RawView], names: Sequence[str], splits: Sequence[str]
+) -> tuple[list[View], tuple[str, ...]]:
+    """Views of photographs that are there, and notes of intrinsics that were scaled to them."""
+    scaled: list[str] = []
+    views: list[View] = []
+    for view, name, split in zip(raw, names, splits, strict=True):
+        width, height = image_size(view.image)
+        intrinsics = scaled_to(view.intrinsics, (width, height), where=str(view.image))
+        if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
+            before = f"{view.intrinsics.width}x{view.intrinsics.height}"
+            scaled.append(f"intrinsics of {before} were scaled to photographs of {width}x{height}")
+        where = f"{path}: {view.relative}"
+        camera = _camera(view, intrinsics, width, height, where=where)
+        with made_from(where):
+            made = View(
+                name=name,
+                camera=camera,
+                image=view.image,
+                split=split,
+                mask=view.mask,
+                depth=view.depth,
+                depth_unit=view.depth_unit,
+            )
+        views.append(made)
+    return views, tuple(dict.fromkeys(scaled))
 
 
 def view_names(relatives: Sequence[str]) -> list[str]:
