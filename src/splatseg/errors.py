@@ -83,9 +83,18 @@ def reason(error: BaseException) -> str:
         words = " ".join(str(error).split()[:40])
     except ValueError:  # the error names a number of too many digits
         words = ""
-    clean = "".join(c if c.isprintable() else "?" for c in words).rstrip(".")
-    clean = clean or type(error).__name__
-    return clean if len(clean) <= _REASON else f"{clean[: _REASON - 3]}..."
+    return brief(words.rstrip(".")) or type(error).__name__
+
+
+def brief(text: str, limit: int = _REASON) -> str:
+    """Words that hold foreign text, as a message shows them: printable, cut.
+
+    Example:
+        >>> brief("other rows, other " + "x" * 1000, 30)
+        'other rows, other xxxxxxxxx...'
+    """
+    clean = "".join(c if c.isprintable() else "?" for c in text[: limit + 1])
+    return clean if len(clean) <= limit else f"{clean[: limit - 3]}..."
 
 
 class _Shown(reprlib.Repr):

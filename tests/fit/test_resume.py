@@ -23,6 +23,7 @@ from splatseg.fit import (
     fit,
 )
 from splatseg.fit._checkpoint import read_checkpoint, write_checkpoint
+from splatseg.fit._identity import check_identity
 from splatseg.fit._resume import CheckpointClock
 from splatseg.fit._run import FitRun
 from splatseg.io.npz_writing import discard_checkpoint_file
@@ -466,3 +467,12 @@ def test_intervals_are_checked(path: Path) -> None:
             Checkpoints(path=path, seconds=seconds)
     with pytest.raises(InputError, match=r"checkpoints\.steps: expected at least 1, got 0"):
         Checkpoints(path=path, steps=0)
+
+
+def test_names_of_a_damaged_record_do_not_fill_the_screen(tmp_path) -> None:
+    identity = {"data": {"x" * 5000: 1, "line\nbreak": 2}, "options": {}, "defaults": {}}
+    with pytest.raises(InputError, match="of this fit, got one with other ") as caught:
+        check_identity(tmp_path, identity, {"data": {}, "options": {}, "defaults": {}})
+    words = str(caught.value)
+    assert len(words) < 500 + len(str(tmp_path))
+    assert words.isprintable()

@@ -106,7 +106,7 @@ def test_defaults_are_those_that_the_figures_were_measured_with() -> None:
     """Decision 0013; other numbers need other figures."""
     assert asdict(ConfusionOptions()) == {
         "effective_views": 10.0,
-        "max_correlation": 0.27,
+        "max_correlation": 1.0,
         "correlated_views": 3.0,
         "min_confusion": 3e-3,
         "diagonal_prior": 5.0,
@@ -135,7 +135,7 @@ def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
     """Of a Gaussian half mouse, half desk three independent views are not enough to say mouse."""
     labels = desk_and_mouse()
     for correlation, views in ((None, 10), (-0.1, 10), (0.27, 10), (0.28, 1.5)):
-        options = ConfusionOptions(correlated_views=1.5)
+        options = ConfusionOptions(max_correlation=0.27, correlated_views=1.5)
         found = correct_confusion(labels, options=options, view_correlation=correlation)
         expected = correct_confusion(labels, options=ConfusionOptions(effective_views=views))
         assert torch.equal(found.shares, expected.shares)
@@ -146,9 +146,13 @@ def test_errors_over_ranges_of_views_leave_few_independent_ones() -> None:
     found = correct_confusion(labels, options=independent, view_correlation=1.0)
     assert found.ids[18:].tolist() == [2, 2]
     found = correct_confusion(labels, view_correlation=0.9)
+    assert found.info.edit("correct_confusion")["effective_views"] == 10.0
+    found = correct_confusion(
+        labels, options=ConfusionOptions(max_correlation=0.27), view_correlation=0.9
+    )
     assert found.info.edit("correct_confusion")["effective_views"] == 3.0
     # Never more than there are at most.
-    few = ConfusionOptions(effective_views=2.0)
+    few = ConfusionOptions(effective_views=2.0, max_correlation=0.27)
     found = correct_confusion(labels, options=few, view_correlation=0.9)
     assert found.info.edit("correct_confusion")["effective_views"] == 2.0
 

@@ -420,6 +420,9 @@ def test_a_checkpoint_of_another_training_is_refused(rng, views, tmp_path) -> No
     other = sampler_of(random_gaussians(rng, N), views, random_maps(rng, views, IDS), pixels=60)
     with pytest.raises(InputError, match="got one with other Gaussians, other evidence"):
         run(other, settings={"blend": "a"})
+    with pytest.raises(InputError, match="got one with ") as caught:
+        run(settings={"blend": "a" * 5000})
+    assert len(str(caught.value)) < 500 + len(str(path))
     fewer = sampler_of(gaussians, views, maps, pixels=59)
     with pytest.raises(InputError, match="got one with pixels 60 instead of 59"):
         run(fewer, settings={"blend": "a"})

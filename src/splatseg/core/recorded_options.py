@@ -21,6 +21,9 @@ class Absent(Enum):
 
 ABSENT: Final = Absent.ABSENT
 
+DIFFERENCES: Final = 240
+"""Characters of a message that lists differences, whose names may be a file's."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptionDifference:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Camera, Capture, View
-from splatseg.core.recorded_options import differing_names, option_differences
-from splatseg.errors import InputError
+from splatseg.core.recorded_options import DIFFERENCES, differing_names, option_differences
+from splatseg.errors import InputError, brief
 from splatseg.fit._options import FitOptions
 from splatseg.io.json_files import parse_object
 
@@ -74,7 +74,7 @@ def check_identity(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any])
     if differing:
         raise InputError(
             f"{path}: expected a checkpoint with the data and options of this fit, got one with "
-            f"{', '.join(differing)}."
+            f"{brief(', '.join(differing), DIFFERENCES)}."
         )
 
 

@@ -144,17 +144,18 @@ def _view(
     files = {
         field: _resolve(entry, key, folder=folder, source=source) for field, key in _FILES.items()
     }
-    return View(
-        name=name,
-        split=split,
-        camera=_camera(merged, entry, where=where),
-        image=files["image"],
-        mask=files["mask"],
-        depth=files["depth"],
-        depth_unit=number(merged, "depth_unit_scale_factor", MILLIMETRE, where=where)
-        if files["depth"]
-        else None,
-    )
+    with made_from(where):
+        return View(
+            name=name,
+            split=split,
+            camera=_camera(merged, entry, where=where),
+            image=files["image"],
+            mask=files["mask"],
+            depth=files["depth"],
+            depth_unit=number(merged, "depth_unit_scale_factor", MILLIMETRE, where=where)
+            if files["depth"]
+            else None,
+        )
 
 
 def _resolve(

@@ -301,6 +301,10 @@ def _source(
     if not isinstance(source, dict):
         return None
     entry = cast(dict[str, Any], source)
+    if any("\0" in str(entry.get(key)) for key in ("relative", "absolute")):
+        raise FileFormatError(
+            f"{root / SCENE_FILE}: expected paths of the source, got {quoted(source)}."
+        )
     candidates = [
         Path(os.path.normpath(root / str(entry.get("relative")))),
         Path(str(entry.get("absolute"))),

@@ -1,6 +1,6 @@
 """Uplift as a method: every pixel votes for its label on the Gaussians it shows."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from splatseg.core import Labels
 from splatseg.lift.mass.confusion import ConfusionOptions
@@ -18,8 +18,7 @@ class UpliftMethodOptions:
 
     correct_confusion: bool = True
     """Relabel under how often the evidence takes one id for another, which finds small things
-    that most views miss; less where errors of class maps hold over ranges of views. Not with
-    FlashSplat's rules."""
+    that most views miss. Not with FlashSplat's rules."""
 
     confusion: ConfusionOptions = field(default_factory=ConfusionOptions)
     """How the evidence errs."""
@@ -28,10 +27,6 @@ class UpliftMethodOptions:
 def run(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
     """Label Gaussians by votes of pixels, see `lift.pipeline.lift_labels`."""
     confusion = options.confusion if options.correct_confusion else None
-    if confusion is not None and inputs.evidence.kind != "labels":
-        # A tracker's ids of one thing follow each other by ranges of views: to gather them is
-        # what relabelling is for.
-        confusion = replace(confusion, max_correlation=1.0)
     return lift_labels(
         inputs.gaussians,
         inputs.views,

@@ -13,6 +13,7 @@ import torch
 from splatseg.core import Camera
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
+from splatseg.io.captures._colmap_text import read_frames
 from splatseg.io.captures.colmap import read_colmap_model
 from splatseg.io.captures.colmap_model import MODELS, ColmapCamera, intrinsics_of
 
@@ -206,6 +207,16 @@ def test_impossible_frames_are_refused(rig_capture, change, message) -> None:
     path.write_text(path.read_text().replace(*change))
     with pytest.raises(InputError, match=message):
         read_capture(folder)
+
+
+@pytest.mark.parametrize("count", [4, 10**9, 10**30, -1])
+def test_a_frame_with_fewer_images_than_it_says_is_refused_at_once(tmp_path, count) -> None:
+    path = tmp_path / "frames.txt"
+    path.write_text("# comment\n1 1 1 0 0 0 0 0 0 2 CAMERA 1 11 CAMERA 2 12\n")
+    assert read_frames(path)[0].images == ((1, 11), (2, 12))
+    path.write_text(path.read_text().replace("0 2 CAMERA", f"0 {count} CAMERA"))
+    with pytest.raises(FileFormatError, match=r"frames\.txt: line 2: expected FRAME_ID"):
+        read_frames(path)
 
 
 def test_a_zero_quaternion_is_no_pose(rig_capture) -> None:

@@ -485,3 +485,17 @@ def test_what_is_no_evidence(tmp_path) -> None:
 def test_where_there_is_no_evidence_the_command_that_makes_some_is_named(tmp_path) -> None:
     with pytest.raises(InputError, match=r"\(there is none; `splatseg see` makes some\), got 'm'"):
         find_evidence([tmp_path], "m")
+
+
+@pytest.mark.parametrize("category", [True, 1.5, "1", -2, 2**31, None])
+def test_a_category_that_is_no_id_is_refused(tmp_path, category) -> None:
+    Image.fromarray(np.ones((2, 3), np.uint8)).save(tmp_path / "a.png")
+    row = {"id": 1, "category_id": 2}
+    for value in (2, -1, category):
+        table = {"a": {"segments_info": [row | {"category_id": value}]}}
+        (tmp_path / "segments.json").write_text(json.dumps(table))
+        evidence = open_evidence(tmp_path)
+        if value is not category:
+            assert [one.category for one in evidence.segments("a")] == [value]
+    with pytest.raises(FileFormatError, match=r"segments\.json: view 'a': expected segments"):
+        evidence.segments("a")

@@ -290,6 +290,7 @@ def _edit(path: Path, change) -> None:
         (lambda c: c.update(split=[1]), "a split of lists of view names"),
         (lambda c: c.update(up=[1, 2]), "up as three numbers"),
         (lambda c: c.update(classes=[{"id": "a"}]), "an integer id and a name"),
+        (lambda c: c.update(source={"absolute": "\0"}), "scene.json: expected paths of the source"),
     ],
 )
 def test_a_scene_json_that_contradicts_itself(version_1, change, message) -> None:

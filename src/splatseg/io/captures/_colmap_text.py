@@ -110,7 +110,10 @@ def read_frames(path: Path) -> tuple[ColmapFrame, ...]:
     def parse(line: str) -> ColmapFrame:
         words = line.split()
         pose = rigid_matrix(tuple(float(w) for w in words[2:9]))
-        data = [words[10 + 3 * i : 13 + 3 * i] for i in range(int(words[9]))]
+        count = int(words[9])
+        if not 0 <= 3 * count <= len(words) - 10:
+            raise ValueError("NUM_DATA is not the number of entries")
+        data = [words[10 + 3 * i : 13 + 3 * i] for i in range(count)]
         images = tuple((int(s), int(i)) for kind, s, i in data if kind == "CAMERA")
         return ColmapFrame(rig_id=int(words[1]), rig_from_world=pose, images=images)
 

@@ -108,7 +108,7 @@ class PanopticEvidence(TableEvidence):
             fields = cast(dict[str, Any], row) if isinstance(row, dict) else {}
             id, category = fields.get("id"), fields.get("category_id")
             score = fields.get("score", 1.0)
-            if not is_id(id) or not isinstance(category, int) or not -1 <= category <= MAX_FILE_ID:
+            if not is_id(id) or not (category == -1 or is_id(category)):
                 raise FileFormatError(
                     f"{path}: view {name!r}: expected segments with id and category_id up to "
                     f"{MAX_FILE_ID}, got {quoted(row)}."

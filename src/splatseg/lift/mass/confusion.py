@@ -59,9 +59,10 @@ class ConfusionOptions:
     """Upper bound of independent views that a Gaussian's votes count as; fewer where fewer saw
     it."""
 
-    max_correlation: float = 0.27
+    max_correlation: float = 1.0
     """Highest correlation of neighbouring views, in [-1, 1], at which views count as independent.
-    Above it errors hold over ranges of views."""
+    Above it errors hold over ranges of views; 1: whatever it is. No threshold was found that
+    leaves real captures alone."""
 
     correlated_views: float = 3.0
     """Upper bound of independent views above `max_correlation`."""

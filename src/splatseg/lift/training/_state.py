@@ -15,8 +15,8 @@ from torch import Tensor
 
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_integer, json_number
-from splatseg.core.recorded_options import differing_names, option_differences
-from splatseg.errors import FileFormatError, InputError, quoted
+from splatseg.core.recorded_options import DIFFERENCES, differing_names, option_differences
+from splatseg.errors import FileFormatError, InputError, brief, quoted
 from splatseg.io.json_files import parse_object
 from splatseg.io.npz import open_npz
 from splatseg.io.npz_writing import write_checkpoint_file
@@ -225,7 +225,7 @@ def _check_identity(path: Path, saved: Mapping[str, Any], wanted: Mapping[str, A
     if differing:
         raise InputError(
             f"{path}: expected a checkpoint with the data and options of this training, got one "
-            f"with {', '.join(differing)}."
+            f"with {brief(', '.join(differing), DIFFERENCES)}."
         )
 
 
