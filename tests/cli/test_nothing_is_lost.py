@@ -16,9 +16,7 @@ from splatseg.errors import FileFormatError
 from splatseg.io.evidence import evidence_header, open_evidence
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.lock import scene_lock
-from splatseg.io.scene import (
-    load_scene,
-)
+from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.models import record_evidence
 from splatseg.models.classical import Classical

@@ -12,9 +12,7 @@ import pytest
 
 from splatseg.errors import MissingFileError
 from splatseg.fit import checkpoint_summary
-from splatseg.io.scene import (
-    load_scene,
-)
+from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished
 from splatseg.synthetic import cameras, room, write_capture
 

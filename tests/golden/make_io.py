@@ -38,11 +38,7 @@ from splatseg.core import (
 from splatseg.io.evidence import create_evidence, save_features, save_label_map, save_masks
 from splatseg.io.layers import VERSION as LAYER_VERSION
 from splatseg.io.layers import save_layer
-from splatseg.io.scene import (
-    VERSION,
-    save_scene,
-    save_scene_layer,
-)
+from splatseg.io.scene import VERSION, save_scene, save_scene_layer
 from splatseg.io.scene_folder import CAMERAS_FILE, SCENE_FILE
 
 ROOT = Path(__file__).parent / f"scene-v{VERSION}"

@@ -7,10 +7,7 @@ import pytest
 from splatseg.edit import load_document
 from splatseg.fit import FitOptions
 from splatseg.io.evidence import open_evidence
-from splatseg.io.scene import (
-    load_scene,
-    scene_layer_names,
-)
+from splatseg.io.scene import load_scene, scene_layer_names
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.tasks import (
     DemoOptions,
@@ -23,6 +20,7 @@ from splatseg.tasks import (
     fit_capture,
     import_scene,
     make_demo,
+    make_scene,
     see,
     sharpen_scene,
 )
@@ -66,6 +64,26 @@ def test_a_cancelled_fit_goes_on_from_its_last_checkpoint(small_room, straight, 
     assert made.result.steps == 40
     assert gaussians(folder) == straight
     assert not (folder / CHECKPOINT_FILE).exists()
+
+
+def test_a_fit_that_is_stopped_while_it_is_scored_can_be_resumed(
+    small_room, straight, tmp_path, monkeypatch
+) -> None:
+    folder = tmp_path / "scene"
+    with monkeypatch.context() as patch:
+        patch.setattr(make_scene, "score_and_report", _interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            fit_capture(small_room, folder, fit_options=FIT, options=OFTEN, backend="cpu")
+    assert is_scene(folder)
+    assert not (folder / "reports" / "fit.html").exists()
+    made = fit_capture(small_room, folder, fit_options=FIT, options=GOING_ON, backend="cpu")
+    assert made.report.is_file()
+    assert gaussians(folder) == straight
+    assert not (folder / CHECKPOINT_FILE).exists()
+
+
+def _interrupt(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_a_fit_that_is_asked_to_end_leaves_a_scene(small_room, straight, tmp_path) -> None:

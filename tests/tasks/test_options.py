@@ -8,10 +8,7 @@ import torch
 from splatseg.edit import load_document
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions
-from splatseg.io.scene import (
-    load_scene,
-    scene_layer_names,
-)
+from splatseg.io.scene import load_scene, scene_layer_names
 from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.io.splats import read_splats, write_splats
 from splatseg.tasks import (

@@ -15,9 +15,7 @@ from splatseg.cli import main
 from splatseg.core import Labels
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import FitOptions
-from splatseg.io.scene import (
-    load_scene,
-)
+from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import training_file
 from splatseg.lift.training import _train, training_summary
 from splatseg.methods import find_method

@@ -22,12 +22,7 @@ from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.io.atomic import is_vacant
 from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
-from splatseg.io.scene import (
-    load_scene,
-    save_scene,
-    save_scene_layer,
-    scene_layer_names,
-)
+from splatseg.io.scene import load_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import is_scene, work_on_scene
 from splatseg.lift import Attached, AttachOptions, attach
 from splatseg.tasks._observer import SILENT, Observer

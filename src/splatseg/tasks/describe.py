@@ -26,11 +26,7 @@ from splatseg.io.evidence import Evidence, evidence_names, open_evidence
 from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import load_layer
 from splatseg.io.lock import lock_owner
-from splatseg.io.scene import (
-    load_scene,
-    load_scene_layer,
-    scene_layer_names,
-)
+from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished, training_files
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
 from splatseg.tasks.stopped_fit import where_it_stopped

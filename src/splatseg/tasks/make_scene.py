@@ -23,9 +23,7 @@ from splatseg.fit import (
     reduction_note,
 )
 from splatseg.io.npz_writing import discard_checkpoint_file
-from splatseg.io.scene import (
-    save_scene,
-)
+from splatseg.io.scene import save_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.pose import PoseReport
 from splatseg.render import BackendName
@@ -163,6 +161,9 @@ def fit_capture(
             command=command,
             timings=timings,
         )
+        # Not before the report: who is stopped there can resume, and gets it.
+        if not (stopped or options.keep_checkpoint):
+            discard_checkpoint_file(folder / CHECKPOINT_FILE)
     if done.verdict.warns:
         observer.note(f"{done.verdict.words.lower()}: {done.verdict.sentence.rstrip('.')}")
     return MadeScene(
@@ -225,14 +226,11 @@ def _fitted(
                 checkpoints=checkpoints,
             )
         provenance = _provenance(options, fit_options, backend, result)
-        _save(folder, capture, result, provenance, keep=options.keep_checkpoint)
+        _save(folder, capture, result, provenance)
     return result, interrupts.requested or result.interrupted
 
 
-def _save(
-    folder: Path, capture: Capture, result: FitResult, provenance: dict[str, Any], *, keep: bool
-) -> None:
-    """Write the scene; then a finished fit needs its checkpoint no more."""
+def _save(folder: Path, capture: Capture, result: FitResult, provenance: dict[str, Any]) -> None:
     scene = Scene(
         gaussians=result.gaussians,
         views=result.views,
@@ -243,8 +241,6 @@ def _save(
         provenance=provenance,
     )
     save_scene(scene, folder)
-    if not (result.interrupted or keep):
-        discard_checkpoint_file(folder / CHECKPOINT_FILE)
 
 
 def _beginning(capture: Capture, options: FitOptions) -> str:
