@@ -13,6 +13,7 @@ from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, FitResult, fit
 from splatseg.io.scene import save_scene
 from splatseg.lift import GaussianField
+from splatseg.pose import PoseReport
 from splatseg.tasks._fit_report import score_and_report
 
 OPTIONS = FitOptions(minutes=None, steps=120, max_gaussians=70, seed=3, background="black")
@@ -150,9 +151,21 @@ def test_one_held_out_view_and_none(fitted) -> None:
 def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
     root, capture, result = fitted
     (root / "capture").mkdir()
-    report = {"photographs": 12, "registered": ["a", "b"], "error": 0.61234, "mapper": "global"}
-    report["seconds"] = {"copies": 1.5, "features": 20.25, "mapping": 8.0}
-    (root / "capture" / "poses.json").write_text(json.dumps({"report": report}))
+    report = PoseReport(
+        photographs=12,
+        registered=("a", "b"),
+        left_out=(),
+        mapper="global",
+        tries=(),
+        error=0.61234,
+        longest=1600,
+        points=9,
+        track_length=2.5,
+        lenses=(),
+        seconds={"copies": 1.5, "features": 20.25, "mapping": 8.0},
+    ).as_json()
+    content = {"format": "splatseg-poses", "version": 1, "made_of": "x", "report": report}
+    (root / "capture" / "poses.json").write_text(json.dumps(content))
     noted = replace(capture, notes=("sizes were <odd> & fixed",))
     short = replace(result, history=(), notes=("exposure +0.1",))
     score_and_report(root, noted, short, options=OPTIONS, backend="cpu", scoring=True)
@@ -165,4 +178,6 @@ def test_too_short_for_a_curve_and_poses_that_were_found(fitted) -> None:
     for expected in ("29.8 s (copies 1.5, features 20.2, mapping 8.0)", "poses: seconds"):
         assert expected in words
     assert "<odd>" not in text
-    assert json.loads((root / "reports" / "fit.json").read_text())["poses"] == report
+    assert json.loads((root / "reports" / "fit.json").read_text())["poses"] == json.loads(
+        json.dumps(report)
+    )
