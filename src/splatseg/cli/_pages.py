@@ -7,6 +7,7 @@ import contextlib
 import importlib
 import io
 import os
+import re
 import textwrap
 from collections.abc import Sequence
 from importlib.metadata import entry_points
@@ -74,9 +75,12 @@ def made_page(name: str, module: str, words: Sequence[str] = ()) -> str:
 
 
 def wrapped(page: str) -> str:
-    """A page without lines that are too long, blanks at their ends or two empty lines in a row."""
+    """A page without lines that are too long, blanks at their ends or two empty lines in a row.
+
+    The heading of options within a method's options names them alone, as their flags do.
+    """
     lines: list[str] = []
-    for line in page.rstrip().splitlines():
+    for line in re.sub(r"(?m)^ options\.(?=\w+ options *$)", " ", page).rstrip().splitlines():
         if not line.strip() and lines and not lines[-1]:
             continue
         # A command line is to be copied in one piece.

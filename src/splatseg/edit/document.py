@@ -1,6 +1,6 @@
 """A scene with its layers, which edits change together."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -61,8 +61,15 @@ def load_document(root: Path | str, *, data: Path | str | None = None) -> Docume
 
 
 @boundary
-def save_document(document: Document, root: Path | str) -> Document:
+def save_document(
+    document: Document, root: Path | str, *, evidence: Sequence[Path] = ()
+) -> Document:
     """Write a new scene folder with its layers, whole or not at all.
+
+    Args:
+        document: The scene and its layers.
+        root: The folder to write.
+        evidence: Folders of evidence of the same photographs, copied under their own names.
 
     Raises:
         InputError: If something is there already: edits write new scenes.
@@ -72,4 +79,5 @@ def save_document(document: Document, root: Path | str) -> Document:
         raise InputError(
             f"{root}: expected a new folder, got one that is there; an edit never overwrites."
         )
-    return replace(document, scene=save_scene(document.scene, root, layers=document.layers))
+    scene = save_scene(document.scene, root, layers=document.layers, evidence=evidence)
+    return replace(document, scene=scene)

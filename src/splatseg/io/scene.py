@@ -19,7 +19,8 @@ absolute one, and opens without it.
 
 import os
 import re
-from collections.abc import Mapping
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -64,11 +65,16 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 
 @boundary
 def save_scene(
-    scene: Scene, root: Path | str, *, layers: Mapping[str, Layer] | None = None
+    scene: Scene,
+    root: Path | str,
+    *,
+    layers: Mapping[str, Layer] | None = None,
+    evidence: Sequence[Path] = (),
 ) -> Scene:
     """Write a scene folder; layers, evidence and reports that are there stay.
 
-    A new folder appears whole or not at all, with its `layers`. In one that is there, be it a
+    A new folder appears whole or not at all, with its `layers` and copies of the folders of
+    `evidence`, each under its own name. In one that is there, be it a
     scene or the checkpoint of one that was being fitted, the new files take the places of the
     old ones together: a process that is killed leaves the old scene or the new one.
 
@@ -76,15 +82,20 @@ def save_scene(
         The scene with `root` set.
 
     Raises:
-        InputError: If `root` is a folder of something else, a value has no place in JSON, or a
-            layer has not one row a Gaussian.
+        InputError: If `root` is a folder of something else, a value has no place in JSON, a layer
+            has not one row a Gaussian, evidence is no folder, or is given to a scene that is there.
         MissingFileError: If the parent of `root` does not exist.
         OutputError: If the disk is full, or there is no permission.
     """
     root = Path(root)
     for name, layer in (layers or {}).items():
         _check_layer(name, layer, len(scene.gaussians))
+    for folder in evidence:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: expected a folder of evidence, got none.")
     there = is_scene(root) or is_unfinished(root)
+    if there and evidence:
+        raise InputError(f"{root}: expected a new folder to copy evidence to, got a scene.")
     if root.is_dir() and not there and not is_vacant(root):
         raise InputError(f"{root}: expected an empty folder or a scene to write to, got neither.")
     if there:
@@ -93,6 +104,8 @@ def save_scene(
     else:
         with atomic_folder(root, durable=True) as temporary:
             _write(scene, temporary, layers or {}, final=root)
+            for folder in evidence:
+                shutil.copytree(folder, temporary / "evidence" / folder.name)
     return replace(scene, root=root)
 
 

@@ -31,7 +31,6 @@ from splatseg.fit import (
 from splatseg.io.evidence import (
     Evidence,
     check_map_sizes,
-    copy_evidence,
     find_evidence,
     open_evidence,
 )
@@ -144,8 +143,8 @@ def sharpen_scene(
     after = _psnr(scene, found.gaussians, spaced, backend)
     layers = {**document.layers, **_sharpened(document, options.layer, merged(layer, found))}
     new = _sharpened_scene(scene, options, how, found, psnr=[before, after])
-    saved = save_document(Document(scene=new, layers=layers), folder)
-    _bring_evidence(evidence, scene, folder)
+    document = Document(scene=new, layers=layers)
+    saved = save_document(document, folder, evidence=_own_evidence(evidence, scene))
     return SharpenedScene(
         folder=folder,
         document=saved,
@@ -231,12 +230,12 @@ def _sharpened_scene(
     return replace(scene, gaussians=found.gaussians, provenance=provenance)
 
 
-def _bring_evidence(evidence: Evidence, scene: Scene, folder: Path) -> None:
-    """Copy evidence that lies in the scene's own folder, which the new one could not find."""
+def _own_evidence(evidence: Evidence, scene: Scene) -> tuple[Path, ...]:
+    """Evidence that lies in the scene's own folder, which the new one could not find."""
     if scene.root is None:
-        return
-    if evidence.folder.resolve().parent == (scene.root / "evidence").resolve():
-        copy_evidence(evidence.folder, folder)
+        return ()
+    inside = evidence.folder.resolve().parent == (scene.root / "evidence").resolve()
+    return (evidence.folder,) if inside else ()
 
 
 def _sharpened(document: Document, address: str, labels: Labels) -> dict[str, Layer]:

@@ -362,3 +362,24 @@ def test_layers_that_are_not_of_the_scene(version_1) -> None:
         load_scene_layer(version_1, "gone")
     with pytest.raises(InputError, match="layer 'l': expected 3 rows .* got 2"):
         save_scene_layer(Labels(ids=torch.ones(2), confidence=torch.ones(2)), version_1, "l")
+
+
+def test_evidence_appears_with_a_new_scene_or_not_at_all(tmp_path, golden, monkeypatch) -> None:
+    evidence = tmp_path / "a" / "masks"
+    (evidence / "deeper").mkdir(parents=True)
+    (evidence / "deeper" / "v.png").write_bytes(b"123")
+    scene = golden.golden_scene()
+    saved = save_scene(scene, tmp_path / "with", evidence=[evidence])
+    assert (saved.root / "evidence" / "masks" / "deeper" / "v.png").read_bytes() == b"123"
+    with pytest.raises(InputError, match="expected a new folder to copy evidence to"):
+        save_scene(scene, tmp_path / "with", evidence=[evidence])
+    with pytest.raises(InputError, match="expected a folder of evidence, got none"):
+        save_scene(scene, tmp_path / "without", evidence=[tmp_path / "none"])
+
+    def stopped(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "copytree", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        save_scene(scene, tmp_path / "stopped", evidence=[evidence])
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "with"}

@@ -30,7 +30,6 @@ from splatseg.io.evidence._segments import SEGMENTS_FILE as SEGMENTS_FILE
 from splatseg.io.evidence._segments import PanopticEvidence as PanopticEvidence
 from splatseg.io.evidence._segments import TrackedEvidence as TrackedEvidence
 from splatseg.io.evidence._sizes import check_map_sizes as check_map_sizes
-from splatseg.io.evidence._write import copy_evidence as copy_evidence
 from splatseg.io.evidence._write import create_evidence as create_evidence
 from splatseg.io.evidence._write import save_features as save_features
 from splatseg.io.evidence._write import save_label_map as save_label_map

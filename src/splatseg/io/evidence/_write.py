@@ -1,6 +1,5 @@
 """Writes evidence: a folder with evidence.json and one file a view, each whole or not there."""
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet,
 from splatseg.core.boundary import boundary
 from splatseg.core.view_names import check_view_name
 from splatseg.errors import InputError, MissingFileError, RangeError
-from splatseg.io.atomic import atomic_file, atomic_folder
+from splatseg.io.atomic import atomic_file
 from splatseg.io.class_tables import class_rows
 from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
@@ -203,24 +202,3 @@ def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Pa
     path = folder / f"{name}{suffix}"
     with named_write_failures(path):
         return path_inside(folder, f"{name}{suffix}", make=make)
-
-
-@boundary
-def copy_evidence(folder: Path | str, scene: Path | str) -> Path:
-    """Give a scene the evidence of another one of the same photographs, whole or not at all.
-
-    Args:
-        folder: The evidence.
-        scene: The scene folder; evidence of this name that it has is replaced.
-
-    Raises:
-        InputError: If there is no such folder.
-        MissingFileError: If there is no scene folder.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder of evidence, got none.")
-    target = path_inside(Path(scene), "evidence", folder.name, make=False)
-    with atomic_folder(target) as temporary:
-        shutil.copytree(folder, temporary, dirs_exist_ok=True)
-    return target
