@@ -138,6 +138,27 @@ def test_a_kill_between_the_two_renames_is_finished(tmp_path: Path, aside: str) 
     assert (tmp_path / name / "new").exists()
 
 
+def test_what_took_the_name_since_stays(tmp_path: Path) -> None:
+    holder = tmp_path / f"{TEMPORARY}{_ended()}-abc"
+    (holder / "previous").mkdir(parents=True)
+    (holder / "rgb" / "new").mkdir(parents=True)
+    (tmp_path / "rgb").mkdir()
+    sweep(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["rgb"]
+    assert not list((tmp_path / "rgb").iterdir())
+
+
+def test_a_link_of_that_name_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere" / "x").mkdir(parents=True)
+    (tmp_path / "scene").mkdir()
+    link = tmp_path / "scene" / f"{TEMPORARY}{_ended()}-abc"
+    (tmp_path / "elsewhere" / "previous").mkdir()
+    link.symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    sweep(tmp_path / "scene")
+    assert link.is_symlink()
+    assert sorted(path.name for path in (tmp_path / "elsewhere").iterdir()) == ["previous", "x"]
+
+
 def test_what_was_half_written_takes_no_place(tmp_path: Path) -> None:
     holder = tmp_path / f"{TEMPORARY}{_ended()}-abc"
     (holder / "rgb").mkdir(parents=True)

@@ -1,5 +1,6 @@
 """What cannot be written is named, with what to do; what was there stays."""
 
+import errno
 import os
 import resource
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 
 from splatseg.core import Labels
 from splatseg.errors import InputError, OutputError
-from splatseg.io.atomic import atomic_file, atomic_folder
+from splatseg.io.atomic import atomic_file, atomic_folder, sync
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.npz_writing import unfinished, write_checkpoint_file
 from splatseg.io.write_errors import failure_to_write
@@ -99,3 +100,24 @@ def test_scenes_layers_and_checkpoints_wait_for_the_disk(
     with atomic_folder(tmp_path / "scene", durable=True) as temporary:
         (temporary / "scene.json").touch()
     assert done == ["sync scene.json", "sync scene", "rename scene", here]
+
+
+def test_a_file_system_may_lack_syncing_of_folders_but_not_of_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(number: int) -> None:
+        def fsync(handle: int) -> None:
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(os, "fsync", fsync)
+
+    file = tmp_path / "a"
+    file.touch()
+    for number in (errno.EINVAL, errno.ENOTSUP):
+        refused(number)
+        sync(tmp_path)
+        with pytest.raises(OSError, match=os.strerror(number)):
+            sync(file)
+    refused(errno.EIO)
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)):
+        sync(tmp_path)
