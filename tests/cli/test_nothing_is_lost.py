@@ -154,17 +154,21 @@ def test_signals_end_a_see_half_way(small, splatseg, monkeypatch, number) -> Non
         return masks(self, image)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Classical, "masks", slow)
-    # What a shell starts in the background ignores Ctrl-C, and tests may run there.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    # What a shell starts in the background ignores Ctrl-C, what nohup starts hang-ups, and tests may
+    # run there.
+    handlers = dict.fromkeys((signal.SIGTERM, signal.SIGHUP), signal.SIG_DFL)
+    handlers[signal.SIGINT] = signal.default_int_handler
+    before = {one: signal.signal(one, handler) for one, handler in handlers.items()}
     began = time.monotonic()
     try:
         status, _, err = splatseg("see", small.scene, *SEE)
+        assert {one: signal.getsignal(one) for one in handlers} == handlers, "as it was before"
     finally:
-        signal.signal(signal.SIGINT, before)
+        for one, handler in before.items():
+            signal.signal(one, handler)
     assert time.monotonic() - began < 15
     assert status == 1
     assert "interrupted" in err
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL, "as it was before"
     folder = small.scene / "evidence" / "masks"
     assert open_evidence(folder, unfinished="allow").view_names == ("train_0",)
     assert not list(small.scene.rglob(".splatseg*"))
