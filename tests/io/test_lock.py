@@ -138,6 +138,27 @@ def test_a_kill_between_the_two_renames_is_finished(tmp_path: Path, aside: str) 
     assert (tmp_path / name / "new").exists()
 
 
+def test_a_lock_whose_file_its_owner_has_just_removed_is_taken_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between opening and locking the file its owner may end: who locks it then locks nothing."""
+    from splatseg.io import lock
+
+    ends = [lambda: (tmp_path / LOCK_FILE).unlink()]
+
+    def try_lock(handle: int, **more: bool) -> str:
+        if ends:
+            ends.pop()()
+        return real(handle, **more)
+
+    real = lock.try_lock
+    monkeypatch.setattr(lock, "try_lock", try_lock)
+    with scene_lock(tmp_path, "fit"):
+        owner = lock_owner(tmp_path)
+        assert owner is not None
+        assert owner.process == os.getpid()
+
+
 def test_what_took_the_name_since_stays(tmp_path: Path) -> None:
     holder = tmp_path / f"{TEMPORARY}{_ended()}-abc"
     (holder / "previous").mkdir(parents=True)
