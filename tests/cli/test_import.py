@@ -81,7 +81,9 @@ def test_a_wrong_frame_is_found_and_undone(small, splat_file, splatseg, tmp_path
 
 
 def test_up(splat_file, splatseg, tmp_path) -> None:
-    assert splatseg("import", splat_file, "-o", tmp_path / "s", *SMALL, "--up", "+z")[0] == 0
+    status, out, err = splatseg("import", splat_file, "-o", tmp_path / "s", *SMALL, "--up", "+z")
+    assert status == 0, err
+    assert "up is" not in out + err, "it was said"
     scene = load_scene(tmp_path / "s")
     assert scene.up == (0.0, 0.0, 1.0)
     assert all(abs(float(v.camera.cam_from_world[0, 2])) < 1e-9 for v in scene.views)
@@ -89,8 +91,9 @@ def test_up(splat_file, splatseg, tmp_path) -> None:
 
 def test_gltf_is_y_up(project_root, splatseg, tmp_path) -> None:
     file = project_root / "tests" / "golden" / "tools" / "ring.glb"
-    status, _, err = splatseg("import", file, "-o", tmp_path / "s", *SMALL)
+    status, out, err = splatseg("import", file, "-o", tmp_path / "s", *SMALL)
     assert status == 0, err
+    assert "up is +y, as is usual in such files" in out + err
     assert load_scene(tmp_path / "s").up == (0.0, 1.0, 0.0)
 
 

@@ -126,7 +126,8 @@ def import_scene(
             observer.info(_aligned(alignment))
         scene = _with_photographs(gaussians, capture, alignment, provenance)
     else:
-        up = _up(file, options.up)
+        axis = _up_axis(file) if options.up == "auto" else options.up
+        up = _direction(axis)
         with observer.stage("placing cameras") as step:
             placed = place_cameras(
                 gaussians,
@@ -140,6 +141,11 @@ def import_scene(
             )
         scene = _with_cameras(gaussians, up, placed, provenance)
         observer.info(_placed(placed))
+        if options.up == "auto":
+            observer.info(
+                f"up is {axis}, as is usual in such files; where the views lie on their side, "
+                "say which axis is, such as --up +z"
+            )
     return ImportedScene(scene=save_scene(scene, folder), alignment=alignment, placed=placed)
 
 
@@ -193,11 +199,14 @@ def _with_cameras(
     return Scene(gaussians=gaussians, views=placed.views, up=up, provenance=provenance)
 
 
-def _up(file: Path, name: UpAxis) -> tuple[float, float, float]:
-    if name == "auto":
-        name = "+y" if splat_format(file) == "gltf" else "-y"
-    sign = 1.0 if name[0] == "+" else -1.0
-    x, y, z = (sign if axis == name[1] else 0.0 for axis in "xyz")
+def _up_axis(file: Path) -> str:
+    """The axis that is up in files of this format; nothing in them says so."""
+    return "+y" if splat_format(file) == "gltf" else "-y"
+
+
+def _direction(axis: str) -> tuple[float, float, float]:
+    sign = 1.0 if axis[0] == "+" else -1.0
+    x, y, z = (sign if letter == axis[1] else 0.0 for letter in "xyz")
     return x, y, z
 
 
