@@ -154,8 +154,8 @@ def test_signals_end_a_see_half_way(small, splatseg, monkeypatch, number) -> Non
         return masks(self, image)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Classical, "masks", slow)
-    # What a shell starts in the background ignores Ctrl-C, what nohup starts hang-ups, and tests may
-    # run there.
+    # What a shell starts in the background ignores Ctrl-C, what nohup starts ignores hang-ups, and
+    # tests may run there.
     handlers = dict.fromkeys((signal.SIGTERM, signal.SIGHUP), signal.SIG_DFL)
     handlers[signal.SIGINT] = signal.default_int_handler
     before = {one: signal.signal(one, handler) for one, handler in handlers.items()}
