@@ -514,6 +514,17 @@ def test_other_words_that_cannot_be_used(small, splatseg, recorded) -> None:
     assert "--evidence" in sentence
 
 
+def test_files_with_an_ending_of_their_own_are_told(small, splatseg, tmp_path) -> None:
+    folder = tmp_path / "predictions"
+    folder.mkdir()
+    for view in load_scene(small.scene).views:
+        np.save(folder / f"{view.name}_pred.npy", np.zeros((3, 3), int))
+    words = ("see", small.scene, "--model", folder, "--evidence", "mine")
+    assert "--suffix _pred reads them without it." in refused(splatseg(*words))
+    np.save(folder / "other.npy", np.zeros((3, 3), int))
+    assert "--suffix" not in refused(splatseg(*words)), "it would not read all of them"
+
+
 def test_label_maps_as_people_have_them(small, splatseg, tmp_path) -> None:
     """Half-size soft maps in float16 with an ending in their names: named, enlarged, said."""
     folder = tmp_path / "predictions"

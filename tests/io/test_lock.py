@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -157,6 +158,38 @@ def test_a_lock_whose_file_its_owner_has_just_removed_is_taken_again(
         owner = lock_owner(tmp_path)
         assert owner is not None
         assert owner.process == os.getpid()
+
+
+def test_what_a_longer_file_said_before_is_gone(tmp_path: Path) -> None:
+    (tmp_path / LOCK_FILE).write_text(" " * 1000 + "{")
+    with scene_lock(tmp_path, "fit"):
+        owner = lock_owner(tmp_path)
+        assert owner is not None
+        assert (owner.work, owner.process) == ("fit", os.getpid())
+
+
+def test_where_there_are_no_locks_the_number_of_the_process_has_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from splatseg.io import lock
+
+    monkeypatch.setattr(lock, "try_lock", lambda handle, **more: "unknown")
+    here, ended = socket.gethostname(), _ended()
+    for process, host, works in [
+        (os.getppid(), here, True),
+        (ended, here, False),
+        (ended, f"not-{here}", True),  # who knows
+        (os.getpid(), here, False),
+    ]:
+        owner = {"work": "fit", "process": process, "host": host, "since": 0.0}
+        (tmp_path / LOCK_FILE).write_text(json.dumps(owner))
+        assert (lock_owner(tmp_path) is not None) == works, (process, host)
+        if works:
+            with pytest.raises(InputError, match="works on this"), scene_lock(tmp_path, "see"):
+                pass
+        else:
+            with scene_lock(tmp_path, "see"):
+                pass
 
 
 def test_what_took_the_name_since_stays(tmp_path: Path) -> None:

@@ -64,8 +64,8 @@ class Command:
     classes: Annotated[str | None, tyro.conf.arg(metavar="NAME_OR_FILE")] = None
     """Names of the ids of recorded label maps: ade20k, coco, cityscapes or scannet, for the ids
     of their annotations, with -train behind it for the ids from 0 that networks learn; or a
-    JSON file with "classes" (id, name, isthing, colour). Pictures in a table's colours are read
-    by it."""
+    JSON file with "classes" (id, name, isthing, colour), where 0 is a class if it is called so.
+    Pictures in a table's colours are read by it."""
 
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder where the model's answers are kept by the content of the photographs, for other

@@ -10,10 +10,10 @@ _MAX_ID = 2**31 - 1
 """Ids are int32."""
 
 
-def class_table(rows: object, *, where: str) -> ClassTable:
+def class_table(rows: object, *, where: str, keep_zero: bool = False) -> ClassTable:
     """A class table from its JSON rows; ``isthing`` (true) and ``colour`` may lack.
 
-    A row of id 0 is left out: 0 is void in files.
+    A row of id 0 is left out, as 0 is void in files, unless it is to be kept.
 
     Raises:
         FileFormatError: If a row has no integer id or no name; the message starts with `where`.
@@ -27,7 +27,7 @@ def class_table(rows: object, *, where: str) -> ClassTable:
     ids = [row.id for row in table]
     if len(set(ids)) != len(ids):
         raise FileFormatError(f"{where}: expected classes of distinct ids, got one twice.")
-    return ClassTable(rows=tuple(row for row in table if row.id != 0))
+    return ClassTable(rows=tuple(row for row in table if keep_zero or row.id != 0))
 
 
 def class_rows(table: ClassTable) -> list[dict[str, Any]]:

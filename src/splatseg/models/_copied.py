@@ -65,7 +65,8 @@ def copied(
     if len(lacking) == len(views):
         raise InputError(
             f"{evidence.folder}: expected evidence of the views asked for ({some(lacking)}), got "
-            f"none of them but {len(there)} others ({some(sorted(there))})."
+            f"none of them but {len(there)} others ({some(sorted(there))})"
+            f"{_ending_hint(lacking, sorted(there))}."
         )
     if lacking and missing == "refuse":
         raise InputError(
@@ -73,6 +74,15 @@ def copied(
             f"({some(lacking)}); name those that are there, or allow missing ones."
         )
     return _Copied(evidence=evidence, lacking=tuple(lacking))
+
+
+def _ending_hint(names: Sequence[str], others: Sequence[str]) -> str:
+    """The option that reads files which are named as views are, with an ending of their own."""
+    endings = (other.removeprefix(names[0]) for other in others if other.startswith(names[0]))
+    ending = min(endings, key=len, default="")
+    if ending and all(other.endswith(ending) for other in others):
+        return f"; --suffix {ending} reads them without it"
+    return ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

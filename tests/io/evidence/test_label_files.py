@@ -77,6 +77,58 @@ def test_soft_maps_of_a_known_data_set(tmp_path: Path, rng: np.random.Generator)
         open_evidence(tmp_path, classes="coco").label_map("a")
 
 
+def table_file(folder: Path, names: dict[int, str]) -> str:
+    """A class table of somebody's own."""
+    rows = [{"id": id, "name": name} for id, name in names.items()]
+    (folder / "mine.json").write_text(json.dumps({"classes": rows}))
+    return str(folder / "mine.json")
+
+
+@pytest.mark.parametrize(
+    ("names", "ids", "known"),
+    [
+        # 0 is a class where the table calls it so, and the names move with the ids.
+        ({0: "wall", 1: "floor", 7: "lamp"}, [[1, 2, 3], [8, 8, 1]], {1: "wall", 8: "lamp"}),
+        ({0: "Background", 1: "floor", 7: "lamp"}, [[-1, 1, 2], [7, 7, -1]], {1: "floor"}),
+        ({0: "unlabelled", 1: "floor"}, [[-1, 1, 2], [7, 7, -1]], {1: "floor"}),
+        ({1: "floor", 7: "lamp"}, [[-1, 1, 2], [7, 7, -1]], {1: "floor", 7: "lamp"}),
+    ],
+)
+def test_a_table_of_ones_own_says_what_zero_is(
+    tmp_path: Path, names: dict[int, str], ids: list[list[int]], known: dict[int, str]
+) -> None:
+    table = table_file(tmp_path, names)
+    np.save(tmp_path / "a.npy", IDS)
+    evidence = open_evidence(tmp_path, classes=table)
+    assert evidence.label_map("a").ids.tolist() == ids
+    assert evidence.classes is not None
+    assert {id: evidence.classes.name_of(id) for id in known} == known
+    assert "background" not in {row.name.lower() for row in evidence.classes.rows}
+
+
+@pytest.mark.parametrize(
+    ("names", "void"),
+    [
+        ({0: "wall", 1: "floor", 2: "lamp"}, False),
+        ({0: "void", 1: "floor", 2: "lamp"}, True),
+        ({1: "wall", 2: "floor", 3: "lamp"}, False),  # counted from 1
+    ],
+)
+def test_a_table_of_ones_own_names_the_channels_of_soft_maps(
+    tmp_path: Path, rng: np.random.Generator, names: dict[int, str], void: bool
+) -> None:
+    scores = rng.normal(size=(3, 4, 6)).astype(np.float32)
+    np.save(tmp_path / "a.npy", scores)
+    evidence = open_evidence(tmp_path, classes=table_file(tmp_path, names))
+    wanted = scores.argmax(axis=0) + 1
+    if void:
+        wanted[wanted == 1] = -1
+    assert np.array_equal(evidence.label_map("a").ids.numpy(), wanted)
+    assert evidence.classes is not None
+    found = {row.id: row.name for row in evidence.classes.rows}
+    assert found == ({} if void else {1: "wall"}) | {2: "floor", 3: "lamp"}
+
+
 def test_colours_of_a_table(tmp_path: Path) -> None:
     """Road, car and none in the colours of Cityscapes, and by their two kinds of ids."""
     pixels = np.array([[(128, 64, 128), (0, 0, 142), (0, 0, 0)]], np.uint8)

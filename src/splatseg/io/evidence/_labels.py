@@ -46,9 +46,12 @@ class IdRule:
 
     def classes(self, table: ClassTable | None) -> ClassTable | None:
         """A class table of the file's ids as one of the ids in memory."""
-        if table is None or not self.zero_is_class:
-            return table
-        return ClassTable(rows=tuple(replace(row, id=row.id + 1) for row in table.rows))
+        if table is None:
+            return None
+        if not self.zero_is_class:
+            return ClassTable(rows=tuple(row for row in table.rows if row.id != 0))
+        rows = (row for row in table.rows if row.id != self.void)
+        return ClassTable(rows=tuple(replace(row, id=row.id + 1) for row in rows))
 
     @property
     def source_ids(self) -> Mapping[int, int] | None:

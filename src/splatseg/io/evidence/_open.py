@@ -1,6 +1,7 @@
 """Finds evidence by name and tells its kind."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -132,18 +133,22 @@ def _label_arrays(folder: Path, suffix: str, arrays: Mapping[str, Path]) -> Mapp
 
 
 def _named_table(classes: str | None, *, soft: bool) -> LabelTable | None:
-    """The table that was asked for; of a soft map that with a class a channel."""
-    if classes is None:
-        return None
-    table = label_table(classes)
-    return (training_table(classes) or table) if soft else table
+    """The table that was asked for; of a soft map that with a class a channel, counted from 0."""
+    if classes is None or not soft:
+        return None if classes is None else label_table(classes)
+    table = training_table(classes) or label_table(classes)
+    if any(row.id == 0 for row in table.classes.rows):
+        return table
+    rows = tuple(replace(row, id=row.id - 1) for row in table.classes.rows)
+    return replace(table, classes=ClassTable(rows=rows))
 
 
 def _rule(rule: IdRule, table: LabelTable | None, *, soft: bool) -> IdRule:
     """What 0 and other ids mean: what was said, else what the table or a soft map says."""
     void = rule.void
-    if void is None and table is not None and not soft:
-        void = table.void
+    if void is None and table is not None:
+        # A channel of a soft map can be that of nothing, of whatever other id none can.
+        void = table.void if not soft else table.void_channel
     zero = rule.zero_is_class or soft or (table is not None and table.zero_is_class)
     return IdRule(zero_is_class=zero, void=void)
 

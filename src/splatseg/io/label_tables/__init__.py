@@ -17,6 +17,9 @@ from splatseg.io.json_files import read_json
 TABLES = ("ade20k", "coco", "cityscapes", "scannet")
 """Data sets whose tables are known by name."""
 
+_VOID_NAMES = ("background", "ignore", "none", "unannotated", "unknown", "unlabel", "void")
+"""How names of what is no class begin in the usual tables."""
+
 _TRAIN = "-train"
 _TRAIN_VOID = 255
 
@@ -32,9 +35,18 @@ class LabelTable:
     zero_is_class: bool = False
     void: int | None = None
 
+    @property
+    def void_channel(self) -> int | None:
+        """The channel of soft maps that is of no class: 0, where the table calls it so."""
+        named = any(row.id == 0 and _is_void(row.name) for row in self.classes.rows)
+        return 0 if named else None
+
 
 def label_table(name: str) -> LabelTable:
-    """A table by name, or from a JSON file: a list of classes, or an object with ``classes``.
+    """A table by name, or from a JSON file: an object with ``classes``, a list of rows.
+
+    A file that gives 0 the name of a class says that 0 is one; names such as void, background or
+    unlabelled are of none.
 
     Raises:
         InputError: If there is no such table and no such file.
@@ -53,13 +65,21 @@ def label_table(name: str) -> LabelTable:
         known = ", ".join(f"{table}, {table}{_TRAIN}" for table in TABLES)
         raise InputError(f"classes: expected one of {known} or a JSON file, got {name!r:.80}.")
     content: Any = read_json(path)
-    return LabelTable(name=name, classes=class_table(content.get("classes"), where=str(path)))
+    table = class_table(content.get("classes"), where=str(path), keep_zero=True)
+    zero = next((row.name for row in table.rows if row.id == 0), None)
+    return LabelTable(
+        name=name, classes=table, zero_is_class=zero is not None and not _is_void(zero)
+    )
 
 
 def training_table(name: str) -> LabelTable | None:
     """The table of training ids of a data set that is known by name, in either of its names."""
     base = name.removesuffix(_TRAIN)
     return _training(base) if base in TABLES else None
+
+
+def _is_void(name: str) -> bool:
+    return name.lower().startswith(_VOID_NAMES)
 
 
 def _annotated(base: str) -> LabelTable:
