@@ -22,7 +22,11 @@ CAMERA = Camera(
     width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0, cam_from_world=torch.eye(4).double()
 )
 CLIMBING = ("../x", "a/../../x", "/etc/x", "..", ".", "", "a//b", "a/", "..\\x", "a\0b")
-NO_NAMES = (*CLIMBING, "a\nb", "\x1b[2J", "\udcff", ".hidden", "a/.b", "x" * (MAX_PART + 1))
+NO_NAMES = (
+    *CLIMBING,
+    *("a\nb", "\x1b[2J", "\u2028", "\u2029", "\udcff"),
+    *(".hidden", "a/.b", "x" * (MAX_PART + 1)),
+)
 
 
 @pytest.mark.parametrize("name", NO_NAMES)
