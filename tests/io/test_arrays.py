@@ -139,6 +139,16 @@ def test_a_flipped_bit_of_the_values_is_found(tmp_path) -> None:
         read_npz(tmp_path / "a.npz", ["a"])
 
 
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_a_check_sum_that_is_not_that_of_the_values_is_found(tmp_path, save) -> None:
+    save(tmp_path / "a.npz", a=np.arange(100))
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    data[data.index(b"PK\x01\x02") + 16] ^= 1  # the CRC of the member, in the directory
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(FileFormatError, match=r"a.npz.*CRC"):
+        read_npz(tmp_path / "a.npz", ["a"])
+
+
 def test_long_names_are_cut_in_messages(tmp_path) -> None:
     path = npz(tmp_path / "a.npz", **{"x" * 5000: b"", "y" * 5000: b""})
     with pytest.raises(FileFormatError) as caught:

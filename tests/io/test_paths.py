@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import Camera, LabelMap, MaskSet, View
-from splatseg.core.view_names import MAX_PART, clean_view_names, view_name_fault
+from splatseg.core.view_names import MAX_NAME, MAX_PART, clean_view_names, view_name_fault
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.captures import read_capture
 from splatseg.io.captures.build import view_names
@@ -25,7 +25,8 @@ CLIMBING = ("../x", "a/../../x", "/etc/x", "..", ".", "", "a//b", "a/", "..\\x",
 NO_NAMES = (
     *CLIMBING,
     *("a\nb", "\x1b[2J", "\u2028", "\u2029", "\udcff"),
-    *(".hidden", "a/.b", "x" * (MAX_PART + 1)),
+    *(".hidden", "a/.b", "a\\b", "x" * (MAX_PART + 1)),
+    *("\u00e9" * (MAX_PART // 2 + 1), "/".join(["x" * MAX_PART] * (MAX_NAME // MAX_PART))),
 )
 
 
@@ -53,6 +54,7 @@ def test_good_names_stay(name: str) -> None:
         (["i/A.png", "i/a.png", "i/a_2.png"], ["A", "a_3", "a_2"]),
         (["e\u0301.png", "\u00e9.png"], ["e\u0301", "\u00e9_2"]),
         (["evidence.png", "x.png"], ["evidence_2", "x"]),
+        (["../b.png", "b.png"], ["b_2", "b"]),
         (["a\n.png", "\x1b.png"], ["a_", "_"]),
     ],
 )

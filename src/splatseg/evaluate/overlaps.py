@@ -196,7 +196,9 @@ def best_pairs(
         own = np.arange(count)
         cost = np.concatenate((2.0 - values, np.full(count, 2.0)))
         where = (np.concatenate((rows, own)), np.concatenate((columns, shape[1] + own)))
-        graph = csr_array((cost, where), shape=(count, shape[1] + count))
+        # Graphs of older SciPy have indices of 32 bits.
+        pairs = tuple(index.astype(np.int32) for index in where)
+        graph = csr_array((cost, pairs), shape=(count, shape[1] + count))
         picked, partners = min_weight_full_bipartite_matching(graph)
         got = 2.0 - np.asarray(graph[picked, partners]).ravel()
     order = np.argsort(picked)

@@ -7,8 +7,10 @@ bytes; nothing is pickled.
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
+from numpy.lib.format import write_array
 from numpy.typing import NDArray
 
 from splatseg.io.atomic import sync
@@ -36,9 +38,12 @@ def save_arrays(
     """
     text = json_text(f"{name}: header", header)
     named: dict[str, Any] = {HEADER: np.frombuffer(text.encode(), np.uint8), **arrays}
-    with path.open("wb") as file:
-        # Before numpy 2.1 allow_pickle=False would become an array of that name.
-        np.savez(file, **named)
+    # As np.savez does it, which before numpy 2.1 makes allow_pickle=False an array of that name, and
+    # where the disk is full leaves an archive that complains when it is collected.
+    with ZipFile(path, "w") as archive:
+        for key, array in named.items():
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                write_array(member, np.asanyarray(array), allow_pickle=False)
 
 
 def write_checkpoint_file(

@@ -122,7 +122,9 @@ def _pieces(count: int, first: Tensor, second: Tensor) -> Int64[Tensor, "n"]:
     from scipy.sparse.csgraph import connected_components
 
     ones = torch.ones(len(first), dtype=torch.bool).numpy()
-    graph = coo_array((ones, (first.numpy(), second.numpy())), shape=(count, count))
+    # Graphs of older SciPy have indices of 32 bits; there are never 2^31 Gaussians.
+    pairs = (first.int().numpy(), second.int().numpy())
+    graph = coo_array((ones, pairs), shape=(count, count))
     _, pieces = connected_components(graph, directed=False)
     labels = torch.from_numpy(pieces).long()
     firsts = torch.full((count,), count, dtype=torch.int64)
