@@ -38,8 +38,8 @@ def save_arrays(
     """
     text = json_text(f"{name}: header", header)
     named: dict[str, Any] = {HEADER: np.frombuffer(text.encode(), np.uint8), **arrays}
-    # As np.savez does it, which before numpy 2.1 makes allow_pickle=False an array of that name, and
-    # where the disk is full leaves an archive that complains when it is collected.
+    # As np.savez does it, which before numpy 2.1 makes allow_pickle=False an array of that name, or
+    # leaves an archive that complains when it is collected, where the disk is full.
     with ZipFile(path, "w") as archive:
         for key, array in named.items():
             with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
