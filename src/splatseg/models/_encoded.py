@@ -3,7 +3,10 @@
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
+import torch
+
 from splatseg.core.models import Image
+from splatseg.errors import BackendError
 from splatseg.models._content import image_digest
 
 _A = TypeVar("_A")
@@ -25,7 +28,25 @@ class LastImages(Generic[_A]):
         if all(digest in self._kept for digest in digests):
             return
         self._kept = {}  # before the run: the two together may not fit
-        self._kept = dict(zip(digests, self._run(images), strict=True))
+        self._kept = dict(zip(digests, self._fitting(images), strict=True))
+
+    def _fitting(self, images: Sequence[Image]) -> list[_A]:
+        """As many together as memory holds, half as many where they do not fit."""
+        try:
+            return list(self._run(images))
+        except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
+            if not isinstance(error, torch.OutOfMemoryError | MemoryError) and (
+                "allocate memory" not in str(error)
+            ):
+                raise
+            height, width = (int(side) for side in images[0].shape[:2])
+            if len(images) == 1:
+                raise BackendError(
+                    f"there is not enough memory for an image of {width}x{height}; --size N "
+                    "makes it smaller for the network, --dtype bfloat16 halves the network."
+                ) from error
+        half = len(images) // 2
+        return [*self._fitting(images[:half]), *self._fitting(images[half:])]
 
     def of(self, image: Image) -> _A:
         """What the network makes of an image."""

@@ -16,6 +16,8 @@ from splatseg.models._sources import What
 if TYPE_CHECKING:
     import torch
 
+_GPU_BATCH = 16
+
 Precision = Literal["float32", "float16", "bfloat16"]
 
 
@@ -88,6 +90,13 @@ class Loading:
     size: int | None
     report: Callable[[str], None]
     """Told in a sentence what the user should know."""
+
+    @property
+    def images_together(self) -> int:
+        """Images that pass the network together, fewer where memory does not hold them."""
+        if self.batch is not None:
+            return self.batch
+        return 1 if self.device.type == "cpu" else _GPU_BATCH
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -53,7 +53,7 @@ class Dino:
         extra = {"add_pooling_layer": False} if kind == "vit" else {}
         self.name = name
         self.note = f"weights {place.name}"
-        self.batch_size = place.batch
+        self.batch_size = place.images_together
         self._options = options
         self._place = place
         self._network = network(place, classes[kind], **extra)
