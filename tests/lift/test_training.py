@@ -382,7 +382,7 @@ def test_a_broken_write_leaves_the_older_checkpoint(sampler, tmp_path, monkeypat
     with pytest.raises(KeyboardInterrupt):
         train(Regression(), sampler, options=options, checkpoints=checkpoints, cancelled=Stop(3))
     before = path.read_bytes()
-    monkeypatch.setattr(np, "savez", fails)
+    monkeypatch.setattr("splatseg.io.npz_writing.write_array", fails)
     told: list[str] = []
     going_on = replace(checkpoints, resume=True, failed=told.append)
     again = train(Regression(), sampler, options=options, checkpoints=going_on)
