@@ -19,12 +19,12 @@ from splatseg.models._loading import loading_of
 
 ENTRY_POINT_GROUP = "splatseg.models"
 
-_TRANSFORMERS = "splatseg.models.transformers"
+_NETWORKS = "splatseg.models.networks"
 _OWN = {
     "classical": "splatseg.models.classical:CLASSICAL",
-    "dino": f"{_TRANSFORMERS}.dino:DINO",
-    "dinov2": f"{_TRANSFORMERS}.dino:DINOV2",
-    "dinov3": f"{_TRANSFORMERS}.dino:DINOV3",
+    "dino": f"{_NETWORKS}.dino:DINO",
+    "dinov2": f"{_NETWORKS}.dino:DINOV2",
+    "dinov3": f"{_NETWORKS}.dino:DINOV3",
 }
 
 

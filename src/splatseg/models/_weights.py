@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.errors import InputError, MissingFileError, MissingPackageError
+from splatseg.io.json_files import read_json
 from splatseg.models._family import Checkpoint, LoadOptions, ModelFamily
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
@@ -91,14 +92,21 @@ def _check_folder(folder: Path) -> None:
 
 
 def _in_cache(id: str) -> Path | None:
-    """What the hub's cache of this machine has of an id."""
-    hub = _hub()
-    try:
-        folder = Path(hub.snapshot_download(id, local_files_only=True))
-    except hub.errors.LocalEntryNotFoundError:
+    """What the hub's cache of this machine has of an id, if all of it is there."""
+    found = _hub().try_to_load_from_cache(id, "config.json")
+    if not isinstance(found, str):
         return None
+    folder = Path(found).parent
     # A download that was stopped leaves a folder without its largest files.
-    return folder if (folder / "config.json").is_file() and weight_files(folder) else None
+    there = {path.name for path in weight_files(folder)}
+    return folder if there and _shards(folder) <= there else None
+
+
+def _shards(folder: Path) -> set[str]:
+    """The files that weights in several parts are in, by their index."""
+    index = folder / "model.safetensors.index.json"
+    parts = read_json(index).get("weight_map") if index.is_file() else None
+    return set(map(str, parts.values())) if isinstance(parts, dict) else set()  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 
 def _fetched(id: str, report: Callable[[str], None]) -> Path:

@@ -1,7 +1,6 @@
 """The library transformers, imported so that a broken torchvision does no harm; its networks."""
 
 import importlib
-import json
 import sys
 from collections.abc import Sequence
 from typing import Any, cast
@@ -11,6 +10,8 @@ from splatseg.io.json_files import read_json
 from splatseg.models._family import Loading
 
 _SOME = 3
+
+_UNNEEDED = "torchvision"
 
 
 def library() -> Any:
@@ -22,11 +23,11 @@ def library() -> Any:
     Raises:
         MissingPackageError: If it is not installed, or too old.
     """
-    if "torchvision" not in sys.modules:
+    if _UNNEEDED not in sys.modules:
         try:
-            importlib.import_module("torchvision")
+            importlib.import_module(_UNNEEDED)
         except (ImportError, RuntimeError, OSError):
-            sys.modules["torchvision"] = cast(Any, None)
+            sys.modules[_UNNEEDED] = cast(Any, None)
     try:
         return importlib.import_module("transformers")
     except ImportError as error:
@@ -68,6 +69,7 @@ def network(place: Loading, class_name: str, **options: Any) -> Any:
         FileFormatError: If the weights are broken, or lack tensors of the network.
     """
     cls = getattr(library(), class_name)
+    broken = importlib.import_module("safetensors").SafetensorError
     logger = library().utils.logging
     before, bars = logger.get_verbosity(), logger.is_progress_bar_enabled()
     logger.set_verbosity_error()  # what is missing is an error below, and nothing else is news
@@ -77,7 +79,7 @@ def network(place: Loading, class_name: str, **options: Any) -> Any:
             place.folder, dtype=place.dtype, local_files_only=True, output_loading_info=True,
             **options,
         )  # fmt: skip
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, broken) as error:
         words = str(error).strip().splitlines()
         raise FileFormatError(
             f"{place.folder}: the weights cannot be loaded as {class_name} "

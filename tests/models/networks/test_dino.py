@@ -7,7 +7,7 @@ from splatseg.core.models import BatchedModel, DenseFeatures
 from splatseg.errors import BackendError, FileFormatError, RangeError
 from splatseg.models import LoadOptions, find_model
 from splatseg.models._images import IMAGENET
-from splatseg.models.transformers.dino import DinoOptions
+from splatseg.models.networks.dino import DinoOptions
 
 KINDS = [("dino", "dino"), ("dinov2", "dinov2"), ("dinov2", "dinov2_with_registers"),
          ("dinov3", "dinov3")]  # fmt: skip

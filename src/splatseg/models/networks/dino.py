@@ -18,7 +18,7 @@ from splatseg.errors import RangeError
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading, ModelFamily
 from splatseg.models._images import Normalisation, patch_grid, patch_input
-from splatseg.models.transformers._library import configuration, network
+from splatseg.models.networks._library import configuration, network
 
 _CLASSES = {
     "dino": {"vit": "ViTModel"},
