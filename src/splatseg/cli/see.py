@@ -99,7 +99,7 @@ _HIDDEN_LOADING = (
     Annotated[LoadOptions, tyro.conf.OmitArgPrefixes, tyro.conf.Suppress],
     field(default_factory=LoadOptions),
 )
-"""The flags of weights for a model that has none: not in its help, and refused, which says why."""
+"""For a model that has no weights: their flags are unknown to it, and so refused."""
 
 _NO_OPTIONS = ("options", Annotated[Any, tyro.conf.Suppress], field(default=None))
 
