@@ -500,14 +500,18 @@ def test_a_folder_cannot_be_copied_onto_itself(small, splatseg, recorded) -> Non
 
 
 def test_other_words_that_cannot_be_used(small, splatseg, recorded) -> None:
-    sentence = refused(see(splatseg, small, "sam"))
+    sentence = refused(see(splatseg, small, "sammy"))
     assert "expected one of classical" in sentence
-    assert "got 'sam'" in sentence
+    assert "got 'sammy'" in sentence
     assert "expected evidence of labels, got masks" in refused(
         see(splatseg, small, recorded, "--what", "labels")
     )
-    sentence = refused(see(splatseg, small, recorded, "--min-area", "0.2"))
-    assert "settings of regions with model classical" in sentence
+    status, _, error = see(splatseg, small, recorded, "--min-area", "0.2")
+    assert status == 2
+    assert "Unrecognized options: --min-area" in error
+    status, _, error = splatseg("see", small.scene, *CLASSICAL, "--weights", "x/y")
+    assert status == 2
+    assert "Unrecognized options: --weights" in error
     sentence = refused(splatseg("see", small.scene, *CLASSICAL, "--void", "3"))
     assert "--void" in sentence
     sentence = refused(splatseg("see", small.scene, "--model", "classical", "--evidence", "../up"))

@@ -1,6 +1,7 @@
 """Models by name, those of other packages, and the ten lines of docs/models.md."""
 
 import re
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import ClassVar
@@ -19,7 +20,10 @@ from splatseg.core import (
 from splatseg.errors import InputError, MissingPackageError
 from splatseg.models import (
     ENTRY_POINT_GROUP,
+    LoadOptions,
+    ModelFamily,
     _registry,
+    find_family,
     find_model,
     model_names,
     record_evidence,
@@ -71,7 +75,8 @@ def importable(monkeypatch):
 
 def test_another_packages_model_is_found_by_its_name(installed, views, tmp_path) -> None:
     installed(halves="models_of_another_package:Halves")
-    assert model_names() == ("classical", "halves")
+    assert model_names()[0] == "classical", "ours come first"
+    assert model_names()[-1] == "halves"
     model = find_model("halves")
     assert isinstance(model, Model)
     assert isinstance(model, AutomaticMasks)
@@ -83,10 +88,13 @@ def test_another_packages_model_is_found_by_its_name(installed, views, tmp_path)
 def test_names_that_nobody_knows_are_answered_with_those_that_are(installed) -> None:
     installed(halves="models_of_another_package:Halves")
     with pytest.raises(InputError) as caught:
-        find_model("sam")
-    assert str(caught.value) == (
-        "model: expected one of classical, halves, or a folder of recorded evidence, got 'sam'."
-    )
+        find_model("sammy")
+    sentence = str(caught.value)
+    assert sentence.startswith("model: expected one of classical, ")
+    assert sentence.endswith(", halves, or a folder of recorded evidence, got 'sammy'.")
+    with pytest.raises(InputError, match="did you mean halves"):
+        find_family("halfes")
+    assert find_family("halves") is None, "it is made whole"
 
 
 def test_another_package_cannot_take_the_place_of_a_name_of_ours(installed) -> None:
@@ -108,7 +116,11 @@ def test_a_name_comes_before_a_folder(tmp_path, monkeypatch) -> None:
         ("package_that_is_not_there:Model", MissingPackageError, "cannot be loaded: No module"),
         ("models_of_another_package:Gone", MissingPackageError, "no attribute 'Gone'"),
         ("models_of_another_package:NoModel", InputError, "name, settings and note, got NoModel"),
-        ("models_of_another_package:NOT_CALLABLE", InputError, "something to call, got int"),
+        (
+            "models_of_another_package:NOT_CALLABLE",
+            InputError,
+            "something to call or a family, got int",
+        ),
     ],
 )
 def test_what_cannot_be_loaded_is_said(installed, value, error, words) -> None:
@@ -117,6 +129,45 @@ def test_what_cannot_be_loaded_is_said(installed, value, error, words) -> None:
     with pytest.raises(error, match=words) as caught:
         find_model("broken")
     assert str(caught.value).startswith(f"model 'broken' ({value})")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SideOptions:
+    """Options of a family of another package."""
+
+    left: bool = True
+
+
+def side(options: SideOptions, place: object) -> Halves:
+    """A model of these options."""
+    model = Halves()
+    model.settings = {"left": options.left, "place": place is not None}
+    return model
+
+
+SIDES = ModelFamily(
+    name="sides",
+    summary="a side",
+    reference="none",
+    gives=("masks",),
+    options=SideOptions,
+    load=side,
+)
+
+
+def test_a_family_of_another_package_has_options(installed) -> None:
+    installed(sides="models_of_another_package:SIDES")
+    assert find_model("sides").settings == {"left": True, "place": False}
+    assert find_model("sides", SideOptions(left=False)).settings["left"] is False
+    with pytest.raises(InputError, match="expected SideOptions for model sides, got dict"):
+        find_model("sides", {"left": False})
+    with pytest.raises(InputError, match="model sides has none"):
+        find_model("sides", loading=LoadOptions(weights="x"))
+    installed(halves="models_of_another_package:Halves", other="models_of_another_package:SIDES")
+    with pytest.raises(InputError, match="takes neither options nor weights"):
+        find_model("halves", SideOptions())
+    with pytest.raises(InputError, match="expected a family of this name, got 'sides'"):
+        find_model("other")
 
 
 def test_deep_features_have_a_name_a_depth() -> None:

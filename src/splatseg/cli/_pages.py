@@ -19,6 +19,8 @@ from splatseg.cli._words import option_value
 FOLDER = Path(__file__).parent / "pages"
 _WIDTH = 80
 _HELP = ("--help", "-h")
+KINDS = {"segment": "--method", "see": "--model"}
+"""Commands whose options depend on the value of one of them."""
 
 
 def kept_page(name: str, words: Sequence[str]) -> str | None:
@@ -28,16 +30,17 @@ def kept_page(name: str, words: Sequence[str]) -> str | None:
         name: The command.
         words: What follows it.
     """
-    method = option_value(words, "--method")
+    option = KINDS.get(name, "")
+    kind = option_value(words, option) if option else None
     rest = [word for word in words if word not in _HELP]
     if len(rest) == len(words):
         return None
-    if method is None and not rest:
-        if name == "segment" and entry_points(group="splatseg.methods"):
-            return None  # other packages' methods are to be listed too
+    if kind is None and not rest:
+        if option and entry_points(group=f"splatseg.{option.removeprefix('--')}s"):
+            return None  # other packages' methods and models are to be listed too
         path = FOLDER / f"{name}.txt"
-    elif rest in (["--method", method], [f"--method={method}"]):
-        path = FOLDER / f"{name}-{method}.txt"
+    elif option and rest in ([option, kind], [f"{option}={kind}"]):
+        path = FOLDER / f"{name}-{kind}.txt"
     else:
         return None
     # A method's name is a word of the user's, and no path.

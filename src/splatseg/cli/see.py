@@ -1,20 +1,23 @@
 """``splatseg see``: a 2D model, or evidence recorded elsewhere -> evidence of a scene."""
 
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder
-from splatseg.cli._words import listed
+from splatseg.cli._words import listed, option_value
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
-from splatseg.models import SeenEvidence
-from splatseg.models.classical import RegionOptions
+from splatseg.models import LoadOptions, ModelFamily, SeenEvidence, find_family, model_names
 from splatseg.tasks import SeeOptions, see
 
+CONFIG = (tyro.conf.HelptextFromCommentsOff,)
+"""Options of the model and of its weights are flags without a prefix."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Command:
     """Look at a scene's photographs with a 2D model, and write down what it sees.
 
@@ -24,6 +27,8 @@ class Command:
     For example:
 
     splatseg see room --model classical --evidence masks
+
+    splatseg see room --model dinov2 --weights facebook/dinov2-base --download --evidence dino
 
     splatseg see room --model sam-masks --evidence masks_sam --views all --allow-missing
 
@@ -35,14 +40,16 @@ class Command:
     scene: SceneFolder
 
     model: Annotated[str, tyro.conf.arg(metavar="NAME_OR_FOLDER")]
-    """The model: classical (a stand-in that needs no weights), one that an installed package
-    brings, or a folder of evidence that was recorded elsewhere (docs/models.md)."""
+    """The model: one of those above, or a folder of evidence that was recorded elsewhere
+    (docs/models.md). `splatseg see --model NAME --help` shows the options of one."""
 
     evidence: Annotated[str, tyro.conf.arg(metavar="NAME")]
     """Name of the evidence to write."""
 
-    what: Literal["masks", "labels", "panoptic", "features", "text"] | None = None
-    """What to ask the model for. None takes what it has, masks before the others."""
+    what: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ..")] = ()
+    """What to ask the model for: masks, labels, panoptic, features, text. Without it what the
+    model has, masks before the others. Of several, by comma or by space, each further one is
+    written to NAME.WHAT, and each image passes the network once."""
 
     views: tuple[str, ...] = ("train",)
     """Which views: train, all, or names of views, by comma or by space. It is recorded with the
@@ -80,20 +87,84 @@ class Command:
     json: Json = False
     quiet: Quiet = False
 
-    regions: RegionOptions = field(default_factory=RegionOptions)
-    """Settings of the masks of model classical."""
+    loading: tyro.conf.OmitArgPrefixes[LoadOptions] = field(default_factory=LoadOptions)
+    """Weights, and where and how the network runs."""
+
+    options: Any = None
+    """Options of the model."""
+
+
+_HIDDEN_LOADING = (
+    "loading",
+    Annotated[LoadOptions, tyro.conf.OmitArgPrefixes, tyro.conf.Suppress],
+    field(default_factory=LoadOptions),
+)
+"""For a model that has no weights: their flags are unknown to it, and so refused."""
+
+_NO_OPTIONS = ("options", Annotated[Any, tyro.conf.Suppress], field(default=None))
+
+
+def command_for(words: Sequence[str]) -> type[Any]:
+    """The command with the flags of the model that the words name.
+
+    Flags of other models are unknown to it, and so refused.
+    """
+    name = option_value(words, "--model")
+    if name is None:
+        return _with_summaries()
+    family = find_family(name) if name in model_names() else None
+    if family is None:
+        return _made([_NO_OPTIONS, _HIDDEN_LOADING], Command.__doc__)
+    options = Annotated[
+        family.options,
+        tyro.conf.OmitArgPrefixes,
+        tyro.conf.arg(help=f"Options of model {name}: {family.summary} ({family.reference})."),
+    ]
+    fields: list[Any] = [("options", options, field(default_factory=family.options))]
+    if not family.needs_weights:
+        fields.append(_HIDDEN_LOADING)
+    return _made(fields, f"{Command.__doc__}{_weights(family)}")
+
+
+def _made(fields: list[Any], text: str | None) -> type[Any]:
+    made = make_dataclass("Command", fields, bases=(Command,), frozen=True, kw_only=True)
+    made.__doc__ = text
+    return made
+
+
+def _weights(family: ModelFamily) -> str:
+    """Published weights of a family, a line each."""
+    if not family.checkpoints:
+        return ""
+    rows = "\n".join(
+        f"- {one.id} ({one.megabytes} MB, {one.licence}{f'; {one.note}' if one.note else ''})"
+        for one in family.checkpoints
+    )
+    return f"\n\nWeights on the Hugging Face hub, the default first:\n\n{rows}"
+
+
+def _with_summaries() -> type[Any]:
+    """The command without a model, whose help lists the models."""
+    rows: list[str] = []
+    for name in model_names():
+        family = find_family(name)
+        rows.append(f"- {name}: {'of another package' if family is None else family.summary}")
+    text = "\n".join(rows)
+    return _made([_NO_OPTIONS, _HIDDEN_LOADING], f"{Command.__doc__}\n\nModels:\n\n{text}")
 
 
 def run(command: Command) -> None:
     """See a scene."""
     asked = {field.name: getattr(command, field.name) for field in fields(SeeOptions)}
     asked["views"] = listed("--views", command.views)
+    asked["what"] = command.what
     seen = see(
         open_scene(command.scene, command.data),
         command.model,
         command.evidence,
         options=SeeOptions(**asked),
-        regions=command.regions,
+        model_options=command.options,
+        loading=None if command.loading == LoadOptions() else command.loading,
         backend=command.backend,
         observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
@@ -108,7 +179,11 @@ def run(command: Command) -> None:
         "bytes": seen.bytes,
         "notes": list(seen.notes),
     }
-    print_result(facts, [summary(seen), str(seen.folder)], json=command.json)
+    lines = [summary(seen), str(seen.folder)]
+    for one in seen.further:
+        lines += [summary(one), str(one.folder)]
+    facts["further"] = [str(one.folder) for one in seen.further]
+    print_result(facts, lines, json=command.json)
 
 
 def summary(seen: SeenEvidence) -> str:

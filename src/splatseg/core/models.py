@@ -56,6 +56,23 @@ class ModelWithDefaults(Model, Protocol):
 
 
 @runtime_checkable
+class BatchedModel(Model, Protocol):
+    """A model whose network takes several images at once."""
+
+    @property
+    def batch_size(self) -> int:
+        """How many images to announce together."""
+        ...
+
+    def encode(self, images: Sequence[Image]) -> None:
+        """Pass images of one size through the network together.
+
+        Questions about them that come next are answered from that; others as ever.
+        """
+        ...
+
+
+@runtime_checkable
 class AutomaticMasks(Model, Protocol):
     """Finds the things in an image by itself."""
 

@@ -4,9 +4,14 @@ Models see images and give evidence; they never see Gaussians. See ``docs/models
 """
 
 from splatseg.models._cache import ModelCache as ModelCache
+from splatseg.models._family import Checkpoint as Checkpoint
+from splatseg.models._family import Loading as Loading
+from splatseg.models._family import LoadOptions as LoadOptions
+from splatseg.models._family import ModelFamily as ModelFamily
 from splatseg.models._record import SeenEvidence as SeenEvidence
 from splatseg.models._record import record_evidence as record_evidence
 from splatseg.models._registry import ENTRY_POINT_GROUP as ENTRY_POINT_GROUP
+from splatseg.models._registry import find_family as find_family
 from splatseg.models._registry import find_model as find_model
 from splatseg.models._registry import model_names as model_names
 from splatseg.models.recorded import recorded_model as recorded_model

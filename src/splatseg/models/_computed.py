@@ -12,6 +12,7 @@ from splatseg._check import check_choice
 from splatseg.core import ClassTable, FeatureMap, LabelMap, View
 from splatseg.core.models import (
     AutomaticMasks,
+    BatchedModel,
     DenseFeatures,
     Image,
     Model,
@@ -80,6 +81,26 @@ def computed(
     return _Computed(model=model, asked=what, cache=cache, image_of=image_of)
 
 
+def batch_of(model: Model) -> int:
+    """How many views are looked at together."""
+    return max(1, model.batch_size) if isinstance(model, BatchedModel) else 1
+
+
+def announce(model: Model, sources: Sequence[Source], views: Sequence[View]) -> None:
+    """Let a model that takes several images at once see those of the next views.
+
+    Images of one size go together.
+    """
+    if not isinstance(model, BatchedModel) or len(views) < 2:
+        return
+    images: list[Image] = []
+    for source in sources:
+        if isinstance(source, _Computed):
+            images = max(images, source.announced(views), key=len)
+    if len({tuple(image.shape) for image in images}) == 1:
+        model.encode(images)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Computed(Source):
     model: Any
@@ -88,6 +109,9 @@ class _Computed(Source):
     image_of: Callable[[View, Path], Image] | None
     counts: dict[str, int] = field(default_factory=dict[str, int])
     """Masks by view, for the notes."""
+
+    images: dict[str, Image] = field(default_factory=dict[str, Image])
+    """Pictures of the views that are looked at together, by name."""
 
     @property
     @override
@@ -132,7 +156,7 @@ class _Computed(Source):
 
     @override
     def write(self, folder: Path, view: View) -> int:
-        image = load_image(view) if self.image_of is None else self.image_of(view, folder)
+        image = self._image(view, folder)
         if self.asked == "masks":
             masks = without_empty(self._ask(ModelCache.masks, self.model.masks, image))
             self._check_size(view, masks.height, masks.width)
@@ -170,6 +194,22 @@ class _Computed(Source):
         if not none:
             return ()
         return (f"{len(none)} of {len(self.counts)} views have no mask at all ({some(none)}).",)
+
+    def announced(self, views: Sequence[View]) -> list[Image]:
+        """Pictures of views that are asked about next, and that no cache answers for."""
+        self.images.clear()
+        if self.image_of is not None:
+            return []  # renders are kept with the evidence, a view at a time
+        self.images.update({view.name: load_image(view) for view in views})
+        images = list(self.images.values())
+        if self.cache is None:
+            return images
+        return [i for i in images if not self.cache.entry(self.asked, self.model, i).is_file()]
+
+    def _image(self, view: View, folder: Path) -> Image:
+        if view.name in self.images:
+            return self.images.pop(view.name)
+        return load_image(view) if self.image_of is None else self.image_of(view, folder)
 
     def _ask(self, cached: Callable[..., Any], direct: Callable[[Image], Any], image: Image) -> Any:
         return direct(image) if self.cache is None else cached(self.cache, self.model, image)

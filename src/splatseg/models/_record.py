@@ -4,8 +4,8 @@ import importlib.metadata
 import shutil
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -19,7 +19,7 @@ from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header,
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.io.write_errors import named_write_failures
 from splatseg.models._cache import ModelCache
-from splatseg.models._computed import computed
+from splatseg.models._computed import announce, batch_of, computed
 from splatseg.models._copied import copied
 from splatseg.models._sources import Source, What, some, views_done
 from splatseg.models.recorded import AnyRecorded
@@ -58,6 +58,9 @@ class SeenEvidence:
     notes: tuple[str, ...]
     """What the user should know of the evidence, a sentence each."""
 
+    further: tuple["SeenEvidence", ...] = ()
+    """What was written beside it, where several kinds were asked for."""
+
 
 @boundary
 def record_evidence(
@@ -65,7 +68,7 @@ def record_evidence(
     views: Sequence[View],
     folder: Path | str,
     *,
-    what: What | None = None,
+    what: What | Sequence[What] | None = None,
     asked: str = "train",
     overwrite: bool = False,
     missing: Literal["refuse", "skip"] = "refuse",
@@ -83,7 +86,8 @@ def record_evidence(
         views: The views to look at.
         folder: Where to write, usually SCENE/evidence/NAME. Its parent must exist.
         what: Masks, labels, panoptic, features or text; None takes what the model has, masks
-            before the others.
+            before the others. Of several the first goes to `folder`, each further one beside it
+            to NAME.WHAT; a network that gives them together passes each image once.
         asked: How the views were asked for; recorded, so that it can be seen later what the
             evidence may be used for.
         overwrite: Whether evidence of the same name is replaced, once the new one is complete.
@@ -98,46 +102,121 @@ def record_evidence(
         InputError: If the model has no such thing, the folder holds something else or was made
             with other settings, or recorded evidence lacks views.
         FileFormatError: If recorded evidence is broken or has not the photograph's size.
+        BackendError: If an image does not fit the memory of the device.
         OutputError: If the disk is full, or there is no permission.
     """
-    target = Path(folder)
     if not views:
         raise InputError("views: expected at least one view, got none.")
-    source = (
-        copied(model, views, what=what, missing=missing)
+    asked_for = _distinct(what)
+    sources = [
+        copied(model, views, what=one, missing=missing)
         if isinstance(model, AnyRecorded)
-        else computed(model, what=what, cache=cache, image_of=image_of)
-    )
-    source.check_target(target)
-    available = source.available(views)
+        else computed(model, what=one, cache=cache, image_of=image_of)
+        for one in asked_for
+    ]
+    folders = evidence_folders(Path(folder), asked_for)
+    for source, target in zip(sources, folders, strict=True):
+        source.check_target(target)
+    available = frozenset.intersection(*(source.available(views) for source in sources))
     wanted = [view for view in views if view.name in available]
-    metadata = _metadata(model, source, asked)
     started = time.monotonic()
-    masks = 0
-    with _work_folder(target, source, overwrite=overwrite) as folder:
-        done = _begin(folder, source, wanted, metadata)
+    with ExitStack() as stack:
+        targets = [
+            stack.enter_context(
+                _target(model, source, target, wanted, asked=asked, overwrite=overwrite)
+            )
+            for source, target in zip(sources, folders, strict=True)
+        ]
+        done = frozenset.intersection(*(target.done for target in targets))
         todo = [view for view in wanted if view.name not in done]
-        source.start(folder, wanted)
-        for i, view in enumerate(todo):
+        for first in range(0, len(todo), batch_of(model)):
+            together = todo[first : first + batch_of(model)]
             if progress is not None:
-                progress(len(done) + i, len(wanted))
-            masks += source.write(folder, view)
+                progress(len(done) + first, len(wanted))
+            announce(model, [target.source for target in targets], together)
+            for view in together:
+                for target in targets:
+                    target.write(view)
         if progress is not None:
             progress(len(wanted), len(wanted))
         seconds = time.monotonic() - started
-        source.finish(folder)
-        _write_header(folder, source, metadata | {"complete": True})
-    return SeenEvidence(
-        folder=target,
-        model=model.name,
-        kind=source.kind,
-        views=len(wanted),
-        kept=len(done),
-        masks=masks if source.kind == "masks" else None,
-        seconds=seconds,
-        bytes=sum(path.stat().st_size for path in target.rglob("*") if path.is_file()),
-        notes=source.notes(),
-    )
+        for target in targets:
+            target.finish()
+    seen = [target.seen(model.name, seconds) for target in targets]
+    return replace(seen[0], further=tuple(seen[1:]))
+
+
+def evidence_folders(folder: Path, what: Sequence[What | None]) -> list[Path]:
+    """Where each of several kinds of evidence goes: the first to the folder, others beside it."""
+    return [folder, *(folder.with_name(f"{folder.name}.{one}") for one in what[1:])]
+
+
+def _distinct(what: What | Sequence[What] | None) -> list[What | None]:
+    if what is None or isinstance(what, str):
+        return [what]
+    if not what:
+        return [None]
+    if len(set(what)) != len(what):
+        raise InputError(f"what: expected different kinds, got {', '.join(what)}.")
+    return list(what)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Target:
+    """One folder of evidence while it is being written."""
+
+    source: Source
+    target: Path
+    folder: Path
+    """Where views are written now."""
+
+    metadata: Mapping[str, Any]
+    wanted: int
+    done: frozenset[str]
+    masks: int = 0
+
+    def write(self, view: View) -> None:
+        if view.name not in self.done:
+            self.masks += self.source.write(self.folder, view)
+
+    def finish(self) -> None:
+        self.source.finish(self.folder)
+        _write_header(self.folder, self.source, {**self.metadata, "complete": True})
+
+    def seen(self, model: str, seconds: float) -> SeenEvidence:
+        files = (path for path in self.target.rglob("*") if path.is_file())
+        return SeenEvidence(
+            folder=self.target,
+            model=model,
+            kind=self.source.kind,
+            views=self.wanted,
+            kept=len(self.done),
+            masks=self.masks if self.source.kind == "masks" else None,
+            seconds=seconds,
+            bytes=sum(path.stat().st_size for path in files),
+            notes=self.source.notes(),
+        )
+
+
+@contextmanager
+def _target(
+    model: Model,
+    source: Source,
+    target: Path,
+    wanted: Sequence[View],
+    *,
+    asked: str,
+    overwrite: bool,
+) -> Generator[_Target]:
+    """A folder to write evidence to, with what was done in it before."""
+    metadata = _metadata(model, source, asked)
+    with _work_folder(target, source, overwrite=overwrite) as folder:
+        done = _begin(folder, source, wanted, metadata)
+        source.start(folder, wanted)
+        yield _Target(
+            source=source, target=target, folder=folder, metadata=metadata,
+            wanted=len(wanted), done=done,
+        )  # fmt: skip
 
 
 def _metadata(model: Model, source: Source, asked: str) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 Another package brings a model by an entry point of the group ``splatseg.models``: its name is
 the model's, its value something that gives the model when called without arguments, such as its
-class.
+class, or a `ModelFamily`, which has options and weights.
 """
 
+import difflib
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -13,59 +14,133 @@ from typing import Any, cast
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Model
 from splatseg.errors import InputError, MissingPackageError
+from splatseg.models._family import LoadOptions, ModelFamily
+from splatseg.models._loading import loading_of
 
 ENTRY_POINT_GROUP = "splatseg.models"
 
-_OWN = {"classical": "splatseg.models.classical:Classical"}
+_NETWORKS = "splatseg.models.networks"
+_OWN = {
+    "classical": "splatseg.models.classical:CLASSICAL",
+    "dino": f"{_NETWORKS}.dino:DINO",
+    "dinov2": f"{_NETWORKS}.dino:DINOV2",
+    "dinov3": f"{_NETWORKS}.dino:DINOV3",
+}
 
 
 def model_names() -> tuple[str, ...]:
-    """Names that `find_model` knows, sorted. Nothing is loaded for it."""
-    return tuple(sorted(_known()))
+    """Names that `find_model` knows, ours first. Nothing is loaded for it."""
+    return tuple(_known())
 
 
 @boundary
-def find_model(name: str | Path) -> Model:
+def find_family(name: str) -> ModelFamily | None:
+    """What a model of this name is made from; None for one that another package makes whole.
+
+    Raises:
+        InputError: If there is none, or what another package brings is no model.
+        MissingPackageError: If the package that brings it cannot be imported.
+    """
+    known = _known()
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"known: {', '.join(known)}."
+        raise InputError(f"there is no model {name!r}; {hint}")
+    found = _loaded(known[name])
+    if isinstance(found, ModelFamily) and found.name != name:
+        raise InputError(f"model {name!r}: expected a family of this name, got {found.name!r}.")
+    return found if isinstance(found, ModelFamily) else None
+
+
+@boundary
+def find_model(
+    name: str | Path,
+    options: object = None,
+    *,
+    loading: LoadOptions | None = None,
+    report: Callable[[str], None] | None = None,
+) -> Model:
     """The model of this name, or the recorded one of this folder.
 
     A name comes before a folder; ``./classical`` is always the folder.
 
+    Args:
+        name: The name, or the folder.
+        options: An instance of the family's options; None takes its defaults.
+        loading: Its weights, and where and how it runs; goes with models that have weights.
+        report: Told in a sentence what the user should know, such as what is fetched.
+
     Raises:
-        InputError: If there is neither, or what another package brings is no model.
+        InputError: If there is neither, options are not those of the model, or what another
+            package brings is no model.
+        MissingFileError: If the weights are not on this machine.
+        FileFormatError: If the weights are broken, or of another model.
         MissingPackageError: If the package that brings it, or one it needs, cannot be imported.
     """
     known = _known()
-    if str(name) in known:
-        return _load(known[str(name)])
-    if Path(name).is_dir():
+    text = str(name)
+    if text not in known:
+        if not Path(name).is_dir():
+            names = ", ".join(known)
+            raise InputError(
+                f"model: expected one of {names}, or a folder of recorded evidence, got {text!r}."
+            )
+        _refuse(text, options, loading)
         from splatseg.models.recorded import recorded_model
 
         return recorded_model(name)
-    names = ", ".join(sorted(known))
-    raise InputError(
-        f"model: expected one of {names}, or a folder of recorded evidence, got {str(name)!r}."
-    )
+    family = find_family(text)
+    if family is None:
+        _refuse(text, options, loading)
+        return _made(known[text])
+    if options is not None and not isinstance(options, family.options):
+        raise InputError(
+            f"options: expected {family.options.__name__} for model {text}, "
+            f"got {type(options).__name__}."
+        )
+    settings = family.options() if options is None else options
+    if not family.needs_weights:
+        if loading not in (None, LoadOptions()):
+            raise InputError(f"weights: model {text} has none.")
+        return family.load(settings, None)
+    place = loading_of(family, loading or LoadOptions(), report=report or _silent)
+    return family.load(settings, place)
+
+
+def _refuse(name: str, options: object, loading: LoadOptions | None) -> None:
+    if options is not None or loading not in (None, LoadOptions()):
+        raise InputError(f"options: model {name} takes neither options nor weights.")
+
+
+def _silent(sentence: str) -> None:
+    """Where nobody listens."""
 
 
 def _known() -> dict[str, EntryPoint]:
-    found = {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
     own = {
         name: EntryPoint(name=name, value=value, group=ENTRY_POINT_GROUP)
         for name, value in _OWN.items()
     }
-    return found | own  # another package cannot take the place of one of ours
+    others = {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
+    # Another package cannot take the place of one of ours.
+    return own | {name: others[name] for name in sorted(others) if name not in own}
 
 
-def _load(entry: EntryPoint) -> Model:
+def _loaded(entry: EntryPoint) -> object:
     try:
-        make: object = entry.load()
+        return cast(object, entry.load())
     except (ImportError, AttributeError) as error:
         raise MissingPackageError(
             f"model {entry.name!r} ({entry.value}) cannot be loaded: {error}."
         ) from error
+
+
+def _made(entry: EntryPoint) -> Model:
+    """A model that another package makes whole."""
+    make = _loaded(entry)
     if not callable(make):
         raise InputError(
-            f"model {entry.name!r} ({entry.value}): expected something to call, "
+            f"model {entry.name!r} ({entry.value}): expected something to call or a family, "
             f"got {type(make).__name__}."
         )
     model = cast(Callable[[], Any], make)()

@@ -10,8 +10,13 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import RENDERS_FOLDER
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
-from splatseg.models import ModelCache, SeenEvidence, find_model, record_evidence
-from splatseg.models.classical import Classical, RegionOptions
+from splatseg.models import (
+    LoadOptions,
+    ModelCache,
+    SeenEvidence,
+    find_model,
+    record_evidence,
+)
 from splatseg.models.recorded import AnyRecorded, recorded_model
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
@@ -28,8 +33,9 @@ What = Literal["masks", "labels", "panoptic", "features", "text"]
 class SeeOptions:
     """What a model is asked, of which views, and what is kept."""
 
-    what: What | None = None
-    """What to ask the model for. None takes what it has, masks before the others."""
+    what: tuple[What, ...] = ()
+    """What to ask the model for; nothing takes what it has, masks before the others. Of several
+    each further one is written to NAME.WHAT, and each image passes the network once."""
 
     views: tuple[str, ...] = ("train",)
     """Which views: train, all, or names of views. It is recorded with the evidence."""
@@ -74,7 +80,8 @@ def see(
     evidence: str,
     *,
     options: SeeOptions | None = None,
-    regions: RegionOptions | None = None,
+    model_options: object = None,
+    loading: LoadOptions | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> SeenEvidence:
@@ -91,21 +98,26 @@ def see(
         model: The model; or the name of one, or a folder of evidence recorded elsewhere.
         evidence: Name of the evidence to write.
         options: What is asked.
-        regions: Settings of the masks of the model ``classical``.
+        model_options: Options of the model's family, such as `RegionOptions` of ``classical``; None
+            takes its defaults.
+        loading: The model's weights, and where and how it runs.
         backend: Who renders views without photographs.
         observer: Is told of the progress.
 
     Raises:
         InputError: If there is no such model, it cannot be asked this, the scene has no such
             views, other evidence of this name is there, or another process works on the scene.
-        FileFormatError: If recorded evidence is broken or has not the photograph's size.
+        FileFormatError: If recorded evidence is broken or has not the photograph's size, or weights
+            are broken.
+        MissingFileError: If weights are not on this machine.
+        BackendError: If an image does not fit the memory of the device.
     """
     options = options or SeeOptions()
     check_name("evidence", evidence)
     if scene.root is None:
         raise InputError("scene: expected one that was read from its folder, got one without.")
     views = views_asked(scene, options.views)
-    found = _model(model, options, regions)
+    found = _model(model, options, model_options, loading, observer)
     cache = None
     if options.cache is not None:
         cache = ModelCache(folder=options.cache, precision=options.precision, report=observer.note)
@@ -118,7 +130,7 @@ def see(
             found,
             views,
             folder,
-            what=options.what,
+            what=options.what or None,
             asked=views_recorded(options.views),
             overwrite=options.overwrite,
             missing="skip" if options.allow_missing else "refuse",
@@ -142,14 +154,23 @@ def _rendered(drawn: int, folder: Path) -> str:
     return f"{drawn} {views} rendered for the model; the renders are in {folder / RENDERS_FOLDER}."
 
 
-def _model(asked: str | Model, options: SeeOptions, regions: RegionOptions | None) -> Model:
+def _model(
+    asked: str | Model,
+    options: SeeOptions,
+    model_options: object,
+    loading: LoadOptions | None,
+    observer: Observer,
+) -> Model:
     """The model with its settings; settings that it does not have are refused."""
-    model = find_model(asked) if isinstance(asked, str) else asked
+    if isinstance(asked, str):
+        model = find_model(asked, model_options, loading=loading, report=observer.note)
+    elif model_options is not None or loading is not None:
+        raise InputError("model: expected a name with options and weights, got a model made.")
+    else:
+        model = asked
     name = asked if isinstance(asked, str) else model.name
-    if not isinstance(model, Classical) and regions not in (None, RegionOptions()):
-        raise InputError(f"expected settings of regions with model classical, got model {name}.")
     if isinstance(model, AnyRecorded) and isinstance(asked, str):
-        kind = "masks" if options.what == "masks" else None
+        kind = "masks" if options.what == ("masks",) else None
         return recorded_model(
             name,
             kind=kind,
@@ -163,6 +184,4 @@ def _model(asked: str | Model, options: SeeOptions, regions: RegionOptions | Non
             "zero_is_class, void, suffix, classes: expected with evidence recorded elsewhere, got "
             f"model {name}."
         )
-    if isinstance(model, Classical) and regions is not None:
-        return Classical(regions=regions)
     return model

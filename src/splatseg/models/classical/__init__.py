@@ -12,6 +12,7 @@ import torch
 
 from splatseg.core import MaskSet
 from splatseg.core.models import DeepFeatures, Embedding, Image, Prompt
+from splatseg.models._family import ModelFamily
 from splatseg.models.classical._descriptor import DescriptorOptions as DescriptorOptions
 from splatseg.models.classical._descriptor import (
     colour_gradient_features as colour_gradient_features,
@@ -86,3 +87,13 @@ class Classical:
     def features(self, image: Image) -> DeepFeatures:
         """Colour and gradients per cell: `colour_gradient_features`."""
         return colour_gradient_features(image, self.descriptor)
+
+
+CLASSICAL = ModelFamily(
+    name="classical",
+    summary="masks and features by colour and edges: a stand-in that needs no weights",
+    reference="docs/models.md",
+    gives=("masks", "features"),
+    options=RegionOptions,
+    load=lambda options, place: Classical(regions=options),
+)

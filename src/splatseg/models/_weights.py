@@ -1,0 +1,170 @@
+"""Where the weights of a model are: a folder, or what the hub's cache of this machine holds.
+
+Nothing is fetched unless it is asked for; then size and licence are said first.
+"""
+
+import hashlib
+import importlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from splatseg.errors import InputError, MissingFileError, MissingPackageError
+from splatseg.io.json_files import read_json
+from splatseg.models._family import Checkpoint, LoadOptions, ModelFamily
+
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_WEIGHTS = ("*.safetensors", "*.bin", "*.pt", "*.ckpt")
+_FILES = ("*.json", "*.txt", "*.model")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+def find_weights(
+    family: ModelFamily, options: LoadOptions, *, report: Callable[[str], None]
+) -> tuple[Path, str]:
+    """The folder of the weights that are asked for, and what they are called.
+
+    Raises:
+        MissingFileError: If they are not on this machine and may not be fetched, or cannot be.
+        MissingPackageError: If they are named by an id of the hub without the package for it.
+        InputError: If what is named is neither a folder nor an id.
+    """
+    asked = options.weights or family.checkpoints[0].id
+    folder = Path(asked)
+    if folder.is_dir():
+        _check_folder(folder)
+        return folder, folder.resolve().name
+    if folder.exists():
+        raise InputError(
+            f"weights: expected a folder with config.json and the weights, got the file {asked}."
+        )
+    if not _HUB_ID.fullmatch(asked):
+        raise MissingFileError(
+            f"{asked}: there is no such folder of weights, and it is no id of the Hugging Face hub "
+            "(OWNER/NAME)."
+        )
+    known = next((one for one in family.checkpoints if one.id == asked), None)
+    found = _in_cache(asked)
+    if found is None and options.download:
+        found = _fetched(asked, report)
+    if found is None:
+        raise MissingFileError(
+            f"weights: {asked} is not on this machine ({_described(known)}); --download fetches "
+            "it, or --weights FOLDER takes a copy."
+        )
+    return found, asked
+
+
+def digest_of(folder: Path) -> str:
+    """SHA-256 over the names and contents of configuration and weights.
+
+    Files of the hub's cache are links to contents that are named by their own SHA-256.
+    """
+    digest = hashlib.sha256()
+    for path in weight_files(folder):
+        content = path.resolve().name
+        if not (path.is_symlink() and _SHA256.fullmatch(content)):
+            with path.open("rb") as file:
+                content = hashlib.file_digest(file, "sha256").hexdigest()
+        digest.update(f"{path.name}\0{content}\0".encode())
+    return digest.hexdigest()
+
+
+def weight_files(folder: Path) -> list[Path]:
+    """The configuration and the files that the weights are in, by name.
+
+    Where there are safetensors, other formats are not looked at.
+    """
+    for pattern in _WEIGHTS:
+        found = sorted(folder.glob(pattern))
+        if found:
+            return [*sorted(folder.glob("*config.json")), *found]
+    return []
+
+
+def _check_folder(folder: Path) -> None:
+    if not (folder / "config.json").is_file() or not weight_files(folder):
+        raise MissingFileError(
+            f"{folder}: expected weights as save_pretrained writes them (config.json and "
+            "model.safetensors), got a folder without."
+        )
+
+
+def _in_cache(id: str) -> Path | None:
+    """What the hub's cache of this machine has of an id, if all of it is there."""
+    found = _hub().try_to_load_from_cache(id, "config.json")
+    if not isinstance(found, str):
+        return None
+    folder = Path(found).parent
+    # A download that was stopped leaves a folder without its largest files.
+    there = {path.name for path in weight_files(folder)}
+    return folder if there and _shards(folder) <= there else None
+
+
+def _shards(folder: Path) -> set[str]:
+    """The files that weights in several parts are in, by their index."""
+    index = folder / "model.safetensors.index.json"
+    parts = read_json(index).get("weight_map") if index.is_file() else None
+    return set(map(str, parts.values())) if isinstance(parts, dict) else set()  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+
+
+def _fetched(id: str, report: Callable[[str], None]) -> Path:
+    """Fetch weights, after saying how much that is and under which licence."""
+    hub = _hub()
+    try:
+        about = hub.HfApi().model_info(id, files_metadata=True)
+        names, size = _wanted({file.rfilename: file.size or 0 for file in about.siblings or ()})
+        licence = _licence(about)
+        report(f"{id}: fetching {size / 1e6:.0f} MB from the Hugging Face hub, licence {licence}.")
+        return Path(hub.snapshot_download(id, allow_patterns=list(names)))
+    except hub.errors.GatedRepoError as error:
+        raise MissingFileError(
+            f"weights: {id} is given only to those who accepted its licence on the Hugging Face "
+            "hub; do so there, then `hf auth login`."
+        ) from error
+    except hub.errors.RepositoryNotFoundError as error:
+        raise MissingFileError(f"weights: the Hugging Face hub has no {id}.") from error
+    except (OSError, hub.errors.HTTPError) as error:
+        raise MissingFileError(
+            f"weights: {id} cannot be fetched ({type(error).__name__}); is there a network? "
+            "--weights FOLDER takes a copy."
+        ) from error
+
+
+def _wanted(sizes: Mapping[str, int]) -> tuple[Sequence[str], int]:
+    """The files of a repository that are needed, and their bytes: one format of the weights."""
+    top = [name for name in sizes if "/" not in name]
+    for pattern in _WEIGHTS:
+        weights = [name for name in top if Path(name).match(pattern)]
+        if weights:
+            break
+    else:
+        weights = []
+    names = [name for name in top if any(Path(name).match(p) for p in _FILES)] + weights
+    return names, sum(sizes[name] for name in names)
+
+
+def _licence(about: Any) -> str:
+    card = getattr(about, "card_data", None)
+    name = getattr(card, "license_name", None) or getattr(card, "license", None)
+    return str(name) if name else "not said"
+
+
+def _described(known: Checkpoint | None) -> str:
+    if known is None:
+        return "its size and licence are said before it is fetched"
+    note = f"; {known.note}" if known.note else ""
+    return f"{known.megabytes} MB, licence {known.licence}{note}"
+
+
+def _hub() -> Any:
+    try:
+        huggingface_hub = importlib.import_module("huggingface_hub")
+        importlib.import_module("huggingface_hub.errors")
+    except ImportError as error:
+        raise MissingPackageError(
+            "weights of the Hugging Face hub need a package that is not installed "
+            "(huggingface_hub). Try: pip install 'splatseg[models]'."
+        ) from error
+    return huggingface_hub
