@@ -1,10 +1,11 @@
 """Seconds of automatic masks, by stage, of networks with random weights.
 
-    python benchmarks/mask_generator.py             a tiny SAM, 1024 points on a photograph of 640x426
-    python benchmarks/mask_generator.py --full      SAM ViT-B at full size
+    python benchmarks/mask_generator.py          a tiny SAM, 1024 points on a picture of 640x426
+    python benchmarks/mask_generator.py --full   SAM ViT-B at full size
 
-Nothing is filtered before the masks are brought to the photograph's size (thresholds 0, every box kept
-up to an overlap of 0.98), which is the worst case; with real weights most candidates leave earlier.
+Nothing is filtered before the masks are brought to the picture's size (thresholds 0, every box
+kept up to an overlap of 0.98), which is the worst case; with real weights most candidates leave
+earlier.
 """
 
 import argparse
@@ -25,12 +26,21 @@ def tiny(folder: Path, *, full: bool) -> Path:
     from transformers import SamConfig, SamModel
 
     torch.manual_seed(7)
-    small: dict[str, Any] = {
-        "hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2, "window_size": 4,
-        "global_attn_indexes": [1], "mlp_dim": 64,
-    }  # fmt: skip
-    vision = {"initializer_range": 0.3, **({} if full else small)}
-    SamModel(SamConfig(vision_config=vision, initializer_range=0.02)).save_pretrained(folder)
+    if full:
+        config = SamConfig(vision_config={"initializer_range": 0.3})
+    else:
+        vision: dict[str, Any] = {
+            "hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2, "window_size": 4,
+            "global_attn_indexes": [1], "mlp_dim": 64, "initializer_range": 0.3, "image_size": 256,
+        }  # fmt: skip
+        decoder = {"mlp_dim": 64, "num_attention_heads": 2, "iou_head_hidden_dim": 32}
+        config = SamConfig(
+            vision_config=vision,
+            prompt_encoder_config={"image_size": 256},
+            mask_decoder_config=decoder,
+            initializer_range=0.3,
+        )
+    SamModel(config).save_pretrained(folder)
     return folder
 
 
