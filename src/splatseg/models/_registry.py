@@ -22,6 +22,10 @@ ENTRY_POINT_GROUP = "splatseg.models"
 _NETWORKS = "splatseg.models.networks"
 _OWN = {
     "classical": "splatseg.models.classical:CLASSICAL",
+    "sam": f"{_NETWORKS}.sam:SAM",
+    "sam-hq": f"{_NETWORKS}.sam:SAM_HQ",
+    "sam2": f"{_NETWORKS}.sam:SAM2",
+    "sam3": f"{_NETWORKS}.sam:SAM3",
     "dino": f"{_NETWORKS}.dino:DINO",
     "dinov2": f"{_NETWORKS}.dino:DINOV2",
     "dinov3": f"{_NETWORKS}.dino:DINOV3",
