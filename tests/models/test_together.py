@@ -10,6 +10,7 @@ from splatseg.core import FeatureMap, MaskSet
 from splatseg.core.models import DeepFeatures
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
+from splatseg.io.images import load_image
 from splatseg.models import ModelCache, record_evidence
 from splatseg.models._encoded import LastImages
 
@@ -55,6 +56,19 @@ def test_several_kinds_cost_one_pass_an_image(views, tmp_path) -> None:
     for name in ("v0", "v1", "v2"):
         one, other = (open_evidence(f).features(name) for f in (alone.folder, further.folder))
         assert torch.equal(one.features, other.features)
+
+
+def test_pictures_that_are_given_go_together_too(views, tmp_path) -> None:
+    """`see` gives them: photographs, and renders of views that have none."""
+    model, given = Counting(), []
+
+    def image_of(view, folder):
+        given.append((view.name, folder))
+        return load_image(view)
+
+    record_evidence(model, views, tmp_path / "e", what="masks", image_of=image_of)
+    assert model.passes == [2, 1]
+    assert given == [(name, tmp_path / "e") for name in ("v0", "v1", "v2")], "each once"
 
 
 def test_what_is_done_of_each_kind_stays(views, tmp_path) -> None:

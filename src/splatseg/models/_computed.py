@@ -1,7 +1,7 @@
 """Evidence from a model that is run, directly or through a cache."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -86,17 +86,22 @@ def batch_of(model: Model) -> int:
     return max(1, model.batch_size) if isinstance(model, BatchedModel) else 1
 
 
-def announce(model: Model, sources: Sequence[Source], views: Sequence[View]) -> None:
+def announce(model: Model, targets: Iterable[tuple[Source, Path]], views: Sequence[View]) -> None:
     """Let a model that takes several images at once see those of the next views.
 
     Images of one size go together.
+
+    Args:
+        model: The model.
+        targets: What is asked of it, and the folder that each is written to.
+        views: The next views.
     """
     if not isinstance(model, BatchedModel) or len(views) < 2:
         return
     images: list[Image] = []
-    for source in sources:
+    for source, folder in targets:
         if isinstance(source, _Computed):
-            images = max(images, source.announced(views), key=len)
+            images = max(images, source.announced(views, folder), key=len)
     if len({tuple(image.shape) for image in images}) == 1:
         model.encode(images)
 
@@ -195,12 +200,10 @@ class _Computed(Source):
             return ()
         return (f"{len(none)} of {len(self.counts)} views have no mask at all ({some(none)}).",)
 
-    def announced(self, views: Sequence[View]) -> list[Image]:
+    def announced(self, views: Sequence[View], folder: Path) -> list[Image]:
         """Pictures of views that are asked about next, and that no cache answers for."""
         self.images.clear()
-        if self.image_of is not None:
-            return []  # renders are kept with the evidence, a view at a time
-        self.images.update({view.name: load_image(view) for view in views})
+        self.images.update({view.name: self._image(view, folder) for view in views})
         images = list(self.images.values())
         if self.cache is None:
             return images

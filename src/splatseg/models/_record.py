@@ -133,7 +133,7 @@ def record_evidence(
             together = todo[first : first + batch_of(model)]
             if progress is not None:
                 progress(len(done) + first, len(wanted))
-            announce(model, [target.source for target in targets], together)
+            announce(model, [(target.source, target.folder) for target in targets], together)
             for view in together:
                 for target in targets:
                     target.write(view)
