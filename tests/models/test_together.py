@@ -42,6 +42,19 @@ class Counting:
         return DeepFeatures(maps=(one,), depths=("grey",))
 
 
+def test_several_kinds_read_each_photograph_once(views, tmp_path) -> None:
+    read: list[str] = []
+
+    def image_of(view, _folder):
+        read.append(view.name)
+        return load_image(view)
+
+    record_evidence(
+        Counting(), views, tmp_path / "e", what=["masks", "features"], image_of=image_of
+    )
+    assert read == ["v0", "v1", "v2"]
+
+
 def test_several_kinds_cost_one_pass_an_image(views, tmp_path) -> None:
     model = Counting()
     seen = record_evidence(model, views, tmp_path / "e", what=["masks", "features"])

@@ -56,14 +56,37 @@ def abilities(model: Model) -> tuple[What, ...]:
     return tuple(what for what, protocol in _PROTOCOLS.items() if isinstance(model, protocol))
 
 
+class Pictures:
+    """Pictures of the views that are being looked at, so that several kinds read each once.
+
+    Args:
+        image_of: Gives the picture of a view, and may keep it in the folder that evidence is
+            written to; None takes photographs.
+    """
+
+    def __init__(self, image_of: Callable[[View, Path], Image] | None) -> None:
+        self._image_of = image_of
+        self._kept: dict[tuple[str, Path | None], Image] = {}
+
+    def of(self, view: View, folder: Path) -> Image:
+        """The picture of a view, for evidence that is written to a folder."""
+        # What is drawn is kept beside each kind; a photograph is the same for all.
+        key = (view.name, folder if view.image is None else None)
+        if key not in self._kept:
+            self._kept[key] = (
+                load_image(view) if self._image_of is None else self._image_of(view, folder)
+            )
+        return self._kept[key]
+
+    def forget(self) -> None:
+        """Let go of the pictures: other views come."""
+        self._kept.clear()
+
+
 def computed(
-    model: Model,
-    *,
-    what: What | None,
-    cache: ModelCache | None,
-    image_of: Callable[[View, Path], Image] | None,
+    model: Model, *, what: What | None, cache: ModelCache | None, pictures: Pictures
 ) -> Source:
-    """Evidence from running a model on what `image_of` gives of each view.
+    """Evidence from running a model on pictures of views.
 
     Raises:
         InputError: If the model cannot give this, or nothing at all.
@@ -78,7 +101,7 @@ def computed(
         raise InputError(
             f"model {model.name!r}: expected one of what it gives ({', '.join(can)}), got {what!r}."
         )
-    return _Computed(model=model, asked=what, cache=cache, image_of=image_of)
+    return _Computed(model=model, asked=what, cache=cache, pictures=pictures)
 
 
 def batch_of(model: Model) -> int:
@@ -111,12 +134,9 @@ class _Computed(Source):
     model: Any
     asked: What
     cache: ModelCache | None
-    image_of: Callable[[View, Path], Image] | None
+    pictures: Pictures
     counts: dict[str, int] = field(default_factory=dict[str, int])
     """Masks by view, for the notes."""
-
-    images: dict[str, Image] = field(default_factory=dict[str, Image])
-    """Pictures of the views that are looked at together, by name."""
 
     @property
     @override
@@ -161,7 +181,7 @@ class _Computed(Source):
 
     @override
     def write(self, folder: Path, view: View) -> int:
-        image = self._image(view, folder)
+        image = self.pictures.of(view, folder)
         if self.asked == "masks":
             masks = without_empty(self._ask(ModelCache.masks, self.model.masks, image))
             self._check_size(view, masks.height, masks.width)
@@ -202,17 +222,10 @@ class _Computed(Source):
 
     def announced(self, views: Sequence[View], folder: Path) -> list[Image]:
         """Pictures of views that are asked about next, and that no cache answers for."""
-        self.images.clear()
-        self.images.update({view.name: self._image(view, folder) for view in views})
-        images = list(self.images.values())
+        images = [self.pictures.of(view, folder) for view in views]
         if self.cache is None:
             return images
         return [i for i in images if not self.cache.entry(self.asked, self.model, i).is_file()]
-
-    def _image(self, view: View, folder: Path) -> Image:
-        if view.name in self.images:
-            return self.images.pop(view.name)
-        return load_image(view) if self.image_of is None else self.image_of(view, folder)
 
     def _ask(self, cached: Callable[..., Any], direct: Callable[[Image], Any], image: Image) -> Any:
         return direct(image) if self.cache is None else cached(self.cache, self.model, image)

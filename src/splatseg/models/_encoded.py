@@ -18,8 +18,17 @@ class LastImages(Generic[_A]):
     What is kept is found by the content of the image, so it changes no answer.
     """
 
-    def __init__(self, run: Callable[[Sequence[Image]], Sequence[_A]]) -> None:
+    def __init__(
+        self, run: Callable[[Sequence[Image]], Sequence[_A]], *, resizable: bool = True
+    ) -> None:
+        """Keep what a network makes of images.
+
+        Args:
+            run: The network.
+            resizable: Whether it takes inputs of another size, which saves memory.
+        """
         self._run = run
+        self._resizable = resizable
         self._kept: dict[str, _A] = {}
 
     def encode(self, images: Sequence[Image]) -> None:
@@ -41,9 +50,10 @@ class LastImages(Generic[_A]):
                 raise
             height, width = (int(side) for side in images[0].shape[:2])
             if len(images) == 1:
+                smaller = "--size N makes it smaller for the network, " * self._resizable
                 raise BackendError(
-                    f"there is not enough memory for an image of {width}x{height}; --size N "
-                    "makes it smaller for the network, --dtype bfloat16 halves the network."
+                    f"there is not enough memory for an image of {width}x{height}; {smaller}"
+                    "--dtype bfloat16 halves the network."
                 ) from error
         half = len(images) // 2
         return [*self._fitting(images[:half]), *self._fitting(images[half:])]

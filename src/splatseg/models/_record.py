@@ -19,7 +19,7 @@ from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header,
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.io.write_errors import named_write_failures
 from splatseg.models._cache import ModelCache
-from splatseg.models._computed import announce, batch_of, computed
+from splatseg.models._computed import Pictures, announce, batch_of, computed
 from splatseg.models._copied import copied
 from splatseg.models._sources import Source, What, some, views_done
 from splatseg.models.recorded import AnyRecorded
@@ -108,10 +108,11 @@ def record_evidence(
     if not views:
         raise InputError("views: expected at least one view, got none.")
     asked_for = _distinct(what)
+    pictures = Pictures(image_of)
     sources = [
         copied(model, views, what=one, missing=missing)
         if isinstance(model, AnyRecorded)
-        else computed(model, what=one, cache=cache, image_of=image_of)
+        else computed(model, what=one, cache=cache, pictures=pictures)
         for one in asked_for
     ]
     folders = evidence_folders(Path(folder), asked_for)
@@ -133,6 +134,7 @@ def record_evidence(
             together = todo[first : first + batch_of(model)]
             if progress is not None:
                 progress(len(done) + first, len(wanted))
+            pictures.forget()
             announce(model, [(target.source, target.folder) for target in targets], together)
             for view in together:
                 for target in targets:

@@ -2,12 +2,15 @@
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any, cast
 
+from splatseg.core.models import Model
 from splatseg.errors import FileFormatError, MissingPackageError
 from splatseg.io.json_files import read_json
-from splatseg.models._family import Loading
+from splatseg.models._family import Checkpoint, Loading, ModelFamily
+from splatseg.models._sources import What
 
 _SOME = 3
 
@@ -97,3 +100,54 @@ def network(place: Loading, class_name: str, **options: Any) -> Any:
             f"{len(lacking)} of its tensors ({', '.join(sorted(lacking)[:_SOME])}{more})."
         )
     return made.to(place.device).eval()
+
+
+def network_family(
+    name: str,
+    summary: str,
+    *checkpoints: Checkpoint,
+    reference: str,
+    gives: tuple[What, ...],
+    options: type[Any],
+    make: Callable[[str, Any, Loading], Model],
+) -> ModelFamily:
+    """A family of networks of this library.
+
+    Args:
+        name: As it is asked for.
+        summary: One line.
+        checkpoints: Published weights, the default first.
+        reference: The paper.
+        gives: What such a model can be asked for.
+        options: Dataclass of its options.
+        make: Makes the model of the family's name, options and weights.
+    """
+    return ModelFamily(
+        name=name,
+        summary=summary,
+        reference=reference,
+        gives=gives,
+        options=options,
+        load=lambda chosen, place: make(name, chosen, cast(Loading, place)),
+        checkpoints=checkpoints,
+        packages=("transformers",),
+    )
+
+
+def settings_of(
+    options: Any, place: Loading, *, size: int, unrecorded: Sequence[str] = ()
+) -> dict[str, Any]:
+    """What changes a network's answers: its options, weights, precision and size of the input.
+
+    Args:
+        options: The dataclass of its options.
+        place: The weights.
+        size: Side of the input, pixels.
+        unrecorded: Names of options that change no answer.
+    """
+    chosen = {name: value for name, value in asdict(options).items() if name not in unrecorded}
+    return chosen | {
+        "weights": place.digest,
+        "dtype": str(place.dtype).removeprefix("torch."),
+        "size": size,
+    }

@@ -5,7 +5,7 @@ Caron et al. 2021 (arXiv:2104.14294), Oquab et al. 2023 (arXiv:2304.07193), Darc
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -16,9 +16,9 @@ from splatseg.core.boundary import convert_fields
 from splatseg.core.models import DeepFeatures, Image
 from splatseg.errors import RangeError
 from splatseg.models._encoded import LastImages
-from splatseg.models._family import Checkpoint, Loading, ModelFamily
+from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import Normalisation, patch_grid, patch_input
-from splatseg.models.networks._library import configuration, network
+from splatseg.models.networks._library import configuration, network, network_family, settings_of
 
 _CLASSES = {
     "dino": {"vit": "ViTModel"},
@@ -76,12 +76,12 @@ class Dino:
     @property
     def settings(self) -> Mapping[str, Any]:
         """Options, weights, precision and size of the input."""
-        return {
-            **asdict(self._options),
-            "weights": self._place.digest,
-            "dtype": str(self._place.dtype).removeprefix("torch."),
-            "size": self._size,
-        }
+        return settings_of(self._options, self._place, size=self._size)
+
+    @property
+    def default_settings(self) -> Mapping[str, Any]:
+        """The same with default options."""
+        return settings_of(DinoOptions(), self._place, size=self._size)
 
     def encode(self, images: Sequence[Image]) -> None:
         """Pass images of one size through the network at once."""
@@ -136,42 +136,38 @@ def _trained_size(config: Any) -> int:
     return int(max(size) if isinstance(size, list | tuple) else size)
 
 
-def _family(name: str, summary: str, reference: str, *checkpoints: Checkpoint) -> ModelFamily:
-    return ModelFamily(
-        name=name,
-        summary=summary,
-        reference=reference,
-        gives=("features",),
-        options=DinoOptions,
-        load=lambda options, place: Dino(name, options, cast(Loading, place)),
-        checkpoints=checkpoints,
-        packages=("transformers",),
-    )
-
-
-DINO = _family(
+DINO = network_family(
     "dino",
     "features of patches, of 2021: the teacher of CoSSegGaussians",
-    "arXiv:2104.14294",
     Checkpoint(id="facebook/dino-vitb16", megabytes=343, licence="Apache-2.0"),
     Checkpoint(id="facebook/dino-vits8", megabytes=87, licence="Apache-2.0"),
+    reference="arXiv:2104.14294",
+    gives=("features",),
+    options=DinoOptions,
+    make=Dino,
 )
-DINOV2 = _family(
+DINOV2 = network_family(
     "dinov2",
     "features of patches, of 2023",
-    "arXiv:2304.07193",
     Checkpoint(id="facebook/dinov2-small", megabytes=88, licence="Apache-2.0"),
     Checkpoint(id="facebook/dinov2-base", megabytes=346, licence="Apache-2.0"),
     Checkpoint(id="facebook/dinov2-with-registers-base", megabytes=346, licence="Apache-2.0"),
+    reference="arXiv:2304.07193",
+    gives=("features",),
+    options=DinoOptions,
+    make=Dino,
 )
-DINOV3 = _family(
+DINOV3 = network_family(
     "dinov3",
     "features of patches, of 2025",
-    "arXiv:2508.10104",
     Checkpoint(
         id="facebook/dinov3-vitb16-pretrain-lvd1689m",
         megabytes=343,
         licence="DINOv3 License",
         note="access must be asked for",
     ),
+    reference="arXiv:2508.10104",
+    gives=("features",),
+    options=DinoOptions,
+    make=Dino,
 )

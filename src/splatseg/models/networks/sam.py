@@ -5,7 +5,7 @@ Kirillov et al. 2023 (arXiv:2304.02643), Ke et al. 2023 (arXiv:2306.01567), Ravi
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 import torch
@@ -18,10 +18,10 @@ from splatseg.core.boundary import convert_fields
 from splatseg.core.models import DeepFeatures, Embedding, Image, Prompt
 from splatseg.errors import RangeError
 from splatseg.models._encoded import LastImages
-from splatseg.models._family import Checkpoint, Loading, ModelFamily
+from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import Frame, Normalisation, frame_of, network_input
 from splatseg.models._mask_generator import Decode, MaskGeneratorOptions, automatic_masks
-from splatseg.models.networks._library import configuration, network
+from splatseg.models.networks._library import configuration, network, network_family, settings_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,18 +88,20 @@ class Sam:
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
         self._normalisation = Normalisation.of(place.folder)
-        self._last = LastImages[_Seen](self._encode)
+        self._last = LastImages[_Seen](self._encode, resizable=False)
 
     @property
     def settings(self) -> Mapping[str, Any]:
         """Options, weights, precision and size of the input."""
-        settings = asdict(self._options)
-        del settings["prompts_per_batch"]  # it changes no answer
-        return settings | {
-            "weights": self._place.digest,
-            "dtype": str(self._place.dtype).removeprefix("torch."),
-            "size": self._size,
-        }
+        return self._settings(self._options)
+
+    @property
+    def default_settings(self) -> Mapping[str, Any]:
+        """The same with default options."""
+        return self._settings(SamOptions())
+
+    def _settings(self, options: SamOptions) -> Mapping[str, Any]:
+        return settings_of(options, self._place, size=self._size, unrecorded=("prompts_per_batch",))
 
     def encode(self, images: Sequence[Image]) -> None:
         """Pass images of one size through the encoder at once."""
@@ -292,46 +294,45 @@ def _flat(found: Any) -> list[Tensor]:
     return cast("list[Tensor]", items)
 
 
-def _family(name: str, summary: str, reference: str, *checkpoints: Checkpoint) -> ModelFamily:
-    return ModelFamily(
-        name=name,
-        summary=summary,
-        reference=reference,
-        gives=("masks", "features"),
-        options=SamOptions,
-        load=lambda options, place: Sam(name, options, cast(Loading, place)),
-        checkpoints=checkpoints,
-        packages=("transformers",),
-    )
-
-
-SAM = _family(
+SAM = network_family(
     "sam",
     "Segment Anything of 2023: masks of parts, objects and groups, and its embedding",
-    "arXiv:2304.02643",
     Checkpoint(id="facebook/sam-vit-base", megabytes=375, licence="Apache-2.0"),
     Checkpoint(id="facebook/sam-vit-large", megabytes=1250, licence="Apache-2.0"),
     Checkpoint(id="facebook/sam-vit-huge", megabytes=2565, licence="Apache-2.0"),
+    reference="arXiv:2304.02643",
+    gives=("masks", "features"),
+    options=SamOptions,
+    make=Sam,
 )
-SAM_HQ = _family(
+SAM_HQ = network_family(
     "sam-hq",
     "Segment Anything with finer borders",
-    "arXiv:2306.01567",
     Checkpoint(id="syscv-community/sam-hq-vit-base", megabytes=379, licence="Apache-2.0"),
+    reference="arXiv:2306.01567",
+    gives=("masks", "features"),
+    options=SamOptions,
+    make=Sam,
 )
-SAM2 = _family(
+SAM2 = network_family(
     "sam2",
     "Segment Anything 2: masks, faster than the first",
-    "arXiv:2408.00714",
     Checkpoint(id="facebook/sam2.1-hiera-small", megabytes=184, licence="Apache-2.0"),
     Checkpoint(id="facebook/sam2.1-hiera-base-plus", megabytes=324, licence="Apache-2.0"),
     Checkpoint(id="facebook/sam2.1-hiera-large", megabytes=898, licence="Apache-2.0"),
+    reference="arXiv:2408.00714",
+    gives=("masks", "features"),
+    options=SamOptions,
+    make=Sam,
 )
-SAM3 = _family(
+SAM3 = network_family(
     "sam3",
     "Segment Anything 3: its tracker's masks for points and boxes",
-    "arXiv:2511.16719",
     Checkpoint(
         id="facebook/sam3", megabytes=3440, licence="SAM License", note="access must be asked for"
     ),
+    reference="arXiv:2511.16719",
+    gives=("masks", "features"),
+    options=SamOptions,
+    make=Sam,
 )
