@@ -5,6 +5,7 @@ of at most a tenth of the perturbation, with either strategy.
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from scipy.spatial import KDTree
 
 from splatseg.core import Camera, Capture, Gaussians, PointCloud, View
+from splatseg.errors import InputError
 from splatseg.evaluate import evaluate_photographs
 from splatseg.fit import FitOptions, Strategy, fit
 from splatseg.io.images import save_png
@@ -119,3 +121,28 @@ def test_a_known_scene_is_recovered(strategy: Strategy, tmp_path, rng) -> None:
     sizes = result.gaussians.scales[shapes].sort(dim=1).values
     off = (sizes / truth.scales.sort(dim=1).values).log().abs()
     assert float(off.median()) < 0.05, "sizes are right, too"
+
+
+def test_fixed_gaussians_stay_at_the_points_in_their_order(tmp_path, rng) -> None:
+    capture = photographed(scene(rng), tmp_path, rng)
+    assert capture.points is not None
+    options = FitOptions(
+        minutes=None, steps=300, max_gaussians=3, sh_degree=0, background="black",
+        densify_from=1, densify_every=10,
+    ).with_strategy("fixed")  # fmt: skip
+    result = fit(capture, options=options, backend="cpu")
+    torch.testing.assert_close(
+        result.gaussians.means, capture.points.points.float(), rtol=1e-5, atol=1e-6
+    )
+    before = fit(capture, options=replace(options, steps=1), backend="cpu").gaussians
+    assert float((result.gaussians.sh - before.sh).abs().max()) > 0.1, "colours are learned"
+    assert float((result.gaussians.scales / before.scales).log().abs().max()) > 0.1
+    psnr = evaluate_photographs(GaussianField(result.gaussians), capture.train_views).psnr
+    assert psnr > evaluate_photographs(GaussianField(before), capture.train_views).psnr + 3
+
+
+def test_fixed_gaussians_need_points() -> None:
+    with pytest.raises(InputError, match="fixed starts at the capture's points, got start random"):
+        FitOptions(start="random").with_strategy("fixed")
+    with pytest.raises(InputError, match="fixed goes with start points"):
+        FitOptions(strategy="fixed")

@@ -116,7 +116,7 @@ def test_classic_has_its_own_penalties_and_its_own_end() -> None:
     back = options.with_strategy("mcmc")
     assert back == FitOptions(seed=3)
     assert back.with_strategy("mcmc") is back
-    with pytest.raises(InputError, match="strategy: expected one of mcmc, classic"):
+    with pytest.raises(InputError, match="strategy: expected one of mcmc, classic, fixed"):
         back.with_strategy("new")
 
 

@@ -66,7 +66,8 @@ class Command:
 
     strategy: Strategy = "mcmc"
     """How Gaussians come and go. mcmc: the faint move to where there are others, up to the
-    number asked for. classic: cloned and split where the picture pulls at them."""
+    number asked for. classic: cloned and split where the picture pulls at them. fixed: one stays
+    at each of the capture's points, in their order, and none comes or goes."""
 
     start: Literal["auto", "points", "random"] = _DEFAULT.start
     """Where Gaussians start. points: at the capture's points. random: on rays of the photographs,

@@ -1,4 +1,4 @@
-"""Density control during a fit: both strategies behind one interface."""
+"""Density control during a fit: the strategies behind one interface."""
 
 from typing import Protocol
 
@@ -54,12 +54,38 @@ def density_of(options: FitOptions, *, start: int, extent: float, device: torch.
     """
     if options.strategy == "classic":
         return Classic(options, start=start, extent=extent, device=device)
+    if options.strategy == "fixed":
+        return Fixed()
     return Relocation(options, start=start)
 
 
 def _round_due(options: FitOptions, *, steps: int, progress: float) -> bool:
     every = steps >= options.densify_from and steps % options.densify_every == 0
     return every and progress < options.densify_until
+
+
+class Fixed:
+    """Neither adds nor removes."""
+
+    needs_screen_gradients = False
+
+    def add_view(
+        self, rows: Tensor, gradients: Tensor, *, camera: Camera, parameters: Parameters
+    ) -> None:
+        """Views are not needed."""
+
+    def after_step(
+        self, state: State, *, steps: int, progress: float, generator: torch.Generator
+    ) -> State:
+        """The state as it is."""
+        return state
+
+    def state(self) -> dict[str, Tensor]:
+        """There is no state."""
+        return {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """There is no state."""
 
 
 class Relocation:

@@ -51,7 +51,7 @@ def initial_parameters(
     """An isotropic Gaussian at each start point, of the point's colour.
 
     Its scale is the mean distance of the three nearest other points. If there are more points
-    than `max_gaussians`, a random subset is taken.
+    than `max_gaussians`, a random subset is taken, unless they are to stay.
 
     Raises:
         InputError: If the capture has no start points.
@@ -69,7 +69,7 @@ def initial_parameters(
             f"{capture.path}: {int((~finite).sum())} of {len(points)} start points are not finite."
         )
     colours = torch.full_like(points, 0.5) if cloud.colours is None else cloud.colours / 255.0
-    if len(points) > options.max_gaussians:
+    if len(points) > options.max_gaussians and options.strategy != "fixed":
         order = torch.randperm(len(points), generator=generator)
         chosen = order[: options.max_gaussians].sort().values
         points, colours = points[chosen], colours[chosen]

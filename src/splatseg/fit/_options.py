@@ -12,7 +12,8 @@ from splatseg.fit._background import Background, fixed_colour
 from splatseg.io.images import DEFAULT_LONGEST
 
 Preset = Literal["quick", "default", "full"]
-Strategy = Literal["mcmc", "classic"]
+Strategy = Literal["mcmc", "classic", "fixed"]
+STRATEGIES: tuple[Strategy, ...] = ("mcmc", "classic", "fixed")
 
 # Of a fit with half a million Gaussians at 512 x 384 pixels.
 _STEPS_PER_MINUTE = 1500
@@ -184,7 +185,8 @@ class FitOptions:
     """Density control. mcmc: dead Gaussians are relocated to live ones, and the number grows to
     `max_gaussians` on a schedule (Kheradmand et al. 2024). classic: Gaussians with large
     view-space gradients are cloned or split, and transparent ones are pruned (Kerbl et al.
-    2023)."""
+    2023). fixed: a Gaussian stays at each of the capture's points, in their order, whatever
+    `max_gaussians` is; it learns all but its position, and none is added or pruned."""
 
     densify_every: int = 100
     """Steps between two rounds of relocation, or of cloning and splitting."""
@@ -230,10 +232,15 @@ class FitOptions:
         convert_fields(self)
         self._check_length()
         check_choice("start", self.start, ("auto", "points", "random"))
-        check_choice("strategy", self.strategy, ("mcmc", "classic"))
+        check_choice("strategy", self.strategy, STRATEGIES)
         check_choice("masks", self.masks, ("ignore", "alpha", "off"))
         check_choice("depth", self.depth, ("off", "metric", "relative"))
         fixed_colour(self.background)
+        if self.strategy == "fixed" and (self.start != "points" or self.prune_floaters):
+            raise InputError(
+                "strategy: fixed goes with start points and without prune_floaters, got start "
+                f"{self.start} and prune_floaters {self.prune_floaters}."
+            )
         for name, minimum in _MINIMA.items():
             value = getattr(self, name)
             if value is not None and value < minimum:
@@ -294,19 +301,25 @@ class FitOptions:
         """The same options with another strategy and its defaults.
 
         ``classic`` has no regularisers and no noise, and stops densifying half-way (Kerbl et al.
-        2023).
+        2023). ``fixed`` has none either, and starts at the points.
 
         Raises:
             InputError: If the strategy does not exist.
         """
-        check_choice("strategy", strategy, ("mcmc", "classic"))
+        check_choice("strategy", strategy, STRATEGIES)
         if strategy == self.strategy:
             return self
         fresh = type(self)()
         names = ("opacity_penalty", "scale_penalty", "noise", "densify_until")
-        own = dict.fromkeys(names[:3], 0.0) | {"densify_until": 0.5}
+        own: dict[str, Any] = dict.fromkeys(names[:3], 0.0) | {"densify_until": 0.5}
         if strategy == "mcmc":
             own = {name: getattr(fresh, name) for name in names}
+        if strategy == "fixed":
+            if self.start == "random":
+                raise InputError(
+                    "strategy: fixed starts at the capture's points, got start random."
+                )
+            own |= {"start": "points", "prune_floaters": False}
         return replace(self, strategy=strategy, **own)
 
     def with_length(self, *, minutes: float | None = None, steps: int | None = None) -> Self:

@@ -112,7 +112,8 @@ class FitRun:
 
     def gaussians(self) -> Gaussians:
         found = final_gaussians(self._state[0])
-        found = found[found.opacities > self._options.dead_opacity]
+        if self._options.strategy != "fixed":
+            found = found[found.opacities > self._options.dead_opacity]
         return self.views.in_capture_frame(
             found.replace(
                 antialiased=self._options.antialiased, low_pass=self._options.low_pass_drawn

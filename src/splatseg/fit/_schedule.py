@@ -35,8 +35,9 @@ def rates_at(progress: float, *, options: FitOptions, extent: float) -> Rates:
     """
     start, end = options.position_rate, options.position_rate_end
     left = options.final_rate**progress
+    means = 0.0 if options.strategy == "fixed" else extent * start * (end / start) ** progress
     return Rates(
-        means=extent * start * (end / start) ** progress,
+        means=means,
         log_scales=options.scale_rate * left,
         rotations=options.rotation_rate * left,
         logits=options.opacity_rate * left,

@@ -98,7 +98,7 @@ class MadeScene:
 
 @boundary
 def fit_capture(
-    data: Path,
+    data: Path | Capture,
     folder: Path,
     *,
     options: MakeSceneOptions | None = None,
@@ -115,7 +115,8 @@ def fit_capture(
     from.
 
     Args:
-        data: Folder of a capture or of bare photographs, or a video.
+        data: Folder of a capture or of bare photographs, or a video; or a capture that was read,
+            whose views and split are taken as they are.
         folder: The scene folder to write. A scene that is there is replaced unless it has
             layers.
         options: What is around the fit.
@@ -181,23 +182,26 @@ def fit_capture(
 
 
 def _capture(
-    data: Path,
+    data: Path | Capture,
     folder: Path,
     options: MakeSceneOptions,
     fit_options: FitOptions,
     observer: Observer,
 ) -> tuple[Capture, PoseReport | None]:
     """The capture with its poses; the observer is told what it is."""
-    capture, poses = capture_of(
-        data,
-        scene=folder,
-        format=options.format,
-        strict=options.strict,
-        poses=options.poses,
-        frames=options.frames,
-        seed=fit_options.seed,
-        observer=observer,
-    )
+    if isinstance(data, Capture):
+        capture, poses = data, None
+    else:
+        capture, poses = capture_of(
+            data,
+            scene=folder,
+            format=options.format,
+            strict=options.strict,
+            poses=options.poses,
+            frames=options.frames,
+            seed=fit_options.seed,
+            observer=observer,
+        )
     for note in (*capture.notes, reduction_note(capture.train_views, longest=fit_options.longest)):
         if note is not None:
             observer.note(note)
