@@ -1,0 +1,1 @@
+"""Protocols of published benchmarks as data: what is asked, every choice, the published figures."""

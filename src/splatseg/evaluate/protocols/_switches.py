@@ -1,0 +1,181 @@
+"""Switches of protocols: every choice that changes a figure, as a value that is recorded."""
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+from splatseg._check import check_choice, check_range
+from splatseg.core.boundary import convert_fields
+from splatseg.errors import RangeError
+
+Averaging = Literal["tasks", "scenes", "pairs", "pooled"]
+"""tasks: mean over the views of a task, then over all tasks of all scenes. scenes: over views, then
+over the tasks of a scene, then over scenes. pairs: over all (view, task) of a scene, then over
+scenes. pooled: pixels of all views of a task together, then over the tasks of a scene, then over
+scenes."""
+
+Missing = Literal["wrong", "skipped"]
+"""What a view or task without a prediction counts as: nothing right, or as if it were not asked."""
+
+Threshold = Literal["fixed", "reference", "oracle"]
+"""Where a cut comes from: the protocol, the prompt of the reference view, or the truth that is
+evaluated, which no user has."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Switches:
+    """What all protocols choose."""
+
+    averaging: Averaging = "scenes"
+    """How figures of views and tasks become one."""
+
+    missing: Missing = "wrong"
+    """What a missing prediction counts as."""
+
+    scored_in_training: bool = False
+    """Whether photographs of scored views were fitted, or are held out."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_choice("averaging", self.averaging, ("tasks", "scenes", "pairs", "pooled"))
+        check_choice("missing", self.missing, ("wrong", "skipped"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetSwitches(Switches):
+    """Choices where one thing is asked for at a time, and is a mask."""
+
+    prompt: Literal["scribble", "mask", "words"] = "mask"
+    """What is given: strokes in a view, a mask of a view, or text."""
+
+    decided: Literal["pixels", "gaussians"] = "pixels"
+    """Whether pixels of a rendered signal are chosen, or Gaussians, whose silhouette is drawn
+    without what may hide it."""
+
+    threshold: Threshold = "fixed"
+    """Where the cut of scores comes from."""
+
+    silhouette_cut: float = 0.5
+    """Alpha above which a pixel is in the silhouette of chosen Gaussians."""
+
+    reference_scored: bool = False
+    """Whether the view of the prompt counts."""
+
+    truth_above: int = 127
+    """Pixels of the truth's picture above this are inside, 0 to 255; how its masks are read."""
+
+    boundary_ratio: float | None = None
+    """Width of the band of Boundary IoU, as a share of the diagonal; None leaves it out."""
+
+    hits_at: tuple[float, ...] = ()
+    """IoU above which a (view, task) counts as found, for Acc@."""
+
+    negatives: tuple[str, ...] = ()
+    """Words that relevancy is held against."""
+
+    temperature: float = 10.0
+    """Factor of cosines in the softmax of relevancy."""
+
+    box_filter: int = 0
+    """Side of the box that relevancy is averaged with, pixels; 0 takes it as it is."""
+
+    stretch: bool = False
+    """Whether relevancy is stretched to [-1, 1] in each view and clipped at 0 before it is cut."""
+
+    relevancy_cut: float = 0.5
+    """Relevancy above which a pixel, or a Gaussian, is taken."""
+
+    majority: int = 0
+    """Side of the window of the majority filter on masks, pixels; 0 has none."""
+
+    localisation: bool = False
+    """Whether the peak of relevancy is held against the annotation's boxes."""
+
+    segment_share: float = 0.5
+    """Share of a segment's pixels in the prompted view that must lie in the prompt's mask for it
+    to be taken, where the method gives segments."""
+
+    def __post_init__(self) -> None:
+        Switches.__post_init__(self)
+        check_choice("prompt", self.prompt, ("scribble", "mask", "words"))
+        check_choice("decided", self.decided, ("pixels", "gaussians"))
+        check_choice("threshold", self.threshold, ("fixed", "reference", "oracle"))
+        for name in ("silhouette_cut", "relevancy_cut", "segment_share", *(
+            ("boundary_ratio",) if self.boundary_ratio is not None else ()
+        )):  # fmt: skip
+            check_range(name, getattr(self, name), 0.0, 1.0)
+        if not 0 <= self.truth_above <= 254:
+            raise RangeError(f"truth_above: expected 0 to 254, got {self.truth_above}.")
+        for name in ("box_filter", "majority"):
+            if getattr(self, name) < 0:
+                raise RangeError(f"{name}: expected 0 or more, got {getattr(self, name)}.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapSwitches(Switches):
+    """Choices where every pixel of views has a true class or instance."""
+
+    zero_is_instance: bool = False
+    """Whether pixels without an instance are one more, as in Gaga's evaluation."""
+
+    mostly_void: Literal["counted", "dropped"] = "counted"
+    """What a predicted segment of which more than half lies on void counts as in PQ: found where
+    nothing is, or nothing, as in COCO's."""
+
+    match_iou: float = 0.5
+    """IoU above which two segments match."""
+
+    def __post_init__(self) -> None:
+        Switches.__post_init__(self)
+        check_choice("mostly_void", self.mostly_void, ("counted", "dropped"))
+        check_range("match_iou", self.match_iou, 0.5, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointSwitches(Switches):
+    """Choices where points of the surface have a true class."""
+
+    class_ids: tuple[int, ...] = ()
+    """Ids that are scored; points of others are left out."""
+
+    fixed_points: bool = True
+    """Whether Gaussians stay at the points that are scored, so that a label of one is that of the
+    other; else points take labels from Gaussians around them."""
+
+    min_opacity: float = 0.1
+    """Gaussians of less opacity have no label, and their points are left out."""
+
+    frame_step: int = 20
+    """Every so many frames of the capture are used."""
+
+    def __post_init__(self) -> None:
+        Switches.__post_init__(self)
+        check_range("min_opacity", self.min_opacity, 0.0, 1.0)
+        if self.frame_step < 1:
+            raise RangeError(f"frame_step: expected 1 or more, got {self.frame_step}.")
+
+
+def recorded(switches: Switches) -> dict[str, Any]:
+    """All switches, in values that JSON holds."""
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in asdict(switches).items()
+    }
+
+
+def differences(one: Switches | dict[str, Any], other: Switches | dict[str, Any]) -> list[str]:
+    """What two sets of switches differ in, a phrase each; none where they are the same."""
+    left, right = (s if isinstance(s, dict) else recorded(s) for s in (one, other))
+    return [
+        f"{name} {_shown(left, name)} and {_shown(right, name)}"
+        for name in sorted(set(left) | set(right))
+        if name not in left or name not in right or left[name] != right[name]
+    ]
+
+
+def _shown(switches: dict[str, Any], name: str) -> str:
+    return repr(switches[name]) if name in switches else "absent"
+
+
+def names_of(switches: type[Switches]) -> tuple[str, ...]:
+    """Names of the switches of a kind."""
+    return tuple(field.name for field in fields(switches))
