@@ -25,6 +25,8 @@ from splatseg.lift.mass.uplift import uplift as uplift
 from splatseg.lift.point_labels import PointLabelOptions as PointLabelOptions
 from splatseg.lift.point_labels import PointRule as PointRule
 from splatseg.lift.point_labels import labels_of_points as labels_of_points
+from splatseg.lift.relevancy import TextSpace as TextSpace
+from splatseg.lift.relevancy import relevancy as relevancy
 from splatseg.lift.segments.matching import MatchedMaps as MatchedMaps
 from splatseg.lift.segments.panoptic import merge_panoptic as merge_panoptic
 from splatseg.lift.segments.recorded import EvidenceSegments as EvidenceSegments

@@ -21,6 +21,9 @@ Threshold = Literal["fixed", "reference", "oracle"]
 evaluated, which no user has."""
 
 
+_SAMPLED = ("positive_share", "negative_share")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Switches:
     """What all protocols choose."""
@@ -90,6 +93,12 @@ class TargetSwitches(Switches):
     localisation: bool = False
     """Whether the peak of relevancy is held against the annotation's boxes."""
 
+    positive_share: float = 0.02
+    """Share of the pixels of the skeleton of positive strokes that become points."""
+
+    negative_share: float = 0.005
+    """Share of the pixels of the skeleton of negative strokes that do."""
+
     segment_share: float = 0.5
     """Share of a segment's pixels in the prompted view that must lie in the prompt's mask for it
     to be taken, where the method gives segments."""
@@ -99,9 +108,8 @@ class TargetSwitches(Switches):
         check_choice("prompt", self.prompt, ("scribble", "mask", "words"))
         check_choice("decided", self.decided, ("pixels", "gaussians"))
         check_choice("threshold", self.threshold, ("fixed", "reference", "oracle"))
-        for name in ("silhouette_cut", "relevancy_cut", "segment_share", *(
-            ("boundary_ratio",) if self.boundary_ratio is not None else ()
-        )):  # fmt: skip
+        shares = ("silhouette_cut", "relevancy_cut", "segment_share", *_SAMPLED)
+        for name in (*shares, *(("boundary_ratio",) if self.boundary_ratio is not None else ())):
             check_range(name, getattr(self, name), 0.0, 1.0)
         if not 0 <= self.truth_above <= 254:
             raise RangeError(f"truth_above: expected 0 to 254, got {self.truth_above}.")

@@ -1,0 +1,96 @@
+"""A protocol: which layout, what is asked of a method, and every choice of how it is scored."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_args, get_origin, get_type_hints
+
+from splatseg.core.boundary import convert_fields
+from splatseg.errors import InputError
+from splatseg.evaluate.protocols._switches import Switches
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Protocol:
+    """An experiment of the field as data."""
+
+    name: str
+    """As ``splatseg bench NAME`` asks for it."""
+
+    summary: str
+    """What is asked and measured, one line, lower case, without a full stop."""
+
+    layout: str
+    """Layout of the data set that it reads, one of `splatseg.io.benchmarks.LAYOUTS`."""
+
+    reference: str
+    """Who states it."""
+
+    switches: Switches
+    """Every choice; its class says what is asked: targets, maps, or points."""
+
+    measure: str
+    """The measure that it is known for, such as ``iou``."""
+
+    scenes: tuple[str, ...] = ()
+    """Its scenes; none where all of the data set are meant."""
+
+    note: str = ""
+    """What else should be known, such as what of the original is not settled."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
+    def with_switches(self, changes: dict[str, Any]) -> "Protocol":
+        """The same protocol with other choices; results record them.
+
+        Raises:
+            InputError: If it has no such switch.
+        """
+        known = {field.name for field in fields(self.switches)}
+        for name in changes:
+            if name not in known:
+                raise InputError(
+                    f"switch: protocol {self.name} has {', '.join(sorted(known))}; got {name!r}."
+                )
+        return replace(self, switches=replace(self.switches, **changes))
+
+
+def switch_value(protocol: Protocol, text: str) -> tuple[str, Any]:
+    """Name and value of ``NAME=VALUE`` as a person types it.
+
+    Raises:
+        InputError: If it is not of this form, there is no such switch, or the value does not fit.
+
+    Example:
+        >>> from splatseg.evaluate.protocols import find_protocol
+        >>> switch_value(find_protocol("spin-nerf"), "reference_scored=no")
+        ('reference_scored', False)
+    """
+    name, equals, value = text.partition("=")
+    hints = get_type_hints(type(protocol.switches))
+    if not equals or name not in hints:
+        raise InputError(
+            f"switch: expected NAME=VALUE with a name of {', '.join(sorted(hints))}, got {text!r}."
+        )
+    return name, _parsed(name, value, hints[name])
+
+
+def _parsed(name: str, text: str, kind: Any) -> Any:
+    options = [one for one in get_args(kind) if one is not type(None)]
+    if type(None) in get_args(kind):
+        return None if text.lower() in ("", "none") else _parsed(name, text, options[0])
+    if get_origin(kind) is tuple:
+        item = options[0]
+        return tuple(_parsed(name, one.strip(), item) for one in text.split(",") if one.strip())
+    if options:  # a Literal
+        return text
+    if kind is bool:
+        if text.lower() not in ("yes", "no", "true", "false"):
+            raise InputError(f"switch: {name}: expected yes or no, got {text!r}.")
+        return text.lower() in ("yes", "true")
+    try:
+        return kind(text)
+    except ValueError as error:
+        raise InputError(f"switch: {name}: expected {_WORDS[kind]}, got {text!r}.") from error
+
+
+_WORDS = {int: "a whole number", float: "a number", str: "text"}
