@@ -7,6 +7,7 @@ from pathlib import Path
 from splatseg.core import Capture, View
 from splatseg.errors import InputError, quoted
 from splatseg.io.captures import read_capture
+from splatseg.io.foreign import read_lines
 
 ALL_TRAIN = "every view is a training view, as the benchmark has it"
 """The note on captures whose benchmark fits to all photographs."""
@@ -53,7 +54,9 @@ def trained_on_all(capture: Capture) -> Capture:
     path = capture.path / "sparse" / "0" / "test.txt"
     if not path.is_file():
         return split_by(capture, {}, ALL_TRAIN)
-    named = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").split("\n")]
+    named = [
+        line.strip() for line in path.read_text(encoding="utf-8", errors="replace").split("\n")
+    ]
     names = ViewsByFile(capture)
     tests = {names.find(Path(name).stem, where=path): "test" for name in named if name}
     return split_by(capture, tests, "the split is that of sparse/0/test.txt")

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -59,8 +58,10 @@ VIEW_PAIRS = {
 
 
 def find_nvos(folder: Path) -> bool:
-    """Whether a folder has the benchmark's labels."""
-    return _labels_below(folder) is not None
+    """Whether a folder has the benchmark's labels, or is a scene beside them."""
+    if not _labels_below(folder) and not find_formats(folder):
+        return False
+    return _find_labels(folder) is not None
 
 
 def read_nvos(folder: Path) -> tuple[BenchmarkScene, ...]:
@@ -190,14 +191,21 @@ def _labels_below(folder: Path) -> Path | None:
 
 def _labels_of(folder: Path) -> tuple[Path, Path]:
     """The data set's folder and that of its labels; a scene lies a folder or two below it."""
+    found = _find_labels(folder)
+    if found is None:
+        raise MissingFileError(
+            f"{folder}: expected the folders scribbles and masks of NVOS, there or in labels/llff, "
+            "got none."
+        )
+    return found
+
+
+def _find_labels(folder: Path) -> tuple[Path, Path] | None:
     for root in (folder, *list(folder.resolve().parents)[:_LEVELS_UP]):
         labels = _labels_below(root)
         if labels is not None:
             return root, labels
-    raise MissingFileError(
-        f"{folder}: expected the folders scribbles and masks of NVOS, there or in labels/llff, "
-        "got none."
-    )
+    return None
 
 
 def _scene_folder(root: Path, labels: Path, task: str) -> Path:
