@@ -79,6 +79,19 @@ def read_bytes(path: Path, expected: str) -> bytes:
         return path.read_bytes()
 
 
+def read_lines(path: Path, expected: str) -> list[str]:
+    """Lines of a text file without the space around them, empty ones left out.
+
+    Raises:
+        MissingFileError: If it is not there.
+        FileFormatError: If it cannot be read, or is no UTF-8.
+    """
+    content = read_bytes(path, expected)
+    with reading(path, expected):
+        text = content.decode("utf-8-sig")
+    return [line for line in (line.strip() for line in text.splitlines()) if line]
+
+
 def is_file(path: Path) -> bool:
     """Whether a path that a file names is a file; names that no file can have are none."""
     try:

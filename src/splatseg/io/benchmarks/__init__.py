@@ -1,0 +1,81 @@
+"""Public benchmarks in the folders that people have: what is asked of a scene, and its truth.
+
+One module a layout; ``docs/benchmarks.md`` says which files each of them reads. Nothing of a mask
+or a photograph is read before somebody asks for it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatseg._check import check_choice
+from splatseg.core import BenchmarkScene
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, MissingFileError
+from splatseg.io.benchmarks.lerf_mask import find_lerf_mask, read_lerf_mask
+from splatseg.io.benchmarks.lerf_ovs import find_lerf_ovs, read_lerf_ovs
+from splatseg.io.benchmarks.nvos import find_nvos, read_nvos
+from splatseg.io.benchmarks.spin_nerf import find_spin_nerf, read_spin_nerf
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """How a layout is told and read."""
+
+    found: Callable[[Path], object]
+    """Something true where a folder has it."""
+
+    read: Callable[[Path], tuple[BenchmarkScene, ...]]
+
+
+_LAYOUTS: Mapping[str, _Layout] = {
+    "nvos": _Layout(find_nvos, read_nvos),
+    "lerf-mask": _Layout(find_lerf_mask, read_lerf_mask),
+    "lerf-ovs": _Layout(find_lerf_ovs, read_lerf_ovs),
+    # Last: masks beside photographs are all that tells it.
+    "spin-nerf": _Layout(find_spin_nerf, read_spin_nerf),
+}
+
+LAYOUTS = tuple(_LAYOUTS)
+"""Layouts that are read, in the order in which they are looked for."""
+
+
+@boundary
+def read_benchmark(layout: str, folder: Path) -> tuple[BenchmarkScene, ...]:
+    """Read scenes of a benchmark: cameras, tasks and truth, sorted by name.
+
+    Masks and maps are read when they are asked for, by the `read` of their values; that is when a
+    damaged one is found. Files that are not there, or of views that are not, are found here.
+
+    Args:
+        layout: One of `LAYOUTS`.
+        folder: A scene, or the data set's folder with several.
+
+    Raises:
+        MissingFileError: If there is no such folder, or files of the layout are missing.
+        InputError: If a file is damaged, or of a view that the scene does not have; one sentence
+            that names it.
+    """
+    check_choice("layout", layout, LAYOUTS)
+    if not folder.is_dir():
+        raise MissingFileError(f"{folder}: there is no such folder of a benchmark.")
+    return _LAYOUTS[layout].read(folder)
+
+
+@boundary
+def find_layout(folder: Path) -> str:
+    """The layout of a folder: the first of `LAYOUTS` that it has.
+
+    Raises:
+        MissingFileError: If there is no such folder.
+        InputError: If it has none of them.
+    """
+    if not folder.is_dir():
+        raise MissingFileError(f"{folder}: there is no such folder of a benchmark.")
+    for name, layout in _LAYOUTS.items():
+        if layout.found(folder):
+            return name
+    raise InputError(
+        f"{folder}: expected a benchmark in one of the layouts {', '.join(LAYOUTS)}, got none of "
+        "them."
+    )
