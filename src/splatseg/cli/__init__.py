@@ -77,6 +77,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.evaluate",
         summary="score a layer against label maps of held-out views",
     ),
+    "bench": CommandEntry(
+        module="splatseg.cli.bench",
+        summary="methods under a published protocol, with the published figures beside",
+    ),
     "edit": CommandEntry(
         module="splatseg.cli.edit",
         summary="things removed, kept alone, copied, moved, coloured, joined -> a new scene",

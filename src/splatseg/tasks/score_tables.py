@@ -1,4 +1,4 @@
-"""Scores of classes and confusion matrices as files: CSV, Markdown or LaTeX, by their ending."""
+"""Tables of scores as files: CSV, Markdown or LaTeX, by their ending."""
 
 import csv
 import io
@@ -49,7 +49,7 @@ def write_class_table(figures: Mapping[str, Any], path: Path) -> None:
         [int(id), names[id], pixels[id], float(iou)] for id, iou in figures["per_class"].items()
     ]
     rows.append(["", "mean", sum(pixels.values()), float(figures["mIoU"])])
-    _write(path, ["id", "class", "pixels", "IoU"], rows)
+    write_table(path, ["id", "class", "pixels", "IoU"], rows)
 
 
 def write_confusion(figures: Mapping[str, Any], path: Path) -> None:
@@ -66,10 +66,15 @@ def write_confusion(figures: Mapping[str, Any], path: Path) -> None:
         [matrix["names"][str(id)], *counts]
         for id, counts in zip(matrix["true"], matrix["counts"], strict=True)
     ]
-    _write(path, ["true class", *names], rows)
+    write_table(path, ["true class", *names], rows)
 
 
-def _write(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+    """Write rows under the names of columns; numbers stand right.
+
+    Raises:
+        InputError: If the ending is none of a table's, or the folder is not there.
+    """
     check_table_file("table", path)
     made = {".csv": _csv, ".md": _markdown, ".tex": _latex}[path.suffix.lower()]
     with atomic_file(path) as temporary:

@@ -63,9 +63,6 @@ class TargetSwitches(Switches):
     reference_scored: bool = False
     """Whether the view of the prompt counts."""
 
-    truth_above: int = 127
-    """Pixels of the truth's picture above this are inside, 0 to 255; how its masks are read."""
-
     boundary_ratio: float | None = None
     """Width of the band of Boundary IoU, as a share of the diagonal; None leaves it out."""
 
@@ -111,8 +108,6 @@ class TargetSwitches(Switches):
         shares = ("silhouette_cut", "relevancy_cut", "segment_share", *_SAMPLED)
         for name in (*shares, *(("boundary_ratio",) if self.boundary_ratio is not None else ())):
             check_range(name, getattr(self, name), 0.0, 1.0)
-        if not 0 <= self.truth_above <= 254:
-            raise RangeError(f"truth_above: expected 0 to 254, got {self.truth_above}.")
         for name in ("box_filter", "majority"):
             if getattr(self, name) < 0:
                 raise RangeError(f"{name}: expected 0 or more, got {getattr(self, name)}.")

@@ -1,0 +1,146 @@
+"""Scenes of a benchmark with Gaussians: fitted with its own split, or fitted before."""
+
+import hashlib
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Capture, PointCloud, Scene
+from splatseg.core.benchmark import BenchmarkScene
+from splatseg.core.json_values import plain_object
+from splatseg.errors import InputError
+from splatseg.evaluate.protocols import PointSwitches, Protocol, TargetSwitches
+from splatseg.io.paths import path_inside
+from splatseg.io.scene import load_scene
+from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
+from splatseg.render import BackendName
+from splatseg.tasks._observer import Observer
+from splatseg.tasks.benchmark.options import BenchOptions
+from splatseg.tasks.make_scene import MakeSceneOptions, fit_capture
+
+SCENES_FOLDER = "scenes"
+
+
+def fitted_scene(
+    bench: BenchmarkScene,
+    protocol: Protocol,
+    root: Path,
+    *,
+    options: BenchOptions,
+    backend: BackendName,
+    command: str,
+    observer: Observer,
+) -> Scene:
+    """The scene with Gaussians; fitted, gone on with, or taken as it is.
+
+    Raises:
+        InputError: If the folder holds a fit with other options, or a scene that was fitted before
+            learned from views that the protocol holds out.
+    """
+    fixed = isinstance(protocol.switches, PointSwitches) and protocol.switches.fixed_points
+    if options.fitted is not None:
+        scene = load_scene(Path(options.fitted.replace("{scene}", bench.name)))
+        _check_views(scene, bench, protocol)
+        return scene
+    fit_options = options.fit_options(fixed=fixed)
+    kind = f"{bench.layout}-fixed" if fixed else bench.layout
+    folder = path_inside(root, SCENES_FOLDER, kind, bench.name)
+    if not is_scene(folder) or (folder / CHECKPOINT_FILE).is_file():
+        fit_capture(
+            _capture(bench, protocol, fixed=fixed),
+            folder,
+            options=MakeSceneOptions(
+                preset=options.preset, resume=(folder / CHECKPOINT_FILE).is_file()
+            ),
+            fit_options=fit_options,
+            backend=backend,
+            command=command,
+            observer=observer,
+        )
+    scene = load_scene(folder)
+    _check_options(scene, plain_object("options", asdict(fit_options)))
+    return scene
+
+
+def held_out_views(bench: BenchmarkScene, protocol: Protocol) -> frozenset[str]:
+    """Names of the views that a fit must not learn from.
+
+    Of things that are asked for they are the scored ones, else those of the data set's split.
+    """
+    if protocol.switches.scored_in_training:
+        return frozenset()
+    if not isinstance(protocol.switches, TargetSwitches):
+        return frozenset(view.name for view in bench.capture.views if view.split != "train")
+    prompts = {
+        one.view
+        for task in bench.tasks
+        for one in (task.reference, task.scribble)
+        if one is not None
+    }
+    return frozenset(true.view for task in bench.tasks for true in task.truth) - prompts
+
+
+def gaussians_digest(scene: Scene) -> str:
+    """SHA-256 of the Gaussians' values."""
+    digest = hashlib.sha256()
+    for name in ("means", "rotations", "scales", "opacities", "sh"):
+        values = getattr(scene.gaussians, name).detach().cpu().contiguous()
+        digest.update(values.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _capture(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> Capture:
+    capture = bench.capture
+    if isinstance(protocol.switches, PointSwitches) and protocol.switches.frame_step > 1:
+        views = capture.views[:: protocol.switches.frame_step]
+        capture = replace(capture, views=views)
+    out = held_out_views(bench, protocol)
+    views = tuple(
+        replace(view, split="test" if view.name in out else "train") for view in capture.views
+    )
+    capture = replace(capture, views=views)
+    if not fixed:
+        return capture
+    if bench.points is None:
+        raise InputError(
+            f"scene {bench.name}: expected labelled points that Gaussians stay at, got none."
+        )
+    colours = None if capture.points is None else capture.points.colours
+    same = capture.points is not None and len(capture.points) == len(bench.points.points)
+    return replace(
+        capture, points=PointCloud(points=bench.points.points, colours=colours if same else None)
+    )
+
+
+def _check_views(scene: Scene, bench: BenchmarkScene, protocol: Protocol) -> None:
+    """Refuse a scene that lacks views of the benchmark, or learned from those it holds out."""
+    known = {view.name: view for view in scene.views}
+    lacking = [view.name for view in bench.capture.views if view.name not in known]
+    if lacking:
+        raise InputError(
+            f"{scene.root}: expected a fit of the {len(bench.capture.views)} views of "
+            f"{bench.name}, {len(lacking)} are not in it, the first is {lacking[0]}."
+        )
+    held_out = held_out_views(bench, protocol)
+    learned = sorted(name for name in held_out if known[name].split == "train")
+    if learned:
+        raise InputError(
+            f"{scene.root}: expected a fit that did not learn from the {len(held_out)} views that "
+            f"{protocol.name} holds out, got one that learned from {len(learned)} of them "
+            f"({learned[0]})."
+        )
+
+
+def _check_options(scene: Scene, wanted: Any) -> None:
+    """Refuse a fit with other options: results of the two do not go into one table."""
+    there = scene.provenance.get("options", {})
+    other = [
+        f"{name} {there.get(name)} there, {value} now"
+        for name, value in wanted.items()
+        if there.get(name) != value
+    ]
+    if other:
+        raise InputError(
+            f"{scene.root}: expected a fit with these options, got another ({'; '.join(other[:4])})"
+            "; choose another output, or take the fit as it is with `fitted`."
+        )

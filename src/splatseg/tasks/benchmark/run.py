@@ -1,0 +1,250 @@
+"""A protocol run over methods and scenes, each result kept as soon as it is there."""
+
+import importlib.metadata
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Model
+from splatseg.core.benchmark import BenchmarkScene
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.json_values import plain_object
+from splatseg.errors import InputError
+from splatseg.evaluate.protocols import (
+    PointSwitches,
+    Protocol,
+    TargetSwitches,
+    find_protocol,
+    mask_scores,
+    switch_value,
+)
+from splatseg.io.benchmarks import read_benchmark
+from splatseg.io.paths import path_inside
+from splatseg.io.write_errors import named_write_failures
+from splatseg.methods import find_method
+from splatseg.render import BackendName
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.benchmark.fits import fitted_scene, gaussians_digest
+from splatseg.tasks.benchmark.job import Job
+from splatseg.tasks.benchmark.maps import map_scores
+from splatseg.tasks.benchmark.options import BenchOptions
+from splatseg.tasks.benchmark.points import point_scores
+from splatseg.tasks.benchmark.results import (
+    MethodResult,
+    SceneResult,
+    kept_result,
+    key_of,
+    oracle_of,
+    over_scenes,
+    result_path,
+    save_result,
+    switches_of,
+)
+from splatseg.tasks.benchmark.sight import model_of
+from splatseg.tasks.benchmark.targets import TargetRun
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BenchRun:
+    """What was measured under a protocol."""
+
+    protocol: Protocol
+    """With the choices that were made."""
+
+    methods: tuple[MethodResult, ...]
+    folder: Path
+    kept: int
+    """Results that an earlier run had made."""
+
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
+
+@boundary
+def bench(
+    protocol: str,
+    data: Path,
+    folder: Path,
+    *,
+    options: BenchOptions | None = None,
+    backend: BackendName = "auto",
+    command: str = "",
+    observer: Observer = SILENT,
+) -> BenchRun:
+    """Run methods under a published protocol: fit, see, segment, score.
+
+    Each scene is fitted once for all methods, each result is written when it is there, and a run
+    that was stopped goes on with the next one.
+
+    Args:
+        protocol: Its name, see `splatseg.evaluate.protocols.PROTOCOLS`.
+        data: The data set in the layout that the protocol reads: a scene, or all of them.
+        folder: Where fits, predictions and results are kept; it may be there from an earlier run.
+        options: Methods, models, fits, and choices other than the protocol's.
+        backend: Who renders.
+        command: The words that started it, for the record; may be empty.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If there is no such protocol, method, model or scene, they do not fit
+            together, or the folder holds fits with other options.
+        MissingFileError: If the data set is not there, or lacks files of its layout.
+    """
+    options = options or BenchOptions()
+    chosen = find_protocol(protocol)
+    chosen = chosen.with_switches(dict(switch_value(chosen, one) for one in options.switches))
+    methods = [find_method(name) for name in options.methods]
+    scenes = _asked_scenes(read_benchmark(chosen.layout, data), options, data)
+    with named_write_failures(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    notes = _notes(chosen, scenes)
+    for note in notes:
+        observer.note(note.rstrip("."))
+    prompter, grounder = _models(chosen, options, observer)
+    found: dict[str, list[SceneResult]] = {method.name: [] for method in methods}
+    kept = 0
+    for one in scenes:
+        for note in one.notes:
+            observer.note(f"{one.name}: {note.rstrip('.')}")
+        scene = fitted_scene(
+            one, chosen, folder, options=options, backend=backend, command=command,
+            observer=observer,
+        )  # fmt: skip
+        digest = gaussians_digest(scene)
+        for method in methods:
+            job = Job(
+                protocol=chosen, bench=one, scene=scene, method=method, root=folder,
+                prompter=prompter, grounder=grounder, options=options, backend=backend,
+                observer=observer,
+            )  # fmt: skip
+            result, was_kept = _result(job, digest, command)
+            found[method.name].append(result)
+            kept += was_kept
+    return BenchRun(
+        protocol=chosen,
+        methods=tuple(over_scenes(chosen, name, results) for name, results in found.items()),
+        folder=folder,
+        kept=kept,
+        notes=tuple(notes),
+    )
+
+
+def _result(job: Job, digest: str, command: str) -> tuple[SceneResult, bool]:
+    """The result of a method in a scene, and whether it was there."""
+    made = _made_from(job, digest)
+    key = key_of(made)
+    path = result_path(job.root, job.protocol.name, job.method.name, job.bench.name)
+    before = None if job.options.again else kept_result(path, key)
+    if before is not None:
+        job.observer.info(f"{job.bench.name}, {job.method.name}: as it was measured before")
+        return before, True
+    began = time.monotonic()
+    scores, rows, notes = _scored(job)
+    result = SceneResult(
+        protocol=job.protocol.name,
+        scene=job.bench.name,
+        method=job.method.name,
+        scores=scores,
+        rows=tuple(rows),
+        switches=switches_of(job.protocol),
+        oracle=oracle_of(job.protocol.switches),
+        notes=tuple(notes),
+        made={**made, "command": command, "seconds": round(time.monotonic() - began, 3)},
+        key=key,
+    )
+    save_result(result, path)
+    figure = scores.get(job.protocol.measure)
+    shown = "not measured" if figure is None else f"{figure:.4f}"
+    job.observer.info(f"{job.bench.name}, {job.method.name}: {job.protocol.measure} {shown}")
+    for note in notes:
+        job.observer.note(f"{job.bench.name}, {job.method.name}: {note.rstrip('.')}")
+    return result, False
+
+
+def _scored(job: Job) -> tuple[dict[str, float], list[Mapping[str, Any]], list[str]]:
+    """Scores, rows and notes of a method in a scene."""
+    switches = job.protocol.switches
+    if isinstance(switches, TargetSwitches):
+        if not job.bench.tasks:
+            raise InputError(f"scene {job.bench.name}: expected things to ask for, got none.")
+        run = TargetRun(job)
+        folder = path_inside(
+            job.root, "predictions", job.protocol.name, job.method.name, job.bench.name
+        )
+        with job.observer.stage("score") as step:
+            count = sum(len(run.scored(task)) for task in job.bench.tasks)
+            rows = []
+            for row in run.rows(folder):
+                rows.append(row)
+                step(len(rows), count)
+        return mask_scores(rows, switches), [row.to_json() for row in rows], run.notes
+    if isinstance(switches, PointSwitches):
+        scores, classes, notes = point_scores(job)
+        return scores, [*classes], notes
+    scores, maps, notes = map_scores(job)
+    return scores, [*maps], notes
+
+
+def _made_from(job: Job, digest: str) -> dict[str, Any]:
+    """All that a result depends on, in values that JSON holds."""
+    method = job.method
+    chosen = method.published_options if job.options.published else method.options()
+    return plain_object(
+        "made",
+        {
+            "protocol": job.protocol.name,
+            "switches": switches_of(job.protocol),
+            "scene": job.bench.name,
+            "method": method.name,
+            "options": asdict(chosen) if is_dataclass(chosen) else {},  # pyright: ignore[reportArgumentType]
+            "published": job.options.published,
+            "seed": job.options.seed,
+            "models": list(job.options.models),
+            "prompter": _recorded_model(job.prompter),
+            "gaussians": digest,
+            "backend": job.backend,
+            "versions": {name: importlib.metadata.version(name) for name in ("splatseg", "torch")},
+        },
+    )
+
+
+def _recorded_model(model: Model | None) -> dict[str, Any] | None:
+    return None if model is None else {"name": model.name, "settings": dict(model.settings)}
+
+
+def _asked_scenes(
+    scenes: Sequence[BenchmarkScene], options: BenchOptions, data: Path
+) -> list[BenchmarkScene]:
+    known = [one.name for one in scenes]
+    for name in options.scenes:
+        if name not in known:
+            raise InputError(f"{data}: expected scenes {', '.join(known)}, got {name!r}.")
+    return [one for one in scenes if not options.scenes or one.name in options.scenes]
+
+
+def _notes(protocol: Protocol, scenes: Sequence[BenchmarkScene]) -> list[str]:
+    """How the scenes at hand differ from those of the protocol."""
+    if not protocol.scenes:
+        return []
+    names = {one.name for one in scenes}
+    there, others = [n for n in protocol.scenes if n in names], names - set(protocol.scenes)
+    notes: list[str] = []
+    if len(there) < len(protocol.scenes):
+        notes.append(f"{len(there)} of the {len(protocol.scenes)} scenes of the protocol are run.")
+    if others:
+        notes.append(f"{', '.join(sorted(others))}: of no published figure.")
+    return notes
+
+
+def _models(
+    protocol: Protocol, options: BenchOptions, observer: Observer
+) -> tuple[Model | None, Model | None]:
+    """Who answers strokes, and who finds words in pictures."""
+    switches = protocol.switches
+    if not isinstance(switches, TargetSwitches) or switches.prompt != "scribble":
+        return None, None
+    return model_of(options.prompter, options, observer), None
