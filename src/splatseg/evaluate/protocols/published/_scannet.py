@@ -7,8 +7,8 @@ _MEASURES = ("miou", "mean_accuracy")
 _ISSUE = "issue OpenGaussian #32"
 _EIGHT = "On 8 of the 10 scenes."
 _LIGHT_SPLAT = (
-    "On 8 of the 10 scenes. 37.11 and 47.78 are given without classes, taken to be of 19 and 10; a "
-    "second source says 13.69, of which it says as little."
+    "On 8 of the 10 scenes. 37.11 and 47.78 are given without classes: an index of results has "
+    "47.78 for 10, and 37.11 is taken to be of 19. A second source says 13.69, not of which."
 )
 
 
