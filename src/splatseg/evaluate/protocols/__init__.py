@@ -21,3 +21,4 @@ from splatseg.evaluate.protocols._words import peak_in_boxes as peak_in_boxes
 from splatseg.evaluate.protocols._words import relevancy_mask as relevancy_mask
 from splatseg.evaluate.protocols._words import smoothed_relevancy as smoothed_relevancy
 from splatseg.evaluate.protocols._words import stretched as stretched
+from splatseg.evaluate.protocols.published import published_figures as published_figures

@@ -3,8 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from splatseg._check import check_range
 from splatseg.core.boundary import convert_fields
-from splatseg.errors import RangeError
+from splatseg.errors import InputError, RangeError
+
+_MAX_DECIBELS = 100.0  # of one level in 8 bits it is 48
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +28,8 @@ class PublishedFigure:
     """The scene; None is the mean over all of them."""
 
     source: str
-    """Where it stands: a table of a paper, a repository, an issue, or second-hand."""
+    """Where it stands: a table of a paper, a repository, an issue, or second-hand. Where one source
+    gives several figures of a method and scene, words after a comma tell them apart."""
 
     verified: bool
     """Whether it was read in the original table."""
@@ -35,6 +39,13 @@ class PublishedFigure:
 
     def __post_init__(self) -> None:
         convert_fields(self)
+        for field in ("protocol", "method", "source"):
+            if not getattr(self, field).strip():
+                raise InputError(f"{field}: expected a name, got none.")
+        if not self.scores:
+            raise InputError("scores: expected at least one measure, got none.")
         for name, value in self.scores.items():
-            if name != "psnr" and not 0 <= value <= 1:
+            if name == "psnr":
+                check_range(name, value, 0.0, _MAX_DECIBELS)
+            elif not 0 <= value <= 1:
                 raise RangeError(f"{name}: expected a share in [0, 1], got {value}.")
