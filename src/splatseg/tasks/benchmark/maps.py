@@ -15,6 +15,7 @@ from splatseg.core.benchmark import TrueMaps
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     Confusion,
+    evaluate_instances,
     per_image_miou,
     semantic_score,
 )
@@ -94,6 +95,16 @@ def _classes(job: Job, seen: Seen, layer: Layer, *, by_words: bool) -> Scores:
         "per_image_miou": per_image_miou(confusions),
     }
     return scores, rows, notes
+
+
+def _instances(job: Job, layer: Layer) -> Scores:
+    """Scores of instances matched over the scene, and panoptic quality where they have classes."""
+    truth = _truth(job, job.bench.instances, "instances")
+    field = GaussianField(job.scene.gaussians, {_LAYER: layer}, backend=job.backend)
+    views = _scored(job, truth)
+    report = evaluate_instances(field, views, _LAYER, _Maps(maps=truth))
+    scores = {"instance_miou": report.score.miou}
+    return scores, [], []
 
 
 def _truth(job: Job, maps: TrueMaps | None, what: str) -> TrueMaps:

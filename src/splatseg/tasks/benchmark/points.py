@@ -23,7 +23,8 @@ from splatseg.errors import InputError
 from splatseg.evaluate import Confusion, semantic_score
 from splatseg.evaluate.protocols import PointSwitches
 from splatseg.io.evidence import open_evidence
-from splatseg.lift import ClassifierHead, GaussianField
+from splatseg.lift import GaussianField
+from splatseg.lift.heads import ClassifierHead
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import Seen
 from splatseg.tasks.benchmark.spoken import vocabulary_of

@@ -13,14 +13,20 @@ from splatseg.tasks.benchmark.run import BenchRun
 from splatseg.tasks.score_tables import Cell, write_table
 
 MEASURED = "measured here"
-_VERIFIED, _SECOND_HAND = "published", "published, not verified"
+_UNVERIFIED = " (not verified)"
 _KINDS = (".md", ".csv", ".tex")
 
 
-def bench_table(run: BenchRun) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
+def bench_table(
+    run: BenchRun, *, notes: bool = True
+) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
     """Names of columns, and a row a method: measured ones first, then published ones.
 
     Scores are in percent, PSNR in decibels; an empty cell was not measured, or not published.
+
+    Args:
+        run: What was measured.
+        notes: Whether sources of published figures come with what is known of their settings.
     """
     published = published_figures(run.protocol.name)
     means = [one for one in published if one.scene is None]
@@ -30,7 +36,9 @@ def bench_table(run: BenchRun) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]
         scenes = []
     columns = ("method", *measures, *scenes, "source")
     rows = [_measured(method, measures, scenes, run) for method in run.methods]
-    return columns, rows + [_published(one, measures, scenes, published, run) for one in means]
+    for one in means:
+        rows.append(_published(one, measures, scenes, published, run, notes=notes))
+    return columns, rows
 
 
 def write_tables(run: BenchRun, *, command: str) -> tuple[Path, ...]:
@@ -83,19 +91,20 @@ def _published(
     scenes: Sequence[str],
     figures: Sequence[PublishedFigure],
     run: BenchRun,
+    *,
+    notes: bool,
 ) -> tuple[Cell, ...]:
     own = {
         one.scene: one.scores.get(run.protocol.measure)
         for one in figures
         if one.method == mean.method and one.source == mean.source
     }
-    mark = _VERIFIED if mean.verified else _SECOND_HAND
-    note = f"; {mean.note}" if mean.note else ""
+    note = f"; {mean.note}" if mean.note and notes else ""
     return (
         mean.method,
         *(_figure(name, mean.scores.get(name)) for name in measures),
         *(_figure(run.protocol.measure, own.get(scene)) for scene in scenes),
-        f"{mark}: {mean.source}{note}",
+        f"{mean.source}{'' if mean.verified else _UNVERIFIED}{note}",
     )
 
 
