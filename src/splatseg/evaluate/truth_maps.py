@@ -44,6 +44,9 @@ _PIXELS = 1 << 17
 """Pixels whose rays are looked at together."""
 
 _POINTS = 1 << 16
+_SAME_SURFACE = 0.05
+"""Share of its depth by which what is seen through a hole is farther."""
+
 _CORNERS = 6
 _HEXAGON = ((0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5))
 
@@ -56,16 +59,16 @@ class PointSurfaceOptions:
     """Of the hexagon that each point becomes, scene units. None takes `spread` times the distance
     to the point's `neighbours`-th neighbour, but no more than three times the median of these."""
 
-    spread: float = 1.0
+    spread: float = 0.6
     """Of the radius where none is given: larger closes holes, smaller keeps outlines."""
 
     neighbours: int = 6
     """Other points whose distance tells the radius and which tell the tangent plane of a point
     without a normal, at least 3."""
 
-    fill: int = 2
-    """Holes of up to twice so many pixels across take the nearest pixel's label and depth; 0 fills
-    none."""
+    fill: int = 3
+    """Holes of up to twice so many pixels across, through which nothing or what is farther is seen,
+    take label and depth of the nearest pixel that is near enough; 0 fills none."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
@@ -339,19 +342,32 @@ def _tangent_planes(
 def _filled(
     maps: dict[str, Tensor], depth: Tensor, pixels: int
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Holes closed: pixels without a hit that a square of hits around them swallows."""
-    from scipy.ndimage import binary_closing, distance_transform_edt
+    """Holes in what is near, through which something farther or nothing is seen, closed.
 
-    hit = depth > 0
-    if bool(hit.all()) or not bool(hit.any()):
-        return maps, depth
-    grown = torch.nn.functional.pad(hit[None, None].float(), [pixels] * 4, mode="replicate")
-    window = torch.ones(2 * pixels + 1, 2 * pixels + 1, dtype=torch.bool).numpy()
-    closed = binary_closing(grown[0, 0].numpy() > 0, structure=window)
-    hole = torch.from_numpy(closed)[pixels:-pixels, pixels:-pixels] & ~hit
-    nearest = distance_transform_edt(~hit.numpy(), return_distances=False, return_indices=True)
-    row, column = (torch.from_numpy(part).long() for part in nearest)
-    filled = {
-        name: torch.where(hole, rows[row, column], rows) for name, rows in maps.items()
-    }
-    return filled, torch.where(hole, depth[row, column], depth)
+    A hole is what the morphological closing of 1 / z by a square window fills. It takes the nearest
+    pixel that is as near as the closing says.
+    """
+    from scipy.ndimage import grey_closing
+
+    near = torch.where(depth > 0, 1 / depth.double().clamp_min(1e-300), 0.0)
+    side = 2 * pixels + 1
+    closed = torch.from_numpy(grey_closing(near.numpy(), size=(side, side), mode="nearest"))
+    hole = near < closed * (1 - _SAME_SURFACE)
+    rows, columns = hole.nonzero().unbind(-1)
+    limit = closed[rows, columns] * (1 - _SAME_SURFACE)
+    source = torch.full((len(rows), 2), -1)
+    steps = sorted(
+        ((y, x) for y in range(-pixels, pixels + 1) for x in range(-pixels, pixels + 1)),
+        key=lambda step: (step[0] ** 2 + step[1] ** 2, step),
+    )
+    for y, x in steps:
+        row, column = rows + y, columns + x
+        inside = (row >= 0) & (row < near.shape[0]) & (column >= 0) & (column < near.shape[1])
+        row, column = row.clamp(0, near.shape[0] - 1), column.clamp(0, near.shape[1] - 1)
+        takes = inside & (source[:, 0] < 0) & (near[row, column] >= limit)
+        source[takes] = torch.stack((row, column), dim=-1)[takes]
+    found = (source[:, 0] >= 0).nonzero()[:, 0]
+    to, of = (rows[found], columns[found]), tuple(source[found].unbind(-1))
+    for values in (*maps.values(), depth):
+        values[to] = values[of].clone()
+    return maps, depth
