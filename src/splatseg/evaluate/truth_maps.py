@@ -47,6 +47,9 @@ _POINTS = 1 << 16
 _SAME_SURFACE = 0.05
 """Share of its depth by which what is seen through a hole is farther."""
 
+_OUTLIER = 3.0
+"""How many times farther a point's neighbours may be than those of its neighbours are."""
+
 _CORNERS = 6
 _HEXAGON = ((0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5))
 
@@ -57,7 +60,8 @@ class PointSurfaceOptions:
 
     radius: float | None = None
     """Of the hexagon that each point becomes, scene units. None takes `spread` times the distance
-    to the point's `neighbours`-th neighbour, but no more than three times the median of these."""
+    to the point's `neighbours`-th neighbour, but no more than three times the median of that of
+    its neighbours: points far from all others stay small."""
 
     spread: float = 0.6
     """Of the radius where none is given: larger closes holes, smaller keeps outlines."""
@@ -296,12 +300,9 @@ def _hexagons(
     if options.radius is not None:
         radii = torch.full((count,), options.radius, dtype=torch.float64)
     else:
+        if count < 2:
+            raise InputError("radius: expected a radius for a point without neighbours, got None.")
         radii = options.spread * reach
-        if not bool((radii > 0).any()):
-            raise InputError(
-                "radius: expected a radius for points that have no neighbours, got None."
-            )
-        radii = radii.clamp_max(3 * float(radii[radii > 0].median()))
     # Any direction across the normal: from the axis that the normal is farthest from.
     axis = torch.nn.functional.one_hot(normals.abs().argmin(dim=-1), 3).double()
     first = torch.nn.functional.normalize(torch.linalg.cross(normals, axis), dim=-1)
@@ -317,26 +318,30 @@ def _hexagons(
 def _tangent_planes(
     cloud: LabelledPoints, options: PointSurfaceOptions
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Unit normals, given or of the neighbours' plane, and the distance to the last neighbour."""
+    """Unit normals, given or of the neighbours' plane, and how far the neighbours reach."""
     index = NeighbourIndex(cloud.points)
     normals = torch.empty(len(cloud), 3, dtype=torch.float64)
     reach = torch.empty(len(cloud), dtype=torch.float64)
+    others: list[Int[Tensor, "m k"]] = []
     for rows in torch.arange(len(cloud)).split(_POINTS):
         found = index.nearest_others(options.neighbours, rows=rows)
         there = found.indices >= 0
         reach[rows] = torch.where(there, found.distances, 0.0).amax(dim=-1)
-        offsets = cloud.points[found.indices.clamp_min(0)] - cloud.points[rows, None]
-        offsets = torch.where(there[..., None], offsets, 0.0)
-        offsets = torch.cat((offsets, torch.zeros(len(rows), 1, 3, dtype=torch.float64)), dim=1)
-        weights = torch.cat((there, torch.ones(len(rows), 1, dtype=torch.bool)), dim=1)[..., None]
+        # The point itself is one of those that the plane is put through.
+        near = torch.where(there, found.indices, rows[:, None])
+        near = torch.cat((rows[:, None], near), dim=1)
+        others.append(near.int())
+        offsets = cloud.points[near] - cloud.points[rows, None]
+        weights = torch.cat((torch.ones_like(there[:, :1]), there), dim=1)[..., None].double()
         middle = (offsets * weights).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True)
-        spread = (offsets - middle) * weights
-        normals[rows] = torch.linalg.eigh(spread.mT @ spread).eigenvectors[..., 0]
+        apart = (offsets - middle) * weights
+        normals[rows] = torch.linalg.eigh(apart.mT @ apart).eigenvectors[..., 0]
+    usual = torch.cat([reach[near.long()].median(dim=-1).values for near in others])
     if cloud.normals is not None:
         lengths = torch.linalg.vector_norm(cloud.normals, dim=-1, keepdim=True)
         given = cloud.normals / lengths.clamp_min(1e-300)
         normals = torch.where(lengths > 0, given, normals)
-    return normals, reach
+    return normals, torch.minimum(reach, _OUTLIER * usual)
 
 
 def _filled(
