@@ -19,7 +19,8 @@ def test_a_mesh_keeps_positions_in_double_and_ids_in_32_bits() -> None:
         vertex_labels={"label": torch.tensor([1, -1, 2])},
         face_labels={"object": torch.tensor([5])},
     )
-    assert mesh.vertices.dtype == torch.float64 and mesh.faces.dtype == torch.int64
+    assert mesh.vertices.dtype == torch.float64
+    assert mesh.faces.dtype == torch.int64
     assert {name: ids.dtype for name, ids in mesh.labels.items()} == {
         "label": torch.int32, "object": torch.int32,
     }  # fmt: skip

@@ -54,7 +54,8 @@ def test_hits_are_those_of_every_ray_against_every_triangle(seed, at) -> None:
     slow = reference.cast(vertices, faces, origins, directions)
     fast = RayCaster(vertices, faces).cast(origins, directions)
     sure = clear(vertices, faces, origins, directions)
-    assert sure.double().mean() > 0.9 and (slow.faces >= 0).double().mean() > 0.4
+    assert sure.double().mean() > 0.9
+    assert (slow.faces >= 0).double().mean() > 0.4
     assert torch.equal(fast.faces[sure], slow.faces[sure])
     hit = sure & (slow.faces >= 0)
     torch.testing.assert_close(fast.distances[hit], slow.distances[hit], rtol=1e-9, atol=1e-9)
@@ -75,7 +76,8 @@ def test_distance_is_in_lengths_of_the_direction_and_weights_give_the_place() ->
     along = origin.double() + hits.distances[there, None] * directions[there]
     torch.testing.assert_close(places, along, rtol=0, atol=1e-9)
     missed = hits.faces < 0
-    assert hits.distances[missed].isinf().all() and not hits.weights[missed].any()
+    assert hits.distances[missed].isinf().all()
+    assert not hits.weights[missed].any()
 
 
 def test_both_sides_are_met_and_what_lies_behind_is_not() -> None:
@@ -109,14 +111,16 @@ def test_rays_in_blocks_are_the_same(monkeypatch) -> None:
     assert torch.equal(blocks.faces, whole.faces)
     assert torch.equal(blocks.distances, whole.distances)
     none = caster.cast(torch.zeros(3), torch.zeros(0, 3))
-    assert none.faces.shape == (0,) and none.weights.shape == (0, 3)
+    assert none.faces.shape == (0,)
+    assert none.weights.shape == (0, 3)
 
 
 def test_a_triangle_seen_along_its_plane_gives_finite_answers() -> None:
     caster = RayCaster(torch.tensor([[1.0, 0, 0], [2, 0, 0], [1, 1, 0]]), torch.tensor([[0, 1, 2]]))
     hits = caster.cast(torch.zeros(3), torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.2, 0.0]]))
     there = hits.faces >= 0
-    assert hits.distances[there].isfinite().all() and hits.weights.isfinite().all()
+    assert hits.distances[there].isfinite().all()
+    assert hits.weights.isfinite().all()
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,7 @@ Column = tuple[str, str, Sequence[Any]]
 """Type (``float``, or ``list uchar int``), name, and a number or a list a row."""
 
 
-def write_ply(
-    elements: dict[str, Sequence[Column]], path: Path, *, order: str = "little"
-) -> Path:
+def write_ply(elements: dict[str, Sequence[Column]], path: Path, *, order: str = "little") -> Path:
     """Elements as ``little`` or ``big`` endian binary, or as ``ascii``."""
     kind = "ascii" if order == "ascii" else f"binary_{order}_endian"
     lines = ["ply", f"format {kind} 1.0", "comment made by a test"]

@@ -139,9 +139,7 @@ def _with_property(path: Path, element: PlyElement, words: list[str], line: str)
     )
 
 
-def read_ply_tables(
-    path: Path, header: PlyHeader, names: Collection[str]
-) -> dict[str, PlyTable]:
+def read_ply_tables(path: Path, header: PlyHeader, names: Collection[str]) -> dict[str, PlyTable]:
     """The tables of these elements, those that the file has.
 
     Nothing behind the last of them is read.
@@ -283,9 +281,7 @@ class _BinaryRows:
             },
         )
 
-    def _values(
-        self, rest: bytes, at: int, code: str, count: int
-    ) -> tuple[NDArray[Any], int]:
+    def _values(self, rest: bytes, at: int, code: str, count: int) -> tuple[NDArray[Any], int]:
         end = at + np.dtype(code).itemsize * count
         if count < 0 or end > len(rest):
             raise FileFormatError(f"{self._path}: expected lists that fit the file, got others.")
@@ -304,9 +300,7 @@ class _TextRows:
         """The table of the next element."""
         lines = self._lines[self._at : self._at + element.count]
         if len(lines) < element.count:
-            raise FileFormatError(
-                f"{self._path}: expected {element.count} rows, got {len(lines)}."
-            )
+            raise FileFormatError(f"{self._path}: expected {element.count} rows, got {len(lines)}.")
         self._at += element.count
         try:
             return _parsed(element, lines)

@@ -25,7 +25,7 @@ from splatseg.io.npz import read_npz
 from splatseg.io.ply import PlyLists, PlyTable, read_ply_header, read_ply_tables
 
 _FACES = ("vertex_indices", "vertex_index")
-_COLOURS = re.compile(r"(diffuse_|specular_|ambient_)?(red|green|blue|alpha)|[rgba]|intensity|flags")
+_COLOURS = re.compile(r"(diffuse_|specular_|ambient_)?(red|green|blue|alpha)|[rgba]|intensity")
 _LABELS = re.compile(r"label|class|instance|object|segment|semantic", re.IGNORECASE)
 _NORMALS = ("nx", "ny", "nz")
 _ARRAYS = ("semantic", "instance", "part")

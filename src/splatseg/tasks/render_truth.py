@@ -37,7 +37,7 @@ def render_truth(
     void: int | None = None,
     observer: Observer = SILENT,
 ) -> Rendering:
-    """Draw what views see of a labelled surface, as `render_views` draws what they see of Gaussians.
+    """Draw what views see of a labelled surface, as `render_views` draws Gaussians.
 
     OUTPUT/<labels>/<view>.png has the ids, 16 bit, 0 where nothing is met or the label is void, in
     the photograph's own pixels: what `evaluate_scene` takes as truth.
@@ -62,14 +62,12 @@ def render_truth(
     source_ids = isinstance(surface, Path) and zero_is_class
     if isinstance(surface, Path):
         surface = read_surface(surface, zero_is_class=zero_is_class, void=void)
-    infos = {
-        name: _info(name, ids, source_ids=source_ids) for name, ids in surface.labels.items()
-    }
+    infos = {name: _info(name, ids, source_ids=source_ids) for name, ids in surface.labels.items()}
     field = SurfaceField(surface, points=points, infos=infos)
     options = options or RenderingOptions(what=())
     if not options.what:
         options = replace(options, what=tuple(surface.labels))
-    scene = source if isinstance(source, Scene) else _scene_of(source)
+    scene = source if isinstance(source, Scene) else scene_of_views(source)
     return render_views(scene, output, options=options, field=field, observer=observer)
 
 
@@ -81,7 +79,7 @@ def _info(name: str, ids: Tensor, *, source_ids: bool) -> LayerInfo:
     )
 
 
-def _scene_of(capture: Capture) -> Scene:
+def scene_of_views(capture: Capture) -> Scene:
     """The views of a capture, without Gaussians."""
     none = torch.zeros(0, 3)
     return Scene(

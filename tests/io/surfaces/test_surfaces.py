@@ -32,8 +32,11 @@ def test_a_scannet_mesh(tmp_path, order, kind) -> None:
     assert isinstance(mesh, LabelledMesh)
     assert mesh.vertices.tolist() == [list(row) for row in CORNERS]
     assert mesh.faces.tolist() == [[0, 1, 2], [2, 3, 4]]
-    assert {name: ids.tolist() for name, ids in mesh.labels.items()} == {"label": [-1, 3, 3, 200, 1]}
-    assert mesh.vertices.dtype == torch.float64 and mesh.labels["label"].dtype == torch.int32
+    assert {name: ids.tolist() for name, ids in mesh.labels.items()} == {
+        "label": [-1, 3, 3, 200, 1]
+    }
+    assert mesh.vertices.dtype == torch.float64
+    assert mesh.labels["label"].dtype == torch.int32
 
 
 @pytest.mark.parametrize("order", ["little", "big", "ascii"])
@@ -76,9 +79,11 @@ def test_points_with_normals_and_ids_written_as_floats(tmp_path) -> None:
         {"vertex": [*AXES, *normals, scalar, ("float", "curvature", [0.5] * 5)]}, tmp_path / "a.ply"
     )
     cloud = read_surface(path, void=255)
-    assert isinstance(cloud, LabelledPoints) and list(cloud.labels) == ["scalar_Label"]
+    assert isinstance(cloud, LabelledPoints)
+    assert list(cloud.labels) == ["scalar_Label"]
     assert cloud.labels["scalar_Label"].tolist() == [2, -1, -1, 4, -1]
-    assert cloud.normals is not None and cloud.normals[4].tolist() == [-2, -2, -2]
+    assert cloud.normals is not None
+    assert cloud.normals[4].tolist() == [-2, -2, -2]
 
 
 def test_points_of_an_npz(tmp_path) -> None:
@@ -93,7 +98,8 @@ def test_points_of_an_npz(tmp_path) -> None:
     cloud = read_surface(path, void=9)
     assert cloud.labels["semantic"].tolist() == [-1, 1, 2, 3, -1]
     assert cloud.labels["instance"].tolist() == [7, -1, 7, 7, 60000]
-    assert cloud.normals is not None and cloud.normals[0].tolist() == [0, 0, 127]
+    assert cloud.normals is not None
+    assert cloud.normals[0].tolist() == [0, 0, 127]
     np.savez(path, xyz=np.float32(CORNERS), semantic=np.array([0, 1, 2, 3, -5]))
     assert read_surface(path, zero_is_class=True).labels["semantic"].tolist() == [1, 2, 3, 4, -1]
 
