@@ -92,6 +92,7 @@ PACKAGES = {
     "models",
     "neighbours",
     "pose",
+    "raycast",
     "render",
     "report",
     "synthetic",

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from splatseg import models as models
     from splatseg import neighbours as neighbours
     from splatseg import pose as pose
+    from splatseg import raycast as raycast
     from splatseg import render as render
     from splatseg import report as report
     from splatseg import selection as selection
@@ -140,6 +141,7 @@ _PACKAGES = frozenset(
         "models",
         "neighbours",
         "pose",
+        "raycast",
         "render",
         "report",
         "synthetic",

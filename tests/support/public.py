@@ -24,6 +24,7 @@ PACKAGES = (
     "models",
     "models.classical",
     "neighbours",
+    "raycast",
     "pose",
     "pose.doctor",
     "fit",

@@ -73,5 +73,7 @@ from splatseg.core.sources import FeatureSource as FeatureSource
 from splatseg.core.sources import LabelSource as LabelSource
 from splatseg.core.sources import SegmentSource as SegmentSource
 from splatseg.core.sources import ViewNames as ViewNames
+from splatseg.core.surfaces import LabelledMesh as LabelledMesh
+from splatseg.core.surfaces import LabelledPoints as LabelledPoints
 from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
 from splatseg.core.tree_levels import TreeLevel as TreeLevel

@@ -1,5 +1,6 @@
 """How good a result is: pure measures, and scenes held against truth on chosen views."""
 
+from splatseg.evaluate._panoptic_counts import PanopticCounts as PanopticCounts
 from splatseg.evaluate.agreement import contested as contested
 from splatseg.evaluate.agreement import views_that_show as views_that_show
 from splatseg.evaluate.boundary import BoundaryCounts as BoundaryCounts
@@ -16,6 +17,7 @@ from splatseg.evaluate.held_out_segments import PointReport as PointReport
 from splatseg.evaluate.held_out_segments import evaluate_instances as evaluate_instances
 from splatseg.evaluate.held_out_segments import evaluate_panoptic as evaluate_panoptic
 from splatseg.evaluate.held_out_segments import evaluate_points as evaluate_points
+from splatseg.evaluate.matched_instances import matched_instance_score as matched_instance_score
 from splatseg.evaluate.metrics import BinaryScore as BinaryScore
 from splatseg.evaluate.metrics import Confusion as Confusion
 from splatseg.evaluate.metrics import SemanticScore as SemanticScore
@@ -32,6 +34,7 @@ from splatseg.evaluate.panoptic import Detections as Detections
 from splatseg.evaluate.panoptic import PanopticScore as PanopticScore
 from splatseg.evaluate.panoptic import PrecisionScore as PrecisionScore
 from splatseg.evaluate.panoptic import average_precision as average_precision
+from splatseg.evaluate.panoptic import image_panoptic_score as image_panoptic_score
 from splatseg.evaluate.panoptic import panoptic_score as panoptic_score
 from splatseg.evaluate.panoptic import segment_keys as segment_keys
 from splatseg.evaluate.photographs import PhotographReport as PhotographReport
@@ -41,3 +44,5 @@ from splatseg.evaluate.photographs import render_and_photograph as render_and_ph
 from splatseg.evaluate.solid import gaussian_score as gaussian_score
 from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
 from splatseg.evaluate.solid import labels_from_points as labels_from_points
+from splatseg.evaluate.truth_maps import PointSurfaceOptions as PointSurfaceOptions
+from splatseg.evaluate.truth_maps import SurfaceField as SurfaceField

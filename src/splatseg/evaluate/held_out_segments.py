@@ -24,6 +24,7 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
+from splatseg.evaluate._panoptic_counts import PanopticCounts, VoidRule
 from splatseg.evaluate.held_out import (
     Progress,
     ViewsReport,
@@ -39,6 +40,7 @@ from splatseg.evaluate.panoptic import (
     PanopticScore,
     PrecisionScore,
     average_precision,
+    image_panoptic_score,
     panoptic_score,
     segment_keys,
 )
@@ -57,6 +59,9 @@ class PanopticReport(ViewsReport):
 
     score: PanopticScore
     """PQ over the scene."""
+
+    image_score: PanopticScore
+    """PQ of segments of single images."""
 
     precision: PrecisionScore
     """AP50 of instances in views."""
@@ -126,6 +131,7 @@ def evaluate_panoptic(
     true_instances: LabelSource,
     table: ClassTable,
     scores: Mapping[int, float] | None = None,
+    void_rule: VoidRule = "coco",
     progress: Progress | None = None,
 ) -> PanopticReport:
     """Score a layer of classes and a layer of instances together.
@@ -142,6 +148,7 @@ def evaluate_panoptic(
         true_instances: Instance maps by view name, of the same views.
         table: Which classes are things. A class that it does not know is stuff.
         scores: How sure each instance is, by its id, for AP50; 1 where there is none.
+        void_rule: Which segments of images without a match are false, see `PanopticCounts`.
         progress: Called with the views done and their number.
 
     Raises:
@@ -155,15 +162,16 @@ def evaluate_panoptic(
     layers = [layer for layer in (instances, classes) if layer is not None]
     _check_instances(scored, true_instances)
     total, detections, confusion = Overlaps.none(), Detections(), Confusion.none()
+    counts = PanopticCounts()
     for done, view in enumerate(scored, start=1):
         true, true_ids = _true_maps(view, true_classes, true_instances)
         maps = drawn_like(field, view, layers, true)
         found = maps[0].ids
         drawn = maps[1].ids if class_of is None else map_ids(found, class_of, default=UNLABELLED)
-        one = Overlaps.of(
-            segment_keys(drawn, found, things=things),
-            segment_keys(true.ids, true_ids.ids, things=things),
-        )
+        keys = segment_keys(drawn, found, things=things)
+        true_keys = segment_keys(true.ids, true_ids.ids, things=things)
+        one = Overlaps.of(keys, true_keys)
+        counts = counts + PanopticCounts.of_image(keys, true_keys, void_rule=void_rule)
         total = total + one
         detections = detections + Detections.of(one, view=view.name, things=things, scores=scores)
         confusion = confusion + Confusion.of(drawn, true.ids)
@@ -172,6 +180,7 @@ def evaluate_panoptic(
     both = {name for layer in layers for name in learned_from(field.layer(layer), scored)}
     return PanopticReport(
         score=panoptic_score(total, things=things),
+        image_score=image_panoptic_score(counts, things=things),
         precision=average_precision(detections),
         semantic=semantic_score(confusion),
         views=tuple(view.name for view in scored),

@@ -1,4 +1,4 @@
-r"""Panoptic quality over a scene, and average precision of instances in its views.
+r"""Panoptic quality over a scene and of its images, and average precision of instances in views.
 
 A segment is one instance of a class of things, or all of a class of stuff, over all views
 together (:math:`PQ^{scene}`). A true and a predicted segment match where their classes agree and
@@ -8,6 +8,9 @@ their IoU is above 0.5, which at most one pair of each can be. For each class
 
 and PQ is the mean over the classes that the truth or the prediction has. A pixel of a thing that
 belongs to no instance counts to one segment "no instance" of its class.
+
+PQ of images takes a segment in each view for itself, and adds up matches and misses over the
+views before the quotient, as COCO's scorer does.
 
 AP50 looks at each view for itself: predicted instances in the order of their scores, each a hit
 if the true instance of its class that it overlaps most has an IoU of at least 0.5 and was not hit
@@ -34,12 +37,8 @@ from splatseg._check import check_range
 from splatseg.core import UNLABELLED
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
+from splatseg.evaluate._panoptic_counts import INSTANCE_BITS, MATCH_IOU, PanopticCounts, key_class
 from splatseg.evaluate.overlaps import Overlaps
-
-MATCH_IOU = 0.5
-"""A pair matches above it for PQ, and at it or above for AP50."""
-
-_INSTANCE_BITS = 32
 
 
 @boundary
@@ -65,18 +64,13 @@ def segment_keys(
         )
     classes, instances = classes.long(), instances.long()
     thing = torch.isin(classes, torch.tensor(sorted(things), dtype=torch.int64))
-    keys = (classes << _INSTANCE_BITS) + torch.where(thing, instances + 1, 0)
+    keys = (classes << INSTANCE_BITS) + torch.where(thing, instances + 1, 0)
     return torch.where(classes == UNLABELLED, UNLABELLED, keys)
-
-
-def key_class(key: int) -> int:
-    """The class of a segment's key."""
-    return key >> _INSTANCE_BITS
 
 
 def key_instance(key: int) -> int:
     """The instance of a segment's key, -1 where it has none or its class is stuff."""
-    return (key & ((1 << _INSTANCE_BITS) - 1)) - 1
+    return (key & ((1 << INSTANCE_BITS) - 1)) - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +93,7 @@ class ClassQuality:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PanopticScore:
-    """Panoptic quality over all views together."""
+    """Panoptic quality, of a scene or of images."""
 
     pq: float
     """Mean over the classes of the truth or the prediction."""
@@ -139,28 +133,29 @@ def panoptic_score(overlaps: Overlaps, *, things: Collection[int]) -> PanopticSc
     Raises:
         InputError: If the truth has no segment.
     """
-    true_keys, _ = overlaps.truth_sizes
-    keys, _ = overlaps.predicted_sizes
-    if not len(true_keys):
+    return image_panoptic_score(PanopticCounts.of(overlaps), things=things)
+
+
+@boundary
+def image_panoptic_score(counts: PanopticCounts, *, things: Collection[int]) -> PanopticScore:
+    """Score segments of single images, counts of which were added up.
+
+    Args:
+        counts: Of all images, see `PanopticCounts.of_image`.
+        things: The classes given to `segment_keys`.
+
+    Raises:
+        InputError: If the truth has no segment.
+    """
+    if not (counts.tp or counts.fn):
         raise InputError("truth: expected at least one segment, all pixels are void.")
-    pairs, iou = overlaps.ious()
-    in_truth, in_predicted = _by_class(true_keys), _by_class(keys)
-    matched: dict[int, list[float]] = {}
-    for (true_key, key), value in zip(pairs.tolist(), iou.tolist(), strict=True):
-        if value > MATCH_IOU and key_class(true_key) == key_class(key):
-            matched.setdefault(key_class(key), []).append(value)
     per_class: dict[int, ClassQuality] = {}
-    for one in sorted(in_truth.keys() | in_predicted.keys()):
-        hits = matched.get(one, [])
-        false, missed = in_predicted.get(one, 0) - len(hits), in_truth.get(one, 0) - len(hits)
-        weight = len(hits) + (false + missed) / 2
+    for one in counts.classes:
+        iou, tp = counts.iou.get(one, 0.0), counts.tp.get(one, 0)
+        fp, fn = counts.fp.get(one, 0), counts.fn.get(one, 0)
+        weight = tp + (fp + fn) / 2
         per_class[one] = ClassQuality(
-            pq=sum(hits) / weight,
-            sq=sum(hits) / max(len(hits), 1),
-            rq=len(hits) / weight,
-            tp=len(hits),
-            fp=false,
-            fn=missed,
+            pq=iou / weight, sq=iou / max(tp, 1), rq=tp / weight, tp=tp, fp=fp, fn=fn
         )
     return PanopticScore(
         pq=_mean([one.pq for one in per_class.values()]),

@@ -3,6 +3,7 @@
 from splatseg.synthetic._builder import ROOM_CLASSES as ROOM_CLASSES
 from splatseg.synthetic._capture import write_capture as write_capture
 from splatseg.synthetic._labels import machine_labels as machine_labels
+from splatseg.synthetic._mesh import scene_mesh as scene_mesh
 from splatseg.synthetic._raycast import Truth as Truth
 from splatseg.synthetic._raycast import cast as cast
 from splatseg.synthetic._raycast import render_truth as render_truth

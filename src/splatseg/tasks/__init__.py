@@ -36,6 +36,7 @@ from splatseg.tasks.outputs import report_layer as report_layer
 from splatseg.tasks.render import Rendering as Rendering
 from splatseg.tasks.render import RenderingOptions as RenderingOptions
 from splatseg.tasks.render import render_views as render_views
+from splatseg.tasks.render_truth import render_truth as render_truth
 from splatseg.tasks.see import SeeOptions as SeeOptions
 from splatseg.tasks.see import see as see
 from splatseg.tasks.segment import Segmentation as Segmentation

@@ -73,12 +73,13 @@ def instance_figures(report: InstanceReport) -> dict[str, Any]:
 
 
 def panoptic_figures(report: PanopticReport) -> dict[str, Any]:
-    """Panoptic quality over the scene, AP50 in views, and the classes alone."""
+    """Panoptic quality over the scene and of images, AP50 in views, and the classes alone."""
     score = report.score
     return _views(report) | {
         "PQ_scene": score.pq,
         "PQ_things": score.pq_things,
         "PQ_stuff": score.pq_stuff,
+        "PQ_images": report.image_score.pq,
         "mAP50": report.precision.mean,
         "mIoU": report.semantic.miou,
         "tp": score.tp,

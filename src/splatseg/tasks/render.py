@@ -149,7 +149,11 @@ def render_views(
     try:
         _render(scene, field, views, drawn, output, folders=folders, observer=observer)
         # Before the films, which take a while: what an interruption leaves can be replaced.
-        entry = {"scene": str(scene.root), "split": options.split, "views": len(views)}
+        entry = {
+            "scene": str(scene.root or scene.source),
+            "split": options.split,
+            "views": len(views),
+        }
         write_json(record | dict.fromkeys([*folders, *files], entry), path_inside(output, _RECORD))
         if on_path:
             write_path(views, output, pictures="rgb" in folders)

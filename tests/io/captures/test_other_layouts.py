@@ -205,7 +205,7 @@ def test_ply_points(tmp_path, order) -> None:
         ),
         (
             "ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n",
-            "not understood",
+            "x, y and z",
         ),
         (
             "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"

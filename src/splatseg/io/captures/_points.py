@@ -1,6 +1,8 @@
 """Start points from PLY files: x y z and, where they are there, colours."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,24 +33,23 @@ def read_ply_points(path: Path) -> PointCloud:
         MissingFileError: If there is no such file.
         FileFormatError: If it is not a PLY of points, ends early, or holds NaN or infinity.
     """
-    rows = read_ply_vertices(path)
-    return point_cloud(vertex_positions(path, rows), vertex_colours(rows))
+    columns = read_ply_vertices(path)
+    return point_cloud(vertex_positions(path, columns), vertex_colours(columns))
 
 
-def vertex_colours(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
+def vertex_colours(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8] | None:
     """Colours (n, 3) of vertices, from whichever columns hold them; None where none do."""
-    names = set(rows.dtype.names or ())
     for triple in (
         ("red", "green", "blue"),
         ("r", "g", "b"),
         ("diffuse_red", "diffuse_green", "diffuse_blue"),
     ):
-        if set(triple) <= names:
-            values = np.stack([rows[name] for name in triple], axis=1)
+        if set(triple) <= set(columns):
+            values = np.stack([columns[name] for name in triple], axis=1)
             if np.issubdtype(values.dtype, np.floating):
                 values = np.clip(np.nan_to_num(values), 0, 1) * 255 + 0.5
             return np.clip(values, 0, 255).astype(np.uint8)
-    if {"f_dc_0", "f_dc_1", "f_dc_2"} <= names:
-        sh = np.stack([rows[f"f_dc_{i}"] for i in range(3)], axis=1)
+    if {"f_dc_0", "f_dc_1", "f_dc_2"} <= set(columns):
+        sh = np.stack([columns[f"f_dc_{i}"] for i in range(3)], axis=1)
         return (np.clip(0.5 + SH_C0 * np.nan_to_num(sh), 0, 1) * 255 + 0.5).astype(np.uint8)
     return None
