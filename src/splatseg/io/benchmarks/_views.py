@@ -7,7 +7,6 @@ from pathlib import Path
 from splatseg.core import Capture, View
 from splatseg.errors import InputError, quoted
 from splatseg.io.captures import read_capture
-from splatseg.io.foreign import read_lines
 
 ALL_TRAIN = "every view is a training view, as the benchmark has it"
 """The note on captures whose benchmark fits to all photographs."""
