@@ -21,7 +21,7 @@ def read_numbers(path: Path, *, columns: int, rows: int | None = None) -> NDArra
         MissingFileError: If there is no such file.
         FileFormatError: If a word is no number, or there are more or fewer of them.
     """
-    shape = f"{'rows' if rows is None else rows} of {columns} numbers"
+    shape = f"{'' if rows is None else f'{rows} '}rows of {columns} numbers"
     lines = read_lines(path, shape)
     if not lines or (rows is not None and len(lines) != rows):
         raise FileFormatError(f"{path}: expected {shape}, got {len(lines)} rows.")

@@ -10,7 +10,7 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.io.benchmarks._masks import true_mask
 from splatseg.io.benchmarks._views import ViewsByFile, read_views, scene_folders, trained_on_all
 from splatseg.io.captures import find_formats
-from splatseg.io.foreign import read_lines
+from splatseg.io.foreign import made_from, read_lines
 from splatseg.io.images import find_images
 
 LAYOUT = "3d-ovs"
@@ -70,13 +70,15 @@ def _scene(path: Path) -> BenchmarkScene:
             raise MissingFileError(
                 f"{path / _TRUTH}: expected a mask {name}.png of some view, got none."
             )
+    with made_from(listed):
+        tasks = tuple(
+            TargetTask(name=name, truth=tuple(masks), words=name) for name, masks in truth.items()
+        )
     return BenchmarkScene(
         name=path.resolve().name,
         layout=LAYOUT,
         capture=capture,
-        tasks=tuple(
-            TargetTask(name=name, truth=tuple(masks), words=name) for name, masks in truth.items()
-        ),
+        tasks=tasks,
         notes=capture.notes,
     )
 

@@ -15,6 +15,7 @@ from splatseg.io.benchmarks._masks import true_ids
 from splatseg.io.benchmarks._views import ViewsByFile, read_views, scene_folders, split_by
 from splatseg.io.captures import find_formats
 from splatseg.io.captures.replica import SEQUENCE, find_replica
+from splatseg.io.foreign import made_from
 from splatseg.io.images import find_images
 from splatseg.io.json_files import read_json
 
@@ -173,4 +174,5 @@ def _table(content: Mapping[str, Any], key: str, name: str, path: Path) -> Class
             raise InputError(f"{where}: expected a {name}, got {quoted(word)}.")
         if id > 0:  # 0 is none in maps
             named.setdefault(id, word)
-    return ClassTable(rows=tuple(ClassInfo(id=id, name=word) for id, word in named.items()))
+    with made_from(path):
+        return ClassTable(rows=tuple(ClassInfo(id=id, name=word) for id, word in named.items()))

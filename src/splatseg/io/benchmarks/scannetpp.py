@@ -14,7 +14,7 @@ from splatseg.core import UNLABELLED, BenchmarkScene, ClassInfo, ClassTable, Lab
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.benchmarks._views import read_views, scene_folders
 from splatseg.io.captures.scannetpp import find_scannetpp
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
 
@@ -77,12 +77,12 @@ def read_annotated_points(scans: Path) -> TruePoints:
     ):
         if size:
             ids[np.isin(segments, members)] = names.index(name) + 1
+    with made_from(scans / _ANNOTATION):
+        rows = tuple(ClassInfo(id=i, name=name) for i, name in enumerate(names, start=1))
     return TruePoints(
         points=torch.from_numpy(np.ascontiguousarray(points, np.float32)),
         labels=Labels(ids=torch.from_numpy(ids), confidence=torch.ones(len(ids))),
-        table=ClassTable(
-            rows=tuple(ClassInfo(id=i, name=name) for i, name in enumerate(names, start=1))
-        ),
+        table=ClassTable(rows=rows),
     )
 
 

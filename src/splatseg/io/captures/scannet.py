@@ -77,7 +77,8 @@ def read_scannet(folder: Path, *, strict: bool = False) -> Capture:
             )
         )
     if lost:
-        notes.append(f"{lost} frames whose pose is infinite were left out")
+        frames = "frame" if lost == 1 else "frames"
+        notes.append(f"left out: {lost} {frames} whose pose is infinite")
     capture = build_capture(
         folder, raw, format="scannet", points=_points(folder), notes=notes, strict=strict
     )
