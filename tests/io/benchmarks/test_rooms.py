@@ -51,10 +51,17 @@ def test_replica_as_semantic_nerf_rendered_it(converted, source) -> None:
     assert scene.instances.table.name_of(row["id"]) == row["class_name"]
 
 
-def test_replica_with_faults(converted, tmp_path, write_replica) -> None:
-    sequence = write_replica(tmp_path / "room_0")
+def test_zero_is_none_in_maps(tmp_path, write_replica) -> None:
+    write_replica(tmp_path / "room_0")
     (scene,) = read_benchmark("replica", tmp_path)
     assert (scene.name, scene.instances, scene.semantic.table) == ("room_0", None, None)
+    assert scene.semantic.read["rgb_0"]().ids.unique().tolist() == [-1]
+    assert scene.semantic.read["rgb_2"]().ids.unique().tolist() == [2]
+
+
+def test_replica_with_faults(tmp_path, write_replica) -> None:
+    sequence = write_replica(tmp_path / "room_0")
+    (scene,) = read_benchmark("replica", tmp_path)
     Image.fromarray(np.zeros((40, 40), np.uint8)).save(
         sequence / "semantic_class/semantic_class_0.png"
     )
@@ -169,6 +176,25 @@ def test_scannet_with_faults(converted, tmp_path) -> None:
         shutil.rmtree(scene / folder)
     with pytest.raises(MissingFileError, match=r"expected scene0000_00_vh_clean_2.labels.ply, lab"):
         read_benchmark("scannet", scene)
+
+
+def test_ids_of_scannets_own_become_those_of_nyu40(tmp_path) -> None:
+    scene = tmp_path / "scene0000_00"
+    for folder in ("pose", "color", "intrinsic", "label-filt"):
+        (scene / folder).mkdir(parents=True)
+    (scene / "pose/0.txt").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1")
+    (scene / "intrinsic/intrinsic_color.txt").write_text("9 0 32 0\n0 9 24 0\n0 0 1 0\n0 0 0 1")
+    Image.new("RGB", (64, 48)).save(scene / "color/0.jpg")
+    ids = np.zeros((48, 64), np.uint16)
+    ids[:, 20:], ids[:, 40:] = 1163, 7
+    Image.fromarray(ids).save(scene / "label-filt/0.png")
+    rows = ["id\tcategory\tnyu40id", "7\tledge\t0", "1163\tobject\t40"]
+    (tmp_path / "scannetv2-labels.combined.tsv").write_text("\n".join(rows))
+    (read,) = read_benchmark("scannet", tmp_path)
+    assert read.points is None
+    expected = np.full((48, 64), -1)
+    expected[:, 20:40] = 40
+    np.testing.assert_array_equal(read.semantic.read["0"]().ids, expected)
 
 
 @pytest.mark.parametrize(
