@@ -53,8 +53,8 @@ Format: TypeAlias = Annotated[
     str,
     _named(
         "NAME",
-        "How the capture is read: auto, nerfstudio, blender, colmap, llff or idr. auto takes the "
-        "first of these that is there.",
+        "How the capture is read: auto, nerfstudio, blender, colmap, llff, idr, replica, scannet "
+        "or scannetpp. auto takes the first of these that is there.",
     ),
 ]
 

@@ -30,7 +30,7 @@ class Command:
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """The capture: a folder of COLMAP, nerfstudio, Blender, LLFF or IDR data."""
+    """The capture: a folder in one of the layouts of --format."""
 
     fix: Annotated[Path | None, tyro.conf.arg(metavar="OUT")] = None
     """Folder to write the corrected capture to, as a transforms.json that refers to the same

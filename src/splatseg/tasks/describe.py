@@ -39,6 +39,7 @@ _CAPTURE_FILES = (
     "poses_bounds.npy",
     "cameras_sphere.npz",
     "cameras.npz",
+    "traj_w_c.txt",
 )
 _SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".gltf", ".glb")
 

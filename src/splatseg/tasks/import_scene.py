@@ -30,7 +30,7 @@ class ImportOptions:
     """The capture that the splats were made from. None places virtual cameras."""
 
     format: str = "auto"
-    """How the capture is read: auto, nerfstudio, colmap, blender, llff or idr."""
+    """How the capture is read: auto, or one of `io.captures.FORMATS`."""
 
     as_is: bool = False
     """Take the file as it stands, without comparing it with the photographs."""

@@ -40,7 +40,7 @@ class MakeSceneOptions(CheckpointOptions):
     """What is around a fit: how photographs are read, and how it is kept and goes on."""
 
     format: str = "auto"
-    """How the capture is read: auto, nerfstudio, colmap, blender, llff or idr."""
+    """How the capture is read: auto, or one of `io.captures.FORMATS`."""
 
     strict: bool = False
     """Refuse a capture that lists a photograph which is not there."""

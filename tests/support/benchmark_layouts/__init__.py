@@ -4,14 +4,25 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from support.benchmark_layouts.prompts import write_nvos, write_spin_nerf
+from support.benchmark_layouts.rooms import (
+    write_grouping_replica,
+    write_replica,
+    write_scannet,
+    write_scannetpp,
+)
 from support.benchmark_layouts.source import Source, read_source
-from support.benchmark_layouts.words import write_lerf_mask, write_lerf_ovs
+from support.benchmark_layouts.words import write_lerf_mask, write_lerf_ovs, write_ovs3d
 
 WRITERS: Mapping[str, Callable[[Source, Path], None]] = {
     "nvos": write_nvos,
     "spin-nerf": write_spin_nerf,
     "lerf-mask": write_lerf_mask,
     "lerf-ovs": write_lerf_ovs,
+    "3d-ovs": write_ovs3d,
+    "replica": write_replica,
+    "replica-gg": write_grouping_replica,
+    "scannet": write_scannet,
+    "scannetpp": write_scannetpp,
 }
 
 __all__ = ["WRITERS", "Source", "read_source", "write_layout"]

@@ -1,12 +1,14 @@
-"""Layouts whose prompts are words: LERF-Mask and LERF-OVS."""
+"""Layouts whose prompts are words: LERF-Mask, LERF-OVS and 3D-OVS."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from splatseg.core import View
 from support.benchmark_layouts.source import Mask, Source, link, save_mask, spread
 from support.benchmark_layouts.sparse import write_sparse
 
@@ -63,6 +65,21 @@ def write_lerf_ovs(source: Source, folder: Path) -> None:
         (labels / f"{Path(name).stem}.json").write_text(json.dumps(content, indent=1))
 
 
+def write_ovs3d(source: Source, folder: Path) -> None:
+    """Masks of named things in five training views, each in those that show it."""
+    scene = folder / source.name
+    names = _photographs(source, scene, source.capture.train_views, pattern="{:02d}.jpg", first=0)
+    frames = spread(source.capture.train_views, LABELLED_FRAMES)
+    things = source.clear_things(frames, views_least=2, most=PROMPTS)
+    truth = scene / "segmentations"
+    for view in frames:
+        for thing in things:
+            if source.pixels(thing, view):
+                stem = Path(names[view.name]).stem
+                save_mask(source.mask(thing, view), truth / stem / f"{thing.name}.png")
+    (truth / "classes.txt").write_text("".join(f"{thing.name}\n" for thing in things))
+
+
 def outlines(mask: Mask) -> list[dict[str, Any]]:
     """Outer outlines of the pieces of a mask; holes are lost, as in the layout."""
     found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
@@ -85,13 +102,20 @@ def outlines(mask: Mask) -> list[dict[str, Any]]:
     return pieces
 
 
-def _photographs(source: Source, scene: Path, views) -> dict[str, str]:
+def _photographs(
+    source: Source,
+    scene: Path,
+    views: Sequence[View],
+    *,
+    pattern: str = "frame_{:05d}.jpg",
+    first: int = 1,
+) -> dict[str, str]:
     """Photographs as LERF calls them, with a sparse model; names by view.
 
     Test views come between the others, as where a person walks once around.
     """
     ordered = sorted(views, key=lambda view: (view.name.split("_")[-1], view.name))
-    names = {view.name: f"frame_{i:05d}.jpg" for i, view in enumerate(ordered, start=1)}
+    names = {view.name: pattern.format(i) for i, view in enumerate(ordered, start=first)}
     for view in ordered:
         link(view.image, scene / "images" / names[view.name])
     model = [names[view.name] for view in ordered]

@@ -15,6 +15,15 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.io.benchmarks.lerf_mask import find_lerf_mask, read_lerf_mask
 from splatseg.io.benchmarks.lerf_ovs import find_lerf_ovs, read_lerf_ovs
 from splatseg.io.benchmarks.nvos import find_nvos, read_nvos
+from splatseg.io.benchmarks.ovs3d import find_ovs3d, read_ovs3d
+from splatseg.io.benchmarks.replica import (
+    find_grouping_replica,
+    find_replica_scenes,
+    read_grouping_replica,
+    read_replica_scenes,
+)
+from splatseg.io.benchmarks.scannet import find_scannet_scenes, read_scannet_scenes
+from splatseg.io.benchmarks.scannetpp import find_scannetpp_scenes, read_scannetpp_scenes
 from splatseg.io.benchmarks.spin_nerf import find_spin_nerf, read_spin_nerf
 
 
@@ -32,6 +41,11 @@ _LAYOUTS: Mapping[str, _Layout] = {
     "nvos": _Layout(find_nvos, read_nvos),
     "lerf-mask": _Layout(find_lerf_mask, read_lerf_mask),
     "lerf-ovs": _Layout(find_lerf_ovs, read_lerf_ovs),
+    "3d-ovs": _Layout(find_ovs3d, read_ovs3d),
+    "replica": _Layout(find_replica_scenes, read_replica_scenes),
+    "replica-gg": _Layout(find_grouping_replica, read_grouping_replica),
+    "scannet": _Layout(find_scannet_scenes, read_scannet_scenes),
+    "scannetpp": _Layout(find_scannetpp_scenes, read_scannetpp_scenes),
     # Last: masks beside photographs are all that tells it.
     "spin-nerf": _Layout(find_spin_nerf, read_spin_nerf),
 }

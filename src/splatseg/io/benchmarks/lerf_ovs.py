@@ -22,6 +22,7 @@ from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.benchmarks._masks import check_proportions
 from splatseg.io.benchmarks._views import ViewsByFile, read_views, trained_on_all
 from splatseg.io.captures import find_formats
+from splatseg.io.foreign import made_from
 from splatseg.io.json_files import read_json
 from splatseg.io.limits import check_unpacked
 
@@ -176,14 +177,16 @@ def _scene(path: Path) -> BenchmarkScene:
             of_view[view.name] = _mask(frame, category, view.name)
     if not truth:
         raise FileFormatError(f"{labels}: expected labels with objects, got none in any.")
+    with made_from(labels):
+        tasks = tuple(
+            TargetTask(name=category, truth=tuple(masks.values()), words=category)
+            for category, masks in sorted(truth.items())
+        )
     return BenchmarkScene(
         name=path.resolve().name,
         layout=LAYOUT,
         capture=capture,
-        tasks=tuple(
-            TargetTask(name=category, truth=tuple(masks.values()), words=category)
-            for category, masks in sorted(truth.items())
-        ),
+        tasks=tasks,
         notes=capture.notes,
     )
 

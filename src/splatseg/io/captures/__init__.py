@@ -20,9 +20,13 @@ from splatseg.io.captures.llff import FILE as _LLFF_FILE
 from splatseg.io.captures.llff import read_llff
 from splatseg.io.captures.nerfstudio import FILE as _NERFSTUDIO_FILE
 from splatseg.io.captures.nerfstudio import read_nerfstudio
+from splatseg.io.captures.replica import FILE as _REPLICA_FILE
+from splatseg.io.captures.replica import find_replica, read_replica
+from splatseg.io.captures.scannet import find_scannet, read_scannet
+from splatseg.io.captures.scannetpp import find_scannetpp, read_scannetpp
 from splatseg.io.images import find_images
 
-FORMATS = ("nerfstudio", "blender", "colmap", "llff", "idr")
+FORMATS = ("nerfstudio", "blender", "colmap", "llff", "idr", "replica", "scannet", "scannetpp")
 """Layouts that are read, in the order in which they are looked for."""
 
 
@@ -36,8 +40,8 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     and not there are left out, which is noted too, as long as half of them are there.
 
     Args:
-        path: The capture's folder, or its transforms.json, poses_bounds.npy or
-            cameras_sphere.npz, or the folder of a COLMAP model.
+        path: The capture's folder, or its transforms.json, poses_bounds.npy,
+            cameras_sphere.npz or traj_w_c.txt, or the folder of a COLMAP model.
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
         strict: Refuse a capture that lists a photograph which is not there.
 
@@ -71,8 +75,14 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             return read_colmap(folder, strict=strict)
         case "llff":
             return read_llff(folder, strict=strict)
-        case _:
+        case "idr":
             return read_idr(folder, strict=strict)
+        case "replica":
+            return read_replica(folder, strict=strict)
+        case "scannet":
+            return read_scannet(folder, strict=strict)
+        case _:
+            return read_scannetpp(folder, strict=strict)
 
 
 @boundary
@@ -84,6 +94,9 @@ def find_formats(folder: Path) -> tuple[str, ...]:
         "colmap": find_colmap(folder) is not None,
         "llff": (folder / _LLFF_FILE).is_file(),
         "idr": find_idr(folder) is not None,
+        "replica": find_replica(folder) is not None,
+        "scannet": find_scannet(folder),
+        "scannetpp": find_scannetpp(folder),
     }
     return tuple(format for format in FORMATS if found[format])
 
@@ -96,7 +109,7 @@ def bare_photographs(folder: Path) -> tuple[Path, ...]:
 
 def _from_file(path: Path) -> tuple[Path, str]:
     named = {_NERFSTUDIO_FILE: "nerfstudio", "transforms_train.json": "blender"}
-    named |= {_LLFF_FILE: "llff"} | dict.fromkeys(_IDR_FILES, "idr")
+    named |= {_LLFF_FILE: "llff", _REPLICA_FILE: "replica"} | dict.fromkeys(_IDR_FILES, "idr")
     if path.name not in named:
         raise InputError(f"{path}: expected a capture's folder or one of {', '.join(named)}.")
     return path.parent, named[path.name]
@@ -110,6 +123,6 @@ def _nothing_found(folder: Path) -> str:
             "poses come from COLMAP or another tool, or `splatseg fit` finds them."
         )
     return (
-        f"{folder}: expected a capture (transforms.json, a COLMAP model, poses_bounds.npy or "
-        "cameras_sphere.npz), got none of them."
+        f"{folder}: expected a capture (transforms.json, a COLMAP model, poses_bounds.npy, "
+        "cameras_sphere.npz, or a scene of Replica, ScanNet or ScanNet++), got none of them."
     )

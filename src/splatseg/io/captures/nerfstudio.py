@@ -138,7 +138,7 @@ def _raw_view(
     return RawView(
         image=path.parent / relative,
         relative=relative,
-        intrinsics=_intrinsics(merged, where=where),
+        intrinsics=intrinsics_of_frame(merged, where=where),
         cam_from_world=cam_from_world_of(frame, where=where),
         split=split,
         mask=_beside(path, frame.get("mask_path")),
@@ -153,7 +153,17 @@ def _beside(path: Path, name: object) -> Path | None:
     return path.parent / name.replace("\\", "/") if isinstance(name, str) and name else None
 
 
-def _intrinsics(source: Mapping[str, Any], *, where: str) -> Intrinsics:
+def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics:
+    """The lens of a frame, or of a file that has one lens.
+
+    Args:
+        source: The keys of the frame over those of the file.
+        where: The file and the frame; starts the message.
+
+    Raises:
+        FileFormatError: If the size or a focal length lacks, or the camera model is not one that
+            can be undistorted.
+    """
     model, distortion = lens_of(source, where=where)
     if "w" not in source or "h" not in source:
         raise FileFormatError(f"{where}: expected the image size as w and h, got none.")
