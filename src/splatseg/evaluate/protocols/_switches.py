@@ -120,17 +120,13 @@ class MapSwitches(Switches):
     zero_is_instance: bool = False
     """Whether pixels without an instance are one more, as in Gaga's evaluation."""
 
-    mostly_void: Literal["counted", "dropped"] = "counted"
-    """What a predicted segment of which more than half lies on void counts as in PQ: found where
-    nothing is, or nothing, as in COCO's."""
-
-    match_iou: float = 0.5
-    """IoU above which two segments match."""
+    void_rule: Literal["coco", "strict"] = "coco"
+    """Which segments of an image without a match are false in PQ of images. strict: all. coco: not
+    those with more than half of their pixels where the truth is void."""
 
     def __post_init__(self) -> None:
         Switches.__post_init__(self)
-        check_choice("mostly_void", self.mostly_void, ("counted", "dropped"))
-        check_range("match_iou", self.match_iou, 0.5, 1.0)
+        check_choice("void_rule", self.void_rule, ("coco", "strict"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

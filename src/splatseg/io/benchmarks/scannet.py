@@ -101,7 +101,7 @@ def read_labelled_points(path: Path) -> TruePoints:
         FileFormatError: If it is damaged, lacks the column ``label`` or has others than 0 to 40.
     """
     rows = read_ply_vertices(path)
-    if "label" not in (rows.dtype.names or ()) or rows["label"].dtype.kind not in "iu":
+    if "label" not in rows or rows["label"].dtype.kind not in "iu":
         raise FileFormatError(f"{path}: expected vertices with a whole number label, got none.")
     ids = rows["label"].astype(np.int64)
     if ids.size and not (ids.min() >= 0 and ids.max() <= len(_NAMES)):

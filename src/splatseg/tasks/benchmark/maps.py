@@ -1,25 +1,32 @@
 """Classes and instances of every pixel of views, held against the truth."""
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 from splatseg.core import (
     UNLABELLED,
     Features,
+    InstanceTree,
     LabelMap,
     Layer,
+    Selection,
     View,
     map_ids,
+    with_info,
 )
 from splatseg.core.benchmark import TrueMaps
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     Confusion,
     evaluate_instances,
+    evaluate_panoptic,
+    matched_instance_score,
     per_image_miou,
     semantic_score,
 )
 from splatseg.evaluate.held_out import drawn_and_true
+from splatseg.evaluate.protocols import MapSwitches
 from splatseg.lift import GaussianField
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.job import Job
@@ -65,7 +72,7 @@ def map_scores(job: Job) -> Scores:
         return _classes(job, seen, read_by_words(job, seen, layer, truth.table, ids), by_words=True)
     if seen.kind == "labels":
         return _classes(job, seen, layer, by_words=False)
-    return _instances(job, layer)
+    return _instances(job, seen, layer)
 
 
 def _classes(job: Job, seen: Seen, layer: Layer, *, by_words: bool) -> Scores:
@@ -97,14 +104,77 @@ def _classes(job: Job, seen: Seen, layer: Layer, *, by_words: bool) -> Scores:
     return scores, rows, notes
 
 
-def _instances(job: Job, layer: Layer) -> Scores:
+def _instances(job: Job, seen: Seen, layer: Layer) -> Scores:
     """Scores of instances matched over the scene, and panoptic quality where they have classes."""
     truth = _truth(job, job.bench.instances, "instances")
+    switches = cast(MapSwitches, job.protocol.switches)
+    if isinstance(layer, InstanceTree):
+        layer = layer.cut()
+    if isinstance(layer, Selection):
+        raise InputError(f"method {job.method.name}: expected instances, got a selection.")
+    layer, notes = _in_true_classes(job, seen, layer)
     field = GaussianField(job.scene.gaussians, {_LAYER: layer}, backend=job.backend)
-    views = _scored(job, truth)
-    report = evaluate_instances(field, views, _LAYER, _Maps(maps=truth))
-    scores = {"instance_miou": report.score.miou}
-    return scores, [], []
+    views, source = _scored(job, truth), _Maps(maps=truth)
+    pooled = evaluate_instances(field, views, _LAYER, source).score
+    with job.observer.stage("score") as step:
+        drawn = drawn_and_true(field, views, _LAYER, source, progress=step)
+        matched = matched_instance_score(
+            (
+                (view.name, found.ids, true.ids)
+                for view, (found, true) in zip(views, drawn, strict=True)
+            ),
+            none_is_object=switches.zero_is_instance,
+        )
+    scores = {
+        "instance_miou": matched.miou,
+        "precision": matched.precision50,
+        "recall": matched.recall50,
+        "pooled_instance_miou": pooled.miou,
+    }
+    rows = [
+        {"instance": id, "match": found, "iou": iou}
+        for id, (found, iou) in sorted(matched.matches.items())
+    ]
+    return scores | _panoptic(job, field, layer, views), rows, notes
+
+
+def _panoptic(
+    job: Job, field: GaussianField, layer: Layer, views: Sequence[View]
+) -> dict[str, float]:
+    """Panoptic quality, where the truth has classes and instances and the layer both as well."""
+    semantic, instances = job.bench.semantic, job.bench.instances
+    if semantic is None or instances is None or semantic.table is None:
+        return {}
+    if not layer.info.class_of:
+        return {}
+    report = evaluate_panoptic(
+        field,
+        views,
+        classes=None,
+        instances=_LAYER,
+        true_classes=_Maps(maps=semantic),
+        true_instances=_Maps(maps=instances),
+        table=semantic.table,
+        void_rule=cast(MapSwitches, job.protocol.switches).void_rule,
+    )
+    return {
+        "pq_scene": report.score.pq,
+        "pq": report.image_score.pq,
+        "ap50": report.precision.mean,
+        "miou": report.semantic.miou,
+        "accuracy": report.semantic.accuracy,
+    }
+
+
+def _in_true_classes(job: Job, seen: Seen, layer: Layer) -> tuple[Layer, list[str]]:
+    """The layer with classes of its instances in the truth's ids, by name."""
+    if job.bench.semantic is None or not layer.info.class_of:
+        return layer, []
+    mapping, notes = true_ids_of(job, seen, job.bench.semantic.table)
+    if mapping is None:
+        return layer, notes
+    classes = {id: mapping[one] for id, one in layer.info.class_of.items() if one in mapping}
+    return with_info(layer, replace(layer.info, class_of=classes)), notes
 
 
 def _truth(job: Job, maps: TrueMaps | None, what: str) -> TrueMaps:

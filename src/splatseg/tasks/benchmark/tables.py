@@ -36,8 +36,7 @@ def bench_table(
         scenes = []
     columns = ("method", *measures, *scenes, "source")
     rows = [_measured(method, measures, scenes, run) for method in run.methods]
-    for one in means:
-        rows.append(_published(one, measures, scenes, published, run, notes=notes))
+    rows += [_published(one, measures, scenes, published, run, notes=notes) for one in means]
     return columns, rows
 
 
