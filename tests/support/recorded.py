@@ -233,7 +233,15 @@ def write_text(folder: Path, scene: SyntheticScene, seen: Mapping[str, Seen]) ->
     for i, name in enumerate(dense):
         np.savez_compressed(folder / "features_text" / f"{name}.npz", f=codes[i])
     rows = [(names[i], words[i], "class", i) for i in sorted(names)]
-    rows += [("object", rng.normal(size=WIDTH_OF_WORDS) / 6, "negative", -1)]
+    # A phrase for an instance says no more than its class.
+    things = json.loads((folder / "metadata.json").read_text())["instances"]
+    rows += [
+        (thing["name"], words[thing["class_id"]], "instance", thing["id"])
+        for thing in things
+        if thing["name"] not in names.values()
+    ]
+    for negative in ("object", "things", "stuff", "texture"):
+        rows += [(negative, rng.normal(size=WIDTH_OF_WORDS) / 6, "negative", -1)]
     labels, vectors, kinds, targets = zip(*rows, strict=True)
     unit = np.array(vectors) / np.linalg.norm(vectors, axis=1, keepdims=True)
     np.savez(

@@ -21,7 +21,8 @@ from splatseg.io.benchmarks import LAYOUTS
 def test_every_protocol_names_a_layout_and_records_every_switch() -> None:
     assert len({one.name for one in PROTOCOLS}) == len(PROTOCOLS)
     for one in PROTOCOLS:
-        assert one.layout in LAYOUTS, one.name
+        assert one.layouts, one.name
+        assert set(one.layouts) <= set(LAYOUTS), one.name
         names = {field.name for field in fields(one.switches)}
         assert set(recorded(one.switches)) == names
         assert find_protocol(one.name) is one

@@ -56,7 +56,9 @@ def write_evidence(source: Source, capture: Capture, name: str, folder: Path) ->
 
 def renamed_views(source: Source, capture: Capture) -> dict[str, str]:
     """Names of views in the capture by those of the scene."""
-    found = {_pixels(view.image): view.name for view in capture.views}
+    # A layout may repeat photographs: those to learn from have the evidence.
+    views = sorted(capture.views, key=lambda view: view.split == "train")
+    found = {_pixels(view.image): view.name for view in views}
     own = {view.name: found.get(_pixels(view.image)) for view in source.views}
     return {name: other for name, other in own.items() if other is not None}
 

@@ -35,7 +35,7 @@ _NYU40 = {
 _NVOS = Protocol(
     name="nvos",
     summary="one object of a forward-facing scene by scribbles in one view, its mask in another",
-    layout="nvos",
+    layouts=("nvos",),
     reference="Ren et al. 2022 (NVOS); pairs of views by fvdb's eval_nvos.py",
     switches=TargetSwitches(
         averaging="tasks", prompt="scribble", decided="pixels", silhouette_cut=0.5,
@@ -48,7 +48,7 @@ _NVOS = Protocol(
 _SPIN_NERF = Protocol(
     name="spin-nerf",
     summary="the mask of one view carried to all annotated ones, which include it",
-    layout="spin-nerf",
+    layouts=("spin-nerf",),
     reference="Mirzaei et al. 2023; SA3D's authors on the reference view",
     switches=TargetSwitches(
         averaging="scenes", prompt="mask", scored_in_training=True, reference_scored=True,
@@ -60,7 +60,7 @@ _SPIN_NERF = Protocol(
 _LERF_MASK = Protocol(
     name="lerf-mask",
     summary="objects by words in held-out views",
-    layout="lerf-mask",
+    layouts=("lerf-mask",),
     reference="Gaussian Grouping (Ye et al. 2024)",
     switches=TargetSwitches(
         averaging="scenes",
@@ -76,7 +76,7 @@ _LERF_MASK = Protocol(
 _LERF_OVS_2D = Protocol(
     name="lerf-ovs-2d",
     summary="objects by words, decided in rendered pixels",
-    layout="lerf-ovs",
+    layouts=("lerf-ovs",),
     reference="LangSplat (Qin et al. 2024)",
     switches=TargetSwitches(
         averaging="pairs", prompt="words", decided="pixels", scored_in_training=True,
@@ -90,7 +90,7 @@ _LERF_OVS_2D = Protocol(
 _LERF_OVS_3D = Protocol(
     name="lerf-ovs-3d",
     summary="objects by words, decided for Gaussians, whose silhouette is scored",
-    layout="lerf-ovs",
+    layouts=("lerf-ovs",),
     reference="OpenGaussian (Wu et al. 2024)",
     switches=TargetSwitches(
         averaging="pairs", prompt="words", decided="gaussians", scored_in_training=True,
@@ -104,7 +104,7 @@ _LERF_OVS_3D = Protocol(
 _OVS_3D = Protocol(
     name="3d-ovs",
     summary="objects of long-tail classes by words",
-    layout="3d-ovs",
+    layouts=("3d-ovs",),
     reference="Liu et al. 2023 (3D-OVS), pooled as LaGa has it",
     switches=TargetSwitches(
         averaging="pooled", prompt="words", scored_in_training=True,
@@ -115,20 +115,22 @@ _OVS_3D = Protocol(
 )  # fmt: skip
 
 
-def _views(
-    name: str, summary: str, layout: str, reference: str, scenes: tuple[str, ...] = ()
-) -> Protocol:
+def _views(name: str, summary: str, layouts: tuple[str, ...], reference: str) -> Protocol:
     return Protocol(
-        name=name, summary=summary, layout=layout, reference=reference, scenes=scenes,
-        switches=MapSwitches(), measure="miou",
-    )  # fmt: skip
+        name=name,
+        summary=summary,
+        layouts=layouts,
+        reference=reference,
+        switches=MapSwitches(),
+        measure="miou",
+    )
 
 
-def _gaga(name: str, layout: str, scenes: tuple[str, ...] = ()) -> Protocol:
+def _gaga(name: str, layouts: tuple[str, ...], scenes: tuple[str, ...] = ()) -> Protocol:
     return Protocol(
         name=name,
         summary="instances of held-out views, matched over the scene",
-        layout=layout,
+        layouts=layouts,
         reference="Gaga (Lyu et al. 2024)",
         scenes=scenes,
         switches=MapSwitches(zero_is_instance=True),
@@ -140,7 +142,7 @@ def _points(classes: int) -> Protocol:
     return Protocol(
         name=f"scannet-{classes}",
         summary=f"{classes} classes of the vertices that Gaussians stay at",
-        layout="scannet",
+        layouts=("scannet",),
         reference="OpenGaussian (Wu et al. 2024)",
         switches=PointSwitches(class_ids=_NYU40[classes], scored_in_training=True),
         measure="miou",
@@ -154,7 +156,7 @@ PROTOCOLS: tuple[Protocol, ...] = (
     Protocol(
         name="spin-nerf-ludvig",
         summary="as spin-nerf, without the view of the prompt",
-        layout="spin-nerf",
+        layouts=("spin-nerf",),
         reference="LUDVIG (Marrie et al. 2024)",
         switches=TargetSwitches(
             averaging="scenes", prompt="mask", scored_in_training=True, threshold="reference",
@@ -169,20 +171,22 @@ PROTOCOLS: tuple[Protocol, ...] = (
     _LERF_OVS_3D,
     _OVS_3D,
     _views(
-        "replica", "classes and instances of held-out views of Replica's rooms", "replica",
+        "replica", "classes and instances of held-out views of Replica's rooms",
+        ("replica", "replica-gg"),
         "Zhi et al. 2021 (Semantic-NeRF), CoSSegGaussians; PQ of Siddiqui et al. 2023",
     ),
-    _gaga("replica-gaga", "replica"),
+    _gaga("replica-gaga", ("replica", "replica-gg")),
     _points(19),
     _points(15),
     _points(10),
     _views(
-        "scannet-views", "classes and instances of held-out views of ScanNet's rooms", "scannet",
+        "scannet-views", "classes and instances of held-out views of ScanNet's rooms", ("scannet",),
         "CoSSegGaussians; PQ of Siddiqui et al. 2023",
     ),
-    _gaga("scannet-gaga", "scannet", _GAGA_SCENES),
+    _gaga("scannet-gaga", ("scannet",), _GAGA_SCENES),
     _views(
-        "scannetpp", "classes of views, their truth rendered from the labelled mesh", "scannetpp",
+        "scannetpp", "classes of views, their truth rendered from the labelled mesh",
+        ("scannetpp",),
         "the open-vocabulary voxel paper: mIoU and frequency-weighted IoU",
     ),
 )  # fmt: skip

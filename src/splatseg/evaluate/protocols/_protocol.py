@@ -18,8 +18,8 @@ class Protocol:
     summary: str
     """What is asked and measured, one line, lower case, without a full stop."""
 
-    layout: str
-    """Layout of the data set that it reads, one of `splatseg.io.benchmarks.LAYOUTS`."""
+    layouts: tuple[str, ...]
+    """Layouts of the data set that it reads, of `splatseg.io.benchmarks.LAYOUTS`."""
 
     reference: str
     """Who states it."""

@@ -33,7 +33,7 @@ class Answer:
     """Where it comes from a map of relevancy, for its peak."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)  # no slots: it caches
 class ByIds:
     """Ids of a layer stand for the thing."""
 
@@ -56,7 +56,7 @@ class ByIds:
         return self.gaussians[torch.isin(labels.ids, torch.tensor(self.ids))]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)  # no slots: it caches
 class ByFeatures:
     """What is more like the thing than like anything else."""
 

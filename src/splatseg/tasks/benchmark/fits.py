@@ -70,7 +70,7 @@ def held_out_views(bench: BenchmarkScene, protocol: Protocol) -> frozenset[str]:
     if protocol.switches.scored_in_training:
         return frozenset()
     if not isinstance(protocol.switches, TargetSwitches):
-        return frozenset(view.name for view in bench.capture.views if view.split != "train")
+        return frozenset(view.name for view in bench.capture.test_views)
     prompts = {
         one.view
         for task in bench.tasks
@@ -94,11 +94,12 @@ def _capture(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> Captu
     if isinstance(protocol.switches, PointSwitches) and protocol.switches.frame_step > 1:
         views = capture.views[:: protocol.switches.frame_step]
         capture = replace(capture, views=views)
-    out = held_out_views(bench, protocol)
-    views = tuple(
-        replace(view, split="test" if view.name in out else "train") for view in capture.views
-    )
-    capture = replace(capture, views=views)
+    if protocol.switches.scored_in_training or isinstance(protocol.switches, TargetSwitches):
+        out = held_out_views(bench, protocol)
+        views = tuple(
+            replace(view, split="test" if view.name in out else "train") for view in capture.views
+        )
+        capture = replace(capture, views=views)
     if not fixed:
         return capture
     if bench.points is None:

@@ -1,8 +1,12 @@
 """Classes and instances of every pixel of views, held against the truth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
@@ -27,6 +31,8 @@ from splatseg.evaluate import (
 )
 from splatseg.evaluate.held_out import drawn_and_true
 from splatseg.evaluate.protocols import MapSwitches
+from splatseg.io.evidence import save_label_map
+from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.job import Job
@@ -83,10 +89,12 @@ def _classes(job: Job, seen: Seen, layer: Layer, *, by_words: bool) -> Scores:
     views = _scored(job, truth)
     confusions: list[Confusion] = []
     with job.observer.stage("score") as step:
-        for drawn, true in drawn_and_true(field, views, _LAYER, _Maps(maps=truth), progress=step):
+        maps = drawn_and_true(field, views, _LAYER, _Maps(maps=truth), progress=step)
+        for view, (drawn, true) in zip(views, maps, strict=True):
             ids = drawn.ids
             if mapping is not None:
                 ids = map_ids(ids, mapping, default=UNLABELLED)
+            _keep(job, "classes", view, ids)
             confusions.append(Confusion.of(ids, true.ids))
     pooled = semantic_score(sum(confusions, start=Confusion.none()))
     rows = [
@@ -119,10 +127,7 @@ def _instances(job: Job, seen: Seen, layer: Layer) -> Scores:
     with job.observer.stage("score") as step:
         drawn = drawn_and_true(field, views, _LAYER, source, progress=step)
         matched = matched_instance_score(
-            (
-                (view.name, found.ids, true.ids)
-                for view, (found, true) in zip(views, drawn, strict=True)
-            ),
+            _kept_maps(job, views, drawn),
             none_is_object=switches.zero_is_instance,
         )
     scores = {
@@ -136,6 +141,23 @@ def _instances(job: Job, seen: Seen, layer: Layer) -> Scores:
         for id, (found, iou) in sorted(matched.matches.items())
     ]
     return scores | _panoptic(job, field, layer, views), rows, notes
+
+
+def _kept_maps(
+    job: Job, views: Sequence[View], maps: Iterable[tuple[LabelMap, LabelMap]]
+) -> Iterator[tuple[str, Int[Tensor, "height width"], Int[Tensor, "height width"]]]:
+    """Name, predicted and true ids of each view, which are written on the way."""
+    for view, (found, true) in zip(views, maps, strict=True):
+        _keep(job, "instances", view, found.ids)
+        yield view.name, found.ids, true.ids
+
+
+def _keep(job: Job, kind: str, view: View, ids: Int[Tensor, "height width"]) -> None:
+    """Write a predicted map: 16 bit, 0 for none."""
+    folder = path_inside(
+        job.root, "predictions", job.protocol.name, job.method.name, job.bench.name, kind
+    )
+    save_label_map(LabelMap(ids=torch.where(ids > 0, ids, UNLABELLED)), folder, view.name)
 
 
 def _panoptic(

@@ -22,7 +22,10 @@ from splatseg.core.benchmark import TruePoints
 from splatseg.errors import InputError
 from splatseg.evaluate import Confusion, semantic_score
 from splatseg.evaluate.protocols import PointSwitches
+from splatseg.io.atomic import atomic_file
 from splatseg.io.evidence import open_evidence
+from splatseg.io.npz_writing import save_arrays
+from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.lift.heads import ClassifierHead
 from splatseg.tasks.benchmark.job import Job
@@ -48,6 +51,12 @@ def point_scores(job: Job) -> tuple[dict[str, float], list[dict[str, Any]], list
     found, counted, notes = _labels_of_points(job, truth, switches, wanted)
     true = torch.where(torch.isin(truth.labels.ids, wanted), truth.labels.ids, UNLABELLED)
     true = torch.where(counted, true, UNLABELLED)
+    path = path_inside(
+        job.root, "predictions", job.protocol.name, job.method.name, f"{job.bench.name}.npz"
+    )
+    arrays = {"semantic": found.clamp_min(0).numpy(), "truth": true.clamp_min(0).numpy()}
+    with atomic_file(path) as temporary:
+        save_arrays({}, arrays, temporary, name=path)
     score = semantic_score(Confusion.of(found, true))
     rows: list[dict[str, Any]] = [
         {

@@ -20,7 +20,7 @@ from splatseg.evaluate.protocols import (
     mask_scores,
     switch_value,
 )
-from splatseg.io.benchmarks import read_benchmark
+from splatseg.io.benchmarks import find_layout, read_benchmark
 from splatseg.io.paths import path_inside
 from splatseg.io.write_errors import named_write_failures
 from splatseg.methods import find_method
@@ -98,7 +98,7 @@ def bench(
     chosen = find_protocol(protocol)
     chosen = chosen.with_switches(dict(switch_value(chosen, one) for one in options.switches))
     methods = [find_method(name) for name in options.methods]
-    scenes = _asked_scenes(read_benchmark(chosen.layout, data), options, data)
+    scenes = _asked_scenes(_read(chosen, data), options, data)
     with named_write_failures(folder):
         folder.mkdir(parents=True, exist_ok=True)
     notes = _notes(chosen, scenes)
@@ -108,7 +108,7 @@ def bench(
     found: dict[str, list[SceneResult]] = {method.name: [] for method in methods}
     kept = 0
     for one in scenes:
-        for note in one.notes:
+        for note in one.notes if one.notes != one.capture.notes else ():
             observer.note(f"{one.name}: {note.rstrip('.')}")
         scene = fitted_scene(
             one, chosen, folder, options=options, backend=backend, command=command,
@@ -214,6 +214,18 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
 
 def _recorded_model(model: Model | None) -> dict[str, Any] | None:
     return None if model is None else {"name": model.name, "settings": dict(model.settings)}
+
+
+def _read(protocol: Protocol, data: Path) -> tuple[BenchmarkScene, ...]:
+    """The data set, in the one of the protocol's layouts that it has."""
+    if len(protocol.layouts) == 1:
+        return read_benchmark(protocol.layouts[0], data)
+    found = find_layout(data)
+    if found not in protocol.layouts:
+        raise InputError(
+            f"{data}: expected the layout {' or '.join(protocol.layouts)}, got {found}."
+        )
+    return read_benchmark(found, data)
 
 
 def _asked_scenes(

@@ -1,0 +1,165 @@
+"""Protocols end to end on a generated room, by the command; figures held to another scorer's."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from splatseg.cli import main
+from splatseg.core.benchmark import BenchmarkScene, TrueMaps
+from splatseg.io.benchmarks import read_benchmark
+from splatseg.tasks.benchmark import load_result
+
+DataSet = Callable[[str], Path]
+EVIDENCE = ("masks_sam", "labels_semantic", "labels_panoptic", "features_text", "features_dino")
+STEPS = ("--steps", "60", "--max-gaussians", "4000", "--quiet")
+
+
+@pytest.fixture(scope="session")
+def bench(data_set: DataSet, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Runs a protocol on a layout once; the folder, which is shared by those of a layout."""
+    folders: dict[str, Path] = {}
+    done: set[tuple[str, ...]] = set()
+
+    def run(protocol: str, layout: str, *words: str) -> Path:
+        data = data_set(layout)
+        out = folders.setdefault(layout, tmp_path_factory.mktemp(f"bench-{layout}") / "out")
+        asked = (protocol, layout, *words)
+        if asked not in done:
+            named = [evidence(data, word) if word in EVIDENCE else word for word in words]
+            command = ("bench", protocol, "--data", data, "-o", out, *STEPS, *named)
+            assert main([str(word) for word in command]) == 0
+            done.add(asked)
+        return out
+
+    return run
+
+
+def evidence(data: Path, name: str) -> str:
+    return str(data / "evidence" / "{scene}" / name)
+
+
+def scene_of(layout: str, data: Path) -> BenchmarkScene:
+    (scene,) = read_benchmark(layout, data)
+    return scene
+
+
+def content(out: Path, protocol: str) -> dict[str, Any]:
+    return json.loads((out / f"{protocol}.json").read_text())
+
+
+def save_masks(scene: BenchmarkScene, folder: Path) -> None:
+    """True masks as files that the other scorer reads."""
+    for task in scene.tasks:
+        for true in task.truth:
+            path = folder / task.name / f"{true.view}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(true.read().numpy().astype(np.uint8) * 255).save(path)
+
+
+def save_maps(maps: TrueMaps, views: list[str], folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for view in views:
+        ids = maps.read[view]().ids.clamp_min(0).numpy().astype(np.uint16)
+        Image.fromarray(ids).save(folder / f"{view}.png")
+
+
+@pytest.mark.parametrize(
+    ("protocol", "layout", "words"),
+    [
+        ("spin-nerf", "spin-nerf", ("--method", "uplift")),
+        ("spin-nerf-ludvig", "spin-nerf", ("--method", "associate", "--model", "masks_sam")),
+        ("nvos", "nvos", ("--method", "uplift")),
+        ("lerf-ovs-2d", "lerf-ovs", ("--method", "features", "--model", "features_text")),
+        ("lerf-ovs-3d", "lerf-ovs", ("--method", "features", "--model", "features_text")),
+        ("lerf-mask", "lerf-mask", ("--method", "features", "--model", "features_text")),
+        ("3d-ovs", "3d-ovs", ("--method", "features", "--model", "features_text")),
+    ],
+)
+def test_masks(protocol: str, layout: str, words, bench, data_set, tmp_path, score) -> None:
+    """Every protocol of things asked for, with a method of each kind that can answer it."""
+    data, out = data_set(layout), bench(protocol, layout, *words)
+    found = content(out, protocol)
+    (method,) = found["methods"]
+    scores = found["methods"][method]["scores"]
+    scene = scene_of(layout, data)
+    result = load_result(out / "results" / protocol / method / f"{scene.name}.json")
+    assert result.switches == found["switches"]
+    assert {"command", "seed", "gaussians", "versions", "options"} <= set(result.made)
+    save_masks(scene, tmp_path / "truth")
+    predictions = out / "predictions" / protocol / method / scene.name
+    ious: dict[str, float] = {}
+    for task in scene.tasks:
+        views = sorted(path.stem for path in (predictions / task.name).glob("*.png"))
+        rows = [row for row in result.rows if row["task"] == task.name]
+        assert views == sorted(row["view"] for row in rows)
+        truth = tmp_path / "scored" / task.name
+        truth.mkdir(parents=True)
+        for view in views:
+            (tmp_path / "truth" / task.name / f"{view}.png").rename(truth / f"{view}.png")
+        theirs = score("binary", "--pred", predictions / task.name, "--truth", truth)
+        ious[task.name] = theirs["IoU_mean_over_views"]
+        assert np.mean([row["iou"] for row in rows]) == pytest.approx(
+            theirs["IoU_mean_over_views"], abs=1e-6
+        )
+        assert np.mean([row["accuracy"] for row in rows]) == pytest.approx(
+            theirs["accuracy"], abs=1e-6
+        )
+    if found["switches"]["averaging"] in ("tasks", "scenes"):
+        assert scores["iou"] == pytest.approx(np.mean(list(ious.values())), abs=1e-6)
+    # Chance of a mask as large as these is a few percent; a poor fit reaches more.
+    assert scores["iou"] > 0.1
+
+
+def test_classes_and_instances_of_views(bench, data_set, tmp_path, score) -> None:
+    data, models = data_set("replica"), ("labels_semantic", "labels_panoptic")
+    out = bench("replica", "replica", "--method", "uplift,associate", "--model", *models)
+    found = content(out, "replica")["methods"]
+    scene = scene_of("replica", data)
+    assert scene.semantic is not None
+    assert scene.instances is not None
+    tests = [view.name for view in scene.capture.test_views if view.name in scene.semantic.read]
+    save_maps(scene.semantic, tests, tmp_path / "semantic")
+    save_maps(scene.instances, tests, tmp_path / "instance")
+    predictions = out / "predictions" / "replica"
+    classes = predictions / "uplift" / scene.name / "classes"
+    theirs = score("semantic", "--pred", classes, "--truth", tmp_path / "semantic")
+    ours = found["uplift"]["scores"]
+    assert ours["miou"] == pytest.approx(theirs["mIoU"], abs=1e-6)
+    assert ours["fwiou"] == pytest.approx(theirs["fwIoU"], abs=1e-6)
+    assert ours["accuracy"] == pytest.approx(theirs["accuracy"], abs=1e-6)
+    assert ours["miou"] > 0.2
+    instances = predictions / "associate" / scene.name / "instances"
+    theirs = score("instances", "--pred", instances, "--truth", tmp_path / "instance")
+    ours = found["associate"]["scores"]
+    assert ours["pooled_instance_miou"] == pytest.approx(theirs["mIoU"], abs=1e-6)
+    assert {"pq_scene", "pq", "ap50", "instance_miou", "precision", "recall"} <= set(ours)
+    assert ours["pq_scene"] > 0.05
+    # The same predictions under the protocol that counts what has no instance as one.
+    bench("replica-gaga", "replica", "--method", "associate", "--model", models[1])
+    gaga = content(out, "replica-gaga")["methods"]["associate"]["scores"]
+    assert gaga["instance_miou"] != ours["instance_miou"]
+
+
+@pytest.mark.parametrize("method", ["uplift", "features"])
+def test_classes_of_points(method: str, bench, data_set, tmp_path, score) -> None:
+    data = data_set("scannet")
+    name = {"uplift": "labels_semantic", "features": "features_text"}[method]
+    words = ("--method", method, "--model", name, "--switch", "frame_step=1")
+    out = bench("scannet-19", "scannet", *words)
+    scene = scene_of("scannet", data)
+    ours = load_result(out / f"results/scannet-19/{method}/{scene.name}.json").scores
+    path = out / "predictions" / "scannet-19" / method / f"{scene.name}.npz"
+    arrays = np.load(path)
+    np.savez(tmp_path / "truth.npz", semantic=arrays["truth"])
+    theirs = score("points", "--pred", path, "--truth", tmp_path / "truth.npz")
+    assert ours["miou"] == pytest.approx(theirs["mIoU"], abs=1e-6)
+    assert ours["miou"] > 0.1
+    assert scene.points is not None
+    wanted = torch.isin(scene.points.labels.ids, torch.tensor(range(1, 41)))
+    assert (arrays["truth"] > 0).sum() <= int(wanted.sum())
