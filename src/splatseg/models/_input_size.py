@@ -33,6 +33,9 @@ class InputSize:
     multiple: int = 1
     """Sides are multiples of this."""
 
+    takes_squares: bool = False
+    """The network takes squares only: a size that the user says is both sides."""
+
     @classmethod
     def of(cls, folder: Path, *, otherwise: "InputSize") -> "InputSize":
         """The one that the weights' preprocessor_config.json says.
@@ -92,10 +95,14 @@ class InputSize:
         Args:
             height: Rows of the image.
             width: Columns of the image.
-            size: The longer side, where the user says it: the proportions are kept.
+            size: The longer side, where the user says it: the proportions are kept unless the
+                network takes squares.
         """
-        if size is not None:
+        if size is not None and not self.takes_squares:
             return frame_of(height, width, size=size, multiple=self.multiple)
+        if size is not None:
+            inner = self._whole((size, size))
+            return frame_of(height, width, size=inner[0], shape="square")
         if self.sides is not None and not self.keeps_proportions:
             inner = self._whole(self.sides)
         elif self.sides is not None:

@@ -3,8 +3,10 @@
 Yang et al. 2024 (arXiv:2401.10891, arXiv:2406.09414), Ranftl et al. 2021 (arXiv:2103.13413).
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,6 +29,8 @@ _CLASSES = {
 }
 """Class of the library by family and the weights' ``model_type``."""
 
+_DPT_SIDE = 384
+
 DPT_MEAN = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 """What DPT's weights take where they do not tell."""
 
@@ -35,10 +39,28 @@ UNUSED_OF_DPT = ("neck.fusion_stage.layers.0.residual_layer1.",)
 
 _NORMALISATIONS = {"depth-anything": Normalisation(), "dpt": DPT_MEAN}
 _SIZES = {
-    "depth-anything": InputSize(sides=(518, 518), keeps_proportions=True, multiple=14),
-    "dpt": InputSize(sides=(384, 384), multiple=16),
+    "depth-anything": InputSize(sides=(518, 518), keeps_proportions=True),
+    "dpt": InputSize(sides=(_DPT_SIDE, _DPT_SIDE)),
 }
 """What the input is where the weights do not tell."""
+
+
+def dpt_input_size(config: Any, folder: Path, *, otherwise: InputSize) -> InputSize:
+    """What a network with DPT's head takes: whole patches, and squares where it has no backbone.
+
+    Args:
+        config: The network's configuration.
+        folder: The weights.
+        otherwise: What holds where they do not tell.
+    """
+    found = InputSize.of(folder, otherwise=otherwise)
+    backbone = None if getattr(config, "is_hybrid", False) else config.backbone_config
+    patch = int(getattr(backbone, "patch_size", None) or config.patch_size)
+    found = replace(found, multiple=math.lcm(found.multiple, patch))
+    if backbone is not None:
+        return found
+    side = max(found.sides or (found.shortest or found.longest or _DPT_SIDE,))
+    return InputSize(sides=(side, side), multiple=found.multiple, takes_squares=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +100,7 @@ class DepthNetwork:
         self._options = options
         self._place = place
         self._normalisation = Normalisation.of(place.folder, otherwise=_NORMALISATIONS[name])
-        self._size = InputSize.of(place.folder, otherwise=_SIZES[name])
+        self._size = dpt_input_size(self._network.config, place.folder, otherwise=_SIZES[name])
         self._last = LastImages[DepthMap](self._encode)
 
     @property

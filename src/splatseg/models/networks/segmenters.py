@@ -224,14 +224,18 @@ class Segmenter:
 
     def _task_tokens(self, task: Task) -> Int64[Tensor, "1 length"]:
         """The sentence that tells OneFormer its task, as numbers; 0 after its end."""
-        try:
-            tokenizer = library().AutoTokenizer.from_pretrained(
-                self._place.folder, local_files_only=True
+        folder = self._place.folder
+        # Without these the library makes a tokenizer that knows no word, and does not say so.
+        if not any((folder / name).is_file() for name in _TOKENIZER_FILES):
+            raise FileFormatError(
+                f"{folder}: expected the tokenizer of the weights beside them "
+                f"({' or '.join(_TOKENIZER_FILES)}), got none."
             )
+        try:
+            tokenizer = library().AutoTokenizer.from_pretrained(folder, local_files_only=True)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise FileFormatError(
-                f"{self._place.folder}: expected the tokenizer of the weights beside them, got "
-                f"none that can be loaded ({type(error).__name__})."
+                f"{folder}: the tokenizer of the weights cannot be loaded ({type(error).__name__})."
             ) from error
         found = tokenizer(
             [f"the task is {task}"], padding="max_length", truncation=True,
@@ -241,6 +245,7 @@ class Segmenter:
 
 
 _TASKS: tuple[Task, ...] = ("semantic", "panoptic")
+_TOKENIZER_FILES = ("tokenizer.json", "vocab.json")
 
 
 def window_starts(length: int, side: int) -> list[int]:

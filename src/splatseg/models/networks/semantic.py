@@ -20,7 +20,7 @@ from splatseg.models._images import Normalisation, network_input
 from splatseg.models._input_size import InputSize
 from splatseg.models._queries import SemanticOptions, map_of_scores
 from splatseg.models.networks._library import configuration, network, network_family, settings_of
-from splatseg.models.networks.depth import DPT_MEAN, UNUSED_OF_DPT
+from splatseg.models.networks.depth import DPT_MEAN, UNUSED_OF_DPT, dpt_input_size
 
 _CLASSES = {
     "segformer": {"segformer": "SegformerForSemanticSegmentation"},
@@ -28,11 +28,8 @@ _CLASSES = {
 }
 """Class of the library by family and the weights' ``model_type``."""
 
-_SIZES = {
-    "segformer": InputSize(sides=(512, 512), multiple=1),
-    "dpt-semantic": InputSize(sides=(384, 384), multiple=16),
-}
-"""What the input is where the weights do not tell."""
+_SEGFORMER_SIZE = InputSize(sides=(512, 512))
+_DPT_SIZE = InputSize(sides=(480, 480))
 
 
 class SemanticNetwork:
@@ -52,9 +49,12 @@ class SemanticNetwork:
         self.batch_size = place.images_together
         self._options = options
         self._place = place
-        otherwise = Normalisation() if name == "segformer" else DPT_MEAN
-        self._normalisation = Normalisation.of(place.folder, otherwise=otherwise)
-        self._size = InputSize.of(place.folder, otherwise=_SIZES[name])
+        if name == "segformer":
+            self._normalisation = Normalisation.of(place.folder)
+            self._size = InputSize.of(place.folder, otherwise=_SEGFORMER_SIZE)
+        else:
+            self._normalisation = Normalisation.of(place.folder, otherwise=DPT_MEAN)
+            self._size = dpt_input_size(self._network.config, place.folder, otherwise=_DPT_SIZE)
         self._last = LastImages[Tensor](self._encode)
 
     @property
