@@ -4,7 +4,6 @@ import shutil
 
 import pytest
 import torch
-import torch.nn.functional as F
 
 from splatseg.core.models import BatchedModel, DenseDepth
 from splatseg.errors import FileFormatError, RangeError
@@ -13,7 +12,8 @@ from splatseg.models._images import IMAGENET
 from splatseg.models.networks.depth import UNUSED_OF_DPT, DepthOptions
 
 KINDS = [("depth-anything", "depth_anything", "relative"),
-         ("depth-anything", "depth_anything_metric", "metric"), ("dpt", "dpt", "relative")]  # fmt: skip
+         ("depth-anything", "depth_anything_metric", "metric"),
+         ("dpt", "dpt", "relative")]  # fmt: skip
 
 
 def made(folder, family: str, *, batch: int | None = None, size: int | None = None, **options):
