@@ -209,7 +209,7 @@ def save_features(features: FeatureMap, folder: Path | str, name: str) -> None:
 
 @boundary
 def save_depth_map(depth: DepthMap, folder: Path | str, name: str) -> None:
-    """Write a view's depth map as float16, compressed, with its kind and confidence.
+    """Write a view's depth map as float16, with its kind and confidence.
 
     Raises:
         RangeError: If a value is beyond the range of float16 (65504).
@@ -221,7 +221,7 @@ def save_depth_map(depth: DepthMap, folder: Path | str, name: str) -> None:
         arrays["confidence"] = depth.confidence.detach().cpu().to(torch.float16).numpy()
     path = _view_path(Path(folder), name, ".npz")
     with atomic_file(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **cast(dict[str, Any], arrays))
+        np.savez(file, **cast(dict[str, Any], arrays))
 
 
 def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Path:
