@@ -1,5 +1,7 @@
 """Tiny checkpoints of networks for classes, segments and depth."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -166,18 +168,24 @@ def depth_anything_metric() -> Any:
     return _depth_anything("metric")
 
 
-def save_tokenizer(folder: Any) -> None:
+def save_tokenizer(folder: Path) -> None:
     """A tokenizer that knows the words of OneFormer's tasks, as the library saves one."""
-    from tokenizers import Tokenizer, models, pre_tokenizers
-    from transformers import PreTrainedTokenizerFast
-
     words = ("<pad>", "<unk>", "the", "task", "is", "panoptic", "semantic")
-    tokenizer = Tokenizer(
-        models.WordLevel({word: i for i, word in enumerate(words)}, unk_token="<unk>")
-    )
-    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
-    fast = PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>")
-    fast.save_pretrained(folder)
+    added = [
+        {"id": i, "content": words[i], "single_word": False, "lstrip": False, "rstrip": False,
+         "normalized": False, "special": True}
+        for i in range(2)
+    ]  # fmt: skip
+    content = {
+        "version": "1.0", "truncation": None, "padding": None, "added_tokens": added,
+        "normalizer": None, "pre_tokenizer": {"type": "Whitespace"}, "post_processor": None,
+        "decoder": None,
+        "model": {"type": "WordLevel", "vocab": {word: i for i, word in enumerate(words)},
+                  "unk_token": "<unk>"},
+    }  # fmt: skip
+    (folder / "tokenizer.json").write_text(json.dumps(content))
+    names = {"tokenizer_class": "PreTrainedTokenizerFast", "pad_token": "<pad>"}
+    (folder / "tokenizer_config.json").write_text(json.dumps(names | {"unk_token": "<unk>"}))
 
 
 MAKERS = {

@@ -7,7 +7,7 @@ from typing import Literal
 from splatseg.core import Model, Scene
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
-from splatseg.io.evidence import RENDERS_FOLDER
+from splatseg.io.evidence import RENDERS_FOLDER, EvidenceKind
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
@@ -174,10 +174,10 @@ def _model(
         model = asked
     name = asked if isinstance(asked, str) else model.name
     if isinstance(model, AnyRecorded) and isinstance(asked, str):
-        kind = options.what[0] if options.what in (("masks",), ("depth",)) else None
+        told: dict[tuple[What, ...], EvidenceKind] = {("masks",): "masks", ("depth",): "depth"}
         return recorded_model(
             name,
-            kind=kind,
+            kind=told.get(options.what),
             zero_is_class=options.zero_is_class,
             void=options.void,
             suffix=options.suffix,
