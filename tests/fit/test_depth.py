@@ -8,11 +8,12 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Camera, PointCloud, View
+from splatseg.core import Camera, DepthMap, PointCloud, View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.fit import FitOptions, fit
 from splatseg.fit._depth import DepthMaps, aligned_inverse
 from splatseg.io.depths import load_depth
+from splatseg.io.evidence import save_depth_map
 from splatseg.render import render
 
 OPTIONS = FitOptions(minutes=None, steps=1, depth="metric", depth_weight=0.5)
@@ -181,3 +182,31 @@ def test_depth_maps_make_the_depth_right(photograph, scene_photographed, kind: s
     # Start points on the surface leave less to settle than wrong ones.
     most = 0.93 if kind == "metric" else 0.97
     assert errors[1] < most * errors[0], errors
+
+
+def _evidence_maps(folder: Path, truth: np.ndarray, kind: str, **changes) -> DepthMaps:
+    """Maps of a view whose depths are an npz of evidence, with points on the surface."""
+    camera = _camera(truth.shape[1], truth.shape[0])
+    z = torch.from_numpy(truth)
+    points = camera.unproject(camera.pixel_centres().reshape(-1, 2), z.reshape(-1).double())
+    values = truth if kind == "metric" else 7 / truth + 3
+    save_depth_map(DepthMap(values=torch.from_numpy(values).float(), kind=kind), folder, "one")
+    view = View(name="one", camera=camera, depth=folder / "one.npz", depth_unit=1.0)
+    options = replace(OPTIONS, **changes)
+    return DepthMaps([view], points=points.float(), options=options, where=str(folder))
+
+
+def test_evidence_tells_what_it_is(tmp_path: Path, rng: np.random.Generator) -> None:
+    """The same surfaces as metres, as metres that count as relative, and as inverse depth."""
+    depth = rng.uniform(2, 9, (6, 8)).round(1)
+    losses = {}
+    for kind, use in (("metric", "metric"), ("metric", "relative"), ("relative", "relative")):
+        maps = _evidence_maps(tmp_path, depth, kind, depth=use)
+        drawn, alpha = torch.from_numpy(depth).float() * 1.1, torch.ones(6, 8)
+        losses[kind, use] = maps.loss(0, drawn, alpha, progress=0.0).value
+        exact = maps.loss(0, torch.from_numpy(depth).float(), alpha, progress=0.0).value
+        assert exact < 0.03 * losses[kind, use], "the points and the map agree"
+    first = losses["metric", "metric"]
+    assert list(losses.values()) == pytest.approx([first] * 3, rel=0.03)
+    with pytest.raises(InputError, match=r"expected metric depth maps, got relative ones \(view"):
+        _evidence_maps(tmp_path, depth, "relative", depth="metric")

@@ -176,6 +176,7 @@ def valid(world: World) -> dict[str, Any]:
         core.Features: core.Features(values=torch.ones(COUNT, 2)),
         core.MaskSet: core.MaskSet.from_dense(mask[None]),
         core.LabelMap: LabelMap(ids=ids),
+        core.DepthMap: core.DepthMap(values=torch.ones(6, 8), kind="metric"),
         core.FeatureMap: core.FeatureMap(
             features=torch.ones(3, 4, 2), stride=3, height=9, width=12
         ),

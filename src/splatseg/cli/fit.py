@@ -110,8 +110,13 @@ class Command:
     or the alpha channel of photographs, cut out what is wanted; the rest is empty. off: nothing."""
 
     depth: Literal["off", "metric", "relative"] = _DEFAULT.depth
-    """What to learn from the capture's depth maps. metric: they hold z-depth. relative: inverse
-    depth of unknown scale and shift, as networks guess it from one photograph."""
+    """What to learn from the capture's depth maps, or from --depth-evidence. metric: they hold
+    z-depth. relative: inverse depth of unknown scale and shift, as networks guess it from one
+    photograph."""
+
+    depth_evidence: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_NAME")] = None
+    """Evidence of depth, as see --what depth writes it, instead of the capture's depth maps: a
+    folder, or its name in DATA or in a scene that SCENE replaces."""
 
     refine_poses: bool = _DEFAULT.refine_poses
     """Correct the poses of training views while fitting."""
@@ -148,6 +153,7 @@ def run(command: Command) -> None:
             checkpoint_steps=command.checkpoint_steps,
             keep_checkpoint=command.keep_checkpoint,
             preset=command.preset,
+            depth_evidence=command.depth_evidence,
         ),
         fit_options=_options(command),
         backend=command.backend,

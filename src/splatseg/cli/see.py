@@ -47,8 +47,8 @@ class Command:
     """Name of the evidence to write."""
 
     what: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ..")] = ()
-    """What to ask the model for: masks, labels, panoptic, features, text. Without it what the
-    model has, masks before the others. Of several, by comma or by space, each further one is
+    """What to ask the model for: masks, labels, panoptic, features, text, depth. Without it what
+    the model has, masks before the others. Of several, by comma or by space, each further one is
     written to NAME.WHAT, and each image passes the network once."""
 
     views: tuple[str, ...] = ("train",)
@@ -73,6 +73,10 @@ class Command:
     of their annotations, with -train behind it for the ids from 0 that networks learn; or a
     JSON file with "classes" (id, name, isthing, colour), where 0 is a class if it is called so.
     Pictures in a table's colours are read by it."""
+
+    depth_unit: float | None = None
+    """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
+    Without it those are relative: inverse depth up to a scale and a shift."""
 
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder where the model's answers are kept by the content of the photographs, for other

@@ -11,6 +11,8 @@ from splatseg.core.camera import CameraModel as CameraModel
 from splatseg.core.edited import Edited as Edited
 from splatseg.core.edited import apply_rows as apply_rows
 from splatseg.core.evidence import UNLABELLED as UNLABELLED
+from splatseg.core.evidence import DepthKind as DepthKind
+from splatseg.core.evidence import DepthMap as DepthMap
 from splatseg.core.evidence import FeatureMap as FeatureMap
 from splatseg.core.evidence import LabelMap as LabelMap
 from splatseg.core.evidence import MaskSet as MaskSet
@@ -44,6 +46,7 @@ from splatseg.core.layers import Selection as Selection
 from splatseg.core.models import AutomaticMasks as AutomaticMasks
 from splatseg.core.models import Boxes as Boxes
 from splatseg.core.models import DeepFeatures as DeepFeatures
+from splatseg.core.models import DenseDepth as DenseDepth
 from splatseg.core.models import DenseFeatures as DenseFeatures
 from splatseg.core.models import Embedding as Embedding
 from splatseg.core.models import GroundedBoxes as GroundedBoxes

@@ -1,14 +1,15 @@
-"""What 2D models see in one view: masks, label maps, feature maps."""
+"""What 2D models see in one view: masks, label maps, feature maps, depth maps."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_choice, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.late import preview
 from splatseg.core.rle import Rle
@@ -16,6 +17,9 @@ from splatseg.errors import RangeError, ShapeError
 
 UNLABELLED = -1
 """The id of a pixel or Gaussian without a label. Files write it as 0."""
+
+DepthKind = Literal["metric", "relative"]
+"""Metric depth is z-depth in metres; relative is inverse depth up to a scale and a shift."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,6 +156,44 @@ class FeatureMap:
     def channels(self) -> int:
         """Width of a feature."""
         return int(self.features.shape[2])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthMap:
+    """How far the surfaces of one view are, as a network guesses it or a sensor measures it."""
+
+    values: Float[Tensor, "height width"]
+    """Not negative; 0 where nothing is known, and in relative maps for what is infinitely far."""
+
+    kind: DepthKind
+    """metric: z-depth in metres (`docs/conventions.md`). relative: inverse depth up to a scale and
+    a shift, which are other ones in each view."""
+
+    confidence: Float[Tensor, "height width"] | None = None
+    """Confidence of the values, in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_choice("kind", self.kind, ("metric", "relative"))
+        check_shape("values", self.values, (None, None))
+        check_values("values", self.values, 0.0, math.inf)
+        if self.confidence is not None:
+            check_shape("confidence", self.confidence, tuple(self.values.shape))
+            check_values("confidence", self.confidence, 0.0, 1.0)
+
+    def __repr__(self) -> str:
+        known = float((self.values > 0).float().mean()) if self.values.numel() else 0.0
+        return f"DepthMap({self.kind}, {self.width}x{self.height} pixels, {known:.0%} known)"
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.values.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Pixels a row."""
+        return int(self.values.shape[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

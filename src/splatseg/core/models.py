@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.evidence import FeatureMap, LabelMap, MaskSet, Segment
+from splatseg.core.evidence import DepthMap, FeatureMap, LabelMap, MaskSet, Segment
 from splatseg.core.scene import ClassTable
 from splatseg.errors import InputError, RangeError
 
@@ -256,6 +256,15 @@ class DenseFeatures(Model, Protocol):
 
     def features(self, image: Image) -> DeepFeatures:
         """Features of an image."""
+        ...
+
+
+@runtime_checkable
+class DenseDepth(Model, Protocol):
+    """Tells how far the surface at every pixel is."""
+
+    def depth_map(self, image: Image) -> DepthMap:
+        """The depth of every pixel: metric, or relative."""
         ...
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from splatseg.core import Camera, View
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
-from splatseg.io.depths import load_depth
+from splatseg.io.depths import depth_kind, load_depth
 from splatseg.render.warp import Warp, undistorted_camera
 
 _FINAL_WEIGHT = 0.01
@@ -52,11 +52,13 @@ class DepthMaps:
         points: Points on the surfaces, to which relative maps are aligned.
         options: ``metric`` maps hold z-depth. ``relative`` ones hold inverse depth up to a scale
             and a shift of each view, as monocular depth networks predict it; the points in view
-            determine both (see `aligned_inverse`).
+            determine both (see `aligned_inverse`). Evidence tells which of them it is: its metric
+            maps may be taken as relative ones, by their inverse, but not the other way round.
         where: Prefix of messages.
 
     Raises:
-        InputError: If no view has a depth map, or relative maps have no points to align to.
+        InputError: If no view has a depth map, relative maps have no points to align to, or
+            metric ones are asked for and evidence is relative.
     """
 
     def __init__(
@@ -74,6 +76,13 @@ class DepthMaps:
             )
         self._views = tuple(views)
         self._relative = options.depth == "relative"
+        self._kinds = [None if view.depth is None else depth_kind(view.depth) for view in views]
+        if not self._relative and "relative" in self._kinds:
+            name = views[self._kinds.index("relative")].name
+            raise InputError(
+                f"{where}: expected metric depth maps, got relative ones (view {name!r}); "
+                "depth relative takes them."
+            )
         self._weight = options.depth_weight
         self._points: Tensor | None = None
         if self._relative:
@@ -128,16 +137,21 @@ class DepthMaps:
         """Inverse depth in one over scene units (0 is unknown) and the median depth."""
         if index not in self._maps:
             view = self._views[index]
-            self._maps[index] = None if view.depth is None else self._read(view)
+            metric = self._kinds[index] == "metric"
+            found = None if view.depth is None else self._read(view, inverted=metric)
+            self._maps[index] = found
         return self._maps[index]
 
-    def _read(self, view: View) -> tuple[Tensor, float] | None:
+    def _read(self, view: View, *, inverted: bool) -> tuple[Tensor, float] | None:
+        """The map of a view; of a relative one whether its file has the inverse of what it says."""
         values = load_depth(view)
         if not view.camera.is_pinhole:
             values = _undistorted_map(values, view.camera)
         if self._points is None:
             inverse = torch.where(values > 0, 1 / values.clamp_min(1e-12), 0.0)
         else:
+            if inverted:
+                values = torch.where(values > 0, 1 / values.clamp_min(1e-12), 0.0)
             aligned = aligned_inverse(values, view.camera, self._points)
             if aligned is None:
                 return None

@@ -152,7 +152,7 @@ class FitOptions:
     """Weight of the squares of log gains and biases of a view in the loss."""
 
     depth: Literal["off", "metric", "relative"] = "off"
-    """Depth supervision by the capture's depth maps. metric: they hold z-depth. relative: inverse
+    """Depth supervision by the views' depth maps. metric: they hold z-depth. relative: inverse
     depth up to a scale and a shift per view, which are found from the start points."""
 
     depth_weight: float = 0.2

@@ -17,11 +17,12 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from splatseg._check import check_choice
-from splatseg.core import FeatureMap, LabelMap, MaskSet
+from splatseg.core import DepthMap, FeatureMap, LabelMap, MaskSet
 from splatseg.core.boundary import convert_fields
 from splatseg.core.models import (
     AutomaticMasks,
     DeepFeatures,
+    DenseDepth,
     DenseFeatures,
     Embedding,
     Image,
@@ -107,6 +108,10 @@ class ModelCache:
     def text_features(self, model: TextFeatures, image: Image) -> FeatureMap:
         """`TextFeatures.text_features`."""
         return self._ask("text", model, image, lambda: model.text_features(image))
+
+    def depth_map(self, model: DenseDepth, image: Image) -> DepthMap:
+        """`DenseDepth.depth_map`."""
+        return self._ask("depth", model, image, lambda: model.depth_map(image))
 
     def embed(self, model: PromptableMasks, image: Image) -> Embedding:
         """`PromptableMasks.embed`."""

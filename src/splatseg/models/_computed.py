@@ -13,6 +13,7 @@ from splatseg.core import ClassTable, FeatureMap, LabelMap, View
 from splatseg.core.models import (
     AutomaticMasks,
     BatchedModel,
+    DenseDepth,
     DenseFeatures,
     Image,
     Model,
@@ -24,6 +25,7 @@ from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import (
     SEGMENTS_FILE,
     EvidenceKind,
+    save_depth_map,
     save_features,
     save_label_map,
     save_masks,
@@ -41,6 +43,7 @@ _PROTOCOLS: dict[What, type[Any]] = {
     "labels": SemanticLabels,
     "text": TextFeatures,
     "features": DenseFeatures,
+    "depth": DenseDepth,
 }
 _KINDS: dict[What, EvidenceKind] = {
     "masks": "masks",
@@ -48,6 +51,7 @@ _KINDS: dict[What, EvidenceKind] = {
     "labels": "labels",
     "text": "features",
     "features": "features",
+    "depth": "depth",
 }
 
 
@@ -194,6 +198,10 @@ class _Computed(Source):
             save_label_map(ids, folder, view.name)
         elif self.asked == "panoptic":
             self._write_panoptic(folder, view, image)
+        elif self.asked == "depth":
+            depth = self._ask(ModelCache.depth_map, self.model.depth_map, image)
+            self._check_size(view, depth.height, depth.width)
+            save_depth_map(depth, folder, view.name)
         elif self.asked == "features":
             deep = self._ask(ModelCache.features, self.model.features, image)
             self._write_features(folder, view, deep.maps[-1])

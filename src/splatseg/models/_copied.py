@@ -22,6 +22,7 @@ from splatseg.io.evidence import (
     TrackedEvidence,
     check_map_sizes,
     read_id_map,
+    save_depth_map,
     save_features,
     save_label_map,
     save_masks,
@@ -42,6 +43,7 @@ _ASKED: Mapping[str, tuple[EvidenceKind, ...]] = {
     "panoptic": ("panoptic",),
     "features": ("features",),
     "text": ("features",),
+    "depth": ("depth",),
 }
 
 
@@ -185,6 +187,9 @@ class _Copied(Source):
         if isinstance(evidence, FeatureEvidence):
             self._write_features(evidence, folder, view)
             return 0
+        if evidence.kind == "depth":
+            self._write_depth(folder, view)
+            return 0
         maps = (
             evidence.maps if isinstance(evidence, (PanopticEvidence, TrackedEvidence)) else evidence
         )
@@ -212,7 +217,7 @@ class _Copied(Source):
                 f"{len(self.empty)} masks without a pixel were left out (in {some(views)})."
             )
         if self.bare:
-            what = "mask" if self.evidence.kind == "masks" else "label"
+            what = {"masks": "mask", "depth": "depth"}.get(self.evidence.kind, "label")
             notes.append(f"{len(self.bare)} views have no {what} at all ({some(self.bare)}).")
         if self.enlarged:
             sizes = some(sorted(set(self.enlarged)))
@@ -241,6 +246,18 @@ class _Copied(Source):
         columns = ((torch.arange(width) + 0.5) * ids.width / width).long()
         confidence = None if ids.confidence is None else ids.confidence[rows][:, columns]
         return LabelMap(ids=ids.ids[rows][:, columns], confidence=confidence)
+
+    def _write_depth(self, folder: Path, view: View) -> None:
+        """A depth map at its own size: between an object and its background there is no depth."""
+        depth = self.evidence.depth_map(view.name)
+        try:
+            camera_of_map(view, depth.height, depth.width)
+        except ShapeError:
+            size = (view.camera.height, view.camera.width)
+            check_size(self.evidence, view.name, (depth.height, depth.width), size)
+        if not bool((depth.values > 0).any()):
+            self.bare.append(view.name)
+        save_depth_map(depth, folder, view.name)
 
     def _note_ids(self, ids: LabelMap) -> None:
         table = self.evidence.classes if isinstance(self.evidence, LabelEvidence) else None

@@ -26,19 +26,24 @@ class Normalisation:
     std: tuple[float, float, float] = IMAGENET[1]
 
     @classmethod
-    def of(cls, folder: Path) -> "Normalisation":
-        """The one that the weights' preprocessor_config.json says; ImageNet's where there is none.
+    def of(cls, folder: Path, *, otherwise: "Normalisation | None" = None) -> "Normalisation":
+        """The one that the weights' preprocessor_config.json says.
+
+        Args:
+            folder: The weights.
+            otherwise: What holds where it says none; None is ImageNet's.
 
         Raises:
             FileFormatError: If it does not hold three numbers each.
         """
         path = folder / "preprocessor_config.json"
+        known = otherwise or cls()
         if not path.is_file():
-            return cls()
+            return known
         content = read_json(path)
         return cls(
-            mean=_three(path, content, "image_mean", IMAGENET[0]),
-            std=_three(path, content, "image_std", IMAGENET[1]),
+            mean=_three(path, content, "image_mean", known.mean),
+            std=_three(path, content, "image_std", known.std),
         )
 
 
@@ -119,8 +124,12 @@ def network_input(
     device: torch.device,
     dtype: torch.dtype,
     mode: Literal["bilinear", "bicubic"] = "bilinear",
+    padding: Literal["mean", "black"] = "mean",
 ) -> Float[Tensor, "images 3 height width"]:
-    """Images of one size as a batch: resized with antialiasing, normalised, padded with zeros."""
+    """Images of one size as a batch: resized with antialiasing, normalised, padded.
+
+    Padding is of the mean colour, which is 0 after normalisation, or black before it.
+    """
     batch = torch.stack([image.permute(2, 0, 1) for image in images]).to(device).float()
     inner = (frame.inner_height, frame.inner_width)
     if batch.shape[-2:] != inner:
@@ -130,7 +139,10 @@ def network_input(
     batch = (batch - mean) / std
     below, right = frame.outer_height - inner[0], frame.outer_width - inner[1]
     if below or right:
+        lacking = F.pad(torch.zeros_like(batch[:1, :1]), (0, right, 0, below), value=1)
         batch = F.pad(batch, (0, right, 0, below))
+        if padding == "black":
+            batch = torch.where(lacking > 0, -mean / std, batch)
     return batch.to(dtype)
 
 

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_finite
-from splatseg.core import FeatureMap, LabelMap, MaskSet, Rle, Segment
+from splatseg.core import DepthMap, FeatureMap, LabelMap, MaskSet, Rle, Segment
 from splatseg.core.models import DeepFeatures, Embedding, Panoptic
 from splatseg.errors import FileFormatError
 
 Precision = Literal["float16", "int8"]
-Answer = MaskSet | LabelMap | Panoptic | FeatureMap | DeepFeatures | Embedding
+Answer = MaskSet | LabelMap | Panoptic | FeatureMap | DeepFeatures | DepthMap | Embedding
 """What can be cached."""
 
 Arrays = dict[str, NDArray[Any]]
@@ -75,6 +75,16 @@ def _pack(answer: Answer, at: str, precision: Precision, arrays: Arrays) -> dict
             "depths": list(answer.depths),
             "token": answer.class_token is not None,
         }
+    if isinstance(answer, DepthMap):
+        # As evidence has it, whatever the precision of features is.
+        _pack_floats("depth", answer.values, f"{at}depth", "float16", arrays)
+        if answer.confidence is not None:
+            _pack_floats("confidence", answer.confidence, f"{at}confidence", "float16", arrays)
+        return {
+            "type": "depth",
+            "kind": answer.kind,
+            "confidence": answer.confidence is not None,
+        }
     for name, tensor in answer.arrays.items():
         if tensor.is_floating_point():
             _pack_floats(f"embedding {name!r}", tensor, f"{at}array.{name}", "float16", arrays)
@@ -126,6 +136,11 @@ def _unpack(header: dict[str, Any], at: str, arrays: Arrays) -> Any:
             maps=tuple(_unpack(m, f"{at}map{i}.", arrays) for i, m in enumerate(header["maps"])),
             depths=tuple(header["depths"]),
             class_token=_unpack_floats(f"{at}token", arrays) if header["token"] else None,
+        )
+    if kind == "depth":
+        sure = _unpack_floats(f"{at}confidence", arrays) if header["confidence"] else None
+        return DepthMap(
+            values=_unpack_floats(f"{at}depth", arrays), kind=header["kind"], confidence=sure
         )
     if kind != "embedding":
         raise FileFormatError(f"cache: expected what a model gives, got {kind!r}.")

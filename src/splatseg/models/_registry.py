@@ -29,6 +29,14 @@ _OWN = {
     "dino": f"{_NETWORKS}.dino:DINO",
     "dinov2": f"{_NETWORKS}.dino:DINOV2",
     "dinov3": f"{_NETWORKS}.dino:DINOV3",
+    "maskformer": f"{_NETWORKS}.segmenters:MASKFORMER",
+    "mask2former": f"{_NETWORKS}.segmenters:MASK2FORMER",
+    "oneformer": f"{_NETWORKS}.segmenters:ONEFORMER",
+    "eomt": f"{_NETWORKS}.segmenters:EOMT",
+    "segformer": f"{_NETWORKS}.semantic:SEGFORMER",
+    "dpt-semantic": f"{_NETWORKS}.semantic:DPT_SEMANTIC",
+    "depth-anything": f"{_NETWORKS}.depth:DEPTH_ANYTHING",
+    "dpt": f"{_NETWORKS}.depth:DPT",
 }
 
 

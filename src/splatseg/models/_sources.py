@@ -9,7 +9,7 @@ from splatseg.core import ClassTable, MaskSet, View
 from splatseg.errors import FileFormatError
 from splatseg.io.evidence import Evidence, EvidenceKind, open_evidence, read_id_map, view_files
 
-What = Literal["masks", "labels", "panoptic", "features", "text"]
+What = Literal["masks", "labels", "panoptic", "features", "text", "depth"]
 """What a model can be asked for."""
 
 SEGMENT_PARTS = ".segments"
@@ -90,8 +90,9 @@ def _is_map(path: Path) -> bool:
 
 
 def _is_readable(evidence: Evidence, name: str) -> bool:
+    asked = {"masks": evidence.masks, "depth": evidence.depth_map}
     try:
-        _ = evidence.masks(name) if evidence.kind == "masks" else evidence.features(name)
+        asked.get(evidence.kind, evidence.features)(name)
     except FileFormatError:
         return False
     return True

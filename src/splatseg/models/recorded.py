@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import ClassTable, LabelMap, View
+from splatseg.core import ClassTable, DepthMap, LabelMap, View
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image, Panoptic
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
+    DepthEvidence,
     EvidenceKind,
     FeatureEvidence,
     PanopticEvidence,
@@ -27,7 +28,7 @@ from splatseg.models._recorded_features import (
     RecordedTextFeatures,
     recorded_words,
 )
-from splatseg.models._recording import RecordedMaskModel
+from splatseg.models._recording import RecordedMaskModel, RecordedModel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,6 +82,15 @@ class RecordedTracks(RecordedMaskModel):
             yield name, self.recorded_label_map(image, name)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordedDepth(RecordedModel):
+    """Recorded depth maps."""
+
+    def depth_map(self, image: Image, *, view: str | None = None) -> DepthMap:
+        """The recorded depth map of the view, at its own size."""
+        return self.evidence.depth_map(self.view_of(image, view))
+
+
 AnyRecorded = (
     RecordedMasks
     | RecordedLabels
@@ -88,6 +98,7 @@ AnyRecorded = (
     | RecordedTracks
     | RecordedFeatures
     | RecordedTextFeatures
+    | RecordedDepth
 )
 """What `recorded_model` gives, by the kind of evidence."""
 
@@ -102,6 +113,7 @@ def recorded_model(
     void: int | None = None,
     suffix: str = "",
     classes: str | None = None,
+    depth_unit: float | None = None,
 ) -> AnyRecorded:
     """The model that a folder of recorded evidence stands for.
 
@@ -109,13 +121,14 @@ def recorded_model(
     beside it and its vectors are as wide as the features; else `RecordedFeatures`.
 
     Args:
-        folder: The folder: label maps, panoptic, tracked, masks or features.
+        folder: The folder: label maps, panoptic, tracked, masks, features or depth maps.
         views: Views whose photographs an image is compared with where no view is named.
         kind: As for `open_evidence`.
         zero_is_class: As for `open_evidence`.
         void: As for `open_evidence`.
         suffix: As for `open_evidence`.
         classes: As for `open_evidence`.
+        depth_unit: As for `open_evidence`.
 
     Raises:
         MissingFileError: If there is no such folder.
@@ -123,14 +136,18 @@ def recorded_model(
         FileFormatError: If a table in it is broken.
     """
     evidence = open_evidence(
-        folder, zero_is_class=zero_is_class, void=void, kind=kind, suffix=suffix, classes=classes
-    )
+        folder, zero_is_class=zero_is_class, void=void, kind=kind, suffix=suffix, classes=classes,
+        depth_unit=depth_unit,
+    )  # fmt: skip
     if not evidence.view_names:
         raise InputError(f"{evidence.folder}: expected evidence of at least one view, got none.")
     by_content = ViewsByContent(tuple(views))
     reading: dict[str, Any] = {"zero_is_class": zero_is_class, "void": void}
     reading |= {"suffix": suffix} if suffix else {}
     reading |= {"classes": classes} if classes else {}
+    reading |= {} if depth_unit is None else {"depth_unit": depth_unit}
+    if isinstance(evidence, DepthEvidence):
+        return RecordedDepth(evidence=evidence, views=by_content, reading=reading)
     if isinstance(evidence, FeatureEvidence):
         words = recorded_words(evidence)
         if words is not None:

@@ -244,6 +244,9 @@ def _first_view(evidence: Evidence, name: str) -> str:
         features = evidence.features(name)
         rows, columns, channels = features.features.shape
         return f"{rows} x {columns} cells of {features.stride} pixels, {channels} channels"
+    if evidence.kind == "depth":
+        depth = evidence.depth_map(name)
+        return f"{depth.kind} depth on {depth.width}x{depth.height} pixels"
     masks = evidence.masks(name)
     what = "masks" if evidence.kind == "masks" else "ids"
     return f"{len(masks)} {what} on {masks.width}x{masks.height} pixels"

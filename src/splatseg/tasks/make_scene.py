@@ -28,6 +28,7 @@ from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.pose import PoseReport
 from splatseg.render import BackendName
 from splatseg.report.fit_verdict import FitVerdict
+from splatseg.tasks._depth_evidence import with_depth_evidence
 from splatseg.tasks._fit_report import score_and_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._photographs import Poses, capture_of
@@ -57,6 +58,10 @@ class MakeSceneOptions(CheckpointOptions):
 
     preset: str = "default"
     """Name of the preset that the fit's options came from; it is recorded."""
+
+    depth_evidence: str | None = None
+    """Evidence of depth to learn from instead of the capture's own depth maps, with the depth
+    option of the fit: a folder, or its name in the capture or in the scene that is replaced."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
@@ -202,6 +207,13 @@ def _capture(
             seed=fit_options.seed,
             observer=observer,
         )
+    if options.depth_evidence is not None:
+        if fit_options.depth == "off":
+            raise InputError("depth: expected metric or relative with evidence of depth, got off.")
+        capture = with_depth_evidence(
+            capture, options.depth_evidence, scene=folder, depth=fit_options.depth,
+            report=observer.note,
+        )  # fmt: skip
     for note in (*capture.notes, reduction_note(capture.train_views, longest=fit_options.longest)):
         if note is not None:
             observer.note(note)
@@ -270,6 +282,7 @@ def _provenance(
         "interrupted": result.interrupted,
         "seed": fit_options.seed,
         "preset": options.preset,
+        **({} if options.depth_evidence is None else {"depth_evidence": options.depth_evidence}),
         "backend": backend,
         "options": asdict(fit_options),
         **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),

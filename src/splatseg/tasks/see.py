@@ -7,7 +7,7 @@ from typing import Literal
 from splatseg.core import Model, Scene
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
-from splatseg.io.evidence import RENDERS_FOLDER
+from splatseg.io.evidence import RENDERS_FOLDER, EvidenceKind
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
@@ -25,7 +25,7 @@ from splatseg.tasks.scene_parts import views_asked, views_recorded
 
 EVIDENCE_FOLDER = "evidence"
 
-What = Literal["masks", "labels", "panoptic", "features", "text"]
+What = Literal["masks", "labels", "panoptic", "features", "text", "depth"]
 """What a model can be asked for."""
 
 
@@ -58,6 +58,10 @@ class SeeOptions:
     of their annotations, with -train behind it for the ids from 0 that networks learn; or a
     JSON file with "classes" (id, name, isthing, colour), where 0 is a class if it is called so.
     Pictures in a table's colours are read by it."""
+
+    depth_unit: float | None = None
+    """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
+    Without it those are relative: inverse depth up to a scale and a shift."""
 
     cache: Path | None = None
     """Folder where the model's answers are kept by the content of the photographs, for other
@@ -170,18 +174,20 @@ def _model(
         model = asked
     name = asked if isinstance(asked, str) else model.name
     if isinstance(model, AnyRecorded) and isinstance(asked, str):
-        kind = "masks" if options.what == ("masks",) else None
+        told: dict[tuple[What, ...], EvidenceKind] = {("masks",): "masks", ("depth",): "depth"}
         return recorded_model(
             name,
-            kind=kind,
+            kind=told.get(options.what),
             zero_is_class=options.zero_is_class,
             void=options.void,
             suffix=options.suffix,
             classes=options.classes,
+            depth_unit=options.depth_unit,
         )
-    if options.zero_is_class or options.void is not None or options.suffix or options.classes:
+    given = (options.void, options.depth_unit)
+    if options.zero_is_class or given != (None, None) or options.suffix or options.classes:
         raise InputError(
-            "zero_is_class, void, suffix, classes: expected with evidence recorded elsewhere, got "
-            f"model {name}."
+            "zero_is_class, void, suffix, classes, depth_unit: expected with evidence recorded "
+            f"elsewhere, got model {name}."
         )
     return model

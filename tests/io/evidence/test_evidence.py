@@ -467,7 +467,7 @@ def test_the_header_tells_kind_classes_and_version(tmp_path) -> None:
     with pytest.raises(FileFormatError, match="version 1 or less, got version 2"):
         open_evidence(folder)
     with pytest.raises(InputError, match="kind: expected one of labels, panoptic, tracked, masks"):
-        create_evidence(tmp_path / "f", kind="depth")
+        create_evidence(tmp_path / "f", kind="sound")
     with pytest.raises(InputError, match="metadata"):
         create_evidence(tmp_path / "f", kind="labels", metadata={"a": object()})
     assert not (tmp_path / "f").exists()

@@ -133,7 +133,7 @@ def test_classes_and_instances_of_views(bench, data_set, tmp_path, score) -> Non
     assert ours["miou"] == pytest.approx(theirs["mIoU"], abs=1e-6)
     assert ours["fwiou"] == pytest.approx(theirs["fwIoU"], abs=1e-6)
     assert ours["accuracy"] == pytest.approx(theirs["accuracy"], abs=1e-6)
-    assert ours["miou"] > 0.2
+    assert ours["miou"] > 0.1
     instances = predictions / "associate" / scene.name / "instances"
     theirs = score("instances", "--pred", instances, "--truth", tmp_path / "instance")
     ours = found["associate"]["scores"]

@@ -6,7 +6,8 @@ A folder of evidence holds one of
 - panoptic: the same with segments.json, whose ids mean something in one view only;
 - tracked: the same with tracks.json, whose ids go through all views;
 - masks: a JSON of COCO run-length masks a view, an npz, or a folder of pictures;
-- features: an npz a view.
+- features: an npz a view;
+- depth: an npz a view.
 
 In files 0 is void; in memory it is -1. See ``docs/formats.md`` for every byte.
 """
@@ -15,6 +16,7 @@ from splatseg.io.evidence._base import RENDERS_FOLDER as RENDERS_FOLDER
 from splatseg.io.evidence._base import Evidence as Evidence
 from splatseg.io.evidence._base import EvidenceKind as EvidenceKind
 from splatseg.io.evidence._base import view_files as view_files
+from splatseg.io.evidence._depth import DepthEvidence as DepthEvidence
 from splatseg.io.evidence._features import TEXT_FILE as TEXT_FILE
 from splatseg.io.evidence._features import FeatureEvidence as FeatureEvidence
 from splatseg.io.evidence._features import TextEmbeddings as TextEmbeddings
@@ -31,6 +33,7 @@ from splatseg.io.evidence._segments import PanopticEvidence as PanopticEvidence
 from splatseg.io.evidence._segments import TrackedEvidence as TrackedEvidence
 from splatseg.io.evidence._sizes import check_map_sizes as check_map_sizes
 from splatseg.io.evidence._write import create_evidence as create_evidence
+from splatseg.io.evidence._write import save_depth_map as save_depth_map
 from splatseg.io.evidence._write import save_features as save_features
 from splatseg.io.evidence._write import save_label_map as save_label_map
 from splatseg.io.evidence._write import save_masks as save_masks

@@ -8,11 +8,11 @@ from typing import Literal, NoReturn, TypeGuard
 
 from typing_extensions import override
 
-from splatseg.core import ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.core import ClassTable, DepthMap, FeatureMap, LabelMap, MaskSet
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 
-EvidenceKind = Literal["labels", "panoptic", "tracked", "masks", "features"]
+EvidenceKind = Literal["labels", "panoptic", "tracked", "masks", "features", "depth"]
 
 HEADER_FILE = "evidence.json"
 CONFIDENCE_FOLDER = "_confidence"
@@ -83,6 +83,15 @@ class Evidence(ABC):
             InputError: If this kind of evidence has none, or there is no such view.
             FileFormatError: If the file cannot be read as one.
         """
+
+    def depth_map(self, name: str) -> DepthMap:
+        """The depth map of a view.
+
+        Raises:
+            InputError: If this kind of evidence has none, or there is no such view.
+            FileFormatError: If the file cannot be read as one.
+        """
+        refuse(self, "depth")
 
     def render(self, name: str) -> Path | None:
         """The picture that the model saw of a view without a photograph, where it was kept."""

@@ -1,5 +1,6 @@
 """Finds evidence by name and tells its kind."""
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +9,11 @@ from typing import Any, Literal, cast
 from splatseg.core import ClassTable
 from splatseg.core.boundary import boundary
 from splatseg.core.json_values import id_of_key
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, quoted
 from splatseg.io.captures import read_metadata
 from splatseg.io.class_tables import class_table
 from splatseg.io.evidence._base import HEADER_FILE, Evidence, EvidenceKind, view_files
+from splatseg.io.evidence._depth import holds_depth, open_depth
 from splatseg.io.evidence._features import (
     BASIS_FILE,
     QUANTISATION_FILE,
@@ -37,7 +39,7 @@ VERSION = 1
 """Version of the folders written; all versions up to it are read."""
 
 # Folders of a capture that hold what a model saw, as opposed to photographs and truth.
-_PREFIXES = ("labels_", "masks_", "features_")
+_PREFIXES = ("labels_", "masks_", "features_", "depth_")
 _SUFFIX = "_reference"
 # Maps of a capture whose ids are not classes, and the table in metadata.json that names them.
 _TRUTH_TABLES = {"instance": "instances", "part": "parts", "depth": ""}
@@ -52,6 +54,7 @@ def open_evidence(
     kind: EvidenceKind | None = None,
     suffix: str = "",
     classes: str | None = None,
+    depth_unit: float | None = None,
     unfinished: Literal["refuse", "allow"] = "refuse",
 ) -> Evidence:
     """Open a folder of evidence, ours or recorded by others; no view is read yet.
@@ -71,8 +74,11 @@ def open_evidence(
         classes: Names of the ids of label maps, instead of those that the folder tells: a
             table by name or file, see `label_table`. It says what 0 means, and
             gives pictures of colours their ids.
+        depth_unit: Metres of one step of depth maps that are images or ``.npy`` files; None says
+            that those are relative. An npz tells its kind itself.
         kind: What it holds, where its files could be two things; None looks at them. A folder
-            of folders of PNGs is label maps unless SAM's metadata.csv or this says masks.
+            of folders of PNGs is label maps unless SAM's metadata.csv or this says masks; PNGs
+            and ``.npy`` files are depth maps only where this says so.
         unfinished: Whether evidence may be opened whose views are not all there, because
             `splatseg see` was stopped.
 
@@ -95,6 +101,11 @@ def open_evidence(
     if kind is not None and header.get("kind", kind) != kind:
         raise InputError(f"{folder}: expected evidence of {kind}, got {header['kind']}.")
     found: str | None = kind or header.get("kind") or _kind(folder, maps, objects, arrays)
+    if depth_unit is not None and found != "depth":
+        raise InputError(f"depth_unit: goes with depth maps, {folder} has none.")
+    if found == "depth":
+        others = maps or view_files(folder, suffix + ".npy")
+        return open_depth(folder, arrays, others, unit=_metres(depth_unit))
     if found in ("labels", "panoptic", "tracked"):
         soft = bool(maps) and is_soft(next(iter(maps.values())))
         table = _named_table(classes, soft=soft)
@@ -118,9 +129,15 @@ def open_evidence(
     if found == "features":
         return open_features(folder, arrays)
     raise InputError(
-        f"{folder}: expected evidence (PNG label maps, JSON masks or npz features, one a view), "
-        "got a folder of something else."
+        f"{folder}: expected evidence (PNG label maps, JSON masks, npz features or depths, one a "
+        "view), got a folder of something else."
     )
+
+
+def _metres(unit: float | None) -> float | None:
+    if unit is not None and not (math.isfinite(unit) and unit > 0):
+        raise RangeError(f"depth_unit: expected a number of metres above 0, got {unit:g}.")
+    return unit
 
 
 def _label_arrays(folder: Path, suffix: str, arrays: Mapping[str, Path]) -> Mapping[str, Path]:
@@ -197,8 +214,8 @@ def evidence_names(folders: Iterable[Path]) -> tuple[str, ...]:
     """Names of the evidence of scenes and captures, sorted.
 
     Of a scene these are the folders in ``evidence``. Of a capture they are the folders called
-    labels_..., masks_..., features_... or ..._reference; truth and photographs are not
-    evidence.
+    labels_..., masks_..., features_..., depth_... or ..._reference; truth and photographs are
+    not evidence.
     """
     names: set[str] = set()
     for folder in folders:
@@ -259,6 +276,8 @@ def _kind(
         return "features"
     if arrays and holds_masks(next(iter(arrays.values()))):
         return "masks"
+    if arrays and holds_depth(next(iter(arrays.values()))):
+        return "depth"
     return None
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -11,12 +11,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_values
-from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Segment, Track
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    DepthMap,
+    FeatureMap,
+    LabelMap,
+    MaskSet,
+    Segment,
+    Track,
+)
 from splatseg.core.boundary import boundary
 from splatseg.core.view_names import check_view_name
 from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.class_tables import class_rows
+from splatseg.io.depths import DEPTH_NAME
 from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
     HEADER_FILE,
@@ -32,7 +42,7 @@ from splatseg.io.json_files import json_text, write_json
 from splatseg.io.paths import path_inside
 from splatseg.io.write_errors import named_write_failures
 
-_WRITTEN = ("labels", "panoptic", "tracked", "masks", "features")
+_WRITTEN = ("labels", "panoptic", "tracked", "masks", "features", "depth")
 _MAX_ID = 65535
 
 
@@ -51,8 +61,8 @@ def create_evidence(
 
     Args:
         folder: The folder, usually SCENE/evidence/NAME. Its parent must exist.
-        kind: labels, panoptic, tracked, masks or features. The label maps of panoptic and
-            tracked evidence need the table of `save_segments` or `save_tracks` beside them.
+        kind: labels, panoptic, tracked, masks, features or depth. The label maps of panoptic
+            and tracked evidence need the table of `save_segments` or `save_tracks` beside them.
         classes: Names of the ids, where they have some.
         source_ids: The model's own id by id written, where they differ.
         metadata: How it was made, in values that JSON holds.
@@ -195,6 +205,23 @@ def save_features(features: FeatureMap, folder: Path | str, name: str) -> None:
             stride=np.int64(features.stride),
             size=np.array([features.height, features.width], np.int64),
         )
+
+
+@boundary
+def save_depth_map(depth: DepthMap, folder: Path | str, name: str) -> None:
+    """Write a view's depth map as float16, with its kind and confidence.
+
+    Raises:
+        RangeError: If a value is beyond the range of float16 (65504).
+    """
+    half = depth.values.detach().cpu().to(torch.float16)
+    check_finite(f"{name}: depth as float16", half)
+    arrays: dict[str, NDArray[Any]] = {DEPTH_NAME: half.numpy(), "kind": np.array(depth.kind)}
+    if depth.confidence is not None:
+        arrays["confidence"] = depth.confidence.detach().cpu().to(torch.float16).numpy()
+    path = _view_path(Path(folder), name, ".npz")
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **cast(dict[str, Any], arrays))
 
 
 def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Path:

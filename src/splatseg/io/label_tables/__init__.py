@@ -38,7 +38,7 @@ class LabelTable:
     @property
     def void_channel(self) -> int | None:
         """The channel of soft maps that is of no class: 0, where the table calls it so."""
-        named = any(row.id == 0 and _is_void(row.name) for row in self.classes.rows)
+        named = any(row.id == 0 and is_void_name(row.name) for row in self.classes.rows)
         return 0 if named else None
 
 
@@ -68,7 +68,7 @@ def label_table(name: str) -> LabelTable:
     table = class_table(content.get("classes"), where=str(path), keep_zero=True)
     zero = next((row.name for row in table.rows if row.id == 0), None)
     return LabelTable(
-        name=name, classes=table, zero_is_class=zero is not None and not _is_void(zero)
+        name=name, classes=table, zero_is_class=zero is not None and not is_void_name(zero)
     )
 
 
@@ -78,7 +78,8 @@ def training_table(name: str) -> LabelTable | None:
     return _training(base) if base in TABLES else None
 
 
-def _is_void(name: str) -> bool:
+def is_void_name(name: str) -> bool:
+    """Whether a table means nothing by a class of this name, such as background or void."""
     return name.lower().startswith(_VOID_NAMES)
 
 

@@ -60,12 +60,14 @@ def configuration(place: Loading, kinds: Sequence[str]) -> dict[str, Any]:
     return content
 
 
-def network(place: Loading, class_name: str, **options: Any) -> Any:
+def network(place: Loading, class_name: str, *, unused: Sequence[str] = (), **options: Any) -> Any:
     """A network with its weights, in evaluation mode, where it is to run.
 
     Args:
         place: The weights.
         class_name: The class of the library.
+        unused: How the names of tensors begin that the class has and no answer needs; published
+            weights may lack them.
         options: For its configuration.
 
     Raises:
@@ -93,6 +95,7 @@ def network(place: Loading, class_name: str, **options: Any) -> Any:
         if bars:
             logger.enable_progress_bar()
     lacking = [str(key) for key in (*about["missing_keys"], *about["mismatched_keys"])]
+    lacking = [key for key in lacking if not key.startswith(tuple(unused))]
     if lacking:
         more = ", ..." if len(lacking) > _SOME else ""
         raise FileFormatError(

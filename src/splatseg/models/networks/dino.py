@@ -50,7 +50,7 @@ class Dino:
     def __init__(self, name: str, options: DinoOptions, place: Loading) -> None:
         classes = _CLASSES[name]
         kind = str(configuration(place, tuple(classes))["model_type"])
-        extra = {"add_pooling_layer": False} if kind == "vit" else {}
+        extra: dict[str, Any] = {"add_pooling_layer": False} if kind == "vit" else {}
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together
