@@ -40,6 +40,7 @@ SLOW = (
     "tasks.make_",
     "tasks.import_scene",
     "tasks.e",
+    "tasks.render_truth",
     "tasks.render_views",
     "tasks.attach_layers",
     "tasks.s",

@@ -63,6 +63,7 @@ SURFACE = {
     "read_capture",
     "read_splats",
     "register_method",
+    "render_truth",
     "render_views",
     "save_label_map",
     "save_layer",

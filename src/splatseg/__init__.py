@@ -97,6 +97,7 @@ if TYPE_CHECKING:
     from splatseg.tasks import fit_capture as fit_capture
     from splatseg.tasks import import_scene as import_scene
     from splatseg.tasks import make_demo as make_demo
+    from splatseg.tasks import render_truth as render_truth
     from splatseg.tasks import render_views as render_views
     from splatseg.tasks import save_segmentation as save_segmentation
     from splatseg.tasks import see as see
@@ -124,7 +125,7 @@ _HOMES = {
         "ExportOptions ImportOptions MakeSceneOptions RenderingOptions SeeOptions "
         "SegmentOptions SharpenSceneOptions attach_layers describe edit_scene evaluate_scene "
         "examine_capture export_scene fit_capture "
-        "import_scene make_demo render_views save_segmentation see segment sharpen_scene"
+        "import_scene make_demo render_truth render_views save_segmentation see segment sharpen_scene"
     ),
 }
 _PACKAGES = frozenset(

@@ -266,6 +266,34 @@ def test_a_thing_before_a_wall_does_not_grow_by_filling() -> None:
     assert areas[0] == areas[1] > 100
 
 
+def test_a_point_far_from_all_others_stays_small() -> None:
+    """It lies between the camera and the wall, 1 away from the nearest other point."""
+    stray = torch.tensor([[0.05, 0.05, 1.0]]).double()
+    cloud = LabelledPoints(
+        points=torch.cat((wall().points, stray)),
+        labels={"side": torch.cat((wall().labels["side"], torch.tensor([8])))},
+        normals=torch.tensor([[0.0, 0, 1]]).expand(len(wall()) + 1, 3),
+    )
+    ids, _ = look(SurfaceField(cloud), camera(), "side")
+    # Spacing 0.1, six neighbours within 0.14: a radius of 3 * 0.6 * 0.14 at depth 1 is 6 pixels.
+    assert 0 < int((ids == 8).sum()) < 150
+
+
+def test_the_plane_of_a_point_at_an_edge_is_that_of_its_neighbours() -> None:
+    """A strip of points askew to the axes shows what it shows with its true normals."""
+    line, width = torch.linspace(-1, 1, 41).double(), torch.linspace(0, 0.5, 11).double()
+    u, v = (part.reshape(-1) for part in torch.meshgrid(line, width, indexing="ij"))
+    axes = torch.linalg.qr(torch.tensor([[1.0, 0.2, 0.1], [0.1, 1, 0.5], [0, -0.6, 1]]).double())[0]
+    points = u[:, None] * axes[0] + v[:, None] * axes[1] + torch.tensor([0.0, 0, 2]).double()
+    cloud = LabelledPoints(points=points, labels={"a": torch.ones(len(points)).int()})
+    given = replace(cloud, normals=axes[2].expand(len(points), 3))
+    depths = [look(SurfaceField(one), camera(), "a")[1] for one in (cloud, given)]
+    assert float((depths[1] > 0).double().mean()) > 0.05
+    both = (depths[0] > 0) & (depths[1] > 0)
+    torch.testing.assert_close(depths[0][both], depths[1][both])
+    assert int(((depths[0] > 0) != (depths[1] > 0)).sum()) < 40
+
+
 def test_points_alone_need_a_radius() -> None:
     one = LabelledPoints(points=torch.tensor([[0.0, 0, 2]]), labels={"a": torch.tensor([3])})
     with pytest.raises(InputError, match="radius: expected a radius for a point without"):

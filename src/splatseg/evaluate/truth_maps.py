@@ -17,6 +17,7 @@ References:
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Self
 
 import torch
@@ -244,7 +245,12 @@ class SurfaceView:
         """Begin to look."""
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """Forget what was seen."""
         self._seen = None
 

@@ -1,6 +1,24 @@
 """One function a format: it writes a small sound file and says which file is damaged and read."""
 
-from support.fuzz.targets import benchmarks, captures, evidence, own, pictures, splats
+from support.fuzz.targets import (
+    benchmarks,
+    captures,
+    evidence,
+    own,
+    pictures,
+    splats,
+    surfaces,
+)
 from support.fuzz.targets.base import TARGETS, Target
 
-__all__ = ["TARGETS", "Target", "benchmarks", "captures", "evidence", "own", "pictures", "splats"]
+__all__ = [
+    "TARGETS",
+    "Target",
+    "benchmarks",
+    "captures",
+    "evidence",
+    "own",
+    "pictures",
+    "splats",
+    "surfaces",
+]
