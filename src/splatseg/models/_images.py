@@ -26,19 +26,24 @@ class Normalisation:
     std: tuple[float, float, float] = IMAGENET[1]
 
     @classmethod
-    def of(cls, folder: Path) -> "Normalisation":
-        """The one that the weights' preprocessor_config.json says; ImageNet's where there is none.
+    def of(cls, folder: Path, otherwise: "Normalisation | None" = None) -> "Normalisation":
+        """The one that the weights' preprocessor_config.json says.
+
+        Args:
+            folder: The weights.
+            otherwise: The one where it says none; None takes ImageNet's.
 
         Raises:
             FileFormatError: If it does not hold three numbers each.
         """
         path = folder / "preprocessor_config.json"
+        known = cls() if otherwise is None else otherwise
         if not path.is_file():
-            return cls()
+            return known
         content = read_json(path)
         return cls(
-            mean=_three(path, content, "image_mean", IMAGENET[0]),
-            std=_three(path, content, "image_std", IMAGENET[1]),
+            mean=_three(path, content, "image_mean", known.mean),
+            std=_three(path, content, "image_std", known.std),
         )
 
 

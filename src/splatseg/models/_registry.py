@@ -29,6 +29,8 @@ _OWN = {
     "dino": f"{_NETWORKS}.dino:DINO",
     "dinov2": f"{_NETWORKS}.dino:DINOV2",
     "dinov3": f"{_NETWORKS}.dino:DINOV3",
+    "clip": f"{_NETWORKS}.clip:CLIP",
+    "siglip2": f"{_NETWORKS}.siglip:SIGLIP2",
 }
 
 
