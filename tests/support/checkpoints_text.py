@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 COLOURS = {"image_mean": [0.4, 0.5, 0.6], "image_std": [0.2, 0.25, 0.3]}
 """Of preprocessor_config.json: no network's own, so a test sees whether it is read."""
 
@@ -113,8 +115,142 @@ def siglip2() -> WithWords:
     return WithWords(model=model, tokenizer=tokenizer, about_images={})
 
 
+def clipseg() -> WithWords:
+    """CLIPSeg of 4 x 4 patches of 16 pixels."""
+    from transformers import CLIPSegConfig, CLIPSegForImageSegmentation
+
+    tokenizer = letters()
+    config = CLIPSegConfig(
+        text_config=_clip_text(tokenizer),
+        vision_config={
+            **_TOWER, "num_hidden_layers": 4, "image_size": 64, "patch_size": 16,
+            "projection_dim": 24,
+        },
+        projection_dim=24, extract_layers=[0, 1, 2], reduce_dim=16, decoder_num_attention_heads=2,
+        decoder_intermediate_size=32, initializer_factor=3.0,
+    )  # fmt: skip
+    model = CLIPSegForImageSegmentation(config)
+    with torch.no_grad():
+        # Of new weights words make no difference, and every pixel is sure.
+        model.decoder.film_mul.weight.mul_(60)
+        model.decoder.transposed_convolution.weight.mul_(0.3)
+    size = {"size": {"height": 64, "width": 64}}
+    return WithWords(model=model, tokenizer=tokenizer, about_images=size)
+
+
+def word_pieces() -> Any:
+    """BERT's tokenizer with a few words and single letters; separators have their own numbers."""
+    from transformers import BertTokenizer
+
+    tokens = [f"[unused{i}]" for i in range(1030)]
+    for i, token in {0: "[PAD]", 100: "[UNK]", 101: "[CLS]", 102: "[SEP]", 103: "[MASK]",
+                     1012: ".", 1029: "?"}.items():  # fmt: skip
+        tokens[i] = token
+    for i, letter in enumerate(string.ascii_lowercase):
+        tokens[200 + i], tokens[300 + i] = letter, f"##{letter}"
+    for i, word in enumerate(("chair", "table", "red", "mug")):
+        tokens[400 + i] = word
+    return BertTokenizer(vocab={token: i for i, token in enumerate(tokens)})
+
+
+def _detector(config_class: Any, model_class: Any) -> WithWords:
+    tokenizer = word_pieces()
+    config = config_class(
+        backbone_config={
+            "model_type": "swin", "image_size": 64, "patch_size": 4, "embed_dim": 16,
+            "depths": [1, 1, 1, 1], "num_heads": [2, 2, 2, 2], "window_size": 4,
+            "out_features": ["stage2", "stage3", "stage4"], "initializer_range": 0.3,
+        },
+        text_config={
+            "model_type": "bert", **_TOWER, "vocab_size": len(tokenizer),
+            "max_position_embeddings": 64, "initializer_range": 0.3,
+        },
+        d_model=32, encoder_layers=1, encoder_ffn_dim=32, encoder_attention_heads=2,
+        decoder_layers=2, decoder_ffn_dim=32, decoder_attention_heads=2, num_queries=12,
+        max_text_len=48, num_feature_levels=4, encoder_n_points=2, decoder_n_points=2,
+        init_std=0.3,
+    )  # fmt: skip
+    size = {"size": {"shortest_edge": 64, "longest_edge": 96}}
+    return WithWords(model=model_class(config), tokenizer=tokenizer, about_images=size)
+
+
+def grounding_dino() -> WithWords:
+    """Grounding DINO with 12 queries."""
+    from transformers import GroundingDinoConfig, GroundingDinoForObjectDetection
+
+    return _detector(GroundingDinoConfig, GroundingDinoForObjectDetection)
+
+
+def mm_grounding_dino() -> WithWords:
+    """Grounding DINO of MMDetection with 12 queries."""
+    from transformers import MMGroundingDinoConfig, MMGroundingDinoForObjectDetection
+
+    return _detector(MMGroundingDinoConfig, MMGroundingDinoForObjectDetection)
+
+
+_SAM3_VISION: dict[str, Any] = {
+    "backbone_config": {
+        "model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 64,
+        "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 112, "patch_size": 14,
+        "window_size": 4, "global_attn_indexes": [1], "pretrain_image_size": 56,
+        "initializer_range": 0.3,
+    },
+    "fpn_hidden_size": 32, "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
+    "initializer_range": 0.3,
+}  # fmt: skip
+_SAM3_PART: dict[str, Any] = {
+    "hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2, "initializer_range": 0.3,
+}  # fmt: skip
+
+
+def _sam3_config(tokenizer: Any) -> Any:
+    from transformers import Sam3Config
+
+    return Sam3Config(
+        vision_config=_SAM3_VISION,
+        text_config={"model_type": "clip_text_model", **_clip_text(tokenizer)}
+        | {"max_position_embeddings": 32, "initializer_factor": 3.0},
+        geometry_encoder_config={**_SAM3_PART, "num_layers": 1},
+        detr_encoder_config={**_SAM3_PART, "num_layers": 1},
+        detr_decoder_config={**_SAM3_PART, "num_layers": 2, "num_queries": 10},
+        mask_decoder_config={"hidden_size": 32, "num_attention_heads": 2, "initializer_range": 0.3},
+        initializer_range=0.3,
+    )
+
+
+def sam3() -> WithWords:
+    """SAM 3's detector of 112 pixels with 10 queries."""
+    from transformers import Sam3Model
+
+    tokenizer = letters()
+    return WithWords(model=Sam3Model(_sam3_config(tokenizer)), tokenizer=tokenizer, about_images={})
+
+
+def sam3_tracker() -> Any:
+    """SAM 3's tracker of 112 pixels."""
+    from transformers import Sam3TrackerConfig, Sam3TrackerModel
+
+    config = Sam3TrackerConfig(
+        vision_config=_SAM3_VISION,
+        prompt_encoder_config={
+            "hidden_size": 32, "image_size": 112, "patch_size": 14, "mask_input_channels": 4,
+        },
+        mask_decoder_config={
+            "hidden_size": 32, "mlp_dim": 32, "num_attention_heads": 4, "iou_head_hidden_dim": 32,
+            "num_hidden_layers": 2,
+        },
+        initializer_range=0.3,
+    )  # fmt: skip
+    return Sam3TrackerModel(config)
+
+
 MAKERS = {
     "clip": clip,
     "siglip": siglip,
     "siglip2": siglip2,
+    "clipseg": clipseg,
+    "grounding_dino": grounding_dino,
+    "mm_grounding_dino": mm_grounding_dino,
+    "sam3": sam3,
+    "sam3_tracker": sam3_tracker,
 }

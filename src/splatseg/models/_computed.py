@@ -181,9 +181,9 @@ class _Computed(Source):
     @override
     def start(self, folder: Path, views: Sequence[View]) -> None:
         # Words change no feature, so other words may be asked for in a later call.
-        if self.asked == "text" and isinstance(self.model, TextFeaturesWithWords):
-            if self.model.words:
-                save_text_embeddings(word_vectors(self.model), folder)
+        knows_words = self.asked == "text" and isinstance(self.model, TextFeaturesWithWords)
+        if knows_words and self.model.words:
+            save_text_embeddings(word_vectors(self.model), folder)
 
     @override
     def write(self, folder: Path, view: View) -> int:

@@ -31,6 +31,10 @@ _OWN = {
     "dinov3": f"{_NETWORKS}.dino:DINOV3",
     "clip": f"{_NETWORKS}.clip:CLIP",
     "siglip2": f"{_NETWORKS}.siglip:SIGLIP2",
+    "clipseg": f"{_NETWORKS}.clipseg:CLIPSEG",
+    "grounding-dino": f"{_NETWORKS}.grounding_dino:GROUNDING_DINO",
+    "langsam": f"{_NETWORKS}.langsam:LANGSAM",
+    "sam3-text": f"{_NETWORKS}.sam3_text:SAM3_TEXT",
 }
 
 

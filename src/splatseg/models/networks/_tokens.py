@@ -93,7 +93,10 @@ class Tokens:
         """
         self._check_lengths([text])
         if not self._tokenizer.is_fast:
-            raise FileFormatError("tokenizer: expected tokenizer.json, got one that tells no places.")
+            raise FileFormatError(
+                "tokenizer: expected one that tells where tokens stand (tokenizer.json), got one "
+                "that does not."
+            )
         found = self._tokenizer(text, return_offsets_mapping=True)["offset_mapping"]
         return [(int(start), int(end)) for start, end in found]
 

@@ -54,7 +54,8 @@ class _SiglipTowers(Towers):
     Its image vector is made by a head: a learned query attends to all tokens and the sum of their
     values passes a residual MLP,
 
-    .. math:: z = \sum_j a_j (W_o (W_v x_j + b_v) + b_o), \quad y = z + \mathrm{MLP}(\mathrm{LN}(z)).
+    .. math:: z = b_o + W_o \sum_j a_j (W_v x_j + b_v), \quad
+        y = z + \mathrm{MLP}(\mathrm{LN}(z)).
 
     A patch gets what the head would give if that token were the only one: then :math:`a_j = 1`
     whatever the query is, so value, output projection and MLP are applied to each token. The same
