@@ -171,7 +171,12 @@ def _detector(config_class: Any, model_class: Any) -> WithWords:
         init_std=0.3,
     )  # fmt: skip
     size = {"size": {"shortest_edge": 64, "longest_edge": 96}}
-    return WithWords(model=model_class(config), tokenizer=tokenizer, about_images=size)
+    model = model_class(config)
+    with torch.no_grad():
+        for name, values in model.named_parameters():
+            if name.endswith("bias") and "class_embed" in name:
+                values.zero_()  # as it begins to learn, nothing fits any word
+    return WithWords(model=model, tokenizer=tokenizer, about_images=size)
 
 
 def grounding_dino() -> WithWords:
@@ -226,22 +231,44 @@ def sam3() -> WithWords:
     return WithWords(model=Sam3Model(_sam3_config(tokenizer)), tokenizer=tokenizer, about_images={})
 
 
+_SAM3_TRACKER: dict[str, Any] = {
+    "vision_config": _SAM3_VISION,
+    "prompt_encoder_config": {
+        "hidden_size": 32, "image_size": 112, "patch_size": 14, "mask_input_channels": 4,
+    },
+    "mask_decoder_config": {
+        "hidden_size": 32, "mlp_dim": 32, "num_attention_heads": 4, "iou_head_hidden_dim": 32,
+        "num_hidden_layers": 2,
+    },
+    "initializer_range": 0.3,
+}  # fmt: skip
+
+
 def sam3_tracker() -> Any:
     """SAM 3's tracker of 112 pixels."""
     from transformers import Sam3TrackerConfig, Sam3TrackerModel
 
-    config = Sam3TrackerConfig(
-        vision_config=_SAM3_VISION,
-        prompt_encoder_config={
-            "hidden_size": 32, "image_size": 112, "patch_size": 14, "mask_input_channels": 4,
-        },
-        mask_decoder_config={
-            "hidden_size": 32, "mlp_dim": 32, "num_attention_heads": 4, "iou_head_hidden_dim": 32,
-            "num_hidden_layers": 2,
-        },
-        initializer_range=0.3,
-    )  # fmt: skip
-    return Sam3TrackerModel(config)
+    return Sam3TrackerModel(Sam3TrackerConfig(**_SAM3_TRACKER))
+
+
+def sam3_video() -> WithWords:
+    """SAM 3 as it is published: detector and tracker in one file."""
+    from transformers import Sam3VideoConfig, Sam3VideoModel
+
+    tokenizer = letters()
+    memory = {
+        "image_size": 112, "memory_attention_hidden_size": 32, "memory_attention_num_layers": 1,
+        "memory_attention_num_attention_heads": 1, "memory_attention_feed_forward_hidden_size": 32,
+        "memory_attention_rope_feat_sizes": [8, 8], "memory_encoder_hidden_size": 32,
+        "memory_encoder_output_channels": 16, "mask_downsampler_embed_dim": 32,
+        "memory_fuser_num_layers": 1, "memory_fuser_embed_dim": 32,
+        "memory_fuser_intermediate_dim": 32,
+    }  # fmt: skip
+    config = Sam3VideoConfig(
+        detector_config=_sam3_config(tokenizer).to_dict(),
+        tracker_config={**_SAM3_TRACKER, **memory},
+    )
+    return WithWords(model=Sam3VideoModel(config), tokenizer=tokenizer, about_images={})
 
 
 MAKERS = {
@@ -253,4 +280,5 @@ MAKERS = {
     "mm_grounding_dino": mm_grounding_dino,
     "sam3": sam3,
     "sam3_tracker": sam3_tracker,
+    "sam3_video": sam3_video,
 }

@@ -55,6 +55,14 @@ _TYPES = {
 }
 """Values of the weights' ``model_type`` by family; those of videos hold the same network."""
 
+_SAM3_PARTS = {
+    r"^tracker_model\.": "",
+    r"^tracker_neck\.": "vision_encoder.neck.",
+    r"^detector_model\.vision_encoder\.backbone\.": "vision_encoder.backbone.",
+}
+"""The tracker's tensors in weights that hold the detector too. The library takes one "tracker_model."
+off by itself, and puts two before the names where it writes such weights."""
+
 _CUT = 0.0
 """Logit above which a pixel is in the mask."""
 
@@ -81,15 +89,16 @@ class Sam:
 
     def __init__(self, name: str, options: SamOptions, place: Loading) -> None:
         convert_fields(options)
-        kind = str(configuration(place, _TYPES[name])["model_type"])
-        kind = kind.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
+        held = str(configuration(place, _TYPES[name])["model_type"])
+        kind = held.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
+        parts = {"key_mapping": _SAM3_PARTS} if held == "sam3_video" else {}
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together
         self._kind = _KINDS[kind]
         self._options = options
         self._place = place
-        self._network = network(place, self._kind.class_name)
+        self._network = network(place, self._kind.class_name, **parts)
         self._size = self._trained_size()
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
