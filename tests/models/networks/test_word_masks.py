@@ -194,31 +194,28 @@ def test_second_weights_that_are_not_there(
 
 
 LOAD = """
-import sys
 from splatseg.models import LoadOptions, find_model
 from splatseg.models.networks.langsam import LangSamOptions
 options = LangSamOptions(words=("chair",), sam_model="sam", sam_weights="tiny/sam")
-loading = LoadOptions(weights="tiny/detector", download=sys.argv[1] == "yes", device="cpu")
+loading = LoadOptions(weights="tiny/detector", download=True, device="cpu")
 print(find_model("langsam", options, loading=loading, report=print).note)
 """
 
 
-def test_second_weights_are_fetched_only_when_asked(checkpoints, tmp_path) -> None:
-    def run(download: str) -> str:
+def test_second_weights_are_fetched_by_the_leave_for_the_first(checkpoints, tmp_path) -> None:
+    def run() -> str:
         environment = {
             **os.environ, "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"),
             "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1",
         }  # fmt: skip
         done = subprocess.run(
-            [sys.executable, "-c", LOAD, download], capture_output=True, text=True, env=environment
+            [sys.executable, "-c", LOAD], capture_output=True, text=True, env=environment
         )
         return done.stdout if not done.returncode else done.stderr.strip().splitlines()[-1]
 
     both = {"tiny/detector": checkpoints("grounding_dino"), "tiny/sam": checkpoints("sam")}
     with local_hub(both) as hub:
-        assert "tiny/detector is not on this machine" in run("no")
-        assert not hub.asked
-        said = run("yes")
+        said = run()
         assert "tiny/detector: fetching " in said
         assert "tiny/sam: fetching " in said
         assert said.endswith("weights tiny/detector\n")

@@ -60,8 +60,8 @@ _SAM3_PARTS = {
     r"^tracker_neck\.": "vision_encoder.neck.",
     r"^detector_model\.vision_encoder\.backbone\.": "vision_encoder.backbone.",
 }
-"""The tracker's tensors in weights that hold the detector too. The library takes one "tracker_model."
-off by itself, and puts two before the names where it writes such weights."""
+"""The tracker's tensors in weights that hold the detector too. The library takes one
+"tracker_model." off by itself, and puts two before the names where it writes such weights."""
 
 _CUT = 0.0
 """Logit above which a pixel is in the mask."""
