@@ -11,6 +11,7 @@ import torch
 
 from splatseg import core, edit, evaluate, pose, selection, synthetic
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, Similarity, View
+from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import GaussianField
 
 COUNT, WIDTH, HEIGHT = 6, 12, 9
@@ -186,6 +187,9 @@ def valid(world: World) -> dict[str, Any]:
         core.ClassTable: table,
         core.PointCloud: core.PointCloud(points=torch.rand(20, 3)),
         core.Prompt: core.Prompt(points=torch.tensor([[3.0, 3.0]])),
+        TextEmbeddings: TextEmbeddings(
+            labels=("chair",), vectors=torch.ones(1, 4), kinds=("class",), target_ids=(-1,)
+        ),
         core.Renderable: GaussianField(world.gaussians, {"things": world.labels}),
         core.LabelSource: Maps(),
         evaluate.Overlaps: overlaps,

@@ -84,7 +84,7 @@ def test_a_box_is_of_the_word_of_which_it_fits_most() -> None:
         ]
     )
     boxes = torch.tensor([[0.5, 0.5, 0.2, 0.4]] * 4)
-    options = GroundingDinoOptions(box_threshold=0.35, text_threshold=0.25)
+    options = GroundingDinoOptions(box_threshold=0.35, text_threshold=0.25, max_overlap=1.0)
     found = found_boxes(probabilities, boxes, [[0], [1, 2]], options, size=(100, 200))
     assert found.words == (1, 0)
     torch.testing.assert_close(found.scores, torch.tensor([0.6, 0.4]))

@@ -159,6 +159,15 @@ def test_words_are_what_the_text_encoder_gives(checkpoints, family, kind) -> Non
     assert found.shape[1] == model.text_features(torch.zeros(20, 20, 3).byte()).channels
 
 
+def test_siglip_reads_lower_case_whatever_its_tokenizer_does(checkpoints, monkeypatch) -> None:
+    model = made(checkpoints, "siglip2", "siglip", template="Look, {}")
+    tokens, read = model._towers._tokens, []
+    of = tokens.of
+    monkeypatch.setattr(tokens, "of", lambda texts, **more: read.extend(texts) or of(texts, **more))
+    model.encode_text(["A Chair"])
+    assert read == ["look, a chair"]
+
+
 @pytest.mark.parametrize(("family", "kind"), KINDS)
 def test_cells_lie_on_whole_pixels_and_feel_their_patch(checkpoints, rng, family, kind) -> None:
     model = made(checkpoints, family, kind, size=96)
