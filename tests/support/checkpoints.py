@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from support import checkpoints_labels
+from support import checkpoints_labels, checkpoints_text
 
 SEED = 7
 _VIT: dict[str, Any] = {
@@ -138,4 +138,5 @@ _MAKERS = {
     "dinov2_with_registers": dinov2_with_registers,
     "dinov3": dinov3,
     **checkpoints_labels.MAKERS,
+    **checkpoints_text.MAKERS,
 }

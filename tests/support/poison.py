@@ -11,6 +11,7 @@ import torch
 
 from splatseg import core, edit, evaluate, pose, selection, synthetic
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, Similarity, View
+from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import GaussianField
 
 COUNT, WIDTH, HEIGHT = 6, 12, 9
@@ -194,6 +195,9 @@ def valid(world: World) -> dict[str, Any]:
         ),
         core.LabelledPoints: core.LabelledPoints(
             points=torch.rand(9, 3), labels={"things": torch.ones(9, dtype=torch.int32)}
+        ),
+        TextEmbeddings: TextEmbeddings(
+            labels=("chair",), vectors=torch.ones(1, 4), kinds=("class",), target_ids=(-1,)
         ),
         core.Renderable: GaussianField(world.gaussians, {"things": world.labels}),
         core.LabelSource: Maps(),

@@ -50,6 +50,7 @@ from splatseg.core.models import DenseDepth as DenseDepth
 from splatseg.core.models import DenseFeatures as DenseFeatures
 from splatseg.core.models import Embedding as Embedding
 from splatseg.core.models import GroundedBoxes as GroundedBoxes
+from splatseg.core.models import GroundedMasks as GroundedMasks
 from splatseg.core.models import MaskTracker as MaskTracker
 from splatseg.core.models import Model as Model
 from splatseg.core.models import Panoptic as Panoptic
@@ -58,6 +59,7 @@ from splatseg.core.models import Prompt as Prompt
 from splatseg.core.models import PromptableMasks as PromptableMasks
 from splatseg.core.models import SemanticLabels as SemanticLabels
 from splatseg.core.models import TextFeatures as TextFeatures
+from splatseg.core.models import TextMasks as TextMasks
 from splatseg.core.renderable import PointLabels as PointLabels
 from splatseg.core.renderable import Renderable as Renderable
 from splatseg.core.renderable import RenderableLayer as RenderableLayer

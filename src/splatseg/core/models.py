@@ -281,6 +281,16 @@ class TextFeatures(Model, Protocol):
         ...
 
 
+@runtime_checkable
+class TextFeaturesWithWords(TextFeatures, Protocol):
+    """Text features by a model that was told which words people will ask for."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Words whose vectors are written beside the features; may be empty."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Boxes:
     """Boxes found for words."""
@@ -306,6 +316,34 @@ class GroundedBoxes(Model, Protocol):
 
     def boxes(self, image: Image, words: Sequence[str]) -> Boxes:
         """Boxes of what the words mean, none where they mean nothing here."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TextMasks:
+    """Masks found for words. Masks of one word, and of several, may overlap."""
+
+    masks: MaskSet
+    """The surest first; `scores` say how sure it is that the word is meant."""
+
+    words: tuple[int, ...]
+    """Index of the word that each mask was found for."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        if len(self.words) != len(self.masks):
+            raise InputError(
+                f"words: expected one for each of the {len(self.masks)} masks, got "
+                f"{len(self.words)}."
+            )
+
+
+@runtime_checkable
+class GroundedMasks(Model, Protocol):
+    """Finds what words mean, to the pixel."""
+
+    def grounded_masks(self, image: Image, words: Sequence[str]) -> TextMasks:
+        """Masks of what the words mean, none where they mean nothing here."""
         ...
 
 

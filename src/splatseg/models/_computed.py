@@ -20,6 +20,7 @@ from splatseg.core.models import (
     PanopticSegments,
     SemanticLabels,
     TextFeatures,
+    TextFeaturesWithWords,
 )
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import (
@@ -30,12 +31,14 @@ from splatseg.io.evidence import (
     save_label_map,
     save_masks,
     save_segments,
+    save_text_embeddings,
 )
 from splatseg.io.images import load_image
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.paths import path_inside
 from splatseg.models._cache import ModelCache
 from splatseg.models._sources import SEGMENT_PARTS, Source, What, some, without_empty
+from splatseg.models._words import word_vectors
 
 _PROTOCOLS: dict[What, type[Any]] = {
     "masks": AutomaticMasks,
@@ -181,7 +184,10 @@ class _Computed(Source):
 
     @override
     def start(self, folder: Path, views: Sequence[View]) -> None:
-        return None
+        # Words change no feature, so other words may be asked for in a later call.
+        knows_words = self.asked == "text" and isinstance(self.model, TextFeaturesWithWords)
+        if knows_words and self.model.words:
+            save_text_embeddings(word_vectors(self.model), folder)
 
     @override
     def write(self, folder: Path, view: View) -> int:

@@ -91,6 +91,9 @@ class Loading:
     report: Callable[[str], None]
     """Told in a sentence what the user should know."""
 
+    download: bool = False
+    """Whether further weights that the model needs may be fetched."""
+
     @property
     def images_together(self) -> int:
         """Images that pass the network together, fewer where memory does not hold them."""

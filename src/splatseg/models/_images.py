@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 import torch.nn.functional as F
@@ -26,25 +26,62 @@ class Normalisation:
     std: tuple[float, float, float] = IMAGENET[1]
 
     @classmethod
-    def of(cls, folder: Path, *, otherwise: "Normalisation | None" = None) -> "Normalisation":
-        """The one that the weights' preprocessor_config.json says.
+    def of(cls, folder: Path, otherwise: "Normalisation | None" = None) -> "Normalisation":
+        """The one that the weights' own settings for images say (`image_settings`).
 
         Args:
             folder: The weights.
-            otherwise: What holds where it says none; None is ImageNet's.
+            otherwise: The one where it says none; None takes ImageNet's.
 
         Raises:
             FileFormatError: If it does not hold three numbers each.
         """
-        path = folder / "preprocessor_config.json"
-        known = otherwise or cls()
-        if not path.is_file():
-            return known
-        content = read_json(path)
+        known = cls() if otherwise is None else otherwise
+        path, content = image_settings(folder)
         return cls(
             mean=_three(path, content, "image_mean", known.mean),
             std=_three(path, content, "image_std", known.std),
         )
+
+
+def image_settings(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """How weights want images, and the file that says so; nothing where none does.
+
+    That is preprocessor_config.json, or a part of processor_config.json where newer programs wrote
+    one file for images and words.
+
+    Raises:
+        FileFormatError: If the file is no JSON object.
+    """
+    path = folder / "preprocessor_config.json"
+    if path.is_file():
+        return path, read_json(path)
+    both = folder / "processor_config.json"
+    part = read_json(both).get("image_processor") if both.is_file() else None
+    return both, cast("dict[str, Any]", part) if isinstance(part, dict) else {}
+
+
+def input_side(folder: Path, name: str, otherwise: int) -> int:
+    """A side of the network's input, pixels, that the weights' settings for images give.
+
+    Args:
+        folder: The weights.
+        name: Which: ``height``, ``shortest_edge`` or ``longest_edge``.
+        otherwise: The side where they say none.
+
+    Raises:
+        FileFormatError: If it is no positive whole number.
+    """
+    path, content = image_settings(folder)
+    size = content.get("size")
+    value = cast("dict[str, Any]", size).get(name) if isinstance(size, dict) else None
+    if value is None:
+        return otherwise
+    if not isinstance(value, int) or value < 1:
+        raise FileFormatError(
+            f"{path}: size: {name}: expected a number of pixels, got {value!r:.40}."
+        )
+    return value
 
 
 def _three(

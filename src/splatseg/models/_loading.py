@@ -1,6 +1,7 @@
 """From what is asked for to weights on this machine, a device and a precision."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 
@@ -12,9 +13,19 @@ _TYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.
 
 
 def loading_of(
-    family: ModelFamily, options: LoadOptions, *, report: Callable[[str], None]
+    family: ModelFamily,
+    options: LoadOptions,
+    *,
+    report: Callable[[str], None],
+    flag: str = "--weights",
 ) -> Loading:
     """The weights of a model, found or fetched, and where it is to run.
+
+    Args:
+        family: The model's family.
+        options: Which weights, and where and how they run.
+        report: Told in a sentence what the user should know.
+        flag: Where the weights are named, for the sentence that they are not there.
 
     Raises:
         BackendError: If there is no such device.
@@ -22,7 +33,7 @@ def loading_of(
         MissingFileError: If the weights are not on this machine and are not to be fetched.
     """
     device = _device(options.device)
-    folder, name = find_weights(family, options, report=report)
+    folder, name = find_weights(family, options, report=report, flag=flag)
     return Loading(
         folder=folder,
         name=name,
@@ -32,6 +43,38 @@ def loading_of(
         batch=options.batch,
         size=options.size,
         report=report,
+        download=options.download,
+    )
+
+
+def second_loading(
+    family: ModelFamily, weights: str | None, place: Loading, *, flag: str
+) -> Loading:
+    """The weights of a second network of a model, found by the same rules as those of the first.
+
+    Args:
+        family: The second network's family.
+        weights: Folder or id of its weights; None takes the default of its family.
+        place: The first network's; the second runs there and in the same precision.
+        flag: Where the weights are named.
+
+    Raises:
+        MissingFileError: If they are not on this machine and are not to be fetched.
+        InputError: If what is named is neither a folder nor an id.
+    """
+    return replace(
+        loading_of(
+            family,
+            LoadOptions(
+                weights=weights,
+                download=place.download,
+                device=str(place.device),
+                batch=place.batch,
+            ),
+            report=place.report,
+            flag=flag,
+        ),
+        dtype=place.dtype,
     )
 
 

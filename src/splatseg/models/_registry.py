@@ -37,6 +37,12 @@ _OWN = {
     "dpt-semantic": f"{_NETWORKS}.semantic:DPT_SEMANTIC",
     "depth-anything": f"{_NETWORKS}.depth:DEPTH_ANYTHING",
     "dpt": f"{_NETWORKS}.depth:DPT",
+    "clip": f"{_NETWORKS}.clip:CLIP",
+    "siglip2": f"{_NETWORKS}.siglip:SIGLIP2",
+    "clipseg": f"{_NETWORKS}.clipseg:CLIPSEG",
+    "grounding-dino": f"{_NETWORKS}.grounding_dino:GROUNDING_DINO",
+    "langsam": f"{_NETWORKS}.langsam:LANGSAM",
+    "sam3-text": f"{_NETWORKS}.sam3_text:SAM3_TEXT",
 }
 
 

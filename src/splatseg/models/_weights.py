@@ -21,9 +21,19 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 def find_weights(
-    family: ModelFamily, options: LoadOptions, *, report: Callable[[str], None]
+    family: ModelFamily,
+    options: LoadOptions,
+    *,
+    report: Callable[[str], None],
+    flag: str = "--weights",
 ) -> tuple[Path, str]:
     """The folder of the weights that are asked for, and what they are called.
+
+    Args:
+        family: The model's family.
+        options: Which weights, and whether they may be fetched.
+        report: Told what is fetched.
+        flag: Where the weights are named, for the sentence that they are not there.
 
     Raises:
         MissingFileError: If they are not on this machine and may not be fetched, or cannot be.
@@ -47,11 +57,11 @@ def find_weights(
     known = next((one for one in family.checkpoints if one.id == asked), None)
     found = _in_cache(asked)
     if found is None and options.download:
-        found = _fetched(asked, report)
+        found = _fetched(asked, report, flag)
     if found is None:
         raise MissingFileError(
             f"weights: {asked} is not on this machine ({_described(known)}); --download fetches "
-            "it, or --weights FOLDER takes a copy."
+            f"it, or {flag} FOLDER takes a copy."
         )
     return found, asked
 
@@ -109,7 +119,7 @@ def _shards(folder: Path) -> set[str]:
     return set(map(str, parts.values())) if isinstance(parts, dict) else set()  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 
-def _fetched(id: str, report: Callable[[str], None]) -> Path:
+def _fetched(id: str, report: Callable[[str], None], flag: str) -> Path:
     """Fetch weights, after saying how much that is and under which licence."""
     hub = _hub()
     try:
@@ -128,7 +138,7 @@ def _fetched(id: str, report: Callable[[str], None]) -> Path:
     except (OSError, hub.errors.HTTPError) as error:
         raise MissingFileError(
             f"weights: {id} cannot be fetched ({type(error).__name__}); is there a network? "
-            "--weights FOLDER takes a copy."
+            f"{flag} FOLDER takes a copy."
         ) from error
 
 

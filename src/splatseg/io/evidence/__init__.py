@@ -39,4 +39,5 @@ from splatseg.io.evidence._write import save_label_map as save_label_map
 from splatseg.io.evidence._write import save_masks as save_masks
 from splatseg.io.evidence._write import save_render as save_render
 from splatseg.io.evidence._write import save_segments as save_segments
+from splatseg.io.evidence._write import save_text_embeddings as save_text_embeddings
 from splatseg.io.evidence._write import save_tracks as save_tracks

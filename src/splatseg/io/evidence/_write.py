@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_values
+from splatseg._check import check_choice, check_finite, check_shape, check_values
 from splatseg.core import (
     UNLABELLED,
     ClassTable,
@@ -23,7 +23,7 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.view_names import check_view_name
-from splatseg.errors import InputError, MissingFileError, RangeError
+from splatseg.errors import InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.class_tables import class_rows
 from splatseg.io.depths import DEPTH_NAME
@@ -33,6 +33,7 @@ from splatseg.io.evidence._base import (
     RENDERS_FOLDER,
     EvidenceKind,
 )
+from splatseg.io.evidence._features import TEXT_FILE, TextEmbeddings
 from splatseg.io.evidence._labels import CONFIDENCE_STEPS
 from splatseg.io.evidence._masks import masks_content
 from splatseg.io.evidence._open import FORMAT, VERSION
@@ -222,6 +223,41 @@ def save_depth_map(depth: DepthMap, folder: Path | str, name: str) -> None:
     path = _view_path(Path(folder), name, ".npz")
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **cast(dict[str, Any], arrays))
+
+
+@boundary
+def save_text_embeddings(embeddings: TextEmbeddings, folder: Path | str) -> None:
+    """Write text_embeddings.npz, in the folder of the features or in the one above it.
+
+    Args:
+        embeddings: Unit vectors of words, in the space of the features.
+        folder: The folder.
+
+    Raises:
+        RangeError: If a value is NaN or infinite.
+        InputError: If a word stands there twice.
+        ShapeError: If there is not one vector, kind and id a word.
+    """
+    count = len(embeddings.labels)
+    check_shape("vectors", embeddings.vectors, (count, None))
+    check_finite("vectors", embeddings.vectors)
+    for name in ("kinds", "target_ids"):
+        if len(getattr(embeddings, name)) != count:
+            raise ShapeError(
+                f"{name}: expected one for each of {count} words, got "
+                f"{len(getattr(embeddings, name))}."
+            )
+    if len(set(embeddings.labels)) != count:
+        raise InputError("labels: expected distinct words, got one more than once.")
+    path = path_inside(Path(folder), TEXT_FILE)
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            labels=np.array(embeddings.labels, np.str_),
+            vectors=embeddings.vectors.detach().cpu().numpy().astype(np.float32),
+            kind=np.array(embeddings.kinds, np.str_),
+            target_id=np.array(embeddings.target_ids, np.int64),
+        )
 
 
 def _view_path(folder: Path, name: str, suffix: str, *, make: bool = True) -> Path:

@@ -33,13 +33,19 @@ class _Kind:
     """How images are laid into the square input."""
 
     default_size: int
+    colours: Normalisation | None = None
+    """What is done to colours where the weights do not say; None is as for ImageNet."""
 
+
+_HALVES = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 
 _KINDS = {
     "sam": _Kind(class_name="SamModel", shape="padded", default_size=1024),
     "sam_hq": _Kind(class_name="SamHQModel", shape="padded", default_size=1024),
     "sam2": _Kind(class_name="Sam2Model", shape="square", default_size=1024),
-    "sam3_tracker": _Kind(class_name="Sam3TrackerModel", shape="square", default_size=1008),
+    "sam3_tracker": _Kind(
+        class_name="Sam3TrackerModel", shape="square", default_size=1008, colours=_HALVES
+    ),
 }
 _TYPES = {
     "sam": ("sam",),
@@ -48,6 +54,14 @@ _TYPES = {
     "sam3": ("sam3_tracker", "sam3_video"),
 }
 """Values of the weights' ``model_type`` by family; those of videos hold the same network."""
+
+_SAM3_PARTS = {
+    r"^tracker_model\.": "",
+    r"^tracker_neck\.": "vision_encoder.neck.",
+    r"^detector_model\.vision_encoder\.backbone\.": "vision_encoder.backbone.",
+}
+"""The tracker's tensors in weights that hold the detector too. The library takes one
+"tracker_model." off by itself, and puts two before the names where it writes such weights."""
 
 _CUT = 0.0
 """Logit above which a pixel is in the mask."""
@@ -75,19 +89,20 @@ class Sam:
 
     def __init__(self, name: str, options: SamOptions, place: Loading) -> None:
         convert_fields(options)
-        kind = str(configuration(place, _TYPES[name])["model_type"])
-        kind = kind.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
+        held = str(configuration(place, _TYPES[name])["model_type"])
+        kind = held.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
+        parts = {"key_mapping": _SAM3_PARTS} if held == "sam3_video" else {}
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together
         self._kind = _KINDS[kind]
         self._options = options
         self._place = place
-        self._network = network(place, self._kind.class_name)
+        self._network = network(place, self._kind.class_name, **parts)
         self._size = self._trained_size()
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
-        self._normalisation = Normalisation.of(place.folder)
+        self._normalisation = Normalisation.of(place.folder, self._kind.colours)
         self._last = LastImages[_Seen](self._encode, resizable=False)
 
     @property
@@ -155,15 +170,15 @@ class Sam:
                 for i in range(len(embedding.arrays))
             ),
         )
-        # One mask for several hints, three for a single point, which says least.
-        several = len(prompt.points) + (prompt.box is not None) + (prompt.mask is not None) > 1
+        # Three masks for a single point, which says least; one for a box, a mask, several hints.
+        vague = len(prompt.points) == 1 and prompt.box is None and prompt.mask is None
         logits, scores = self._decode(
             seen,
             points=prompt.points[None] if len(prompt.points) else None,
             positive=prompt.signs[None],
             box=None if prompt.box is None else prompt.box[None],
             mask=None if prompt.mask is None else prompt.mask[None],
-            multimask=self._options.multimask and not several,
+            multimask=self._options.multimask and vague,
         )
         order = torch.sort(scores[0], descending=True, stable=True).indices
         size = (embedding.height, embedding.width)
@@ -216,11 +231,14 @@ class Sam:
         """Embeddings of images, the one that is coarsest last.
 
         SAM 2 and 3 add that there is no memory of earlier frames. Their own function for it takes
-        only features of one layout in memory, and only one size of the input.
+        only features of one layout in memory, and only one size of the input. SAM 3's encoder makes
+        a map more than its tracker takes, a coarser one: that is left out first, as its tracker of
+        videos does; its function for images adds to that one what it then leaves out.
         """
         if self._kind.shape == "padded":
             return _flat(self._network.get_image_embeddings(batch))
         features = self._network.get_image_features(batch, return_dict=True).fpn_hidden_states
+        features = features[: len(self._network.config.vision_config.backbone_feature_sizes)]
         maps = [one.permute(1, 2, 0) for one in features]
         maps[-1] = maps[-1] + self._network.no_memory_embedding.reshape(1, -1, 1)
         sides = [round(one.shape[2] ** 0.5) for one in maps]

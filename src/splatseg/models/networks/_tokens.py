@@ -1,0 +1,120 @@
+"""Tokenizers: from words to the numbers that a text encoder takes."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from splatseg.errors import FileFormatError, RangeError
+from splatseg.models._family import Loading
+from splatseg.models.networks._library import library
+
+_FILES = (
+    "tokenizer.json",
+    "vocab.json",
+    "merges.txt",
+    "vocab.txt",
+    "tokenizer.model",
+    "spiece.model",
+    "tokenizer_config.json",
+    "special_tokens_map.json",
+    "added_tokens.json",
+)
+"""What a tokenizer is read from, where it is there."""
+
+_VOCABULARIES = ("tokenizer.json", "vocab.json", "vocab.txt", "tokenizer.model", "spiece.model")
+"""One of these holds the tokens. Without any the library makes a tokenizer that knows no word."""
+
+
+class Tokens:
+    """The tokenizer that lies beside a network's weights.
+
+    Args:
+        place: The weights.
+        longest: Most tokens that the network takes, those of begin and end included.
+
+    Raises:
+        FileFormatError: If there is none, or it cannot be read.
+    """
+
+    def __init__(self, place: Loading, *, longest: int) -> None:
+        folder = place.folder
+        if not any((folder / name).is_file() for name in _VOCABULARIES):
+            raise FileFormatError(
+                f"{folder}: expected a tokenizer beside the weights (tokenizer.json), got none."
+            )
+        try:
+            self._tokenizer = library().AutoTokenizer.from_pretrained(
+                folder, local_files_only=True, use_fast=True
+            )
+        except Exception as error:
+            # The library of the tokenizers raises Exception itself for a broken file.
+            words = str(error).strip().splitlines()
+            raise FileFormatError(
+                f"{folder}: the tokenizer cannot be read "
+                f"({words[0][:160] if words else type(error).__name__})."
+            ) from error
+        self._longest = longest
+        self._device = place.device
+        self.digest = _digest(folder)
+        """SHA-256 over the tokenizer's files."""
+
+    def of(self, texts: Sequence[str], *, padded_to: int | None = None) -> dict[str, Any]:
+        """Numbers of texts, as long as the longest of them.
+
+        Args:
+            texts: What is said.
+            padded_to: Tokens that each is filled up to, for networks that learned so.
+
+        Returns:
+            ``input_ids`` and ``attention_mask``, (texts, tokens), on the network's device, and
+            whatever else the tokenizer gives.
+
+        Raises:
+            RangeError: If a text has more tokens than the network takes.
+        """
+        self._check_lengths(texts)
+        padding: dict[str, Any] = (
+            {"padding": True}
+            if padded_to is None
+            else {"padding": "max_length", "max_length": padded_to}
+        )
+        found = self._tokenizer(list(texts), return_tensors="pt", **padding)
+        return {name: values.to(self._device) for name, values in found.items()}
+
+    def spans(self, text: str) -> list[tuple[int, int]]:
+        """Where in a text each of its tokens stands: first character, and the one after the last.
+
+        Both are 0 for a token of begin or end.
+
+        Raises:
+            RangeError: If the text has more tokens than the network takes.
+            FileFormatError: If the tokenizer does not know it.
+        """
+        self._check_lengths([text])
+        if not self._tokenizer.is_fast:
+            raise FileFormatError(
+                "tokenizer: expected one that tells where tokens stand (tokenizer.json), got one "
+                "that does not."
+            )
+        found = self._tokenizer(text, return_offsets_mapping=True)["offset_mapping"]
+        return [(int(start), int(end)) for start, end in found]
+
+    def _check_lengths(self, texts: Sequence[str]) -> None:
+        for text in texts:
+            # Longer than the tokenizer's own limit is news to the library, and an error here.
+            count = len(self._tokenizer(text, verbose=False)["input_ids"])
+            if count > self._longest:
+                raise RangeError(
+                    f"words: expected at most {self._longest} tokens, got {count} for {text!r:.60}."
+                )
+
+
+def _digest(folder: Path) -> str:
+    digest = hashlib.sha256()
+    for name in _FILES:
+        path = folder / name
+        if path.is_file():
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+            digest.update(f"{name}\0{content}\0".encode())
+    return digest.hexdigest()

@@ -1,0 +1,245 @@
+"""Grounding DINO: boxes of what words mean; in its first form and that of MMDetection.
+
+Liu et al. 2023 (arXiv:2303.05499), Zhao et al. 2024 (arXiv:2401.02361).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core.boundary import convert_fields
+from splatseg.core.models import Boxes, Image
+from splatseg.errors import InputError, RangeError
+from splatseg.models._family import Checkpoint, Loading
+from splatseg.models._images import Frame, Normalisation, frame_of, input_side, network_input
+from splatseg.models._mask_generator import Candidates, distinct
+from splatseg.models._words import checked_words
+from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._tokens import Tokens
+
+_CLASSES = {
+    "grounding-dino": "GroundingDinoForObjectDetection",
+    "mm-grounding-dino": "MMGroundingDinoForObjectDetection",
+}
+"""Class of the library by the weights' ``model_type``."""
+
+_SHORTEST, _LONGEST = 800, 1333
+"""Sides of the input where the weights do not say: the shorter one, and the longer at most."""
+
+_SEPARATORS = ".?"
+"""What the network takes for the end of a phrase."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundingDinoOptions:
+    """When a box counts as found, and for which word."""
+
+    box_threshold: float = 0.35
+    """Least probability, in [0, 1], of the token that a box fits best, out of those of its word."""
+
+    text_threshold: float = 0.25
+    """Least probability, in [0, 1], of a token that speaks for its word."""
+
+    max_overlap: float = 0.8
+    """Boxes of one word that overlap more, as IoU in [0, 1], are of one thing; the surest is
+    kept."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        for name in ("box_threshold", "text_threshold", "max_overlap"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise RangeError(f"{name}: expected 0 to 1, got {getattr(self, name)}.")
+
+
+class GroundingDino:
+    """Boxes of what words mean, all words in one pass."""
+
+    def __init__(self, name: str, options: GroundingDinoOptions, place: Loading) -> None:
+        kind = str(configuration(place, tuple(_CLASSES))["model_type"])
+        self.name = name
+        self.note = f"weights {place.name}"
+        self._options = options
+        self._place = place
+        self._network = network(place, _CLASSES[kind])
+        config = self._network.config
+        longest = min(int(config.max_text_len), int(config.text_config.max_position_embeddings))
+        self._tokens = Tokens(place, longest=longest)
+        self._shortest = input_side(place.folder, "shortest_edge", _SHORTEST)
+        self._longest = input_side(place.folder, "longest_edge", _LONGEST)
+        self._normalisation = Normalisation.of(place.folder)
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Options, weights, tokenizer, precision and longer side of the input."""
+        return self.settings_with(self._options)
+
+    @property
+    def default_settings(self) -> Mapping[str, Any]:
+        """The same with default options."""
+        return self.settings_with(GroundingDinoOptions())
+
+    def settings_with(self, options: Any, *, unrecorded: Sequence[str] = ()) -> Mapping[str, Any]:
+        """What changes the answers, with other options."""
+        size = self._place.size or self._longest
+        found = settings_of(options, self._place, size=size, unrecorded=unrecorded)
+        return found | {"tokenizer": self._tokens.digest}
+
+    def boxes(self, image: Image, words: Sequence[str]) -> Boxes:
+        """Boxes of what the words mean, the surest first.
+
+        Raises:
+            InputError: If a word is empty, stands there twice or holds a full stop.
+            RangeError: If the words are more than the network takes.
+        """
+        return self.boxes_of([image], words)[0]
+
+    @torch.inference_mode()
+    def boxes_of(self, images: Sequence[Image], words: Sequence[str]) -> list[Boxes]:
+        """`boxes` of images of one size, which pass the network together."""
+        height, width = (int(side) for side in images[0].shape[:2])
+        if not words:
+            return [_no_boxes()] * len(images)
+        text, places = phrases(words)
+        tokens = word_tokens(self._tokens.spans(text), places)
+        asked = self._tokens.of([text] * len(images))
+        batch = network_input(
+            images,
+            self._frame(height, width),
+            self._normalisation,
+            device=self._place.device,
+            dtype=self._place.dtype,
+        )
+        output = self._network(pixel_values=batch, **asked)
+        return [
+            found_boxes(
+                logits.float().sigmoid().cpu(),
+                boxes.float().cpu(),
+                tokens,
+                self._options,
+                size=(height, width),
+            )
+            for logits, boxes in zip(output.logits, output.pred_boxes, strict=True)
+        ]
+
+    def _frame(self, height: int, width: int) -> Frame:
+        """The input: the shorter side as the weights say, unless the longer one is too long."""
+        if self._place.size is not None:
+            return frame_of(height, width, size=self._place.size)
+        scale = min(self._shortest / min(height, width), self._longest / max(height, width))
+        return frame_of(height, width, size=max(1, round(max(height, width) * scale)))
+
+
+def phrases(words: Sequence[str]) -> tuple[str, list[tuple[int, int]]]:
+    """The words as the network reads them, and where each stands: first character, and the end.
+
+    Raises:
+        InputError: If a word is empty, stands there twice or holds a full stop.
+
+    Example:
+        >>> phrases(["Chair", "red mug"])
+        ('chair. red mug.', [(0, 5), (7, 14)])
+    """
+    text, places = "", list[tuple[int, int]]()
+    for word in checked_words(words):
+        if any(sign in word for sign in _SEPARATORS):
+            raise InputError(
+                f"words: expected words without full stops and question marks, which end a phrase "
+                f"for the network, got {word!r:.60}."
+            )
+        start = len(text) + (1 if text else 0)
+        text = f"{text} {word.lower()}." if text else f"{word.lower()}."
+        places.append((start, len(text) - 1))
+    return text, places
+
+
+def word_tokens(
+    spans: Sequence[tuple[int, int]], places: Sequence[tuple[int, int]]
+) -> list[list[int]]:
+    """Indices of the tokens of each word, by where tokens and words stand in the text."""
+    return [
+        [i for i, (low, high) in enumerate(spans) if start <= low < high <= end]
+        for start, end in places
+    ]
+
+
+def found_boxes(
+    probabilities: Float[Tensor, "n tokens"],
+    boxes: Float[Tensor, "n 4"],
+    tokens: Sequence[Sequence[int]],
+    options: GroundingDinoOptions,
+    *,
+    size: tuple[int, int],
+) -> Boxes:
+    """The boxes that fit a word.
+
+    A box is of the word of whose tokens it fits most: the sum of their probabilities, those below
+    `text_threshold` left out, by their number. Its score is that of the token that it fits best.
+
+    Args:
+        probabilities: How well each box fits each token.
+        boxes: Centre x, y, width, height as shares of the image.
+        tokens: Indices of the tokens of each word.
+        options: The thresholds.
+        size: Rows and columns of the image.
+    """
+    share = torch.zeros(len(boxes), len(tokens))
+    score = torch.zeros(len(boxes), len(tokens))
+    for i, of_word in enumerate(tokens):
+        if of_word:
+            fits = probabilities[:, list(of_word)]
+            share[:, i] = torch.where(fits >= options.text_threshold, fits, 0.0).mean(dim=1)
+            score[:, i] = fits.amax(dim=1)
+    most, word = share.max(dim=1)
+    score = score.gather(1, word[:, None])[:, 0]
+    height, width = size
+    corners = torch.cat((boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2), dim=1)
+    corners = corners.clamp(0, 1)
+    keep = (most > 0) & (score >= options.box_threshold)
+    keep &= (corners[:, 2:] > corners[:, :2]).all(dim=1)
+    corners, score, word = corners[keep], score[keep], word[keep]
+    order = _one_a_thing(corners, score, word, options.max_overlap)
+    return Boxes(
+        boxes=corners[order] * torch.tensor([width, height, width, height]),
+        scores=score[order],
+        words=tuple(word[order].tolist()),
+    )
+
+
+def _one_a_thing(
+    corners: Float[Tensor, "n 4"], score: Float[Tensor, "n"], word: Tensor, max_overlap: float
+) -> Tensor:
+    """Indices of boxes, the surest first, without those that a surer box of their word covers."""
+    kept: list[Tensor] = []
+    for one in word.unique():
+        of_word = (word == one).nonzero()[:, 0]
+        found = Candidates(
+            logits=corners[of_word, None], scores=score[of_word], boxes=corners[of_word]
+        )
+        kept.append(of_word[distinct(found, max_overlap)])
+    index = torch.cat(kept).sort().values if kept else torch.zeros(0, dtype=torch.int64)
+    return index[torch.sort(score[index], descending=True, stable=True).indices]
+
+
+def _no_boxes() -> Boxes:
+    return Boxes(boxes=torch.zeros(0, 4), scores=torch.zeros(0), words=())
+
+
+GROUNDING_DINO = network_family(
+    "grounding-dino",
+    "boxes of what words mean, for other steps; langsam makes masks of them",
+    Checkpoint(id="IDEA-Research/grounding-dino-tiny", megabytes=690, licence="Apache-2.0"),
+    Checkpoint(id="IDEA-Research/grounding-dino-base", megabytes=933, licence="Apache-2.0"),
+    Checkpoint(
+        id="openmmlab-community/mm_grounding_dino_tiny_o365v1_goldg_v3det",
+        megabytes=690,
+        licence="Apache-2.0",
+    ),
+    reference="arXiv:2303.05499",
+    gives=(),
+    options=GroundingDinoOptions,
+    make=GroundingDino,
+)
