@@ -50,11 +50,16 @@ class Command:
     """Methods of `splatseg segment`, by comma or by space."""
 
     model: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL ..")] = ()
-    """Who sees for the methods, each NAME, NAME=WEIGHTS, or a folder of recorded evidence in which
-    {scene} stands for the scene's name. A method takes the first that gives what it needs."""
+    """Who sees for the methods, each NAME[=WEIGHTS][,OPTION=VALUE...], or a folder of recorded
+    evidence in which {scene} stands for the scene's name. A method takes the first that gives what
+    it needs."""
 
     prompter: Annotated[str, tyro.conf.arg(metavar="MODEL")] = _DEFAULT.prompter
-    """Who turns strokes into a mask: NAME or NAME=WEIGHTS of a model that answers prompts."""
+    """Who turns strokes into a mask: a model that answers points, named in the same way."""
+
+    grounder: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    """Who finds words in the drawn first view, such as langsam: words become the mask of a prompt
+    so. Without it words are asked for by features."""
 
     scene: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ..")] = ()
     """Scenes to run, by comma or by space; all without it."""
@@ -109,6 +114,7 @@ def run(command: Command) -> None:
             methods=listed("--method", command.method),
             models=command.model,
             prompter=command.prompter,
+            grounder=command.grounder,
             scenes=listed("--scene", command.scene) if command.scene else (),
             fitted=command.fitted,
             preset=command.preset,

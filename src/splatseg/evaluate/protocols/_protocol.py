@@ -1,9 +1,10 @@
 """A protocol: which layout, what is asked of a method, and every choice of how it is scored."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 from splatseg.core.boundary import convert_fields
+from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
 from splatseg.evaluate.protocols._switches import Switches
 
@@ -65,32 +66,4 @@ def switch_value(protocol: Protocol, text: str) -> tuple[str, Any]:
         >>> switch_value(find_protocol("spin-nerf"), "reference_scored=no")
         ('reference_scored', False)
     """
-    name, equals, value = text.partition("=")
-    hints = get_type_hints(type(protocol.switches))
-    if not equals or name not in hints:
-        raise InputError(
-            f"switch: expected NAME=VALUE with a name of {', '.join(sorted(hints))}, got {text!r}."
-        )
-    return name, _parsed(name, value, hints[name])
-
-
-def _parsed(name: str, text: str, kind: Any) -> Any:
-    options = [one for one in get_args(kind) if one is not type(None)]
-    if type(None) in get_args(kind):
-        return None if text.lower() in ("", "none") else _parsed(name, text, options[0])
-    if get_origin(kind) is tuple:
-        item = options[0]
-        return tuple(_parsed(name, one.strip(), item) for one in text.split(",") if one.strip())
-    if options:  # a Literal
-        return text
-    if kind is bool:
-        if text.lower() not in ("yes", "no", "true", "false"):
-            raise InputError(f"switch: {name}: expected yes or no, got {text!r}.")
-        return text.lower() in ("yes", "true")
-    try:
-        return kind(text)
-    except ValueError as error:
-        raise InputError(f"switch: {name}: expected {_WORDS[kind]}, got {text!r}.") from error
-
-
-_WORDS = {int: "a whole number", float: "a number", str: "text"}
+    return typed_field(type(protocol.switches), text, what="switch")

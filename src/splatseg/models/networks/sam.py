@@ -91,7 +91,7 @@ class Sam:
         convert_fields(options)
         held = str(configuration(place, _TYPES[name])["model_type"])
         kind = held.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
-        parts = {"key_mapping": _SAM3_PARTS} if held == "sam3_video" else {}
+        parts: dict[str, Any] = {"key_mapping": _SAM3_PARTS} if held == "sam3_video" else {}
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from splatseg.core import Layer, Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
+from splatseg.core.models import GroundedMasks
 from splatseg.evaluate.protocols import Protocol
 from splatseg.methods import Method
 from splatseg.render import BackendName
@@ -26,7 +27,7 @@ class Job:
     """Folder of the run."""
 
     prompter: Model | None
-    grounder: Model | None
+    grounder: GroundedMasks | None
     """Who finds words in pictures, if one was named."""
 
     options: BenchOptions

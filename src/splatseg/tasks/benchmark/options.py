@@ -15,11 +15,16 @@ class BenchOptions:
     """Methods of `segment`, by name."""
 
     models: tuple[str, ...] = ()
-    """Who sees for the methods, each NAME, NAME=WEIGHTS, or a folder of recorded evidence in which
-    {scene} stands for the scene's name. A method takes the first that gives what it needs."""
+    """Who sees for the methods, each NAME[=WEIGHTS][,OPTION=VALUE...], or a folder of recorded
+    evidence in which {scene} stands for the scene's name. A method takes the first that gives what
+    it needs."""
 
     prompter: str = "classical"
-    """Who turns strokes into a mask: NAME or NAME=WEIGHTS of a model that answers prompts."""
+    """Who turns strokes into a mask: a model that answers points, named in the same way."""
+
+    grounder: str | None = None
+    """Who finds words in the drawn first view, such as langsam, where words become the mask of a
+    prompt; None asks for words by features."""
 
     scenes: tuple[str, ...] = ()
     """Names of scenes to run; none takes all that are there."""

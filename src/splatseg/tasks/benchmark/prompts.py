@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatseg.core import Model, Prompt, PromptableMasks, Scene
+from splatseg.core import Model, Prompt, PromptableMasks, Scene, View
 from splatseg.core.benchmark import Scribble, TargetTask
-from splatseg.core.models import Image
+from splatseg.core.models import GroundedMasks, Image
 from splatseg.errors import InputError
 from splatseg.evaluate.protocols import TargetSwitches, resized_mask
+from splatseg.lift import GaussianField
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,6 +65,31 @@ def prompted_mask(
     if not len(found):
         raise InputError(f"task {task.name}: {prompter.name} found nothing at its strokes.")
     return PromptedMask(view=view.name, mask=found.masks[0].decode())
+
+
+def worded_mask(
+    field: GaussianField, view: View, words: str, grounder: GroundedMasks
+) -> PromptedMask | None:
+    """What words mean in a view as the scene draws it, all of it together; None for nothing.
+
+    Args:
+        field: The scene.
+        view: A view; its photograph is not read.
+        words: What is asked for.
+        grounder: Who finds it.
+    """
+    with field.view(view.camera) as drawn:
+        colour = drawn.signals().colour
+    if colour is None:
+        raise InputError("field: expected one with colours, got one without.")
+    image = (colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    found = grounder.grounded_masks(image, [words]).masks
+    if not len(found):
+        return None
+    together = torch.zeros(view.camera.height, view.camera.width, dtype=torch.bool)
+    for mask in found.masks:
+        together |= mask.decode()
+    return PromptedMask(view=view.name, mask=together)
 
 
 def scribble_prompt(

@@ -11,6 +11,7 @@ from splatseg.core import Model
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.json_values import plain_object
+from splatseg.core.models import GroundedMasks
 from splatseg.errors import InputError
 from splatseg.evaluate.protocols import (
     PointSwitches,
@@ -205,6 +206,7 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
             "seed": job.options.seed,
             "models": list(job.options.models),
             "prompter": _recorded_model(job.prompter),
+            "grounder": _recorded_model(job.grounder),
             "gaussians": digest,
             "backend": job.backend,
             "versions": {name: importlib.metadata.version(name) for name in ("splatseg", "torch")},
@@ -254,9 +256,16 @@ def _notes(protocol: Protocol, scenes: Sequence[BenchmarkScene]) -> list[str]:
 
 def _models(
     protocol: Protocol, options: BenchOptions, observer: Observer
-) -> tuple[Model | None, Model | None]:
+) -> tuple[Model | None, GroundedMasks | None]:
     """Who answers strokes, and who finds words in pictures."""
     switches = protocol.switches
-    if not isinstance(switches, TargetSwitches) or switches.prompt != "scribble":
+    if not isinstance(switches, TargetSwitches):
         return None, None
-    return model_of(options.prompter, options, observer), None
+    if switches.prompt == "scribble":
+        return model_of(options.prompter, options, observer), None
+    if switches.prompt != "words" or options.grounder is None:
+        return None, None
+    grounder = model_of(options.grounder, options, observer)
+    if not isinstance(grounder, GroundedMasks):
+        raise InputError(f"grounder: expected a model that finds words, got {grounder.name}.")
+    return None, grounder

@@ -1,12 +1,12 @@
 """Evidence for the methods of a run, from the models that were named."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
 from splatseg.core import Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
-from splatseg.core.models import TextFeatures
+from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
 from splatseg.io.evidence import TEXT_FILE, EvidenceKind, open_evidence
 from splatseg.methods import Method
@@ -15,6 +15,9 @@ from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
 from splatseg.tasks.see import SeeOptions, What, see
+
+_LOADING = ("size", "dtype", "batch")
+"""Options of loading that each model may have its own of."""
 
 _KIND_OF: dict[What, EvidenceKind] = {
     "masks": "masks", "labels": "labels", "panoptic": "panoptic", "features": "features",
@@ -40,18 +43,37 @@ class Seen:
     """The model, where it is one that runs."""
 
 
-def model_of(name: str, options: BenchOptions, observer: Observer) -> Model:
-    """The model of NAME, NAME=WEIGHTS, or a folder."""
-    found, _, weights = name.partition("=")
-    family = find_family(found) if found in model_names() else None
-    loading = None
-    if family is not None and family.needs_weights:
-        loading = LoadOptions(
-            weights=weights or None, download=options.download, device=options.device
-        )
-    elif weights:
-        raise InputError(f"models: {found} has no weights, got {name!r}.")
-    return find_model(found, loading=loading, report=observer.note)
+def model_of(named: str, options: BenchOptions, observer: Observer) -> Model:
+    """The model of ``NAME[=WEIGHTS][,OPTION=VALUE...]``, or a folder.
+
+    Raises:
+        InputError: If there is none, or it has no such option.
+    """
+    name = name_of(named)
+    family = find_family(name) if name in model_names() else None
+    if family is None:
+        return find_model(named, report=observer.note)
+    first, *rest = named.split(",")
+    weights = first.partition("=")[2]
+    if weights and not family.needs_weights:
+        raise InputError(f"models: {name} has no weights, got {named!r}.")
+    loading = LoadOptions(weights=weights or None, download=options.download, device=options.device)
+    chosen = family.options()
+    for text in rest:
+        if family.needs_weights and text.partition("=")[0] in _LOADING:
+            field, value = typed_field(LoadOptions, text, what=f"model {name}")
+            loading = replace(loading, **{field: value})
+        else:
+            field, value = typed_field(family.options, text, what=f"model {name}")
+            chosen = replace(chosen, **{field: value})
+    return find_model(
+        name, chosen, loading=loading if family.needs_weights else None, report=observer.note
+    )
+
+
+def name_of(named: str) -> str:
+    """The name of a model that was given with weights and options."""
+    return named.split(",")[0].partition("=")[0]
 
 
 def seen_for(
@@ -80,7 +102,7 @@ def seen_for(
     """
     for named in options.models:
         path = Path(named.replace("{scene}", bench.name))
-        recorded = named.partition("=")[0] not in model_names()
+        recorded = name_of(named) not in model_names()
         found = (
             _of_folder(path, method, words=words)
             if recorded
@@ -90,7 +112,7 @@ def seen_for(
             continue
         kind, what = found
         model = None if recorded else model_of(named, options, observer)
-        name = _slug(path.name if recorded else named.partition("=")[0])
+        name = _slug(path.name if recorded else name_of(named))
         seen = see(
             scene,
             str(path) if model is None else model,
@@ -109,11 +131,6 @@ def seen_for(
     )
 
 
-def speaks(model: Model | None) -> bool:
-    """Whether a model encodes words."""
-    return isinstance(model, TextFeatures)
-
-
 def _of_folder(path: Path, method: Method, *, words: bool) -> tuple[EvidenceKind, str] | None:
     kind = open_evidence(path).kind
     beside = path.absolute().parent / TEXT_FILE
@@ -123,7 +140,7 @@ def _of_folder(path: Path, method: Method, *, words: bool) -> tuple[EvidenceKind
 
 
 def _of_model(named: str, method: Method, *, words: bool) -> tuple[EvidenceKind, str] | None:
-    family = find_family(named.partition("=")[0])
+    family = find_family(name_of(named))
     gives: tuple[What, ...] = () if family is None else family.gives
     for what in gives:
         if _KIND_OF[what] in method.evidence and (not words or what == "text"):

@@ -42,7 +42,7 @@ from splatseg.tasks.benchmark.chosen import (
     segments_inside,
 )
 from splatseg.tasks.benchmark.job import Job
-from splatseg.tasks.benchmark.prompts import PromptedMask, prompted_mask
+from splatseg.tasks.benchmark.prompts import PromptedMask, prompted_mask, worded_mask
 from splatseg.tasks.benchmark.sight import Seen
 from splatseg.tasks.benchmark.spoken import Vocabulary, vocabulary_of
 
@@ -135,6 +135,14 @@ class TargetRun:
         return self._by_segments(task, prompt)
 
     def _prompt(self, task: TargetTask) -> PromptedMask | None:
+        if self._job.grounder is not None:
+            first = min(true.view for true in self.scored(task))
+            return worded_mask(
+                GaussianField(self._job.scene.gaussians, backend=self._job.backend),
+                self._job.scene.view(first),
+                task.words or task.name,
+                self._job.grounder,
+            )
         return prompted_mask(
             self._job.scene,
             task,
