@@ -137,8 +137,22 @@ class World:
             left = Maps().label_map(name).ids == 1
             save_masks(core.MaskSet.from_dense(left[None]), masks, name)
         self.masks = open_evidence(masks)
+        self.benchmark = self._benchmark()
         self.room = synthetic.room(seed=0)
         self.truth = synthetic.render_truth(self.room, CAMERA)
+
+    def _benchmark(self) -> Path:
+        """A scene in the layout of SPIn-NeRF."""
+        from support.benchmark_layouts.source import save_mask
+        from support.benchmark_layouts.sparse import write_sparse
+
+        scene = self.folder / "benchmark"
+        write_sparse(scene / "sparse/0", self.views, [f"{name}.png" for name in NAMES], None)
+        (scene / "images").mkdir()
+        for view in self.views:
+            (scene / "images" / f"{view.name}.png").write_bytes(view.image.read_bytes())
+        save_mask(np.ones((HEIGHT, WIDTH), bool), scene / "masks/a.png")
+        return scene
 
     def path(self) -> Path:
         """A path of nothing yet."""
@@ -287,6 +301,8 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "core.LabelledMesh.faces": torch.tensor([[0, 1, 2]]),
         "core.LabelledPoints.points": torch.rand(9, 3),
         "core.LabelledPoints.labels": {"things": torch.ones(9, dtype=torch.int32)},
+        "core.TrueMask.read": lambda: mask,
+        "core.TruePoints.points": torch.rand(COUNT, 3),
         "render.contributors.k": 1,
         "io.images.write_png.array": np.zeros((3, 3), np.uint8),
         "io.images.write_png.path": world.folder / "made.png",
@@ -301,6 +317,9 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "io.scene.save_scene.root": world.folder / "saved",
         "io.evidence.save_label_map.folder": world.folder / "scene" / "evidence" / "labels",
         "io.evidence.create_evidence.kind": "labels",
+        "io.benchmarks.find_layout.folder": world.benchmark,
+        "io.benchmarks.read_benchmark.folder": world.benchmark,
+        "io.benchmarks.read_benchmark.layout": "spin-nerf",
         "io.captures.read_capture.path": world.folder,
         "io.video.write_video.frames": [byte],
         "io.video.write_video.path": world.folder / "made.mp4",

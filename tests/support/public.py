@@ -10,6 +10,7 @@ from typing import Any
 PACKAGES = (
     "core",
     "render",
+    "io.benchmarks",
     "io.captures",
     "io.evidence",
     "io.export",
