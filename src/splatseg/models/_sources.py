@@ -9,7 +9,7 @@ from splatseg.core import ClassTable, MaskSet, View
 from splatseg.errors import FileFormatError
 from splatseg.io.evidence import Evidence, EvidenceKind, open_evidence, read_id_map, view_files
 
-What = Literal["masks", "labels", "panoptic", "features", "text"]
+What = Literal["masks", "labels", "panoptic", "features", "text", "tracked"]
 """What a model can be asked for."""
 
 SEGMENT_PARTS = ".segments"

@@ -25,7 +25,7 @@ from splatseg.tasks.scene_parts import views_asked, views_recorded
 
 EVIDENCE_FOLDER = "evidence"
 
-What = Literal["masks", "labels", "panoptic", "features", "text"]
+What = Literal["masks", "labels", "panoptic", "features", "text", "tracked"]
 """What a model can be asked for."""
 
 
