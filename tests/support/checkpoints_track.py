@@ -66,7 +66,7 @@ def sam3_tracker_video() -> Any:
 
 
 def _sam3_config() -> Any:
-    from transformers import Sam3TrackerVideoConfig, Sam3ViTConfig, Sam3VisionConfig
+    from transformers import Sam3TrackerVideoConfig, Sam3VisionConfig, Sam3ViTConfig
 
     backbone = Sam3ViTConfig(
         hidden_size=32, intermediate_size=64, num_hidden_layers=2, num_attention_heads=2,

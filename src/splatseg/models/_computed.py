@@ -15,6 +15,7 @@ from splatseg.core.models import (
     BatchedModel,
     DenseFeatures,
     Image,
+    MaskTracker,
     Model,
     PanopticSegments,
     SemanticLabels,
@@ -41,6 +42,7 @@ _PROTOCOLS: dict[What, type[Any]] = {
     "labels": SemanticLabels,
     "text": TextFeatures,
     "features": DenseFeatures,
+    "tracked": MaskTracker,
 }
 _KINDS: dict[What, EvidenceKind] = {
     "masks": "masks",
@@ -48,6 +50,7 @@ _KINDS: dict[What, EvidenceKind] = {
     "labels": "labels",
     "text": "features",
     "features": "features",
+    "tracked": "tracked",
 }
 
 
@@ -83,10 +86,8 @@ class Pictures:
         self._kept.clear()
 
 
-def computed(
-    model: Model, *, what: What | None, cache: ModelCache | None, pictures: Pictures
-) -> Source:
-    """Evidence from running a model on pictures of views.
+def ability(model: Model, what: What | None) -> What:
+    """What a model is asked for; None takes the most telling that it can be.
 
     Raises:
         InputError: If the model cannot give this, or nothing at all.
@@ -101,6 +102,18 @@ def computed(
         raise InputError(
             f"model {model.name!r}: expected one of what it gives ({', '.join(can)}), got {what!r}."
         )
+    return what
+
+
+def computed(
+    model: Model, *, what: What | None, cache: ModelCache | None, pictures: Pictures
+) -> Source:
+    """Evidence from running a model on pictures of views, each by itself.
+
+    Raises:
+        InputError: If the model cannot give this, or nothing at all.
+    """
+    what = ability(model, what)
     return _Computed(model=model, asked=what, cache=cache, pictures=pictures)
 
 
@@ -152,6 +165,15 @@ class _Computed(Source):
     @override
     def is_costly(self) -> bool:
         return True
+
+    @property
+    @override
+    def goes_on(self) -> bool:
+        return True
+
+    @override
+    def sequence(self, views: Sequence[View]) -> Sequence[View]:
+        return views
 
     @override
     def available(self, views: Sequence[View]) -> frozenset[str]:

@@ -34,6 +34,15 @@ class Source(ABC):
     def is_costly(self) -> bool:
         """Whether views that are written are worth keeping if a later one fails."""
 
+    @property
+    @abstractmethod
+    def goes_on(self) -> bool:
+        """Whether work that was stopped can go on at the next view, or begins again."""
+
+    @abstractmethod
+    def sequence(self, views: Sequence[View]) -> Sequence[View]:
+        """Views in the order in which they are to be written."""
+
     @abstractmethod
     def available(self, views: Sequence[View]) -> frozenset[str]:
         """Names of the views that there can be evidence of."""
