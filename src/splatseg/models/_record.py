@@ -321,8 +321,6 @@ def _work_folder(target: Path, source: Source, *, overwrite: bool) -> Generator[
     beside = target.with_name(f"{TEMPORARY}see-{target.name}")
     folder = beside if header is not None and overwrite else target
     had_views = folder.is_dir() and _holds_views(folder)
-    if not source.goes_on and _is_unfinished(evidence_header(folder) if had_views else None):
-        had_views = False
     try:
         yield folder
     except BaseException as error:

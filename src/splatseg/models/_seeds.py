@@ -34,7 +34,7 @@ class TrackingOptions:
     larger ones."""
 
     seed_area: float = 0.0
-    """Least share of its view that a seed takes, in [0, 1]."""
+    """Least share of its view that a seed takes, in [0, 1], also where smaller ones lie on it."""
 
     view_order: ViewOrder = "name"
     """Order of the views: name, or path, where each is followed by the nearest camera of those
@@ -105,7 +105,10 @@ class Seeds:
         """Masks on one map, the smallest on top; ids are places in the set, from 1 on."""
         ids = torch.full((masks.height, masks.width), UNLABELLED, dtype=torch.int32)
         level = self.options.seed_level
-        wanted = [i for i in range(len(masks)) if level is None or int(masks.levels[i]) == level]
+        least = self.options.seed_area * ids.numel()
+        # Small ones leave no holes in those that they lie on.
+        wanted = [i for i in range(len(masks)) if masks.masks[i].area >= least]
+        wanted = [i for i in wanted if level is None or int(masks.levels[i]) == level]
         for i in sorted(wanted, key=lambda i: -masks.masks[i].area):
             ids[masks.dense(i)] = i + 1
         return ids
