@@ -1,5 +1,6 @@
 """Tiny trackers: SAM 2 and SAM 3 for videos, with a short memory, so that few frames fill it."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -65,6 +66,50 @@ def sam3_tracker_video() -> Any:
     return _spread(Sam3TrackerVideoModel(_sam3_config()))
 
 
+class _AsPublished:
+    """SAM 3 whole, with its weights under the names that the hub's have.
+
+    The library writes those of the tracker under a prefix twice, and reads them so again; the
+    published ones have it once.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+
+    def save_pretrained(self, folder: Path) -> None:
+        from safetensors.torch import load_file, save_file
+
+        self._model.save_pretrained(folder)
+        path = folder / "model.safetensors"
+        twice = "tracker_model.tracker_model."
+        tensors = {key.replace(twice, twice[14:]): t.clone() for key, t in load_file(path).items()}
+        save_file(tensors, path, metadata={"format": "pt"})
+
+
+def sam3_video() -> Any:
+    """SAM 3 of 64 pixels: a detector, and the tracker that shares its backbone."""
+    from transformers import Sam3Config, Sam3VideoConfig, Sam3VideoModel
+
+    tracker = _sam3_config()
+    part = {"hidden_size": _WIDTH, "num_attention_heads": 4}
+    layer = {**part, "num_layers": 1, "intermediate_size": 32}
+    detector = Sam3Config(
+        vision_config=tracker.vision_config.to_dict(),
+        text_config={
+            "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 1,
+            "num_attention_heads": 2, "projection_dim": 32, "vocab_size": 64,
+        },
+        geometry_encoder_config=layer,
+        detr_encoder_config=layer,
+        detr_decoder_config={**layer, "num_queries": 5},
+        mask_decoder_config=part,
+    )  # fmt: skip
+    config = Sam3VideoConfig(
+        detector_config=detector.to_dict(), tracker_config=tracker.to_dict(), low_res_mask_size=16
+    )
+    return _AsPublished(_spread(Sam3VideoModel(config)))
+
+
 def _sam3_config() -> Any:
     from transformers import Sam3TrackerVideoConfig, Sam3VisionConfig, Sam3ViTConfig
 
@@ -96,4 +141,8 @@ def _spread(model: Any) -> Any:
     return model
 
 
-MAKERS = {"sam2_video": sam2_video, "sam3_tracker_video": sam3_tracker_video}
+MAKERS = {
+    "sam2_video": sam2_video,
+    "sam3_tracker_video": sam3_tracker_video,
+    "sam3_video": sam3_video,
+}

@@ -234,6 +234,24 @@ def test_views_of_any_size(checkpoints, rng) -> None:
         dict(model.track([("b", large)], {"b": LabelMap(ids=ids)}))
 
 
+def test_the_tracker_of_sam3_as_it_is_published(checkpoints, rng) -> None:
+    """The detector is left aside; the backbone is the detector's, which both share."""
+    from safetensors.torch import load_file
+
+    model = made(checkpoints, "sam3-video", "sam3_video")
+    stored = load_file(checkpoints("sam3_video") / "model.safetensors")
+    loaded = model._network.state_dict()
+    block = "backbone.layers.0.mlp.fc1.weight"
+    for ours, theirs in (
+        (f"vision_encoder.{block}", f"detector_model.vision_encoder.{block}"),
+        ("vision_encoder.neck.fpn_layers.0.proj1.weight", "tracker_neck.fpn_layers.0.proj1.weight"),
+        ("mask_decoder.conv_s0.weight", "tracker_model.mask_decoder.conv_s0.weight"),
+    ):
+        assert torch.equal(loaded[ours], stored[theirs])
+    found = dict(model.track(video(rng, 3), {"v0": TWO}))
+    assert torch.equal(found["v0"].ids, TWO.ids)
+
+
 def test_settings_and_refusals(checkpoints, monkeypatch, tmp_path) -> None:
     model = made(checkpoints, "sam2-video", "sam2_video", seeds_remembered=3)
     assert model.settings["seeds_remembered"] == 3
