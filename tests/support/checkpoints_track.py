@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-PRESENCE = 0.5
+PRESENCE = 1.0
 """Added to the logit of an object's being there: most are, and not all."""
 
 _SIDE = 64

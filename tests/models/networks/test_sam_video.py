@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 
 from splatseg.core import LabelMap
-from splatseg.core.models import MaskTracker
+from splatseg.core.models import MaskTracker, Prompt
 from splatseg.errors import FileFormatError, MissingPackageError, RangeError, ShapeError
 from splatseg.models import LoadOptions, find_family, find_model
 from splatseg.models._images import IMAGENET, Normalisation, frame_of, network_input
@@ -250,6 +250,33 @@ def test_the_tracker_of_sam3_as_it_is_published(checkpoints, rng) -> None:
         assert torch.equal(loaded[ours], stored[theirs])
     found = dict(model.track(video(rng, 3), {"v0": TWO}))
     assert torch.equal(found["v0"].ids, TWO.ids)
+
+
+@pytest.mark.parametrize(
+    ("image_family", "family", "kind", "library_name"),
+    [("sam2", *KINDS[0]), ("sam3", "sam3-video", "sam3_video", "Sam3TrackerVideo")],
+)
+def test_the_first_frame_of_a_video_is_an_image(
+    checkpoints, rng, image_family, family, kind, library_name
+) -> None:
+    """A point on it gives the mask that the same weights give as a model of images."""
+    tracker = made(checkpoints, family, kind)
+    ((_, picture),) = video(rng, 1)
+    loading = LoadOptions(weights=str(checkpoints(kind)), device="cpu")
+    model = find_model(image_family, loading=loading)
+    session = session_of(library_name, video=pixel_values([picture]), dtype=torch.float32)
+    point = {"point_coords": torch.tensor([[[[40.0, 20.0]]]]),
+             "point_labels": torch.ones(1, 1, 1, dtype=torch.int32)}  # fmt: skip
+    session.add_point_inputs(session.obj_id_to_idx(1), 0, point)
+    session.obj_with_new_inputs = [1]
+    with torch.inference_mode():
+        output = tracker._network(inference_session=session, frame_idx=0)
+    assert float(output.object_score_logits) > 0
+    wanted = F.interpolate(output.pred_masks, (HEIGHT, WIDTH), mode="bilinear")[0, 0] > 0
+    embedding = model.embed(picture)
+    found = model.prompted_masks(embedding, Prompt(points=torch.tensor([[40.0, 20.0]])))
+    assert bool(wanted.any())
+    assert int((found.masks[0].decode() != wanted).sum()) <= 4, "rounding at the border at most"
 
 
 def test_settings_and_refusals(checkpoints, monkeypatch, tmp_path) -> None:
