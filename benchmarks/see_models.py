@@ -174,8 +174,9 @@ def measured(run: Run, work: Path, scene: Path, checkpoints: Checkpoints, count:
     for name, views in (("few", few), ("all", ["train"])):
         figures = work / f"{run.model}-{name}.json"
         words = [sys.executable, __file__, "--command", str(figures), "see", str(scene),
-                 "--model", run.model, "--evidence", f"{run.model}-{name}", "--views", *views, "--json",
-                 *(flag.format_map(checkpoints) for flag in run.flags)]  # fmt: skip
+                 "--model", run.model, "--evidence", f"{run.model}-{name}", "--json",
+                 "--views", *views]  # fmt: skip
+        words += [flag.format_map(checkpoints) for flag in run.flags]
         if run.kind:
             words += ["--weights", str(checkpoints[run.kind]), "--device", "cpu"]
         if run.cached and name == "all":
