@@ -126,6 +126,8 @@ def test_a_track_is_one_seed_and_a_seed_one_track() -> None:
     seed = row(1, 1, 3, 3, 3, -1, 1)
     assert same_objects(tracked, seed, min_iou=0.25, next_id=20) == {1: 8, 3: 7}
     assert same_objects(tracked, seed, min_iou=0.4, next_id=20) == {1: 20, 3: 7}
+    both = row(1, 1, 3, 3, 3, -1, -1)
+    assert same_objects(tracked, both, min_iou=0.25, next_id=20) == {1: 20, 3: 7}
 
 
 def test_options_are_checked() -> None:

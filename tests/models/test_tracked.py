@@ -409,6 +409,20 @@ def test_trackers_that_do_not_keep_step(moving, masks, tmp_path) -> None:
     refused(Small(), "view 'v0': expected 48x24 pixels .* got 48x5", ShapeError)
 
 
+def test_seeds_are_there_while_their_view_is(moving, masks, tmp_path) -> None:
+    """One label map at a time, however many views bring seeds."""
+    most: list[int] = []
+
+    class Counting(ByColour):
+        def track(self, frames, seeds):
+            for name, ids in super().track(frames, seeds):
+                most.append(len(seeds))
+                yield name, ids
+
+    followed(moving, tmp_path / "t", masks, model=Counting(), seed_every=1)
+    assert most == [1] + [0, 1] * (COUNT - 1)
+
+
 def test_pictures_are_taken_one_at_a_time(moving, masks, tmp_path) -> None:
     """And in the order of the tracker; a progress is told of each."""
     taken: list[str] = []

@@ -14,7 +14,7 @@ from splatseg.errors import FileFormatError, MissingPackageError, RangeError, Sh
 from splatseg.models import LoadOptions, find_family, find_model
 from splatseg.models._images import IMAGENET, Normalisation, frame_of, network_input
 from splatseg.models.networks import _video_memory, sam_video
-from splatseg.models.networks._video_memory import session_of
+from splatseg.models.networks._video_memory import VideoMemory, session_of
 from splatseg.models.networks.sam_video import SamVideoOptions, highest
 
 KINDS = [("sam2-video", "sam2_video", "Sam2Video"),
@@ -73,8 +73,18 @@ def test_it_is_what_the_library_makes_of_a_whole_video(
     session.obj_with_new_inputs = [5, 9]
     with torch.inference_mode():
         model._network(inference_session=session, frame_idx=0)
+    memory = VideoMemory(
+        model._network, session_of(library_name, dtype=torch.float32), seeds_remembered=4
+    )
+    masks = {id: (TWO.ids == id).float()[None, None] for id in (5, 9)}
     present = 0
     for output in model._network.propagate_in_video_iterator(session):
+        memory.next_frame()
+        pixels = pixel_values([frames[output.frame_idx][1]])
+        ids, logits, there = memory.follow(pixels, masks if output.frame_idx == 0 else {})
+        assert ids == (5, 9)
+        torch.testing.assert_close(logits, output.pred_masks[:, 0], rtol=0, atol=1e-6)
+        torch.testing.assert_close(there, output.object_score_logits[:, 0], rtol=0, atol=1e-6)
         if output.frame_idx == 0:
             assert torch.equal(ours["v0"].ids, TWO.ids), "to the pixel, where it is seeded"
             continue
@@ -136,6 +146,27 @@ def test_memory_does_not_grow_with_the_frames(
     assert max(alive) <= 2
 
 
+def test_what_is_kept_of_a_frame(checkpoints, rng) -> None:
+    """Frame 7, of networks that look at the memories of 2 frames and the pointers of 3 before."""
+    model = made(checkpoints, "sam2-video", "sam2_video")
+    session = session_of("Sam2Video", dtype=torch.float32)
+    memory = VideoMemory(model._network, session, seeds_remembered=4)
+    masks = {id: (TWO.ids == id).float()[None, None] for id in (5, 9)}
+    for i, (_, image) in enumerate(video(rng, 8)):
+        memory.next_frame()
+        memory.follow(pixel_values([image]), {} if i else masks)
+    pointers = {"object_pointer", "object_score_logits"}
+    memories = pointers | {"maskmem_features", "maskmem_pos_enc"}
+    for outputs in session.output_dict_per_obj.values():
+        tracked = outputs["non_cond_frame_outputs"]
+        assert {i: set(one) for i, one in tracked.items()} == {
+            4: pointers, 5: memories, 6: memories, 7: memories | {"pred_masks"},
+        }  # fmt: skip
+        assert set(outputs["cond_frame_outputs"][0]) == memories
+        features = tracked[7]["maskmem_features"]
+        assert features.untyped_storage().nbytes() == features.nbytes, "of one object, not of all"
+
+
 def test_more_seeds_are_remembered_if_one_wants(checkpoints, rng) -> None:
     seeds = {f"v{i}": TWO for i in range(4)}
     frames = video(rng, 7)
@@ -165,6 +196,7 @@ def test_later_seeds_add_and_correct(checkpoints, rng) -> None:
     model = made(checkpoints, "sam3-video", "sam3_tracker_video")
     frames = video(rng, 5)
     one, other = marked(id5=(10, 30, 10, 30)), marked(id9=(36, 50, 40, 60), id5=(0, 10, 0, 10))
+    other.ids[5, 5] = -1  # a hole that the network's coarser mask has not
     plain = dict(model.track(frames, {"v0": one}))
     found = dict(model.track(frames, {"v0": one, "v2": other}))
     assert torch.equal(found["v1"].ids, plain["v1"].ids)
@@ -209,6 +241,7 @@ def test_absent_objects_and_overlaps(checkpoints, rng, monkeypatch) -> None:
     right[0] = 4.0
     found = highest([7, 4], torch.stack((left, right)), (4, 4))
     assert found.tolist() == [[4] * 4, *[[7, 7, 7, 4]] * 3]
+    assert highest([7, 4], torch.ones(2, 2, 2), (1, 1)).item() == 4, "of equal ones the lower id"
     assert highest([], torch.zeros(0, 1, 1), (2, 3)).tolist() == [[-1] * 3] * 2
     model = made(checkpoints, "sam2-video", "sam2_video")
     run = _video_memory.VideoMemory.follow
@@ -216,7 +249,8 @@ def test_absent_objects_and_overlaps(checkpoints, rng, monkeypatch) -> None:
 
     def scripted(memory, pixels, seeds):
         ids, logits, _ = run(memory, pixels, seeds)
-        return ids, torch.full_like(logits, 3.0), torch.tensor([scores[id] for id in ids])
+        height = torch.tensor([3.0, 4.0])[:, None, None].expand_as(logits)
+        return ids, height, torch.tensor([scores[id] for id in ids])
 
     monkeypatch.setattr(_video_memory.VideoMemory, "follow", scripted)
     ids = dict(model.track(video(rng, 2), {"v0": TWO}))["v1"].ids

@@ -103,7 +103,7 @@ class VideoMemory:
         """
         session = self._session
         for id in self.ids:
-            self._forget_answer(id, seeded_again=id in seeds)
+            self._forget_answer(id)
         for id, mask in seeds.items():
             session.add_mask_inputs(session.obj_id_to_idx(id), self._frame, mask)
         if not self.ids:
@@ -115,14 +115,12 @@ class VideoMemory:
             self._keep_little(session.obj_id_to_idx(id))
         return tuple(output.object_ids), output.pred_masks[:, 0], output.object_score_logits[:, 0]
 
-    def _forget_answer(self, id: int, *, seeded_again: bool) -> None:
+    def _forget_answer(self, id: int) -> None:
         """Undo what was made of the current frame, where it comes again with other seeds."""
         index = self._session.obj_id_to_idx(id)
-        outputs = self._session.output_dict_per_obj[index]
-        outputs["non_cond_frame_outputs"].pop(self._frame, None)
+        tracked = self._session.output_dict_per_obj[index]["non_cond_frame_outputs"]
+        tracked.pop(self._frame, None)
         self._session.frames_tracked_per_obj[index].pop(self._frame, None)
-        if seeded_again:
-            outputs["cond_frame_outputs"].pop(self._frame, None)
 
     def _keep_little(self, index: int) -> None:
         self._session.mask_inputs_per_obj[index].clear()
