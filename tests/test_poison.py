@@ -8,7 +8,7 @@ import dataclasses
 import inspect
 import typing
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pytest
 
 from splatseg.core.boundary import converters
 from splatseg.errors import SplatsegError
+from splatseg.methods import _registry
 from support import poison
 from support.public import public_callables
 
@@ -58,8 +59,12 @@ SLOW = (
 
 
 @pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    return poison.valid(poison.World(tmp_path_factory.mktemp("world")))
+def known(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+    before = dict(_registry._REGISTERED)
+    yield poison.valid(poison.World(tmp_path_factory.mktemp("world")))
+    # `register_method` is called too: pages of help that are tested later know no such method.
+    _registry._REGISTERED.clear()
+    _registry._REGISTERED.update(before)
 
 
 def runs_nothing(value: Callable[..., Any]) -> bool:

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from support import checkpoints_labels, checkpoints_text
+from support import checkpoints_labels, checkpoints_text, checkpoints_track
 
 SEED = 7
 _VIT: dict[str, Any] = {
@@ -139,4 +139,5 @@ _MAKERS = {
     "dinov3": dinov3,
     **checkpoints_labels.MAKERS,
     **checkpoints_text.MAKERS,
+    **checkpoints_track.MAKERS,
 }

@@ -10,7 +10,14 @@ import tyro
 from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder
 from splatseg.cli._words import listed, option_value
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
-from splatseg.models import LoadOptions, ModelFamily, SeenEvidence, find_family, model_names
+from splatseg.models import (
+    LoadOptions,
+    ModelFamily,
+    SeenEvidence,
+    TrackingOptions,
+    find_family,
+    model_names,
+)
 from splatseg.tasks import SeeOptions, see
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
@@ -30,6 +37,8 @@ class Command:
 
     splatseg see room --model dinov2 --weights facebook/dinov2-base --download --evidence dino
 
+    splatseg see room --model sam2-video --seeds masks --evidence tracks
+
     splatseg see room --model sam-masks --evidence masks_sam --views all --allow-missing
 
     splatseg see room --model label-maps --evidence labels --zero-is-class --void 255
@@ -47,9 +56,9 @@ class Command:
     """Name of the evidence to write."""
 
     what: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ..")] = ()
-    """What to ask the model for: masks, labels, panoptic, features, text, depth. Without it what
-    the model has, masks before the others. Of several, by comma or by space, each further one is
-    written to NAME.WHAT, and each image passes the network once."""
+    """What to ask the model for: masks, labels, panoptic, features, text, depth, tracked. Without
+    it what the model has, masks before the others. Of several, by comma or by space, each further
+    one is written to NAME.WHAT, and each image passes the network once."""
 
     views: tuple[str, ...] = ("train",)
     """Which views: train, all, or names of views, by comma or by space. It is recorded with the
@@ -85,6 +94,10 @@ class Command:
     precision: Literal["float16", "int8"] = "float16"
     """How features are kept in the cache."""
 
+    seeds: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Name of the evidence that says what a tracker is to follow: masks, panoptic segments,
+    labels or tracks of some views, of the scene or its capture."""
+
     overwrite: Overwrite = False
     backend: Backend = "auto"
     data: Data = None
@@ -93,6 +106,9 @@ class Command:
 
     loading: tyro.conf.OmitArgPrefixes[LoadOptions] = field(default_factory=LoadOptions)
     """Weights, and where and how the network runs."""
+
+    tracking: tyro.conf.OmitArgPrefixes[TrackingOptions] = field(default_factory=TrackingOptions)
+    """Which of the seeds count, and the order of the views."""
 
     options: Any = None
     """Options of the model."""
@@ -105,6 +121,16 @@ _HIDDEN_LOADING = (
 )
 """For a model that has no weights: their flags are unknown to it, and so refused."""
 
+_NO_TRACKING = (
+    ("seeds", Annotated[str | None, tyro.conf.Suppress], None),
+    (
+        "tracking",
+        Annotated[TrackingOptions, tyro.conf.OmitArgPrefixes, tyro.conf.Suppress],
+        field(default_factory=TrackingOptions),
+    ),
+)
+"""For a model that follows nothing."""
+
 _NO_OPTIONS = ("options", Annotated[Any, tyro.conf.Suppress], field(default=None))
 
 
@@ -116,7 +142,9 @@ def command_for(words: Sequence[str]) -> type[Any]:
     name = option_value(words, "--model")
     if name is None:
         return _with_summaries()
-    family = find_family(name) if name in model_names() else None
+    if name not in model_names():
+        return _made([_NO_OPTIONS, _HIDDEN_LOADING, *_NO_TRACKING], Command.__doc__)
+    family = find_family(name)
     if family is None:
         return _made([_NO_OPTIONS, _HIDDEN_LOADING], Command.__doc__)
     options = Annotated[
@@ -125,6 +153,8 @@ def command_for(words: Sequence[str]) -> type[Any]:
         tyro.conf.arg(help=f"Options of model {name}: {family.summary} ({family.reference})."),
     ]
     fields: list[Any] = [("options", options, field(default_factory=family.options))]
+    if "tracked" not in family.gives:
+        fields += _NO_TRACKING
     if not family.needs_weights:
         fields.append(_HIDDEN_LOADING)
     return _made(fields, f"{Command.__doc__}{_weights(family)}")
@@ -154,7 +184,9 @@ def _with_summaries() -> type[Any]:
         family = find_family(name)
         rows.append(f"- {name}: {'of another package' if family is None else family.summary}")
     text = "\n".join(rows)
-    return _made([_NO_OPTIONS, _HIDDEN_LOADING], f"{Command.__doc__}\n\nModels:\n\n{text}")
+    return _made(
+        [_NO_OPTIONS, _HIDDEN_LOADING, *_NO_TRACKING], f"{Command.__doc__}\n\nModels:\n\n{text}"
+    )
 
 
 def run(command: Command) -> None:

@@ -356,8 +356,15 @@ class MaskTracker(Model, Protocol):
     ) -> Iterator[tuple[str, LabelMap]]:
         """Follow what the seeds mark; one label map a frame, as frames are taken in.
 
+        At a seeded view the result has the seed's ids where it marks pixels, and what was marked
+        before in the others. Before the first seed there is nothing to follow: all is -1.
+
         Args:
-            frames: Names and images of views, in order. They are taken one at a time.
-            seeds: Label maps by name of the view that they mark. Ids are those of the result.
+            frames: Names and images of views, in order. The next one is taken when the label map
+                of the one before was taken. A frame that comes again at once, under the same
+                name, is answered anew, as if it came for the first time.
+            seeds: Label maps by name of the view that they mark; -1 marks nothing. Ids are those
+                of the result: a later seed may bring new ones, and say again where known ones
+                are. One is looked up when its frame is taken, so that the mapping may grow.
         """
         ...

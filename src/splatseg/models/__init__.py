@@ -14,4 +14,6 @@ from splatseg.models._registry import ENTRY_POINT_GROUP as ENTRY_POINT_GROUP
 from splatseg.models._registry import find_family as find_family
 from splatseg.models._registry import find_model as find_model
 from splatseg.models._registry import model_names as model_names
+from splatseg.models._seeds import TrackingOptions as TrackingOptions
+from splatseg.models._sources import What as What
 from splatseg.models.recorded import recorded_model as recorded_model

@@ -16,6 +16,7 @@ from splatseg.core.models import (
     DenseDepth,
     DenseFeatures,
     Image,
+    MaskTracker,
     Model,
     PanopticSegments,
     SemanticLabels,
@@ -47,6 +48,7 @@ _PROTOCOLS: dict[What, type[Any]] = {
     "text": TextFeatures,
     "features": DenseFeatures,
     "depth": DenseDepth,
+    "tracked": MaskTracker,
 }
 _KINDS: dict[What, EvidenceKind] = {
     "masks": "masks",
@@ -55,6 +57,7 @@ _KINDS: dict[What, EvidenceKind] = {
     "text": "features",
     "features": "features",
     "depth": "depth",
+    "tracked": "tracked",
 }
 
 
@@ -90,10 +93,8 @@ class Pictures:
         self._kept.clear()
 
 
-def computed(
-    model: Model, *, what: What | None, cache: ModelCache | None, pictures: Pictures
-) -> Source:
-    """Evidence from running a model on pictures of views.
+def ability(model: Model, what: What | None) -> What:
+    """What a model is asked for; None takes the most telling that it can be.
 
     Raises:
         InputError: If the model cannot give this, or nothing at all.
@@ -108,6 +109,18 @@ def computed(
         raise InputError(
             f"model {model.name!r}: expected one of what it gives ({', '.join(can)}), got {what!r}."
         )
+    return what
+
+
+def computed(
+    model: Model, *, what: What | None, cache: ModelCache | None, pictures: Pictures
+) -> Source:
+    """Evidence from running a model on pictures of views, each by itself.
+
+    Raises:
+        InputError: If the model cannot give this, or nothing at all.
+    """
+    what = ability(model, what)
     return _Computed(model=model, asked=what, cache=cache, pictures=pictures)
 
 
@@ -159,6 +172,15 @@ class _Computed(Source):
     @override
     def is_costly(self) -> bool:
         return True
+
+    @property
+    @override
+    def goes_on(self) -> bool:
+        return True
+
+    @override
+    def sequence(self, views: Sequence[View]) -> Sequence[View]:
+        return views
 
     @override
     def available(self, views: Sequence[View]) -> frozenset[str]:

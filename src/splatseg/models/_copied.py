@@ -121,6 +121,15 @@ class _Copied(Source):
     def is_costly(self) -> bool:
         return False
 
+    @property
+    @override
+    def goes_on(self) -> bool:
+        return True
+
+    @override
+    def sequence(self, views: Sequence[View]) -> Sequence[View]:
+        return views
+
     @override
     def available(self, views: Sequence[View]) -> frozenset[str]:
         return frozenset(self.evidence.view_names)

@@ -11,21 +11,30 @@ from typing import Any, Literal, cast
 
 from splatseg.core import View
 from splatseg.core.boundary import boundary
-from splatseg.core.models import Image, Model, ModelWithDefaults
+from splatseg.core.models import Image, MaskTracker, Model, ModelWithDefaults
 from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
 from splatseg.errors import InputError
 from splatseg.io.atomic import TEMPORARY, hidden_folder, is_vacant, replace_folder, sweep
-from splatseg.io.evidence import EvidenceKind, create_evidence, evidence_header, view_files
+from splatseg.io.evidence import (
+    Evidence,
+    EvidenceKind,
+    create_evidence,
+    evidence_header,
+    view_files,
+)
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.io.write_errors import named_write_failures
 from splatseg.models._cache import ModelCache
-from splatseg.models._computed import Pictures, announce, batch_of, computed
+from splatseg.models._computed import Pictures, ability, announce, batch_of, computed
 from splatseg.models._copied import copied
+from splatseg.models._seeds import TrackingOptions
 from splatseg.models._sources import Source, What, some, views_done
+from splatseg.models._tracked import tracked
 from splatseg.models.recorded import AnyRecorded
 
 _SAME = ("model", "settings", "what")
-"""What must be as it was for interrupted work to go on."""
+_OF_TRACKS = "tracking"
+"""What must be as it was for interrupted work to go on, and how seeds were followed."""
 
 _DEFAULTS = "default_settings"
 """What a setting counts as that was not recorded, where the model says so."""
@@ -73,6 +82,8 @@ def record_evidence(
     overwrite: bool = False,
     missing: Literal["refuse", "skip"] = "refuse",
     cache: ModelCache | None = None,
+    seeds: Evidence | None = None,
+    tracking: TrackingOptions | None = None,
     image_of: Callable[[View, Path], Image] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SeenEvidence:
@@ -85,14 +96,17 @@ def record_evidence(
         model: The model, or a recorded one.
         views: The views to look at.
         folder: Where to write, usually SCENE/evidence/NAME. Its parent must exist.
-        what: Masks, labels, panoptic, features or text; None takes what the model has, masks
-            before the others. Of several the first goes to `folder`, each further one beside it
-            to NAME.WHAT; a network that gives them together passes each image once.
+        what: Masks, labels, panoptic, features, text or tracked; None takes what the model has,
+            masks before the others. Of several the first goes to `folder`, each further one beside
+            it to NAME.WHAT; a network that gives them together passes each image once.
         asked: How the views were asked for; recorded, so that it can be seen later what the
             evidence may be used for.
         overwrite: Whether evidence of the same name is replaced, once the new one is complete.
         missing: Whether it is an error that recorded evidence lacks a view.
         cache: Where to look before the model is run.
+        seeds: What a tracker is to follow: evidence of masks, panoptic segments, labels or tracks.
+            Tracks are asked for alone, and are written whole or not at all.
+        tracking: Which of the seeds count, and the order of the views.
         image_of: Gives the picture of a view that the model is to see, in the pixels of its
             camera, and may keep it in the folder where the evidence is being written, which it
             is given too. None takes photographs.
@@ -109,17 +123,22 @@ def record_evidence(
         raise InputError("views: expected at least one view, got none.")
     asked_for = _distinct(what)
     pictures = Pictures(image_of)
-    sources = [
-        copied(model, views, what=one, missing=missing)
-        if isinstance(model, AnyRecorded)
-        else computed(model, what=one, cache=cache, pictures=pictures)
-        for one in asked_for
-    ]
+    sources = (
+        _sources_of_tracks(
+            model, views, asked_for, cache=cache, seeds=seeds, tracking=tracking, pictures=pictures
+        )
+        if _is_followed(model, asked_for)
+        else _sources_by_view(
+            model, views, asked_for, cache=cache, missing=missing, pictures=pictures
+        )
+    )
+    if (seeds is not None or tracking is not None) and sources[0].goes_on:
+        raise InputError(f"seeds: expected with a tracker, got model {model.name!r}.")
     folders = evidence_folders(Path(folder), asked_for)
     for source, target in zip(sources, folders, strict=True):
         source.check_target(target)
     available = frozenset.intersection(*(source.available(views) for source in sources))
-    wanted = [view for view in views if view.name in available]
+    wanted = [view for view in sources[0].sequence(views) if view.name in available]
     started = time.monotonic()
     with ExitStack() as stack:
         targets = [
@@ -146,6 +165,51 @@ def record_evidence(
             target.finish()
     seen = [target.seen(model.name, seconds) for target in targets]
     return replace(seen[0], further=tuple(seen[1:]))
+
+
+def _is_followed(model: Model, asked_for: Sequence[What | None]) -> bool:
+    """Whether a tracker is asked for tracks."""
+    if isinstance(model, AnyRecorded):
+        return False
+    return "tracked" in [ability(model, one) for one in asked_for]
+
+
+def _sources_by_view(
+    model: Model,
+    views: Sequence[View],
+    asked_for: Sequence[What | None],
+    *,
+    cache: ModelCache | None,
+    missing: Literal["refuse", "skip"],
+    pictures: Pictures,
+) -> list[Source]:
+    """Evidence of each view by itself, one a kind."""
+    return [
+        copied(model, views, what=one, missing=missing)
+        if isinstance(model, AnyRecorded)
+        else computed(model, what=one, cache=cache, pictures=pictures)
+        for one in asked_for
+    ]
+
+
+def _sources_of_tracks(
+    model: Model,
+    views: Sequence[View],
+    asked_for: Sequence[What | None],
+    *,
+    cache: ModelCache | None,
+    seeds: Evidence | None,
+    tracking: TrackingOptions | None,
+    pictures: Pictures,
+) -> list[Source]:
+    """The evidence of a tracker, which goes through all views."""
+    if len(asked_for) > 1:
+        raise InputError("what: expected tracked alone, since views come in its order; got more.")
+    if cache is not None:
+        raise InputError("cache: keeps answers to single photographs, got a tracker's.")
+    options = tracking or TrackingOptions()
+    tracker = cast(MaskTracker, model)
+    return [tracked(tracker, views, seeds=seeds, options=options, pictures=pictures)]
 
 
 def evidence_folders(folder: Path, what: Sequence[What | None]) -> list[Path]:
@@ -260,7 +324,9 @@ def _work_folder(target: Path, source: Source, *, overwrite: bool) -> Generator[
     try:
         yield folder
     except BaseException as error:
-        worthless = not (had_views or source.is_costly) and isinstance(error, Exception)
+        worthless = not (had_views or source.is_costly) and (
+            isinstance(error, Exception) or not source.goes_on
+        )
         if folder.is_dir() and (worthless or not _holds_views(folder)):
             shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -287,12 +353,21 @@ def _begin(
         _write_header(folder, source, metadata)
         return frozenset()
     _check_same(folder, header, source, metadata)
+    if not source.goes_on and _is_unfinished(header):
+        shutil.rmtree(folder)
+        _write_header(folder, source, metadata)
+        return frozenset()
     there = views_done(folder, source.kind)
     extra = sorted(there - {view.name for view in wanted})
     if extra:
         raise InputError(
             f"{folder}: holds {len(extra)} views that are not asked for now ({some(extra)}); ask "
             "for them too, overwrite it, or choose another name."
+        )
+    if not source.goes_on and len(there) < len(wanted):
+        raise InputError(
+            f"{folder}: holds {len(there)} of {len(wanted)} views, and the others cannot be added; "
+            "overwrite it or choose another name."
         )
     _write_header(folder, source, metadata)
     return there
@@ -303,8 +378,7 @@ def _may_be_lost(
 ) -> bool:
     """Whether a folder holds nothing to go on with: no view, or new evidence of other settings."""
     if not _holds_views(folder):
-        recorded = header.get("metadata")
-        return isinstance(recorded, Mapping) and recorded.get("complete") is False  # pyright: ignore[reportUnknownMemberType]
+        return _is_unfinished(header)
     if not folder.name.startswith(TEMPORARY):
         return False
     try:
@@ -314,19 +388,25 @@ def _may_be_lost(
     return False
 
 
+def _is_unfinished(header: Mapping[str, Any] | None) -> bool:
+    recorded = None if header is None else header.get("metadata")
+    return isinstance(recorded, Mapping) and recorded.get("complete") is False  # pyright: ignore[reportUnknownMemberType]
+
+
 def _check_same(
     folder: Path, header: Mapping[str, Any], source: Source, metadata: Mapping[str, Any]
 ) -> None:
     recorded = header.get("metadata")
     before = cast("Mapping[str, Any]", recorded) if isinstance(recorded, Mapping) else {}
-    if any(key not in before for key in _SAME):
+    same = (*_SAME, *(key for key in (_OF_TRACKS,) if key in metadata))
+    if any(key not in before for key in same):
         raise InputError(
             f"{folder}: this evidence cannot be gone on with, as it does not say how it was made; "
             "overwrite it or choose another name."
         )
     differences = option_differences(
-        {key: before[key] for key in _SAME},
-        {key: metadata[key] for key in _SAME},
+        {key: before[key] for key in same},
+        {key: metadata[key] for key in same},
         defaults={"settings": metadata[_DEFAULTS]},
         recorded_defaults={"settings": before.get(_DEFAULTS, {})},
     )

@@ -26,6 +26,8 @@ _OWN = {
     "sam-hq": f"{_NETWORKS}.sam:SAM_HQ",
     "sam2": f"{_NETWORKS}.sam:SAM2",
     "sam3": f"{_NETWORKS}.sam:SAM3",
+    "sam2-video": f"{_NETWORKS}.sam_video:SAM2_VIDEO",
+    "sam3-video": f"{_NETWORKS}.sam_video:SAM3_VIDEO",
     "dino": f"{_NETWORKS}.dino:DINO",
     "dinov2": f"{_NETWORKS}.dino:DINOV2",
     "dinov3": f"{_NETWORKS}.dino:DINOV3",

@@ -9,7 +9,7 @@ from splatseg.core import ClassTable, MaskSet, View
 from splatseg.errors import FileFormatError
 from splatseg.io.evidence import Evidence, EvidenceKind, open_evidence, read_id_map, view_files
 
-What = Literal["masks", "labels", "panoptic", "features", "text", "depth"]
+What = Literal["masks", "labels", "panoptic", "features", "text", "depth", "tracked"]
 """What a model can be asked for."""
 
 SEGMENT_PARTS = ".segments"
@@ -33,6 +33,15 @@ class Source(ABC):
     @abstractmethod
     def is_costly(self) -> bool:
         """Whether views that are written are worth keeping if a later one fails."""
+
+    @property
+    @abstractmethod
+    def goes_on(self) -> bool:
+        """Whether work that was stopped can go on at the next view, or begins again."""
+
+    @abstractmethod
+    def sequence(self, views: Sequence[View]) -> Sequence[View]:
+        """Views in the order in which they are to be written."""
 
     @abstractmethod
     def available(self, views: Sequence[View]) -> frozenset[str]:

@@ -1,19 +1,27 @@
 """A 2D model looks at a scene's photographs, and what it sees is written down."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from splatseg.core import Model, Scene
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
-from splatseg.io.evidence import RENDERS_FOLDER, EvidenceKind
+from splatseg.io.evidence import (
+    RENDERS_FOLDER,
+    Evidence,
+    EvidenceKind,
+    find_evidence,
+    open_evidence,
+)
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path, work_on_scene
 from splatseg.models import (
     LoadOptions,
     ModelCache,
     SeenEvidence,
+    TrackingOptions,
+    What,
     find_model,
     record_evidence,
 )
@@ -24,9 +32,6 @@ from splatseg.tasks._view_images import ViewImages
 from splatseg.tasks.scene_parts import views_asked, views_recorded
 
 EVIDENCE_FOLDER = "evidence"
-
-What = Literal["masks", "labels", "panoptic", "features", "text", "depth"]
-"""What a model can be asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +75,13 @@ class SeeOptions:
     precision: Literal["float16", "int8"] = "float16"
     """How features are kept in the cache."""
 
+    seeds: str | None = None
+    """Name of the evidence that says what a tracker is to follow: masks, panoptic segments,
+    labels or tracks of some views, of the scene or its capture."""
+
+    tracking: TrackingOptions = field(default_factory=TrackingOptions)
+    """Which of the seeds count, and the order of the views."""
+
     overwrite: bool = False
     """Replace evidence of this name, once the new one is complete."""
 
@@ -95,7 +107,7 @@ def see(
     render is kept beside the evidence in ``_renders``; models get images only.
 
     A call that was stopped, by an exception out of the observer too, has written whole views;
-    the same call again does the rest.
+    the same call again does the rest. A tracker begins again: it leaves all views or none.
 
     Args:
         scene: The scene, read from its folder.
@@ -122,6 +134,8 @@ def see(
         raise InputError("scene: expected one that was read from its folder, got one without.")
     views = views_asked(scene, options.views)
     found = _model(model, options, model_options, loading, observer)
+    seeds = _seeds(scene, options.seeds)
+    tracking = None if seeds is None and options.tracking == TrackingOptions() else options.tracking
     cache = None
     if options.cache is not None:
         cache = ModelCache(folder=options.cache, precision=options.precision, report=observer.note)
@@ -139,6 +153,8 @@ def see(
             overwrite=options.overwrite,
             missing="skip" if options.allow_missing else "refuse",
             cache=cache,
+            seeds=seeds,
+            tracking=tracking,
             image_of=images,
             progress=step,
         )
@@ -149,6 +165,11 @@ def see(
     if cache is not None:
         observer.note(f"{cache.folder}: {cache.size()}")
     return seen
+
+
+def _seeds(scene: Scene, name: str | None) -> Evidence | None:
+    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
+    return None if name is None else open_evidence(find_evidence(folders, name))
 
 
 def _rendered(drawn: int, folder: Path) -> str:

@@ -238,7 +238,8 @@ class Sam:
         if self._kind.shape == "padded":
             return _flat(self._network.get_image_embeddings(batch))
         features = self._network.get_image_features(batch, return_dict=True).fpn_hidden_states
-        features = features[: len(self._network.config.vision_config.backbone_feature_sizes)]
+        # SAM 3 makes one map more, coarser, for its detector alone.
+        features = features[: len(self._network.backbone_feature_sizes)]
         maps = [one.permute(1, 2, 0) for one in features]
         maps[-1] = maps[-1] + self._network.no_memory_embedding.reshape(1, -1, 1)
         sides = [round(one.shape[2] ** 0.5) for one in maps]

@@ -10,11 +10,11 @@ from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
 from splatseg.io.evidence import TEXT_FILE, EvidenceKind, open_evidence
 from splatseg.methods import Method
-from splatseg.models import LoadOptions, find_family, find_model, model_names
+from splatseg.models import LoadOptions, What, find_family, find_model, model_names
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
-from splatseg.tasks.see import SeeOptions, What, see
+from splatseg.tasks.see import SeeOptions, see
 
 _LOADING = ("size", "dtype", "batch")
 """Options of loading that each model may have its own of."""
@@ -143,8 +143,9 @@ def _of_model(named: str, method: Method, *, words: bool) -> tuple[EvidenceKind,
     family = find_family(name_of(named))
     gives: tuple[What, ...] = () if family is None else family.gives
     for what in gives:
-        if _KIND_OF[what] in method.evidence and (not words or what == "text"):
-            return _KIND_OF[what], what
+        kind = _KIND_OF.get(what)
+        if kind in method.evidence and kind is not None and (not words or what == "text"):
+            return kind, what
     return None
 
 
