@@ -5,6 +5,8 @@ from typing import Any
 
 import torch
 
+from support import checkpoints_lseg
+
 SEED = 7
 _VIT: dict[str, Any] = {
     "hidden_size": 32,
@@ -135,4 +137,5 @@ _MAKERS = {
     "dinov2": dinov2,
     "dinov2_with_registers": dinov2_with_registers,
     "dinov3": dinov3,
+    **checkpoints_lseg.MAKERS,
 }

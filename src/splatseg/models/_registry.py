@@ -29,6 +29,7 @@ _OWN = {
     "dino": f"{_NETWORKS}.dino:DINO",
     "dinov2": f"{_NETWORKS}.dino:DINOV2",
     "dinov3": f"{_NETWORKS}.dino:DINOV3",
+    "lseg": "splatseg.models.lseg:LSEG",
 }
 
 
