@@ -12,7 +12,7 @@ WIDTH, DECODER, EMBEDDING, TEXT = 128, 32, 24, 64
 CHANNELS = (16, 24, 32, 40)
 BLOCKS, TEXT_BLOCKS, CONTEXT, GRID = 4, 2, 12, 3
 LETTERS = "abcdefghijklmnopqrstuvwxyz"
-PIECES = ["ch", "cha", "chai", "r</w>", "chair</w>"]
+PIECES = ["ch", "cha", "chai", "chair</w>"]
 VOCABULARY = [
     *LETTERS, *(f"{letter}</w>" for letter in LETTERS), *PIECES,
     "<|startoftext|>", "<|endoftext|>",
@@ -132,7 +132,7 @@ class LSegFiles:
         torch.save(content, folder / "demo_e200.ckpt")
         numbers = {token: i for i, token in enumerate(VOCABULARY)}
         (folder / "vocab.json").write_text(json.dumps(numbers))
-        merges = "#version: 0.2\nc h\nch a\ncha i\nr </w>\nchai r</w>\n"
+        merges = "#version: 0.2\nc h\nch a\ncha i\nchai r</w>\n"
         (folder / "merges.txt").write_text(merges)
 
 

@@ -1,5 +1,6 @@
 """The published checkpoint: read without running it, tensor by tensor, and refused in a sentence."""
 
+import os
 import shutil
 import sys
 import types
@@ -163,6 +164,17 @@ def test_classes_of_the_training_program_are_neither_needed_nor_run(
         assert set(found) == set(read_checkpoint(weights / "demo_e200.ckpt"))
 
 
+class Commands:
+    """What runs a command where it is read without restriction."""
+
+    def __reduce__(self):
+        return os.system, ("exit 1",)
+
+
+class Listed(list):
+    """What a restricted reader does not fill."""
+
+
 def test_files_of_other_kinds(weights: Path, tmp_path) -> None:
     whole = (weights / "demo_e200.ckpt").read_bytes()
     cut = tmp_path / "cut.ckpt"
@@ -180,6 +192,12 @@ def test_files_of_other_kinds(weights: Path, tmp_path) -> None:
         read_checkpoint(tmp_path / "old.ckpt")
     with pytest.raises(MissingFileError):
         read_checkpoint(tmp_path / "gone.ckpt")
+    torch.save({"a": Listed([1])}, tmp_path / "listed.ckpt")
+    with pytest.raises(FileFormatError, match="got one that only the program it is of can read"):
+        read_checkpoint(tmp_path / "listed.ckpt")
+    torch.save({"a": Commands()}, tmp_path / "commands.ckpt")
+    with pytest.raises(FileFormatError, match="got one that only the program it is of can read"):
+        read_checkpoint(tmp_path / "commands.ckpt")
     shutil.copy(cut, tmp_path / "cut.safetensors")
     with pytest.raises(FileFormatError, match="safetensors"):
         read_checkpoint(tmp_path / "cut.safetensors")

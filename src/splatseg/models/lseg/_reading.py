@@ -2,36 +2,31 @@
 
 import pickle
 import zipfile
+from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor
-from typing_extensions import override
 
-from splatseg.errors import FileFormatError, reason
+from splatseg.errors import FileFormatError
 from splatseg.io.foreign import reading
 from splatseg.io.tensors import read_tensors
 
 _EXPECTED = "a checkpoint of PyTorch 1.6 or later, or safetensors"
 
 
-class Inert(dict[Any, Any]):
-    """Stands for every class that a checkpoint names besides tensors: it does nothing.
+class Inert:
+    """Stands for every class and function that a checkpoint names besides those of tensors.
 
-    Checkpoints of Lightning hold its callbacks and options, which are of no use here.
+    Checkpoints of Lightning hold callbacks and options, which are of no use here. Whatever would
+    be made of them becomes a dictionary that nobody reads.
     """
 
-    def __init__(self, *arguments: object) -> None:
-        super().__init__()
-
-    def __setstate__(self, state: object) -> None:
-        """Take no state."""
-
-    @override
-    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return id(self)
+    def __new__(cls, *arguments: object) -> Any:
+        """Make a dictionary, of a kind that takes both items and a state."""
+        return OrderedDict[Any, Any]()
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:
@@ -60,7 +55,7 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
 
 def _loaded(path: Path) -> object:
     with reading(path, _EXPECTED):
-        if not zipfile.is_zipfile(path):
+        if path.stat().st_size and not zipfile.is_zipfile(path):
             raise FileFormatError(f"{path}: expected {_EXPECTED}, got another kind of file.")
         named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
         try:
@@ -72,8 +67,8 @@ def _loaded(path: Path) -> object:
                 )
         except (pickle.UnpicklingError, AssertionError) as error:
             raise FileFormatError(
-                f"{path}: expected a checkpoint that holds tensors and nothing that must be run "
-                f"({reason(error)})."
+                f"{path}: expected a checkpoint of tensors and plain values, got one that only the "
+                "program it is of can read; its state_dict saved as safetensors is taken."
             ) from error
 
 

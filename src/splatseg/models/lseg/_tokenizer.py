@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
 from splatseg.models._weights import cached_file
 from splatseg.models.networks._library import library
 
@@ -69,7 +69,9 @@ class Tokenizer:
                 folder, local_files_only=True
             )
             size = len(self._tokenizer)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except SplatsegError:
+            raise
+        except Exception as error:  # noqa: BLE001 tokenizers raises Exception itself
             words = str(error).strip().splitlines()
             raise FileFormatError(
                 f"{folder}: expected the vocabulary of CLIP, but it cannot be read "
