@@ -1,4 +1,4 @@
-"""The published checkpoint: read without running it, tensor by tensor, and refused in a sentence."""
+"""The published checkpoint: read without running it, tensor by tensor, or refused."""
 
 import os
 import shutil

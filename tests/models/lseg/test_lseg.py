@@ -21,7 +21,9 @@ def image(rng, height: int, width: int) -> torch.Tensor:
     return torch.from_numpy(rng.integers(0, 256, (height, width, 3)).astype("uint8"))
 
 
-def made(weights: Path | str, *, size: int = 64, report=None, dtype="float32", batch=None, **options):
+def made(
+    weights: Path | str, *, size: int = 64, report=None, dtype="float32", batch=None, **options
+):
     loading = LoadOptions(weights=str(weights), size=size, device="cpu", dtype=dtype, batch=batch)
     return find_model("lseg", LSegOptions(**options), loading=loading, report=report)
 
@@ -43,7 +45,9 @@ def test_it_is_what_the_network_gives(weights: Path, rng) -> None:
     deep = model.features(picture)
     assert deep.depths == ("decoder",)
     wide = decoded[0].permute(1, 2, 0)
-    torch.testing.assert_close(deep.maps[0].features, wide, rtol=1e-4, atol=1e-3 * float(wide.std()))
+    torch.testing.assert_close(
+        deep.maps[0].features, wide, rtol=1e-4, atol=1e-3 * float(wide.std())
+    )
     assert float(found.features.std(dim=(0, 1)).mean()) > 0.02, "cells differ"
 
 

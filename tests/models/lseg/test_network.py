@@ -155,7 +155,8 @@ def test_the_image_side_is_transformers_dpt(weights: Path) -> None:
     about = theirs.load_state_dict(_as_dpt(state), strict=False)
     allowed = ("dpt.layernorm", "dpt.pooler", "head", "num_batches", "fusion_stage.layers.0.resid")
     lacking = [one for one in about.missing_keys if not any(part in one for part in allowed)]
-    assert not lacking and not about.unexpected_keys
+    assert not lacking
+    assert not about.unexpected_keys
     batch = torch.randn(2, 3, 64, 96)
     with torch.inference_mode():
         hidden = theirs.dpt(batch, output_hidden_states=True).hidden_states[1:]
@@ -225,7 +226,9 @@ def test_the_text_side_is_transformers_clip(weights: Path) -> None:
     )  # fmt: skip
     theirs = CLIPTextModelWithProjection(config).eval()
     clip = {k.removeprefix("clip_pretrained."): v for k, v in state.items() if "clip" in k}
-    keys = {name: _from_clip(name, clip) for name in theirs.state_dict() if "position_ids" not in name}
+    keys = {
+        name: _from_clip(name, clip) for name in theirs.state_dict() if "position_ids" not in name
+    }
     theirs.load_state_dict(keys, strict=False)
     tokens = torch.tensor([[end - 1, 4, 9, end, 0, 0], [end - 1, 30, 2, 7, 8, end]])
     with torch.inference_mode():

@@ -1,9 +1,8 @@
 """Feature maps: an npz a view. Our own are float16; recorded ones are quantised to 8 bit.
 
-Our own hold the deepest map of a network first, then the names of all depths, the shallower maps
-and the class token, where there are some. A quantised value q stands for q * scale + offset, with scale and offset by channel (and block)
-in quant.npz or basis.npz. Text features are principal components on top of that: the full
-vector is ``normalise((q * scale + offset) @ basis + mean)``.
+Our own are described in `_own_features`. A quantised value q stands for q * scale + offset, with
+scale and offset by channel (and block) in quant.npz or basis.npz. Text features are principal
+components on top of that: the full vector is ``normalise((q * scale + offset) @ basis + mean)``.
 """
 
 from collections.abc import Mapping

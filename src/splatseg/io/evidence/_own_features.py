@@ -69,7 +69,9 @@ def own_features(path: Path, block: str | None) -> FeatureMap:
     if block is not None:
         blocks = own_blocks(path)
         if block not in blocks:
-            known = f"one of the blocks {', '.join(blocks)}" if blocks else "no block, as it has none"
+            known = (
+                f"one of the blocks {', '.join(blocks)}" if blocks else "no block, as it has none"
+            )
             raise InputError(f"{path}: expected {known}, got {block!r}.")
         index = blocks.index(block)
         at = "" if index == len(blocks) - 1 else f"_{index}"

@@ -71,7 +71,7 @@ class Tokenizer:
             size = len(self._tokenizer)
         except SplatsegError:
             raise
-        except Exception as error:  # noqa: BLE001 tokenizers raises Exception itself
+        except Exception as error:
             words = str(error).strip().splitlines()
             raise FileFormatError(
                 f"{folder}: expected the vocabulary of CLIP, but it cannot be read "

@@ -58,5 +58,7 @@ class Block(nn.Module):
         """Tokens after the block."""
         tokens = tokens + self.attention(self.norm_1(tokens))
         inner = self.wider(self.norm_2(tokens))
-        inner = F.gelu(inner) if self._activation == "gelu" else inner * torch.sigmoid(1.702 * inner)
+        inner = (
+            F.gelu(inner) if self._activation == "gelu" else inner * torch.sigmoid(1.702 * inner)
+        )
         return tokens + self.back(inner)
