@@ -1,8 +1,5 @@
 """Methods by name: help, refusals, and the ten lines of docs/methods.md, outside and inside."""
 
-import os
-import re
-import subprocess
 import sys
 import types
 from importlib.metadata import EntryPoint
@@ -27,14 +24,14 @@ from splatseg.methods import (
     methods_table,
     with_table,
 )
+from support.packages import blocks, install, run
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+PAGE = ROOT / "docs" / "methods.md"
 
 
 def block(language: str, index: int) -> str:
-    found = re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    return found[index]
+    return blocks(PAGE, language)[index]
 
 
 MAJORITY = block("python", 1)
@@ -52,32 +49,12 @@ def installed(monkeypatch):
 
 
 def test_a_method_of_another_package_is_installed_and_runs(small, tmp_path) -> None:
-    source, target = tmp_path / "source", tmp_path / "site"
-    source.mkdir()
-    (source / "majority.py").write_text(MAJORITY)
-    (source / "pyproject.toml").write_text(block("toml", 0))
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps"]
-    subprocess.run(
-        [*pip, "--no-build-isolation", "--target", str(target), str(source)],
-        check=True,
-        capture_output=True,
-    )
-    words = ["segment", str(small.scene), "--method", "majority", "--min-share", "0.6"]
-    done = subprocess.run(
-        [sys.executable, "-m", "splatseg", *words, "--evidence", "labels_semantic"],
-        env={**os.environ, "PYTHONPATH": str(target)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    site = install(tmp_path, module="majority", code=MAJORITY, project=block("toml", 0))
+    words = ["segment", small.scene, "--method", "majority", "--min-share", "0.6"]
+    done = run(site, *words, "--evidence", "labels_semantic")
     assert done.returncode == 0, done.stderr
-    listed = subprocess.run(
-        [sys.executable, "-m", "splatseg", "segment", "--help"],
-        env={**os.environ, "PYTHONPATH": str(target)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    listed = run(site, "segment", "--help")
+    assert listed.returncode == 0
     assert "majority: the id with most votes" in " ".join(listed.stdout.split())
     layer = load_scene_layer(small.scene, "labels_semantic")
     assert layer.info.method == "uplift"

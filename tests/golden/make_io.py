@@ -2,13 +2,15 @@
 
 Run from the project's root: ``python tests/golden/make_io.py``. It makes what is not there:
 scene-v1, a scene folder with one view of each lens and evidence of each kind that is written; and
-layers-v3, a layer of each kind, with a record that says something in every field. A version's
+layers-v3, a layer of each kind, with a record that says something in every field; and
+evidence-v2, features of three blocks with a class token. A version's
 files are made once and then kept: later versions of splatseg must read them. The layers in
 scene-v1 are of version 1 and the one in layers-v2 of version 2, as the scripts of then made them;
 their records are of version 0.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from splatseg.core import (
     Camera,
     ClassInfo,
     ClassTable,
+    DeepFeatures,
     FeatureMap,
     Features,
     Gaussians,
@@ -36,6 +39,7 @@ from splatseg.core import (
     with_info,
 )
 from splatseg.io.evidence import create_evidence, save_features, save_label_map, save_masks
+from splatseg.io.evidence._open import VERSION as EVIDENCE_VERSION
 from splatseg.io.layers import VERSION as LAYER_VERSION
 from splatseg.io.layers import save_layer
 from splatseg.io.scene import VERSION, save_scene, save_scene_layer
@@ -43,6 +47,7 @@ from splatseg.io.scene_folder import CAMERAS_FILE, SCENE_FILE
 
 ROOT = Path(__file__).parent / f"scene-v{VERSION}"
 LAYERS = Path(__file__).parent / f"layers-v{LAYER_VERSION}"
+EVIDENCE = Path(__file__).parent / f"evidence-v{EVIDENCE_VERSION}"
 CLASSES = ClassTable(
     rows=(
         ClassInfo(id=1, name="wall", isthing=False, colour=(10, 20, 30)),
@@ -198,9 +203,26 @@ def golden_evidence() -> tuple[LabelMap, MaskSet, FeatureMap]:
     )
 
 
+def golden_deep_features() -> DeepFeatures:
+    """Three blocks, the shallowest on finer cells and wider, and a class token."""
+    _, _, deepest = golden_evidence()
+    middle = replace(deepest, features=deepest.features.flip(0) - 1)
+    finest = torch.arange(96, dtype=torch.float32).reshape(6, 8, 2) / 16
+    shallow = replace(deepest, features=finest, stride=1)
+    return DeepFeatures(
+        maps=(shallow, middle, deepest),
+        depths=("block4", "block8", "block12"),
+        class_token=torch.tensor([0.5, -2.0]),
+    )
+
+
 def main() -> None:
     if not ROOT.exists():
         make_scene()
+    if not EVIDENCE.exists():
+        EVIDENCE.mkdir()
+        create_evidence(EVIDENCE / "features", kind="features", metadata={"model": "a"})
+        save_features(golden_deep_features(), EVIDENCE / "features", "left/1")
     if not LAYERS.exists():
         LAYERS.mkdir()
         for name, layer in golden_layers_of_version_3().items():

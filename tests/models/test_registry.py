@@ -1,6 +1,8 @@
 """Models by name, those of other packages, and the ten lines of docs/models.md."""
 
 import re
+import sys
+import types
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -15,6 +17,8 @@ from splatseg.core import (
     DenseFeatures,
     MaskSet,
     Model,
+    Pointmap,
+    PointmapModel,
     PromptableMasks,
 )
 from splatseg.errors import InputError, MissingPackageError
@@ -68,8 +72,6 @@ HERE = __name__
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
     """This file under a name that an entry point can import."""
-    import sys
-
     monkeypatch.setitem(sys.modules, "models_of_another_package", sys.modules[HERE])
 
 
@@ -175,10 +177,72 @@ def test_deep_features_have_a_name_a_depth() -> None:
         DeepFeatures(maps=(), depths=())
 
 
-def test_the_models_of_the_documentation_run(project_root: Path, views, tmp_path) -> None:
+@pytest.fixture
+def my_network(monkeypatch) -> list[tuple[torch.Size, ...]]:
+    """A scripted network with DUSt3R's outputs; gives the sizes of what it saw."""
+    sizes: list[tuple[torch.Size, ...]] = []
+
+    def network(first, second):
+        sizes.append((first.shape, second.shape))
+        depth = (first.mean(dim=1) + 2)[..., None]  # of images in [-1, 1]
+        one = {"pts3d": depth.expand(-1, -1, -1, 3), "conf": depth[..., 0]}
+        two = {"pts3d_in_other_view": -depth.expand(-1, -1, -1, 3), "conf": depth[..., 0] + 1}
+        return one, two
+
+    module = types.ModuleType("my_network")
+    module.load_network = lambda: network
+    monkeypatch.setitem(sys.modules, "my_network", module)
+    return sizes
+
+
+def test_the_pointmaps_of_the_documentation_run(
+    project_root: Path, my_network, installed, monkeypatch
+) -> None:
+    text = (project_root / "docs" / "models.md").read_text(encoding="utf-8")
+    (block,) = (b for b in _python(text) if "class MyPointmaps" in b)
+    lines = [line for line in block.splitlines() if line.strip()]
+    assert sum(not line.startswith(("import", "from")) for line in lines) <= 10
+    package = types.ModuleType("their_package")
+    exec(compile(block, "docs/models.md", "exec"), package.__dict__)
+    monkeypatch.setitem(sys.modules, "their_package", package)
+    installed(**{"my-pointmaps": "their_package:MyPointmaps"})
+    model = find_model("my-pointmaps")
+    assert isinstance(model, PointmapModel)
+    assert not isinstance(model, DenseFeatures)
+    black, white = (torch.full((48, 64, 3), value, dtype=torch.uint8) for value in (0, 255))
+    first, second = model.pointmaps(white, black)
+    assert my_network == [((1, 3, 384, 512),) * 2]
+    assert isinstance(first, Pointmap)
+    torch.testing.assert_close(first.points, torch.full((384, 512, 3), 3.0))
+    torch.testing.assert_close(second.points, torch.full((384, 512, 3), -3.0))
+    torch.testing.assert_close(first.confidence, torch.full((384, 512), 3.0))
+    torch.testing.assert_close(second.confidence, torch.full((384, 512), 4.0))
+
+
+@pytest.mark.parametrize(
+    ("points", "confidence", "words"),
+    [
+        (torch.zeros(2, 3, 2), torch.ones(2, 3), r"points: expected shape \(any, any, 3\)"),
+        (torch.zeros(2, 3, 3), torch.ones(3, 2), r"confidence: expected shape \(2, 3\)"),
+        (torch.full((2, 3, 3), torch.nan), torch.ones(2, 3), "points: 18 of 18 values are not"),
+        (torch.zeros(2, 3, 3), -torch.ones(2, 3), "confidence: expected values in"),
+    ],
+)
+def test_pointmaps_that_are_none(points, confidence, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Pointmap(points=points, confidence=confidence)
+
+
+def _python(text: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def test_the_models_of_the_documentation_run(
+    project_root: Path, views, tmp_path, my_network
+) -> None:
     """The code of docs/models.md, the model in ten lines among it."""
     text = (project_root / "docs" / "models.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    blocks = _python(text)
     assert len(blocks) >= 2
     names: dict[str, object] = {}
     for block in blocks:

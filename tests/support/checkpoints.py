@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from support import checkpoints_labels, checkpoints_text, checkpoints_track
+from support import checkpoints_labels, checkpoints_lseg, checkpoints_text, checkpoints_track
 
 SEED = 7
 _VIT: dict[str, Any] = {
@@ -140,4 +140,5 @@ _MAKERS = {
     **checkpoints_labels.MAKERS,
     **checkpoints_text.MAKERS,
     **checkpoints_track.MAKERS,
+    **checkpoints_lseg.MAKERS,
 }

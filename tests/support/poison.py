@@ -424,6 +424,8 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "core.flat_layer.level": None,
         "core.Prompt.points": torch.tensor([[3.0, 3.0]]),
         "core.Boxes.words": (0,),
+        "core.Pointmap.points": torch.rand(2, 3, 3),
+        "core.Pointmap.confidence": torch.ones(2, 3),
         "render.SparseWeights.gaussians": COUNT,
         "render.SparseWeights.weights": torch.zeros(1),
         "io.evidence.save_tracks.tracks": (),

@@ -174,6 +174,8 @@ def _weights(family: ModelFamily) -> str:
         f"- {one.id} ({one.megabytes} MB, {one.licence}{f'; {one.note}' if one.note else ''})"
         for one in family.checkpoints
     )
+    if not family.checkpoints[0].on_hub:
+        return f"\n\nPublished weights, of which --weights takes a copy:\n\n{rows}"
     return f"\n\nWeights on the Hugging Face hub, the default first:\n\n{rows}"
 
 

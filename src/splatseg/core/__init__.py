@@ -55,6 +55,8 @@ from splatseg.core.models import MaskTracker as MaskTracker
 from splatseg.core.models import Model as Model
 from splatseg.core.models import Panoptic as Panoptic
 from splatseg.core.models import PanopticSegments as PanopticSegments
+from splatseg.core.models import Pointmap as Pointmap
+from splatseg.core.models import PointmapModel as PointmapModel
 from splatseg.core.models import Prompt as Prompt
 from splatseg.core.models import PromptableMasks as PromptableMasks
 from splatseg.core.models import SemanticLabels as SemanticLabels

@@ -5,6 +5,7 @@ is a value: it keeps nothing of one image that changes the answer to the next. `
 which protocols a model has by its methods, so an adapter inherits from nothing.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -13,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape
+from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import DepthMap, FeatureMap, LabelMap, MaskSet, Segment
 from splatseg.core.scene import ClassTable
@@ -366,5 +367,37 @@ class MaskTracker(Model, Protocol):
             seeds: Label maps by name of the view that they mark; -1 marks nothing. Ids are those
                 of the result: a later seed may bring new ones, and say again where known ones
                 are. One is looked up when its frame is taken, so that the mapping may grow.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pointmap:
+    """Where the surface lies that each pixel of an image shows."""
+
+    points: Float[Tensor, "rows columns 3"]
+    """In the frame of the pair's first camera: x to the right, y down, z forwards. The unit is the
+    network's own, and one for both maps of a pair."""
+
+    confidence: Float[Tensor, "rows columns"]
+    """How sure each is, from 0 on; numbers of one network compare with each other."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_shape("points", self.points, (None, None, 3))
+        check_shape("confidence", self.confidence, tuple(self.points.shape[:2]))
+        check_finite("points", self.points)
+        check_values("confidence", self.confidence, 0.0, math.inf)
+
+
+@runtime_checkable
+class PointmapModel(Model, Protocol):
+    """Sees the geometry of two images at once, as DUSt3R does (arXiv:2312.14132)."""
+
+    def pointmaps(self, first: Image, second: Image) -> tuple[Pointmap, Pointmap]:
+        """Points of both images, **both in the frame of the first one's camera**.
+
+        A map may have any number of rows and columns: they divide its image evenly, so that the
+        middle of row i lies at (i + 0.5) / rows of the image's height.
         """
         ...

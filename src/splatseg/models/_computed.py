@@ -9,7 +9,7 @@ from typing import Any
 from typing_extensions import override
 
 from splatseg._check import check_choice
-from splatseg.core import ClassTable, FeatureMap, LabelMap, View
+from splatseg.core import ClassTable, LabelMap, View
 from splatseg.core.models import (
     AutomaticMasks,
     BatchedModel,
@@ -232,10 +232,13 @@ class _Computed(Source):
             save_depth_map(depth, folder, view.name)
         elif self.asked == "features":
             deep = self._ask(ModelCache.features, self.model.features, image)
-            self._write_features(folder, view, deep.maps[-1])
+            for one in deep.maps:
+                self._check_size(view, one.height, one.width)
+            save_features(deep, folder, view.name)
         else:
             features = self._ask(ModelCache.text_features, self.model.text_features, image)
-            self._write_features(folder, view, features)
+            self._check_size(view, features.height, features.width)
+            save_features(features, folder, view.name)
         return 0
 
     @override
@@ -273,10 +276,6 @@ class _Computed(Source):
                 f"model {self.model.name!r}: view {view.name!r}: expected {camera.width}x"
                 f"{camera.height} pixels as the photograph has, got {width}x{height}."
             )
-
-    def _write_features(self, folder: Path, view: View, features: FeatureMap) -> None:
-        self._check_size(view, features.height, features.width)
-        save_features(features, folder, view.name)
 
     def _write_panoptic(self, folder: Path, view: View, image: Image) -> None:
         found = self._ask(ModelCache.panoptic, self.model.panoptic, image)

@@ -276,11 +276,14 @@ class _Copied(Source):
             self.unnamed.update(present - named - {UNLABELLED})
 
     def _write_features(self, evidence: FeatureEvidence, folder: Path, view: View) -> None:
-        features = evidence.features(view.name)
-        check_grid(evidence, view.name, features, (view.camera.height, view.camera.width))
+        size = view.camera.height, view.camera.width
         if evidence.scale is None:
-            save_features(features, folder, view.name)
+            deep = evidence.deep_features(view.name)
+            for one in deep.maps:
+                check_grid(evidence, view.name, one, size)
+            save_features(deep, folder, view.name)
             return
+        check_grid(evidence, view.name, evidence.features(view.name), size)
         # Quantised features stay as they are: all depths, at their size.
         _copy(evidence.files[view.name], path_inside(folder, f"{view.name}.npz"))
 

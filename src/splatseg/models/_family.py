@@ -23,19 +23,22 @@ Precision = Literal["float32", "float16", "bfloat16"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Checkpoint:
-    """Weights that somebody published on the Hugging Face hub."""
+    """Weights that somebody published, on the Hugging Face hub or elsewhere."""
 
     id: str
-    """OWNER/NAME."""
+    """OWNER/NAME on the hub; the name of the file elsewhere."""
 
     megabytes: int
-    """What is fetched, MB."""
+    """What is fetched, MB; of weights elsewhere, what of them is used."""
 
     licence: str
     """As the model card names it."""
 
     note: str = ""
-    """What else one should know, such as that access must be asked for."""
+    """What else one should know, such as that access must be asked for, or where the file is."""
+
+    on_hub: bool = True
+    """Whether the hub has them; nothing is fetched from elsewhere."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +47,8 @@ class LoadOptions:
 
     weights: str | None = None
     """Folder of the weights, or their id on the Hugging Face hub, of which only what is on this
-    machine is taken. None takes the default of the model."""
+    machine is taken; a file where a model's weights are one. None takes the default of the
+    model."""
 
     download: bool = False
     """Fetch weights from the hub that are not on this machine; what and how much is said before."""
@@ -93,6 +97,8 @@ class Loading:
 
     download: bool = False
     """Whether further weights that the model needs may be fetched."""
+    file: Path | None = None
+    """The file of the weights, where the family takes a single one."""
 
     @property
     def images_together(self) -> int:
@@ -129,6 +135,12 @@ class ModelFamily:
 
     packages: tuple[str, ...] = field(default=())
     """What must be installed besides splatseg."""
+
+    single_file: bool = False
+    """Weights are one file in a layout of its own, without config.json; `Loading.file` is it."""
+
+    instead: str = ""
+    """What serves where its weights are not to be had; a clause, lower case."""
 
     @property
     def needs_weights(self) -> bool:

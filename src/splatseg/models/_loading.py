@@ -33,11 +33,12 @@ def loading_of(
         MissingFileError: If the weights are not on this machine and are not to be fetched.
     """
     device = _device(options.device)
-    folder, name = find_weights(family, options, report=report, flag=flag)
+    found, name = find_weights(family, options, report=report, flag=flag)
     return Loading(
-        folder=folder,
+        folder=found.parent if family.single_file else found,
+        file=found if family.single_file else None,
         name=name,
-        digest=digest_of(folder),
+        digest=digest_of(found),
         device=device,
         dtype=_TYPES[options.dtype],
         batch=options.batch,

@@ -369,8 +369,21 @@ def _begin(
             f"{folder}: holds {len(there)} of {len(wanted)} views, and the others cannot be added; "
             "overwrite it or choose another name."
         )
+    if _lacks_blocks(header, source):
+        raise InputError(
+            f"{folder}: an earlier splatseg began this evidence, which wrote the deepest features "
+            "alone; overwrite it or choose another name."
+        )
     _write_header(folder, source, metadata)
     return there
+
+
+def _lacks_blocks(header: Mapping[str, Any], source: Source) -> bool:
+    """Whether views that are there are of a version that had one block, and others are to come."""
+    recorded = header.get("metadata")
+    before = cast("Mapping[str, Any]", recorded) if isinstance(recorded, Mapping) else {}
+    old = header.get("version") == 1 and before.get("complete") is False
+    return old and source.kind == "features" and source.what == "features"
 
 
 def _may_be_lost(

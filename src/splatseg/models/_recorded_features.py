@@ -24,15 +24,13 @@ class RecordedFeatures(RecordedModel):
     """Recorded features of a network, at one or several depths."""
 
     def features(self, image: Image, *, view: str | None = None) -> DeepFeatures:
-        """The recorded features of the view, all depths."""
+        """The recorded features of the view, all depths, and the class token."""
         evidence = _features_of(self)
         name = self.view_of(image, view)
-        depths = evidence.blocks or ("last",)
-        maps = tuple(
-            evidence.block_features(name, depth if evidence.blocks else None) for depth in depths
-        )
-        check_grid(evidence, name, maps[0], image)
-        return DeepFeatures(maps=maps, depths=depths)
+        deep = evidence.deep_features(name)
+        for one in deep.maps:
+            check_grid(evidence, name, one, image)
+        return deep
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -45,6 +45,7 @@ _OWN = {
     "grounding-dino": f"{_NETWORKS}.grounding_dino:GROUNDING_DINO",
     "langsam": f"{_NETWORKS}.langsam:LANGSAM",
     "sam3-text": f"{_NETWORKS}.sam3_text:SAM3_TEXT",
+    "lseg": "splatseg.models.lseg:LSEG",
 }
 
 

@@ -7,7 +7,14 @@ from typing import Any, Literal
 
 from splatseg.core import ClassTable, MaskSet, View
 from splatseg.errors import FileFormatError
-from splatseg.io.evidence import Evidence, EvidenceKind, open_evidence, read_id_map, view_files
+from splatseg.io.evidence import (
+    Evidence,
+    EvidenceKind,
+    FeatureEvidence,
+    open_evidence,
+    read_id_map,
+    view_files,
+)
 
 What = Literal["masks", "labels", "panoptic", "features", "text", "depth", "tracked"]
 """What a model can be asked for."""
@@ -101,7 +108,10 @@ def _is_map(path: Path) -> bool:
 def _is_readable(evidence: Evidence, name: str) -> bool:
     asked = {"masks": evidence.masks, "depth": evidence.depth_map}
     try:
-        asked.get(evidence.kind, evidence.features)(name)
+        if isinstance(evidence, FeatureEvidence):
+            evidence.deep_features(name)
+        else:
+            asked.get(evidence.kind, evidence.features)(name)
     except FileFormatError:
         return False
     return True

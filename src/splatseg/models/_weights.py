@@ -16,6 +16,7 @@ from splatseg.models._family import Checkpoint, LoadOptions, ModelFamily
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _WEIGHTS = ("*.safetensors", "*.bin", "*.pt", "*.ckpt")
+_CONFIGURATION = "*config.json"
 _FILES = ("*.json", "*.txt", "*.model")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -29,6 +30,8 @@ def find_weights(
 ) -> tuple[Path, str]:
     """The folder of the weights that are asked for, and what they are called.
 
+    Of a family whose weights are a single file it is that file.
+
     Args:
         family: The model's family.
         options: Which weights, and whether they may be fetched.
@@ -40,6 +43,8 @@ def find_weights(
         MissingPackageError: If they are named by an id of the hub without the package for it.
         InputError: If what is named is neither a folder nor an id.
     """
+    if family.single_file:
+        return _single_file(family, options)
     asked = options.weights or family.checkpoints[0].id
     folder = Path(asked)
     if folder.is_dir():
@@ -67,10 +72,13 @@ def find_weights(
 
 
 def digest_of(folder: Path) -> str:
-    """SHA-256 over the names and contents of configuration and weights.
+    """SHA-256 over the names and contents of configuration and weights; of a file, its own.
 
     Files of the hub's cache are links to contents that are named by their own SHA-256.
     """
+    if folder.is_file():
+        with folder.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     digest = hashlib.sha256()
     for path in weight_files(folder):
         content = path.resolve().name
@@ -89,8 +97,47 @@ def weight_files(folder: Path) -> list[Path]:
     for pattern in _WEIGHTS:
         found = sorted(folder.glob(pattern))
         if found:
-            return [*sorted(folder.glob("*config.json")), *found]
+            return [*sorted(folder.glob(_CONFIGURATION)), *found]
     return []
+
+
+def cached_file(id: str, name: str) -> Path | None:
+    """A file of a repository of the hub, if the hub's cache of this machine has it.
+
+    Raises:
+        MissingPackageError: If the package for the hub is not installed.
+    """
+    if not _HUB_ID.fullmatch(id):
+        return None
+    found = _hub().try_to_load_from_cache(id, name)
+    return Path(found) if isinstance(found, str) else None
+
+
+def _single_file(family: ModelFamily, options: LoadOptions) -> tuple[Path, str]:
+    """The file of weights that is asked for, or the only one of a folder, and its name."""
+    known = family.checkpoints[0]
+    instead = f"; {family.instead}" if family.instead else ""
+    if options.weights is None:
+        raise MissingFileError(
+            f"weights: model {family.name} needs {known.id} ({_described(known)}), which is not "
+            f"fetched by splatseg; --weights FILE_OR_FOLDER takes a copy{instead}."
+        )
+    path = Path(options.weights)
+    if path.is_file():
+        return path, path.name
+    if not path.is_dir():
+        raise MissingFileError(
+            f"{path}: there is no such file or folder of weights, expected {known.id} "
+            f"({_described(known)}) or its tensors as safetensors{instead}."
+        )
+    found = [one for one in weight_files(path) if not one.match(_CONFIGURATION)]
+    if len(found) != 1:
+        names = ", ".join(one.name for one in found[:3]) or "none"
+        raise MissingFileError(
+            f"{path}: expected a folder with one file of weights ({', '.join(_WEIGHTS)}), "
+            f"got {names}."
+        )
+    return found[0], found[0].name
 
 
 def _check_folder(folder: Path) -> None:

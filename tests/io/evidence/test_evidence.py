@@ -1,6 +1,8 @@
 """Evidence: recorded folders as they stand, our own round trips, and what is refused."""
 
+import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from splatseg.core import ClassInfo, ClassTable, FeatureMap, LabelMap, MaskSet
+from splatseg.core import ClassInfo, ClassTable, DeepFeatures, FeatureMap, LabelMap, MaskSet
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import (
@@ -426,6 +428,127 @@ def test_features_that_are_broken(tmp_path) -> None:
         evidence.features("b")
 
 
+def deep(rng, *, token: bool = True, depths: int = 3) -> DeepFeatures:
+    """Maps of several depths of an image of 50 x 42: the shallowest on smaller cells, wider."""
+    strides = (7, 14, 14)[-depths:]
+    maps = tuple(
+        FeatureMap(
+            features=torch.from_numpy(rng.normal(size=(-(-42 // s), -(-50 // s), 5 + i))).float(),
+            stride=s, height=42, width=50,
+        )
+        for i, s in enumerate(strides)
+    )  # fmt: skip
+    return DeepFeatures(
+        maps=maps,
+        depths=tuple(f"block{i + 1}" for i in range(depths)),
+        class_token=torch.from_numpy(rng.normal(size=7)).float() if token else None,
+    )
+
+
+@pytest.mark.parametrize("token", [False, True])
+@pytest.mark.parametrize("depths", [1, 3])
+def test_features_of_several_depths_round_trip(tmp_path, rng, token: bool, depths: int) -> None:
+    folder = create_evidence(tmp_path / "e", kind="features")
+    seen = {name: deep(rng, token=token, depths=depths) for name in ("b", "a/c")}
+    for name, one in seen.items():
+        save_features(one, folder, name)
+    evidence = open_evidence(folder)
+    assert isinstance(evidence, FeatureEvidence)
+    several = depths > 1 or token
+    assert evidence.blocks == (seen["b"].depths if several else ())
+    for name, one in seen.items():
+        for block, wanted in zip(one.depths, one.maps, strict=True):
+            found = evidence.block_features(name, block if several else None)
+            assert (found.stride, found.height, found.width) == (wanted.stride, 42, 50)
+            assert torch.equal(found.features, wanted.features.half().float())
+        last = evidence.features(name)
+        assert torch.equal(last.features, one.maps[-1].features.half().float())
+        assert torch.equal(evidence.block_features(name, None).features, last.features)
+        found = evidence.class_token(name)
+        assert (found is None) == (not token)
+        whole = evidence.deep_features(name)
+        assert whole.depths == (one.depths if several else ("last",))
+        assert len(whole.maps) == depths
+        if token:
+            assert torch.equal(found, one.class_token.half().float())
+            assert torch.equal(whole.class_token, found)
+    wanted = "expected one of the blocks" if several else "expected no block, as it has none"
+    with pytest.raises(InputError, match=rf"b.npz: {wanted}.*, got 'block9'"):
+        evidence.block_features("b", "block9")
+
+
+def test_one_map_is_written_as_ever(tmp_path, rng) -> None:
+    """The encoder's embedding of SAM, say: the bytes of version 1."""
+    one = deep(rng, token=False, depths=1)
+    save_features(one, tmp_path, "deep")
+    save_features(one.maps[0], tmp_path, "map")
+    assert (tmp_path / "deep.npz").read_bytes() == (tmp_path / "map.npz").read_bytes()
+
+
+def test_depths_that_cannot_be_written(tmp_path, rng) -> None:
+    good = deep(rng)
+    with pytest.raises(RangeError, match="a: class token"):
+        save_features(replace(good, class_token=torch.tensor([float("nan")])), tmp_path, "a")
+    other = replace(good.maps[0], width=49)
+    with pytest.raises(InputError, match="a: expected maps of one image of 50x42, got .* 49x42"):
+        save_features(replace(good, maps=(other, *good.maps[1:])), tmp_path, "a")
+    with pytest.raises(InputError, match="a: expected depths of different names, got x, x, y"):
+        save_features(replace(good, depths=("x", "x", "y")), tmp_path, "a")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("features_0", np.zeros((2, 3), "f2"), r"expected features of shape \(rows, columns"),
+        ("features_1", None, "expected an array 'features_1'"),
+        ("stride_1", np.array(0), "expected stride as one whole number"),
+        ("blocks", np.arange(3), "expected the names of blocks"),
+        ("blocks", np.array(["a", "a", "b"]), "the same twice"),
+        ("class_token", np.zeros((1, 2), "f2"), "class token as one vector, got float16"),
+        ("class_token", np.array([np.nan], "f2"), "finite class token"),
+    ],
+)
+def test_broken_files_of_several_depths(tmp_path, rng, name, value, words) -> None:
+    folder = create_evidence(tmp_path / "e", kind="features")
+    save_features(deep(rng), folder, "a")
+    with np.load(folder / "a.npz") as archive:
+        content = dict(archive)
+    content |= {name: value}
+    np.savez(folder / "a.npz", **{k: v for k, v in content.items() if v is not None})
+    with pytest.raises(FileFormatError, match=rf"a.npz: .*{words}"):
+        open_evidence(folder).deep_features("a")
+
+
+def test_evidence_of_version_2_is_read_and_written_as_it_was(
+    project_root, tmp_path, monkeypatch
+) -> None:
+    path = project_root / "tests/golden/make_io.py"
+    spec = importlib.util.spec_from_file_location("make_io", path)
+    golden = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(golden)
+    committed = project_root / "tests/golden/evidence-v2"
+    wanted = golden.golden_deep_features()
+    found = open_evidence(committed / "features").deep_features("left/1")
+    assert found.depths == wanted.depths
+    assert torch.equal(found.class_token, wanted.class_token)
+    for one, other in zip(found.maps, wanted.maps, strict=True):
+        assert torch.equal(one.features, other.features)
+        assert (one.stride, one.height, one.width) == (other.stride, other.height, other.width)
+    monkeypatch.setattr(golden, "EVIDENCE", tmp_path / "evidence-v2")
+    golden.main()
+    for file in ("evidence.json", "left/1.npz"):
+        written = (tmp_path / "evidence-v2/features" / file).read_bytes()
+        assert written == (committed / "features" / file).read_bytes(), file
+
+
+def test_other_kinds_stay_of_version_1(tmp_path) -> None:
+    """Programs that know of no blocks go on reading them."""
+    for kind, version in (("labels", 1), ("masks", 1), ("features", 2)):
+        folder = create_evidence(tmp_path / kind, kind=kind)
+        assert json.loads((folder / "evidence.json").read_text())["version"] == version
+
+
 # Folders
 
 
@@ -463,8 +586,8 @@ def test_the_header_tells_kind_classes_and_version(tmp_path) -> None:
     (folder / "evidence.json").write_text(json.dumps(header | {"source_ids": {"a": 1}}))
     with pytest.raises(FileFormatError, match="source_ids of integers by integer"):
         open_evidence(folder)
-    (folder / "evidence.json").write_text(json.dumps(header | {"version": 2}))
-    with pytest.raises(FileFormatError, match="version 1 or less, got version 2"):
+    (folder / "evidence.json").write_text(json.dumps(header | {"version": 3}))
+    with pytest.raises(FileFormatError, match="version 2 or less, got version 3"):
         open_evidence(folder)
     with pytest.raises(InputError, match="kind: expected one of labels, panoptic, tracked, masks"):
         create_evidence(tmp_path / "f", kind="sound")

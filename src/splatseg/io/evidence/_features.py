@@ -1,8 +1,8 @@
 """Feature maps: an npz a view. Our own are float16; recorded ones are quantised to 8 bit.
 
-A quantised value q stands for q * scale + offset, with scale and offset by channel (and block)
-in quant.npz or basis.npz. Text features are principal components on top of that: the full
-vector is ``normalise((q * scale + offset) @ basis + mean)``.
+Our own are described in `_own_features`. A quantised value q stands for q * scale + offset, with
+scale and offset by channel (and block) in quant.npz or basis.npz. Text features are principal
+components on top of that: the full vector is ``normalise((q * scale + offset) @ basis + mean)``.
 """
 
 from collections.abc import Mapping
@@ -20,13 +20,20 @@ from typing_extensions import override
 from splatseg._check import check_shape
 from splatseg.core import FeatureMap, MaskSet
 from splatseg.core.boundary import boundary
+from splatseg.core.models import DeepFeatures
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
+from splatseg.io.evidence._own_features import (
+    check_finite_numbers,
+    own_blocks,
+    own_class_token,
+    own_features,
+    whole_pixels,
+)
 from splatseg.io.npz import npz_names, read_npz
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"
-_MAX_PIXELS = 1 << 24
 
 TEXT_FILE = "text_embeddings.npz"
 
@@ -42,8 +49,8 @@ class FeatureEvidence(IdFreeEvidence):
     stride: int = 1
     """Pixels a cell of quantised features."""
 
-    blocks: tuple[str, ...] = ()
-    """Names of the network's blocks, where a file holds several."""
+    quantised_blocks: tuple[str, ...] = ()
+    """Names of the network's blocks in a file of quantised features, where it holds several."""
 
     basis: NDArray[np.float32] | None = None
     """(components, width): full vectors by principal component."""
@@ -56,6 +63,19 @@ class FeatureEvidence(IdFreeEvidence):
     def kind(self) -> EvidenceKind:
         return "features"
 
+    @property
+    def blocks(self) -> tuple[str, ...]:
+        """Names of the network's blocks, the deepest last; none where a file has one map.
+
+        Our own files tell them themselves; this is what the first view's says.
+
+        Raises:
+            FileFormatError: If that file is broken.
+        """
+        if self.scale is not None or not self.files:
+            return self.quantised_blocks
+        return own_blocks(self.files[self.view_names[0]])
+
     @override
     def masks(self, name: str) -> MaskSet:
         refuse(self, "masks")
@@ -66,7 +86,34 @@ class FeatureEvidence(IdFreeEvidence):
 
         Principal components stay components: `expand` gives full vectors.
         """
+        if self.scale is None:
+            return own_features(self.file_of(name), None)
         return self.block_features(name, self.blocks[-1] if self.blocks else None)
+
+    def class_token(self, name: str) -> Float[Tensor, "width"] | None:
+        """The network's one vector of a whole view, None where it was not written.
+
+        Raises:
+            InputError: If there is no such view.
+            FileFormatError: If the file is broken.
+        """
+        path = self.file_of(name)
+        return own_class_token(path) if self.scale is None else None
+
+    def deep_features(self, name: str) -> DeepFeatures:
+        """All that is there of a view: every block, and the class token.
+
+        Raises:
+            InputError: If there is no such view.
+            FileFormatError: If the file does not hold them.
+        """
+        blocks = self.blocks if self.scale is not None else own_blocks(self.file_of(name))
+        maps = tuple(self.block_features(name, block) for block in blocks)
+        return DeepFeatures(
+            maps=maps or (self.features(name),),
+            depths=blocks or ("last",),
+            class_token=self.class_token(name),
+        )
 
     def block_features(self, name: str, block: str | None) -> FeatureMap:
         """The features of a view from a block of the network; None where there are no blocks.
@@ -77,7 +124,7 @@ class FeatureEvidence(IdFreeEvidence):
         """
         path = self.file_of(name)
         if self.scale is None or self.offset is None:
-            return _own_features(path)
+            return own_features(path, block)
         codes = read_npz(path, ["f"])["f"]
         if codes.dtype.kind not in "iu":
             raise FileFormatError(f"{path}: expected quantised features, got {codes.dtype}.")
@@ -151,7 +198,7 @@ def load_text_embeddings(path: Path) -> TextEmbeddings:
     """
     path = path / TEXT_FILE if path.is_dir() else path
     arrays = read_npz(path, ["labels", "vectors", "kind", "target_id"])
-    _check_finite(path, "vectors", arrays["vectors"])
+    check_finite_numbers(path, "vectors", arrays["vectors"])
     count = arrays["vectors"].shape[0] if arrays["vectors"].ndim == 2 else -1
     columns = [arrays[name] for name in ("labels", "kind", "target_id")]
     if any(column.shape != (count,) for column in columns) or columns[2].dtype.kind not in "iu":
@@ -170,7 +217,7 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
         path = folder / BASIS_FILE
         shared = read_npz(path, ["scale", "offset", "stride", "basis", "mean"])
         for name in ("scale", "offset", "basis", "mean"):
-            _check_finite(path, name, shared[name])
+            check_finite_numbers(path, name, shared[name])
         _check_tables(path, shared)
         basis, mean = shared["basis"], shared["mean"]
         if basis.ndim != 2 or mean.shape != basis.shape[1:]:
@@ -180,7 +227,7 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
             files=files,
             scale=shared["scale"],
             offset=shared["offset"],
-            stride=_whole(path, "stride", shared["stride"]),
+            stride=whole_pixels(path, "stride", shared["stride"]),
             basis=shared["basis"].astype(np.float32),
             mean=shared["mean"].astype(np.float32),
         )
@@ -188,7 +235,7 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
         path = folder / QUANTISATION_FILE
         shared = read_npz(path, ["scale", "offset", "stride", "blocks"])
         for name in ("scale", "offset"):
-            _check_finite(path, name, shared[name])
+            check_finite_numbers(path, name, shared[name])
         _check_tables(path, shared)
         if shared["blocks"].ndim != 1 or shared["blocks"].dtype.kind != "U":
             raise FileFormatError(f"{path}: expected the names of blocks, got others.")
@@ -197,8 +244,8 @@ def open_features(folder: Path, files: Mapping[str, Path]) -> FeatureEvidence:
             files=files,
             scale=shared["scale"],
             offset=shared["offset"],
-            stride=_whole(path, "stride", shared["stride"]),
-            blocks=tuple(str(block) for block in shared["blocks"]),
+            stride=whole_pixels(path, "stride", shared["stride"]),
+            quantised_blocks=tuple(str(block) for block in shared["blocks"]),
         )
     return FeatureEvidence(root=folder, files=files)
 
@@ -213,26 +260,6 @@ def _check_tables(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         )
 
 
-def _whole(path: Path, name: str, value: NDArray[Any]) -> int:
-    """A positive number of pixels that an array of one holds."""
-    whole = value.size == 1 and value.dtype.kind in "iu"
-    number = int(value.reshape(-1)[0]) if whole else 0
-    if not 0 < number <= _MAX_PIXELS:
-        raise FileFormatError(f"{path}: expected {name} as one whole number of pixels.")
-    return number
-
-
-def _check_finite(path: Path, name: str, values: NDArray[Any]) -> None:
-    if values.dtype.kind not in "fiu":
-        raise FileFormatError(f"{path}: expected {name} as numbers, got {values.dtype}.")
-    bad = values.size - int(np.isfinite(values).sum()) if values.dtype.kind == "f" else 0
-    if bad:
-        raise FileFormatError(
-            f"{path}: expected finite {name}, got {bad} of {values.size} values that are NaN or "
-            "infinite."
-        )
-
-
 def holds_masks(path: Path) -> bool:
     """Whether a file is an npz with masks."""
     return "masks" in npz_names(path)
@@ -241,25 +268,3 @@ def holds_masks(path: Path) -> bool:
 def holds_features(path: Path) -> bool:
     """Whether a file is an npz with features in our own layout."""
     return "features" in npz_names(path)
-
-
-def _own_features(path: Path) -> FeatureMap:
-    arrays = read_npz(path, ["features", "stride", "size"])
-    features, size = arrays["features"], arrays["size"]
-    _check_finite(path, "features", features)
-    if (
-        features.ndim != 3
-        or features.dtype.kind != "f"
-        or size.shape != (2,)
-        or 0 in features.shape
-    ):
-        raise FileFormatError(
-            f"{path}: expected features of shape (rows, columns, channels) and a size, "
-            f"got {features.dtype} of {features.shape}."
-        )
-    return FeatureMap(
-        features=torch.from_numpy(features.astype(np.float32)),
-        stride=_whole(path, "stride", arrays["stride"]),
-        height=_whole(path, "height", size[:1]),
-        width=_whole(path, "width", size[1:]),
-    )

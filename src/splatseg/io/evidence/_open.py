@@ -35,14 +35,21 @@ from splatseg.io.label_tables import LabelTable, label_table, training_table
 from splatseg.io.npz import npz_names
 
 FORMAT = "splatseg-evidence"
-VERSION = 1
-"""Version of the folders written; all versions up to it are read."""
+VERSION = 2
+"""Highest version of the folders written; all versions up to it are read."""
+
+_FEATURES_VERSION = 2  # files of features may hold several blocks and a class token
 
 # Folders of a capture that hold what a model saw, as opposed to photographs and truth.
 _PREFIXES = ("labels_", "masks_", "features_", "depth_")
 _SUFFIX = "_reference"
 # Maps of a capture whose ids are not classes, and the table in metadata.json that names them.
 _TRUTH_TABLES = {"instance": "instances", "part": "parts", "depth": ""}
+
+
+def written_version(kind: EvidenceKind) -> int:
+    """The version of new folders: the lowest that has what they may hold."""
+    return _FEATURES_VERSION if kind == "features" else 1
 
 
 @boundary

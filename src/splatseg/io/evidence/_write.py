@@ -22,6 +22,7 @@ from splatseg.core import (
     Track,
 )
 from splatseg.core.boundary import boundary
+from splatseg.core.models import DeepFeatures
 from splatseg.core.view_names import check_view_name
 from splatseg.errors import InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.atomic import atomic_file
@@ -36,7 +37,8 @@ from splatseg.io.evidence._base import (
 from splatseg.io.evidence._features import TEXT_FILE, TextEmbeddings
 from splatseg.io.evidence._labels import CONFIDENCE_STEPS
 from splatseg.io.evidence._masks import masks_content
-from splatseg.io.evidence._open import FORMAT, VERSION
+from splatseg.io.evidence._open import FORMAT, written_version
+from splatseg.io.evidence._own_features import features_content
 from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE
 from splatseg.io.images import save_png, write_png
 from splatseg.io.json_files import json_text, write_json
@@ -76,7 +78,7 @@ def create_evidence(
     folder = Path(folder)
     header = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": written_version(kind),
         "kind": kind,
         "classes": None if classes is None else class_rows(classes),
         "source_ids": None if source_ids is None else {str(k): v for k, v in source_ids.items()},
@@ -189,23 +191,17 @@ def save_tracks(tracks: Sequence[Track], folder: Path | str, *, order: Sequence[
 
 
 @boundary
-def save_features(features: FeatureMap, folder: Path | str, name: str) -> None:
-    """Write a view's features as float16.
+def save_features(features: FeatureMap | DeepFeatures, folder: Path | str, name: str) -> None:
+    """Write a view's features as float16: one map, or those of several depths and a class token.
 
     Raises:
         RangeError: If a value is NaN or infinite, or beyond the range of float16 (65504).
+        InputError: If maps are of images of several sizes, or two depths have one name.
     """
-    check_finite(f"{name}: features", features.features)
-    half = features.features.detach().cpu().to(torch.float16)
-    check_finite(f"{name}: features as float16", half)
+    content = cast(dict[str, Any], features_content(name, features))
     path = _view_path(Path(folder), name, ".npz")
     with atomic_file(path) as temporary, temporary.open("wb") as file:
-        np.savez(
-            file,
-            features=half.numpy(),
-            stride=np.int64(features.stride),
-            size=np.array([features.height, features.width], np.int64),
-        )
+        np.savez(file, **content)
 
 
 @boundary

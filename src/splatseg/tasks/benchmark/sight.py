@@ -144,7 +144,7 @@ def _of_model(named: str, method: Method, *, words: bool) -> tuple[EvidenceKind,
     gives: tuple[What, ...] = () if family is None else family.gives
     for what in gives:
         kind = _KIND_OF.get(what)
-        if kind in method.evidence and kind is not None and (not words or what == "text"):
+        if kind in method.evidence and (not words or what == "text"):
             return kind, what
     return None
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatseg.core import Rle
-from splatseg.io.evidence import load_text_embeddings, open_evidence
+from splatseg.core import DeepFeatures, FeatureMap, Rle
+from splatseg.io.evidence import load_text_embeddings, open_evidence, save_features
 from support.fuzz.targets.base import (
     HEIGHT,
     WIDTH,
@@ -155,15 +155,13 @@ def features(folder: Path) -> Target:
     return _evidence(folder, folder / "a.npz", "features")
 
 
-def _quantised(name: str, shared: dict[str, Any]) -> None:
-    @target(name)
-    def make(folder: Path) -> Target:
-        np.savez(folder / name, scale=np.ones(2, "f4"), offset=np.zeros(2, "f4"), **shared)
-        np.savez(folder / "a.npz", f=np.ones((3, 4, 2), np.uint8))
-        return _evidence(folder, folder / name, "features")
-
-
-_quantised("basis.npz", {"stride": 2, "basis": np.ones((2, 5)), "mean": np.zeros(5)})
+@target("features-blocks.npz")
+def feature_blocks(folder: Path) -> Target:
+    """Our own layout of features at several depths, with a class token."""
+    one = FeatureMap(features=torch.ones(3, 4, 2), stride=2, height=HEIGHT, width=WIDTH)
+    deep = DeepFeatures(maps=(one, one), depths=("block1", "block2"), class_token=torch.ones(2))
+    save_features(deep, folder, "a")
+    return _evidence(folder, folder / "a.npz", "deep_features")
 
 
 @target("quant.npz")
