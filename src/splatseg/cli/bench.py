@@ -80,6 +80,10 @@ class Command:
     switch: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ..")] = ()
     """Choices other than the protocol's; results record them."""
 
+    beside: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="OUT ..")] = ()
+    """Folders of other runs whose results stand in the same table; refused, with the differences,
+    where they were scored by other choices or in other scenes."""
+
     published: bool = False
     """Methods as their authors published them."""
 
@@ -122,6 +126,7 @@ def run(command: Command) -> None:
             max_gaussians=command.max_gaussians,
             switches=command.switch,
             published=command.published,
+            beside=command.beside,
             seed=command.seed,
             again=command.again,
             download=command.download,

@@ -1,6 +1,7 @@
 """What a run of a protocol is told: methods, models, fits, other choices than its own."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError
@@ -46,6 +47,10 @@ class BenchOptions:
 
     published: bool = False
     """Methods as their authors published them."""
+
+    beside: tuple[Path, ...] = ()
+    """Folders of other runs whose results stand in the same table; refused, with the differences,
+    where they were scored by other choices or in other scenes."""
 
     seed: int = 0
     """Of fits, methods and points on strokes."""

@@ -3,14 +3,13 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import FileFormatError, InputError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.evaluate.protocols import (
-    MapSwitches,
     MaskRow,
     Protocol,
     Switches,
@@ -22,6 +21,7 @@ from splatseg.evaluate.protocols import (
 from splatseg.io.json_files import json_text, parse_object, read_json, write_json
 from splatseg.io.paths import path_inside
 
+RESULTS_FOLDER = "results"
 _ROW_FIELDS = tuple(MaskRow.__dataclass_fields__)
 
 
@@ -93,6 +93,37 @@ def over_scenes(protocol: Protocol, method: str, scenes: Sequence[SceneResult]) 
     return MethodResult(protocol=protocol.name, method=method, scores=scores, scenes=tuple(scenes))
 
 
+def check_same_scenes(one: MethodResult, other: MethodResult) -> None:
+    """Raise `InputError` unless two methods were measured in the same scenes."""
+    names = [{scene.scene for scene in result.scenes} for result in (one, other)]
+    if names[0] != names[1]:
+        raise InputError(
+            f"{other.method}: expected results of the scenes {', '.join(sorted(names[0]))}, got "
+            f"those of {', '.join(sorted(names[1]))}."
+        )
+
+
+def results_of(root: Path, protocol: Protocol) -> list[MethodResult]:
+    """What another run measured under a protocol, a result a method, named after its folder.
+
+    Raises:
+        MissingFileError: If there is nothing.
+        FileFormatError: If a file is damaged.
+        InputError: If its scenes were scored by different choices.
+    """
+    folder = root / RESULTS_FOLDER / protocol.name
+    methods = sorted(path for path in folder.glob("*") if path.is_dir())
+    if not methods:
+        raise MissingFileError(f"{folder}: expected results of {protocol.name}, got none.")
+    return [
+        replace(
+            over_scenes(protocol, path.name, [load_result(one) for one in sorted(path.glob("*"))]),
+            method=f"{path.name} ({root.resolve().name})",
+        )
+        for path in methods
+    ]
+
+
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The mean of each measure over scenes; of measures that some scenes lack, none."""
     shared = [name for name in scores[0] if all(name in one for one in scores)]
@@ -121,16 +152,9 @@ def oracle_of(switches: Switches) -> tuple[str, ...]:
     return ()
 
 
-def matching_of(switches: Switches) -> tuple[str, ...]:
-    """What else a reader should know of how results are matched to the truth."""
-    if isinstance(switches, MapSwitches):
-        return ("instances are matched to the truth one to one, as every method's",)
-    return ()
-
-
 def result_path(root: Path, protocol: str, method: str, scene: str) -> Path:
     """The file of a result."""
-    return path_inside(root, "results", protocol, method, f"{scene}.json")
+    return path_inside(root, RESULTS_FOLDER, protocol, method, f"{scene}.json")
 
 
 @boundary

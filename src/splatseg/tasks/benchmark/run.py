@@ -35,11 +35,14 @@ from splatseg.tasks.benchmark.points import point_scores
 from splatseg.tasks.benchmark.results import (
     MethodResult,
     SceneResult,
+    check_comparable,
+    check_same_scenes,
     kept_result,
     key_of,
     oracle_of,
     over_scenes,
     result_path,
+    results_of,
     save_result,
     switches_of,
 )
@@ -125,9 +128,14 @@ def bench(
             result, was_kept = _result(job, digest, command)
             found[method.name].append(result)
             kept += was_kept
+    measured = [over_scenes(chosen, name, results) for name, results in found.items()]
+    others = [one for root in options.beside for one in results_of(root, chosen)]
+    for one in others:
+        check_comparable([*measured[0].scenes, *one.scenes])
+        check_same_scenes(measured[0], one)
     return BenchRun(
         protocol=chosen,
-        methods=tuple(over_scenes(chosen, name, results) for name, results in found.items()),
+        methods=(*measured, *others),
         folder=folder,
         kept=kept,
         notes=tuple(notes),

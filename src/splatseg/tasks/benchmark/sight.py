@@ -46,6 +46,8 @@ class Seen:
 def model_of(named: str, options: BenchOptions, observer: Observer) -> Model:
     """The model of ``NAME[=WEIGHTS][,OPTION=VALUE...]``, or a folder.
 
+    What follows a comma without an ``=`` goes on with the value before it.
+
     Raises:
         InputError: If there is none, or it has no such option.
     """
@@ -53,7 +55,7 @@ def model_of(named: str, options: BenchOptions, observer: Observer) -> Model:
     family = find_family(name) if name in model_names() else None
     if family is None:
         return find_model(named, report=observer.note)
-    first, *rest = named.split(",")
+    first, *rest = _pieces(named)
     weights = first.partition("=")[2]
     if weights and not family.needs_weights:
         raise InputError(f"models: {name} has no weights, got {named!r}.")
@@ -69,6 +71,17 @@ def model_of(named: str, options: BenchOptions, observer: Observer) -> Model:
     return find_model(
         name, chosen, loading=loading if family.needs_weights else None, report=observer.note
     )
+
+
+def _pieces(named: str) -> list[str]:
+    """The name with its weights, then each option."""
+    found: list[str] = []
+    for piece in named.split(","):
+        if len(found) > 1 and "=" not in piece:
+            found[-1] += f",{piece}"
+        else:
+            found.append(piece)
+    return found
 
 
 def name_of(named: str) -> str:

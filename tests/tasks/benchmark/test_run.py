@@ -1,0 +1,233 @@
+"""A run goes on, keeps apart what differs, and refuses what does not fit together."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from splatseg.cli import main
+from splatseg.core import Camera, Gaussians, Labels, Scene, View
+from splatseg.errors import InputError, MissingFileError
+from splatseg.io.images import save_png
+from splatseg.io.scene import load_scene, save_scene
+from splatseg.methods import Method, MethodInputs, _registry, register_method
+from splatseg.methods.uplift import UpliftMethodOptions
+from splatseg.render import render
+from splatseg.tasks import SILENT
+from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
+from splatseg.tasks.benchmark.sight import model_of
+from support.benchmark_layouts.sparse import write_sparse
+
+SIZE = 32
+NAMES = ("a", "b", "c")
+
+
+def camera(x: float) -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 3] = -x
+    return Camera(width=SIZE, height=SIZE, fx=30, fy=30, cx=16, cy=16, cam_from_world=pose)
+
+
+def wall() -> Gaussians:
+    """A red square before a blue wall; the first 25 Gaussians are the square's."""
+    grid = torch.linspace(-0.4, 0.4, 5)
+    near = torch.stack([*torch.meshgrid(grid, grid, indexing="ij")], -1).reshape(-1, 2)
+    wide = torch.linspace(-3, 3, 25)
+    far = torch.stack([*torch.meshgrid(wide, wide, indexing="ij")], -1).reshape(-1, 2)
+    means = torch.cat(
+        (
+            torch.cat((near, torch.full((len(near), 1), 2.0)), 1),
+            torch.cat((far, torch.full((len(far), 1), 3.0)), 1),
+        )
+    )
+    count, things = len(means), len(near)
+    colours = torch.tensor([[-1.0, -1, 1.5]]).repeat(count, 1)
+    colours[:things] = torch.tensor([1.5, -1, -1])
+    scales = torch.full((count, 3), 0.15)
+    scales[:things] = 0.09
+    rotations = torch.zeros(count, 4)
+    rotations[:, 0] = 1
+    return Gaussians(
+        means=means, rotations=rotations, scales=scales,
+        opacities=torch.full((count,), 0.98), sh=colours[:, None],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The wall in SPIn-NeRF's layout, the red pixels its masks, and its scene as if fitted."""
+    root = tmp_path_factory.mktemp("tiny")
+    data, gaussians = root / "data", wall()
+    folder = data / "wall"
+    views = []
+    for i, name in enumerate(NAMES):
+        one = camera(0.15 * i)
+        colour = render(gaussians, one).image.clamp(0, 1)
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        (folder / "masks").mkdir(exist_ok=True)
+        save_png((colour * 255 + 0.5).to(torch.uint8), folder / "images" / f"{name}.png")
+        red = (colour[..., 0] > colour[..., 2]).numpy()
+        Image.fromarray(red.astype(np.uint8) * 255).save(folder / "masks" / f"{name}.png")
+        views.append(View(name=name, camera=one, image=folder / "images" / f"{name}.png"))
+    write_sparse(folder / "sparse/0", views, [f"{name}.png" for name in NAMES], None)
+    scenes = root / "scenes"
+    scenes.mkdir()
+    save_scene(Scene(gaussians=gaussians, views=tuple(views), source=folder), scenes / "wall")
+    return data, scenes
+
+
+@pytest.fixture
+def run(tiny: tuple[Path, Path], tmp_path: Path) -> Callable[..., BenchRun]:
+    """Runs a protocol on the wall with the fit at hand."""
+    data, scenes = tiny
+
+    def go(protocol: str = "spin-nerf", out: str = "out", **options) -> BenchRun:
+        given = {"fitted": str(scenes / "{scene}"), **options}
+        return bench(protocol, data, tmp_path / out, options=BenchOptions(**given), command="c")
+
+    return go
+
+
+def test_a_method_is_measured_once(run, tmp_path) -> None:
+    first = run()
+    (method,) = first.methods
+    assert (first.kept, method.method) == (0, "uplift")
+    assert method.scores["iou"] > 0.8
+    path = tmp_path / "out/results/spin-nerf/uplift/wall.json"
+    before = path.read_bytes()
+    assert run().kept == 1
+    assert path.read_bytes() == before
+    # Anything that changes the result is another experiment.
+    assert run(seed=1).kept == 0
+    assert run(seed=1).kept == 1
+    assert run(seed=1, published=True).kept == 0
+    assert run(seed=1, published=True, switches=("boundary_ratio=none",)).kept == 0
+    assert run(seed=1, published=True, switches=("boundary_ratio=none",), again=True).kept == 0
+    made = load_result(path)
+    assert "boundary_iou" not in made.scores
+    assert made.made["command"] == "c"
+    assert made.switches["boundary_ratio"] is None
+
+
+def test_the_prompts_view_counts_where_the_protocol_says_so(run) -> None:
+    rows = [row["view"] for row in run().methods[0].scenes[0].rows]
+    assert rows == ["a", "b", "c"]
+    other = run("spin-nerf-ludvig").methods[0].scenes[0]
+    assert [row["view"] for row in other.rows] == ["b", "c"]
+
+
+def test_gaussians_are_chosen_where_the_protocol_says_so(run) -> None:
+    """Silhouettes are drawn alone, so what hides the thing takes nothing from it."""
+    flat = run().methods[0].scores["iou"]
+    solid = run(switches=("decided=gaussians",)).methods[0].scores["iou"]
+    assert flat != solid
+    assert solid > 0.5
+    none = run(switches=("decided=gaussians", "silhouette_cut=1.0")).methods[0].scores["iou"]
+    assert none == 0
+
+
+def test_results_of_other_choices_do_not_go_into_one_table(run, tmp_path) -> None:
+    run(out="other", switches=("reference_scored=no",))
+    with pytest.raises(InputError, match=r"they differ in reference_scored True and False\."):
+        run(beside=(tmp_path / "other",))
+    run(out="same")
+    found = run(beside=(tmp_path / "same",))
+    assert [one.method for one in found.methods] == ["uplift", "uplift (same)"]
+    columns, rows = bench_table(found)
+    assert columns[0] == "method"
+    assert rows[0][1:-1] == rows[1][1:-1]
+    with pytest.raises(MissingFileError, match="expected results of spin-nerf, got none"):
+        run(beside=(tmp_path / "nothing",))
+
+
+def test_what_was_chosen_by_the_truth_is_marked(run, tmp_path) -> None:
+    found = run(switches=("threshold=oracle",))
+    assert found.methods[0].oracle == ("cut",)
+    _, rows = bench_table(found)
+    assert str(rows[0][-1]).endswith("oracle cut")
+    assert "oracle" not in str(rows[-1][-1])
+
+
+def first_quarter(inputs: MethodInputs, options: UpliftMethodOptions) -> Labels:
+    """A method that a stranger brings: it looks at nothing."""
+    count = len(inputs.gaussians)
+    ids = torch.where(torch.arange(count) < 25, 1, 2)
+    return Labels(ids=ids, confidence=torch.ones(count))
+
+
+def test_any_registered_method_is_run(run) -> None:
+    register_method(
+        Method(
+            name="stranger", summary="s", reference="r", evidence=("labels",),
+            options=UpliftMethodOptions, run=first_quarter,
+        )
+    )  # fmt: skip
+    try:
+        found = run(methods=("stranger", "uplift"))
+    finally:
+        del _registry._REGISTERED["stranger"]
+    assert [one.method for one in found.methods] == ["stranger", "uplift"]
+    assert found.methods[0].scores["iou"] > 0.9
+
+
+def test_what_does_not_fit_is_refused(run, tmp_path) -> None:
+    with pytest.raises(InputError, match="there is no protocol 'spin'"):
+        run("spin")
+    with pytest.raises(InputError, match="expected scenes wall, got 'door'"):
+        run(scenes=("door",))
+    with pytest.raises(InputError, match="method associate: expected a model that gives"):
+        run(methods=("associate",))
+    with pytest.raises(InputError, match="methods: expected each once"):
+        BenchOptions(methods=("uplift", "uplift"))
+    with pytest.raises(InputError, match="methods: expected at least one"):
+        BenchOptions(methods=())
+    with pytest.raises(MissingFileError, match="no such folder of a benchmark"):
+        bench("spin-nerf", tmp_path / "none", tmp_path / "out")
+    with pytest.raises(InputError, match=r"model classical: expected NAME=VALUE"):
+        run(methods=("associate",), models=("classical,size",))
+    with pytest.raises(InputError, match="models: classical has no weights"):
+        run(methods=("associate",), models=("classical=weights",))
+
+
+def test_a_fit_that_learned_from_held_out_views_is_refused(tiny, run, tmp_path) -> None:
+    _, scenes = tiny
+    with pytest.raises(InputError, match=r"holds out, got one that learned from 2 of them \(b\)"):
+        run(switches=("scored_in_training=no", "reference_scored=no"))
+    scene = load_scene(scenes / "wall")
+    views = tuple(replace(one, split="train" if one.name == "a" else "test") for one in scene.views)
+    save_scene(replace(scene, views=views), tmp_path / "wall")
+    held_out = run(
+        switches=("scored_in_training=no", "reference_scored=no"),
+        fitted=str(tmp_path / "{scene}"),
+    )
+    assert held_out.methods[0].scores["iou"] > 0.8
+
+
+def test_options_of_models() -> None:
+    """What stands behind a model's name reaches it."""
+    plain = model_of("classical", BenchOptions(), SILENT)
+    other = model_of("classical,cuts=0.2,0.4", BenchOptions(), SILENT)
+    assert plain.settings != other.settings
+    assert list(other.settings["cuts"]) == [0.2, 0.4]
+
+
+def test_from_the_command(tiny, tmp_path, capsys) -> None:
+    data, scenes = tiny
+    words = ["bench", "spin-nerf", "--data", str(data), "-o", str(tmp_path / "o")]
+    words += ["--fitted", str(scenes / "{scene}"), "--quiet"]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "measured here" in printed
+    assert "SAGA" in printed
+    for kind in ("md", "csv", "tex", "html", "json"):
+        text = (tmp_path / f"o/spin-nerf.{kind}").read_text()
+        assert "uplift" in text
+    page = (tmp_path / "o/spin-nerf.html").read_text()
+    assert "not verified" in page
+    assert "reference_scored" in page
+    assert main([*words[:2], "--data", str(tmp_path / "none"), *words[4:]]) == 2
+    assert "no such folder" in capsys.readouterr().err
