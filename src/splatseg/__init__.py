@@ -125,7 +125,8 @@ _HOMES = {
         "ExportOptions ImportOptions MakeSceneOptions RenderingOptions SeeOptions "
         "SegmentOptions SharpenSceneOptions attach_layers describe edit_scene evaluate_scene "
         "examine_capture export_scene fit_capture "
-        "import_scene make_demo render_truth render_views save_segmentation see segment sharpen_scene"
+        "import_scene make_demo render_truth render_views save_segmentation see segment "
+        "sharpen_scene"
     ),
 }
 _PACKAGES = frozenset(
