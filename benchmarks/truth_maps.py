@@ -168,7 +168,7 @@ def compare_room() -> None:
         for lens, changes in lenses.items():
             wrong = pixels = 0
             worst = 0.0
-            for view in cameras(scene, train=8, test=0):
+            for view in cameras(scene, train=4, test=0):
                 at = replace(view.camera, **changes)
                 origin, directions = at.rays()
                 distance, which = cast(scene, origin, directions.reshape(-1, 3))
