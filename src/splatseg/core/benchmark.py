@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseg._check import check_shape
@@ -93,9 +93,14 @@ class TruePoints:
 
     table: ClassTable | None = None
 
+    faces: Int[Tensor, "m 3"] | None = None
+    """Triangles between the points, where the annotation is that of a mesh."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("points", self.points, (len(self.labels), 3))
+        if self.faces is not None:
+            check_shape("faces", self.faces, (None, 3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -132,6 +133,20 @@ def ids_of(
     nothing = (ids < 0) | (ids == (UNLABELLED if void is None else void))
     ids = ids + 1 if zero_is_class else torch.where(ids == 0, UNLABELLED, ids)
     return torch.where(nothing, UNLABELLED, ids).to(torch.int32)
+
+
+@boundary
+def read_triangles(path: Path) -> Int64[Tensor, "m 3"] | None:
+    """Triangles of a PLY file, polygons cut into some; None where it has no faces.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no PLY file, or its faces cannot be.
+    """
+    tables = read_ply_tables(path, read_ply_header(path), ["face"])
+    if "face" not in tables or not tables["face"].count:
+        return None
+    return _triangles(path, tables["face"])[0]
 
 
 def _triangles(path: Path, table: PlyTable) -> tuple[Tensor, Tensor]:

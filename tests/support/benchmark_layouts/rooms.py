@@ -152,7 +152,7 @@ def surface_points(source: Source) -> dict[str, NDArray[Any]]:
 def write_ply(
     path: Path, xyz: NDArray[Any], rgb: NDArray[Any], label: NDArray[Any] | None = None
 ) -> None:
-    """A mesh as ScanNet writes it: vertices with colours, a label where there is one, faces."""
+    """A mesh as ScanNet writes it, without faces: points are all that is known of the surface."""
     columns = [(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")]
     columns.append(("alpha", "u1"))
     if label is not None:
@@ -166,10 +166,9 @@ def write_ply(
     words = {"<f4": "float", "u1": "uchar", "<u2": "ushort"}
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
     head += [f"property {words[kind]} {name}" for name, kind in columns]
-    head += ["element face 1", "property list uchar int vertex_indices", "end_header"]
-    face = b"\x03" + np.zeros(3, "<i4").tobytes()
+    head += ["element face 0", "property list uchar int vertex_indices", "end_header"]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(("\n".join(head) + "\n").encode() + rows.tobytes() + face)
+    path.write_bytes(("\n".join(head) + "\n").encode() + rows.tobytes())
 
 
 def fisheye_inside(camera: Camera) -> Camera:

@@ -12,7 +12,10 @@ from PIL import Image
 
 from splatseg.cli import main
 from splatseg.core.benchmark import BenchmarkScene, TrueMaps
+from splatseg.core.surfaces import LabelledPoints
+from splatseg.evaluate import SurfaceField
 from splatseg.io.benchmarks import read_benchmark
+from splatseg.io.evidence import create_evidence, save_label_map
 from splatseg.tasks.benchmark import load_result
 
 DataSet = Callable[[str], Path]
@@ -144,6 +147,25 @@ def test_classes_and_instances_of_views(bench, data_set, tmp_path, score) -> Non
     bench("replica-gaga", "replica", "--method", "associate", "--model", models[1])
     gaga = content(out, "replica-gaga")["methods"]["associate"]["scores"]
     assert gaga["instance_miou"] != ours["instance_miou"]
+
+
+def test_classes_of_views_whose_truth_is_a_labelled_scan(bench, data_set, tmp_path) -> None:
+    """Truth is drawn from the scan; photographs are fisheye ones, and so is the evidence."""
+    data = data_set("scannetpp")
+    scene = scene_of("scannetpp", data)
+    assert scene.semantic is None
+    assert scene.points is not None
+    field = SurfaceField(
+        LabelledPoints(points=scene.points.points, labels={"label": scene.points.labels.ids})
+    )
+    folder = create_evidence(tmp_path / "labels", kind="labels", classes=scene.points.table)
+    for view in scene.capture.train_views:
+        with field.view(view.camera) as drawn:
+            save_label_map(drawn.label_map("label"), folder, view.name)
+    out = bench("scannetpp", "scannetpp", "--method", "uplift", "--model", str(folder))
+    result = load_result(out / f"results/scannetpp/uplift/{scene.name}.json")
+    assert result.scores["miou"] > 0.3
+    assert len(result.rows) == len(scene.capture.test_views)
 
 
 @pytest.mark.parametrize("method", ["uplift", "features"])

@@ -17,6 +17,7 @@ from splatseg.io.captures.scannetpp import find_scannetpp
 from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
+from splatseg.io.surfaces import read_triangles
 
 LAYOUT = "scannetpp"
 
@@ -65,6 +66,11 @@ def read_annotated_points(scans: Path) -> TruePoints:
     """
     mesh = next((scans / name for name in _MESHES if (scans / name).is_file()), scans / _MESHES[0])
     points = vertex_positions(mesh, read_ply_vertices(mesh))
+    faces = read_triangles(mesh)
+    if faces is not None and len(faces) and int(faces.max()) >= len(points):
+        raise FileFormatError(
+            f"{mesh}: expected faces of {len(points)} vertices, got one of {int(faces.max())}."
+        )
     segments = _segments(scans / _SEGMENTS, vertices=len(points))
     groups = _groups(scans / _ANNOTATION)
     names = sorted({name for name, _ in groups})
@@ -83,6 +89,7 @@ def read_annotated_points(scans: Path) -> TruePoints:
         points=torch.from_numpy(np.ascontiguousarray(points, np.float32)),
         labels=Labels(ids=torch.from_numpy(ids), confidence=torch.ones(len(ids))),
         table=ClassTable(rows=rows),
+        faces=faces,
     )
 
 

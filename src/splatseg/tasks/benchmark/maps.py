@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -20,9 +21,11 @@ from splatseg.core import (
     with_info,
 )
 from splatseg.core.benchmark import TrueMaps
+from splatseg.core.surfaces import LabelledMesh, LabelledPoints
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     Confusion,
+    SurfaceField,
     evaluate_instances,
     evaluate_panoptic,
     matched_instance_score,
@@ -40,6 +43,7 @@ from splatseg.tasks.benchmark.points import read_by_words, true_ids_of
 from splatseg.tasks.benchmark.sight import Seen
 
 _LAYER = "layer"
+_SURFACE = "label"
 Scores = tuple[dict[str, float], list[dict[str, Any]], list[str]]
 """Figures, a row a view, and notes."""
 
@@ -71,7 +75,7 @@ def map_scores(job: Job) -> Scores:
     seen = job.seen(words=words)
     layer = job.layer(seen.name)
     if isinstance(layer, Features) and layer.info.head is None:
-        truth = _truth(job, job.bench.semantic, "classes")
+        truth = _truth(job, true_classes(job), "classes")
         if truth.table is None:
             raise InputError(f"scene {job.bench.name}: expected names of its classes, got none.")
         ids = [row.id for row in truth.table.rows]
@@ -83,7 +87,7 @@ def map_scores(job: Job) -> Scores:
 
 def _classes(job: Job, seen: Seen, layer: Layer, *, by_words: bool) -> Scores:
     """Scores of classes, those of the evidence told in the truth's ids by name."""
-    truth = _truth(job, job.bench.semantic, "classes")
+    truth = _truth(job, true_classes(job), "classes")
     mapping, notes = (None, []) if by_words else true_ids_of(job, seen, truth.table)
     field = GaussianField(job.scene.gaussians, {_LAYER: layer}, backend=job.backend)
     views = _scored(job, truth)
@@ -197,6 +201,31 @@ def _in_true_classes(job: Job, seen: Seen, layer: Layer) -> tuple[Layer, list[st
         return layer, notes
     classes = {id: mapping[one] for id, one in layer.info.class_of.items() if one in mapping}
     return with_info(layer, replace(layer.info, class_of=classes)), notes
+
+
+def true_classes(job: Job) -> TrueMaps | None:
+    """Class maps of the data set; drawn from its labelled surface where it has points alone.
+
+    As the open-vocabulary voxel paper scores ScanNet++: rays from the pixels meet the mesh, and
+    take the label of the nearest corner.
+    """
+    points = job.bench.points
+    if job.bench.semantic is not None or points is None:
+        return job.bench.semantic
+    ids = {_SURFACE: points.labels.ids}
+    surface = (
+        LabelledPoints(points=points.points, labels=ids)
+        if points.faces is None
+        else LabelledMesh(vertices=points.points, faces=points.faces, vertex_labels=ids)
+    )
+    field = SurfaceField(surface)
+
+    def drawn(name: str) -> LabelMap:
+        with field.view(job.scene.view(name).camera) as view:
+            return view.label_map(_SURFACE)
+
+    reads = {view.name: partial(drawn, view.name) for view in job.scene.views}
+    return TrueMaps(read=reads, table=points.table)
 
 
 def _truth(job: Job, maps: TrueMaps | None, what: str) -> TrueMaps:
