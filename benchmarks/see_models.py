@@ -58,18 +58,38 @@ class Run:
 
 
 _GRID = ("--points-per-side", "8")
+_WORDS = ("--words", "wall", "box")
+_LOOSE = ("--box-threshold", "0", "--text-threshold", "0")
 _FOLLOWED = ("--seeds", SEEDS)
 RUNS = (
     Run(model="classical"),
     Run(model="sam", kind="sam", flags=_GRID),
     Run(model="sam-hq", kind="sam_hq", flags=_GRID),
     Run(model="sam2", kind="sam2", flags=_GRID),
-    Run(model="sam3", kind="sam3_video", flags=_GRID),
+    Run(model="sam3", kind="sam3_whole", flags=_GRID),
     Run(model="sam2-video", kind="sam2_video", flags=_FOLLOWED, cached=False),
-    Run(model="sam3-video", kind="sam3_video", flags=_FOLLOWED, cached=False),
+    Run(model="sam3-video", kind="sam3_whole", flags=_FOLLOWED, cached=False),
     Run(model="dino", kind="dino"),
     Run(model="dinov2", kind="dinov2"),
     Run(model="dinov3", kind="dinov3"),
+    Run(model="clip", kind="clip", flags=_WORDS),
+    Run(model="siglip2", kind="siglip2", flags=_WORDS),
+    Run(model="lseg", kind="lseg", flags=("--size", "256")),
+    Run(model="clipseg", kind="clipseg", flags=_WORDS),
+    Run(
+        model="langsam",
+        kind="grounding_dino",
+        flags=(*_WORDS, *_LOOSE, "--sam-model", "sam2", "--sam-weights", "{sam2}"),
+    ),
+    Run(model="sam3-text", kind="sam3", flags=(*_WORDS, "--threshold", "0")),
+    Run(model="mask2former", kind="mask2former"),
+    Run(model="maskformer", kind="maskformer"),
+    Run(model="oneformer", kind="oneformer"),
+    Run(model="eomt", kind="eomt"),
+    Run(model="segformer", kind="segformer"),
+    Run(model="dpt-semantic", kind="dpt_semantic"),
+    Run(model="depth-anything", kind="depth_anything"),
+    Run(model="dpt", kind="dpt"),
 )
 
 

@@ -144,5 +144,5 @@ def _spread(model: Any) -> Any:
 MAKERS = {
     "sam2_video": sam2_video,
     "sam3_tracker_video": sam3_tracker_video,
-    "sam3_video": sam3_video,
+    "sam3_whole": sam3_video,
 }

@@ -272,8 +272,8 @@ def test_the_tracker_of_sam3_as_it_is_published(checkpoints, rng) -> None:
     """The detector is left aside; the backbone is the detector's, which both share."""
     from safetensors.torch import load_file
 
-    model = made(checkpoints, "sam3-video", "sam3_video")
-    stored = load_file(checkpoints("sam3_video") / "model.safetensors")
+    model = made(checkpoints, "sam3-video", "sam3_whole")
+    stored = load_file(checkpoints("sam3_whole") / "model.safetensors")
     loaded = model._network.state_dict()
     block = "backbone.layers.0.mlp.fc1.weight"
     for ours, theirs in (
@@ -288,7 +288,7 @@ def test_the_tracker_of_sam3_as_it_is_published(checkpoints, rng) -> None:
 
 @pytest.mark.parametrize(
     ("image_family", "family", "kind", "library_name"),
-    [("sam2", *KINDS[0]), ("sam3", "sam3-video", "sam3_video", "Sam3TrackerVideo")],
+    [("sam2", *KINDS[0]), ("sam3", "sam3-video", "sam3_whole", "Sam3TrackerVideo")],
 )
 def test_the_first_frame_of_a_video_is_an_image(
     checkpoints, rng, image_family, family, kind, library_name
