@@ -12,6 +12,7 @@ import splatseg
 
 SURFACE = {
     "AttachLayersOptions",
+    "BenchOptions",
     "Camera",
     "Capture",
     "CheckpointOptions",
@@ -42,6 +43,7 @@ SURFACE = {
     "SplatsegError",
     "View",
     "attach_layers",
+    "bench",
     "back_project",
     "contributors",
     "create_evidence",

@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from splatseg.render import weights as weights
     from splatseg.synthetic import write_capture as write_capture
     from splatseg.tasks import AttachLayersOptions as AttachLayersOptions
+    from splatseg.tasks import BenchOptions as BenchOptions
     from splatseg.tasks import CheckpointOptions as CheckpointOptions
     from splatseg.tasks import DemoOptions as DemoOptions
     from splatseg.tasks import EditOptions as EditOptions
@@ -89,6 +90,7 @@ if TYPE_CHECKING:
     from splatseg.tasks import SegmentOptions as SegmentOptions
     from splatseg.tasks import SharpenSceneOptions as SharpenSceneOptions
     from splatseg.tasks import attach_layers as attach_layers
+    from splatseg.tasks import bench as bench
     from splatseg.tasks import describe as describe
     from splatseg.tasks import edit_scene as edit_scene
     from splatseg.tasks import evaluate_scene as evaluate_scene
@@ -121,12 +123,11 @@ _HOMES = {
     "splatseg.render": "RenderOptions back_project contributors get_backend weights",
     "splatseg.synthetic": "write_capture",
     "splatseg.tasks": (
-        "AttachLayersOptions CheckpointOptions DemoOptions EditOptions EvaluationOptions "
-        "ExportOptions ImportOptions MakeSceneOptions RenderingOptions SeeOptions "
-        "SegmentOptions SharpenSceneOptions attach_layers describe edit_scene evaluate_scene "
-        "examine_capture export_scene fit_capture "
-        "import_scene make_demo render_truth render_views save_segmentation see segment "
-        "sharpen_scene"
+        "AttachLayersOptions BenchOptions CheckpointOptions DemoOptions EditOptions "
+        "EvaluationOptions ExportOptions ImportOptions MakeSceneOptions RenderingOptions "
+        "SeeOptions SegmentOptions SharpenSceneOptions attach_layers bench describe edit_scene "
+        "evaluate_scene examine_capture export_scene fit_capture import_scene make_demo "
+        "render_truth render_views save_segmentation see segment sharpen_scene"
     ),
 }
 _PACKAGES = frozenset(

@@ -16,8 +16,8 @@ from splatseg.io.scene import load_scene_layer
 
 CLI = Path(cli.__file__).parent
 MAKE = {
-    "attach", "demo", "edit", "evaluate", "export", "fit", "import", "render", "see", "segment",
-    "sharpen",
+    "attach", "bench", "demo", "edit", "evaluate", "export", "fit", "import", "render", "see",
+    "segment", "sharpen",
 }  # fmt: skip
 TELL = {"doctor", "info"}
 SHARED = {
@@ -75,7 +75,7 @@ def test_shared_flags_have_the_shared_type(name) -> None:
         if field in declared and (name, field) not in OWN:
             assert declared[field] == kind, f"{name}: {field}"
             assert hasattr(_types, kind)
-    assert declared.get("data", "Data") == "Data" or name in {"doctor", "fit", "import"}
+    assert declared.get("data", "Data") == "Data" or name in {"bench", "doctor", "fit", "import"}
     assert declared.get("split", "Split") in {"Split", "SplitOrPath"}
 
 

@@ -61,7 +61,7 @@ class Command:
     """Who finds words in the drawn first view, such as langsam: words become the mask of a prompt
     so. Without it words are asked for by features."""
 
-    scene: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ..")] = ()
+    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ..")] = ()
     """Scenes to run, by comma or by space; all without it."""
 
     fitted: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
@@ -119,7 +119,7 @@ def run(command: Command) -> None:
             models=command.model,
             prompter=command.prompter,
             grounder=command.grounder,
-            scenes=listed("--scene", command.scene) if command.scene else (),
+            scenes=listed("--scenes", command.scenes) if command.scenes else (),
             fitted=command.fitted,
             preset=command.preset,
             steps=command.steps,
@@ -136,7 +136,7 @@ def run(command: Command) -> None:
         command=words,
         observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
-    paths = write_tables(done, command=words)
+    paths = write_tables(done, command.output, command=words)
     if command.json:
         print_result(_facts(done, paths), [], json=True)
         return

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SplitOrPath
+from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder, SplitOrPath
 from splatseg.cli._words import listed
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Capture, Scene
@@ -44,20 +44,14 @@ class Command:
     splatseg render scan -o truth --surface scan_vh_clean_2.labels.ply
     """
 
-    scene: Annotated[
-        Path,
-        tyro.conf.Positional,
-        tyro.conf.arg(
-            metavar="SCENE", help="The scene folder; with --surface a capture's folder too."
-        ),
-    ]
+    scene: SceneFolder
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder to write to. DIR/<what> of an earlier render is replaced as a whole."""
 
     split: SplitOrPath = "test"
 
-    what: tuple[str, ...] = ()
+    what: tuple[str, ...] | None = None
     """What to draw: rgb, depth, alpha, and names of layers, by comma or by space. NAME@part is a
     cut of a tree; NAME@hard reads features Gaussian by Gaussian and not view by view. Without it
     rgb, or with --surface all of its labels."""
@@ -124,7 +118,7 @@ def run(command: Command) -> None:
 def _options(command: Command, default: tuple[str, ...]) -> RenderingOptions:
     return RenderingOptions(
         split=command.split,
-        what=listed("--what", command.what) if command.what else default,
+        what=default if command.what is None else listed("--what", command.what),
         coloured=command.coloured,
         video=command.video,
         frames=command.frames,

@@ -106,6 +106,6 @@ def relevancy(
         >>> relevancy(torch.tensor([[0.3, 0.1]]), torch.tensor([[0.1, 0.0]])).round(decimals=3)
         tensor([[0.8810, 0.5000]])
     """
-    if not negatives.shape[-1]:
+    if not negatives.dim() or not negatives.shape[-1]:
         raise InputError("negatives: expected at least one, got none.")
     return torch.sigmoid(temperature * (cosines - negatives.amax(dim=-1, keepdim=True)))

@@ -98,6 +98,10 @@ def _three(
     return red, green, blue
 
 
+HALVES = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
+"""Colours from -1 to 1, as SAM 3 and others take them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
     """Where an image lies in the square or rectangle that a network sees."""

@@ -9,6 +9,8 @@ from splatseg.tasks._observer import Observer as Observer
 from splatseg.tasks.attach import AttachedLayers as AttachedLayers
 from splatseg.tasks.attach import AttachLayersOptions as AttachLayersOptions
 from splatseg.tasks.attach import attach_layers as attach_layers
+from splatseg.tasks.benchmark import BenchOptions as BenchOptions
+from splatseg.tasks.benchmark import bench as bench
 from splatseg.tasks.checkpoint_options import CheckpointOptions as CheckpointOptions
 from splatseg.tasks.demo import Demo as Demo
 from splatseg.tasks.demo import DemoOptions as DemoOptions

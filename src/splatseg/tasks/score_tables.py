@@ -49,7 +49,7 @@ def write_class_table(figures: Mapping[str, Any], path: Path) -> None:
         [int(id), names[id], pixels[id], float(iou)] for id, iou in figures["per_class"].items()
     ]
     rows.append(["", "mean", sum(pixels.values()), float(figures["mIoU"])])
-    write_table(path, ["id", "class", "pixels", "IoU"], rows)
+    write_table(rows, path, columns=["id", "class", "pixels", "IoU"])
 
 
 def write_confusion(figures: Mapping[str, Any], path: Path) -> None:
@@ -66,10 +66,10 @@ def write_confusion(figures: Mapping[str, Any], path: Path) -> None:
         [matrix["names"][str(id)], *counts]
         for id, counts in zip(matrix["true"], matrix["counts"], strict=True)
     ]
-    write_table(path, ["true class", *names], rows)
+    write_table(rows, path, columns=["true class", *names])
 
 
-def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+def write_table(rows: Sequence[Sequence[Cell]], path: Path, *, columns: Sequence[str]) -> None:
     """Write rows under the names of columns; numbers stand right.
 
     Raises:

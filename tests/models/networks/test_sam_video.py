@@ -42,13 +42,18 @@ def marked(**boxes: tuple[int, int, int, int]) -> LabelMap:
 TWO = marked(id5=(10, 30, 10, 30), id9=(36, 50, 40, 60))
 
 
-def pixel_values(images) -> torch.Tensor:
+def pixel_values(images, library_name: str = "Sam2Video") -> torch.Tensor:
     """To the bit what ours are: rounding comes back through the memories of bfloat16."""
+    colours = IMAGENET if library_name == "Sam2Video" else ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
     frame = frame_of(HEIGHT, WIDTH, size=64, shape="square")
     found = network_input(
-        images, frame, Normalisation(), device=torch.device("cpu"), dtype=torch.float32
+        images,
+        frame,
+        Normalisation(mean=colours[0], std=colours[1]),
+        device=torch.device("cpu"),
+        dtype=torch.float32,
     )
-    mean, std = (torch.tensor(values).view(3, 1, 1) for values in IMAGENET)
+    mean, std = (torch.tensor(values).view(3, 1, 1) for values in colours)
     wanted = (torch.stack(images).permute(0, 3, 1, 2) / 255 - mean) / std
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
     return found
@@ -64,9 +69,12 @@ def test_it_is_what_the_library_makes_of_a_whole_video(
     frames = video(rng, 9)
     ours = dict(model.track(iter(frames), {"v0": TWO}))
     session = session_of(
-        library_name, video=pixel_values([image for _, image in frames]), video_height=HEIGHT,
-        video_width=WIDTH, dtype=torch.float32,
-    )  # fmt: skip
+        library_name,
+        video=pixel_values([image for _, image in frames], library_name),
+        video_height=HEIGHT,
+        video_width=WIDTH,
+        dtype=torch.float32,
+    )
     for id in (5, 9):
         mask = (TWO.ids == id).float()[None, None]
         session.add_mask_inputs(session.obj_id_to_idx(id), 0, mask)
@@ -80,7 +88,7 @@ def test_it_is_what_the_library_makes_of_a_whole_video(
     present = 0
     for output in model._network.propagate_in_video_iterator(session):
         memory.next_frame()
-        pixels = pixel_values([frames[output.frame_idx][1]])
+        pixels = pixel_values([frames[output.frame_idx][1]], library_name)
         ids, logits, there = memory.follow(pixels, masks if output.frame_idx == 0 else {})
         assert ids == (5, 9)
         torch.testing.assert_close(logits, output.pred_masks[:, 0], rtol=0, atol=1e-6)
@@ -298,7 +306,9 @@ def test_the_first_frame_of_a_video_is_an_image(
     ((_, picture),) = video(rng, 1)
     loading = LoadOptions(weights=str(checkpoints(kind)), device="cpu")
     model = find_model(image_family, loading=loading)
-    session = session_of(library_name, video=pixel_values([picture]), dtype=torch.float32)
+    session = session_of(
+        library_name, video=pixel_values([picture], library_name), dtype=torch.float32
+    )
     point = {"point_coords": torch.tensor([[[[40.0, 20.0]]]]),
              "point_labels": torch.ones(1, 1, 1, dtype=torch.int32)}  # fmt: skip
     session.add_point_inputs(session.obj_id_to_idx(1), 0, point)

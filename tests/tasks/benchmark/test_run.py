@@ -1,5 +1,6 @@
 """A run goes on, keeps apart what differs, and refuses what does not fit together."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,17 @@ import torch
 from PIL import Image
 
 from splatseg.cli import main
-from splatseg.core import Camera, Gaussians, Labels, Scene, View
+from splatseg.core import (
+    Camera,
+    Embedding,
+    Gaussians,
+    Labels,
+    MaskSet,
+    Prompt,
+    Scene,
+    View,
+)
+from splatseg.core.models import TextMasks
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.images import save_png
 from splatseg.io.scene import load_scene, save_scene
@@ -213,6 +224,104 @@ def test_options_of_models() -> None:
     other = model_of("classical,cuts=0.2,0.4", BenchOptions(), SILENT)
     assert plain.settings != other.settings
     assert "0.2, 0.4" in str(other.settings)
+
+
+def strokes(path: Path, where: tuple[slice, slice]) -> None:
+    mask = np.zeros((SIZE, SIZE), np.uint8)
+    mask[where] = 255
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(mask).save(path)
+
+
+class Redness:
+    """Finds what is red, if the words say so."""
+
+    name, settings, note = "redness", {}, ""
+
+    def grounded_masks(self, image, words) -> TextMasks:
+        red = (image[..., 0].int() > image[..., 2].int())[None]
+        if "red" not in words[0]:
+            red = red[:0]
+        return TextMasks(masks=MaskSet.from_dense(red), words=(0,) * len(red))
+
+
+class Reds(Redness):
+    """Gives what is red where a positive point is on it, and keeps the points."""
+
+    def __init__(self) -> None:
+        self.prompts: list[Prompt] = []
+
+    def embed(self, image) -> Embedding:
+        height, width = (int(side) for side in image.shape[:2])
+        return Embedding(model=self.name, height=height, width=width, arrays={"image": image})
+
+    def prompted_masks(self, embedding, prompt) -> MaskSet:
+        self.prompts.append(prompt)
+        image = embedding.arrays["image"].int()
+        return MaskSet.from_dense((image[..., 0] > image[..., 2])[None])
+
+
+def test_who_answers_strokes(tiny, tmp_path, monkeypatch) -> None:
+    """Shares of the skeletons become points, the prompter's mask is what is lifted."""
+    data, scenes = tiny
+    folder = tmp_path / "nvos"
+    shutil.copytree(data / "wall", folder / "llff" / "wall")
+    strokes(folder / "scribbles/red/pos_0_wall.png", (slice(15, 18), slice(10, 22)))
+    strokes(folder / "scribbles/red/neg_0_wall.png", (slice(2, 3), slice(2, 30)))
+    (folder / "masks/red").mkdir(parents=True)
+    (folder / "reference_image/red").mkdir(parents=True)
+    shutil.copy(data / "wall/masks/b.png", folder / "masks/red/b_mask.png")
+    shutil.copy(data / "wall/images/a.png", folder / "reference_image/red/a.png")
+    model = Reds()
+    monkeypatch.setattr("splatseg.tasks.benchmark.run.model_of", lambda *_: model)
+    given = {"fitted": str(scenes / "{scene}"), "prompter": "reds"}
+    held = ("scored_in_training=yes",)
+    done = bench("nvos", folder, tmp_path / "o", options=BenchOptions(switches=held, **given))
+    assert done.methods[0].scores["iou"] > 0.8
+    (few,) = model.prompts
+    assert int(few.signs.sum()) >= 1
+    assert bool((few.points[few.signs][:, 1] == 16.5).all()), "the middle row of the stroke"
+    all_of_them = (*held, "positive_share=1.0", "negative_share=1.0")
+    bench("nvos", folder, tmp_path / "o", options=BenchOptions(switches=all_of_them, **given))
+    many = model.prompts[-1]
+    assert int(many.signs.sum()) > int(few.signs.sum())
+    assert int((~many.signs).sum()) > 10
+    made = load_result(tmp_path / "o/results/nvos/uplift/wall.json").made
+    assert made["prompter"]["name"] == "redness"
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="expected one of"):
+        bench("nvos", folder, tmp_path / "p", options=BenchOptions(prompter="nobody"))
+
+
+def test_words_found_in_the_drawn_first_view(tiny, tmp_path, monkeypatch) -> None:
+    data, scenes = tiny
+    folder = tmp_path / "lerf"
+    shutil.copytree(data / "wall", folder / "wall")
+    for view in ("b", "c"):
+        for words in ("red square", "green cube"):
+            (folder / "wall/test_mask" / view).mkdir(parents=True, exist_ok=True)
+            source = data / f"wall/masks/{view}.png"
+            shutil.copy(source, folder / "wall/test_mask" / view / f"{words}.png")
+    scene = load_scene(scenes / "wall")
+    views = tuple(replace(one, split="train" if one.name == "a" else "test") for one in scene.views)
+    save_scene(replace(scene, views=views), tmp_path / "wall")
+    asked: list[str] = []
+
+    def model_of(named, options, observer):
+        asked.append(named)
+        return Redness()
+
+    monkeypatch.setattr("splatseg.tasks.benchmark.run.model_of", model_of)
+    options = BenchOptions(fitted=str(tmp_path / "{scene}"), grounder="redness")
+    done = bench("lerf-mask", folder, tmp_path / "o", options=options)
+    assert asked == ["redness"]
+    rows = {(row["task"], row["view"]): row for row in done.methods[0].scenes[0].rows}
+    assert rows["red square", "b"]["iou"] > 0.8
+    assert rows["red square", "c"]["iou"] > 0.8
+    # What is not found counts as wrong, in every view.
+    assert not rows["green cube", "b"]["found"]
+    assert done.methods[0].scores["iou"] < 0.55
+    assert "green cube" in done.methods[0].scenes[0].notes[0]
 
 
 def test_from_the_command(tiny, tmp_path, capsys) -> None:

@@ -21,7 +21,8 @@ from splatseg.core.models import DeepFeatures, Image
 from splatseg.errors import FileFormatError, RangeError
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading, ModelFamily
-from splatseg.models._images import Normalisation, PatchGrid, patch_grid, patch_input
+from splatseg.models._images import HALVES, PatchGrid, patch_grid, patch_input
+from splatseg.models._images import Normalisation as Normalisation
 from splatseg.models.lseg._layout import network_of
 from splatseg.models.lseg._reading import read_checkpoint
 from splatseg.models.lseg._sizes import PATCH
@@ -37,7 +38,6 @@ _MULTIPLE = 2 * PATCH
 _TRAINED_SIZE = 480
 """Side of the crops that the published weights were trained on, pixels."""
 
-_NORMALISATION = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 _SHOWN = 3
 
 
@@ -166,7 +166,7 @@ class LSeg:
             patch=grid.patch,
         )
         batch = patch_input(
-            images, padded, _NORMALISATION,
+            images, padded, HALVES,
             device=self._place.device, dtype=self._place.dtype, mode="bilinear",
         )  # fmt: skip
         decoded = self._network.image(batch).float()

@@ -19,7 +19,7 @@ from splatseg.core.models import Image
 from splatseg.errors import RangeError
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import Normalisation, network_input
+from splatseg.models._images import HALVES, Normalisation, network_input
 from splatseg.models._input_size import InputSize
 from splatseg.models.networks._library import configuration, network, network_family, settings_of
 
@@ -31,13 +31,11 @@ _CLASSES = {
 
 _DPT_SIDE = 384
 
-DPT_MEAN = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
-"""What DPT's weights take where they do not tell."""
 
 UNUSED_OF_DPT = ("neck.fusion_stage.layers.0.residual_layer1.",)
 """The coarsest depth has nothing coarser to be added to; published weights lack it."""
 
-_NORMALISATIONS = {"depth-anything": Normalisation(), "dpt": DPT_MEAN}
+_NORMALISATIONS = {"depth-anything": Normalisation(), "dpt": HALVES}
 _SIZES = {
     "depth-anything": InputSize(sides=(518, 518), keeps_proportions=True),
     "dpt": InputSize(sides=(_DPT_SIDE, _DPT_SIDE)),

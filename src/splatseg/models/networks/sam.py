@@ -19,7 +19,7 @@ from splatseg.core.models import DeepFeatures, Embedding, Image, Prompt
 from splatseg.errors import RangeError
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import Frame, Normalisation, frame_of, network_input
+from splatseg.models._images import HALVES, Frame, Normalisation, frame_of, network_input
 from splatseg.models._mask_generator import Decode, MaskGeneratorOptions, automatic_masks
 from splatseg.models.networks._library import configuration, network, network_family, settings_of
 
@@ -37,14 +37,12 @@ class _Kind:
     """What is done to colours where the weights do not say; None is as for ImageNet."""
 
 
-_HALVES = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
-
 _KINDS = {
     "sam": _Kind(class_name="SamModel", shape="padded", default_size=1024),
     "sam_hq": _Kind(class_name="SamHQModel", shape="padded", default_size=1024),
     "sam2": _Kind(class_name="Sam2Model", shape="square", default_size=1024),
     "sam3_tracker": _Kind(
-        class_name="Sam3TrackerModel", shape="square", default_size=1008, colours=_HALVES
+        class_name="Sam3TrackerModel", shape="square", default_size=1008, colours=HALVES
     ),
 }
 _TYPES = {

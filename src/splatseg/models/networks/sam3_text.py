@@ -18,13 +18,11 @@ from splatseg.core.models import Image, TextMasks
 from splatseg.errors import RangeError
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import Normalisation, frame_of, network_input
+from splatseg.models._images import HALVES, Normalisation, frame_of, network_input
 from splatseg.models._words import checked_words
 from splatseg.models.networks._library import configuration, network, network_family, settings_of
 from splatseg.models.networks._tokens import Tokens
 from splatseg.models.networks._word_masks import Finder, WordMasks, text_masks
-
-_COLOURS = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +61,7 @@ class _Sam3(Finder):
         self._size = _side(config.vision_config.backbone_config.image_size)
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
-        self._normalisation = Normalisation.of(place.folder, _COLOURS)
+        self._normalisation = Normalisation.of(place.folder, HALVES)
         self._last = LastImages[Any](self._encode, resizable=False)
 
     def settings(self, options: Sam3TextOptions) -> Mapping[str, Any]:

@@ -17,7 +17,7 @@ from splatseg.core.boundary import convert_fields
 from splatseg.core.models import Image
 from splatseg.errors import RangeError
 from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import Normalisation, frame_of, network_input
+from splatseg.models._images import HALVES, Normalisation, frame_of, network_input
 from splatseg.models.networks._library import configuration, network, network_family, settings_of
 from splatseg.models.networks._video_memory import VideoMemory, session_of
 
@@ -35,11 +35,16 @@ class _Kind:
     types: tuple[str, ...]
     """Values of the weights' ``model_type``."""
 
+    colours: Normalisation | None = None
+    """What is done to colours where the weights do not say; None is as for ImageNet."""
+
 
 _KINDS = {
     "sam2-video": _Kind(library_name="Sam2Video", types=("sam2_video",)),
     "sam3-video": _Kind(
-        library_name="Sam3TrackerVideo", types=("sam3_tracker_video", "sam3_video")
+        library_name="Sam3TrackerVideo",
+        types=("sam3_tracker_video", "sam3_video"),
+        colours=HALVES,
     ),
 }
 
@@ -74,7 +79,7 @@ class SamVideo:
         self._size = int(self._network.image_size)
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
-        self._normalisation = Normalisation.of(place.folder)
+        self._normalisation = Normalisation.of(place.folder, self._kind.colours)
 
     @property
     def settings(self) -> Mapping[str, Any]:

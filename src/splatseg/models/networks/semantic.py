@@ -16,11 +16,11 @@ from splatseg.core.models import Image
 from splatseg.models._class_names import network_classes
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import Normalisation, network_input
+from splatseg.models._images import HALVES, Normalisation, network_input
 from splatseg.models._input_size import InputSize
 from splatseg.models._queries import SemanticOptions, map_of_scores
 from splatseg.models.networks._library import configuration, network, network_family, settings_of
-from splatseg.models.networks.depth import DPT_MEAN, UNUSED_OF_DPT, dpt_input_size
+from splatseg.models.networks.depth import UNUSED_OF_DPT, dpt_input_size
 
 _CLASSES = {
     "segformer": {"segformer": "SegformerForSemanticSegmentation"},
@@ -53,7 +53,7 @@ class SemanticNetwork:
             self._normalisation = Normalisation.of(place.folder)
             self._size = InputSize.of(place.folder, otherwise=_SEGFORMER_SIZE)
         else:
-            self._normalisation = Normalisation.of(place.folder, otherwise=DPT_MEAN)
+            self._normalisation = Normalisation.of(place.folder, otherwise=HALVES)
             self._size = dpt_input_size(self._network.config, place.folder, otherwise=_DPT_SIZE)
         self._last = LastImages[Tensor](self._encode)
 

@@ -18,7 +18,7 @@ from typing_extensions import override
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import FileFormatError
 from splatseg.models._family import Checkpoint, Loading
-from splatseg.models._images import Normalisation, PatchGrid
+from splatseg.models._images import HALVES, Normalisation, PatchGrid
 from splatseg.models._words import checked_template, checked_words
 from splatseg.models.networks._joint_space import JointSpace, Towers
 from splatseg.models.networks._library import configuration, network, network_family
@@ -27,8 +27,6 @@ from splatseg.models.networks._tokens import Tokens
 _CLASSES = {"siglip": "SiglipModel", "siglip2": "Siglip2Model"}
 """Class of the library by the weights' ``model_type``. SigLIP 2 for images of one size is of the
 first kind; the second takes images of any proportions (NaFlex)."""
-
-_COLOURS = Normalisation(mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +79,7 @@ class _SiglipTowers(Towers):
             else int(vision.image_size)
         )
         self.width = int(vision.hidden_size)
-        self.normalisation = Normalisation.of(place.folder, _COLOURS)
+        self.normalisation = Normalisation.of(place.folder, HALVES)
         self.tokenizer = self._tokens.digest
 
     @override

@@ -40,16 +40,22 @@ def bench_table(
     return columns, rows
 
 
-def write_tables(run: BenchRun, *, command: str) -> tuple[Path, ...]:
-    """Write PROTOCOL.md, .csv, .tex, .html and .json into the run's folder."""
+def write_tables(run: BenchRun, folder: Path, *, command: str = "") -> tuple[Path, ...]:
+    """Write PROTOCOL.md, .csv, .tex, .html and .json into a folder.
+
+    Args:
+        run: What was measured.
+        folder: Where to write.
+        command: The words that started it, for the record.
+    """
     columns, rows = bench_table(run)
-    paths = [path_inside(run.folder, f"{run.protocol.name}{kind}") for kind in _KINDS]
+    paths = [path_inside(folder, f"{run.protocol.name}{kind}") for kind in _KINDS]
     for path in paths:
-        write_table(path, columns, rows)
-    page = path_inside(run.folder, f"{run.protocol.name}.html")
+        write_table(rows, path, columns=columns)
+    page = path_inside(folder, f"{run.protocol.name}.html")
     with atomic_file(page) as temporary:
         temporary.write_text(report_html(_report(run, command)), encoding="utf-8")
-    record = path_inside(run.folder, f"{run.protocol.name}.json")
+    record = path_inside(folder, f"{run.protocol.name}.json")
     write_json(
         {
             "protocol": run.protocol.name,
