@@ -1,0 +1,182 @@
+"""Every protocol of `splatseg bench`, end to end on rendered scenes in the benchmarks' layouts.
+
+    .venv/bin/python benchmarks/protocols.py ../shared --out runs/protocols --steps 1500
+
+Scenes are written in each layout by the writers of `scripts/to_layout`, fitted, segmented by
+methods of each kind and scored; figures are held to ../shared/score/score.py where it has the
+measure: a line a protocol and method. A second call goes on where the first was stopped. Figures
+are of these scenes and of a short fit, and no figures of the benchmarks.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+
+from splatseg import BenchOptions, bench  # noqa: E402
+from splatseg.core import BenchmarkScene  # noqa: E402
+from splatseg.io.benchmarks import read_benchmark  # noqa: E402
+from splatseg.tasks.benchmark import load_result, write_tables  # noqa: E402
+from support.benchmark_layouts import read_source, write_layout  # noqa: E402
+from support.benchmark_layouts.evidence import write_evidence  # noqa: E402
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """A protocol on a scene."""
+
+    protocol: str
+    layout: str
+    scene: str
+    methods: tuple[str, ...]
+    evidence: tuple[str, ...] = ()
+    switches: tuple[str, ...] = ()
+
+
+_TEXT, _CLASSES, _PANOPTIC, _MASKS = (
+    "features_text", "labels_semantic", "labels_panoptic", "masks_sam",
+)  # fmt: skip
+RUNS = (
+    Run(protocol="nvos", layout="nvos", scene="frontal", methods=("uplift", "associate"),
+        evidence=(_MASKS,)),
+    Run(protocol="spin-nerf", layout="spin-nerf", scene="frontal",
+        methods=("uplift", "associate"), evidence=(_MASKS,)),
+    Run(protocol="spin-nerf-ludvig", layout="spin-nerf", scene="frontal",
+        methods=("uplift", "associate"), evidence=(_MASKS,)),
+    Run(protocol="lerf-mask", layout="lerf-mask", scene="toys", methods=("features",),
+        evidence=(_TEXT,)),
+    Run(protocol="lerf-ovs-2d", layout="lerf-ovs", scene="toys", methods=("features",),
+        evidence=(_TEXT,)),
+    Run(protocol="lerf-ovs-3d", layout="lerf-ovs", scene="toys", methods=("features",),
+        evidence=(_TEXT,)),
+    Run(protocol="3d-ovs", layout="3d-ovs", scene="toys", methods=("features",),
+        evidence=(_TEXT,)),
+    Run(protocol="replica", layout="replica", scene="office", methods=("uplift", "associate"),
+        evidence=(_CLASSES, _PANOPTIC)),
+    Run(protocol="replica-gaga", layout="replica", scene="office", methods=("associate",),
+        evidence=(_PANOPTIC,)),
+    Run(protocol="scannet-19", layout="scannet", scene="office", methods=("uplift", "features"),
+        evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
+    Run(protocol="scannet-10", layout="scannet", scene="office", methods=("uplift", "features"),
+        evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Run all protocols, or some."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("shared", type=Path, help="the folder of data/ and score/")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--max-gaussians", type=int, default=100_000)
+    parser.add_argument("--protocols", nargs="*", help="names; all without it")
+    asked = parser.parse_args()
+    for run in RUNS:
+        if not asked.protocols or run.protocol in asked.protocols:
+            _do(run, asked)
+
+
+def _do(run: Run, asked: Any) -> None:
+    data, scene = _written(run, asked)
+    began = time.monotonic()
+    done = bench(
+        run.protocol,
+        data,
+        asked.out / "runs",
+        options=BenchOptions(
+            methods=run.methods,
+            models=tuple(str(data / "evidence" / "{scene}" / name) for name in run.evidence),
+            steps=asked.steps,
+            max_gaussians=asked.max_gaussians,
+            switches=run.switches,
+        ),
+        command=" ".join(sys.argv),
+    )
+    write_tables(done, asked.out / "runs")
+    for method in done.methods:
+        figures = ", ".join(f"{name} {value:.4f}" for name, value in method.scores.items())
+        checks = dict(_checked(run, scene, method.method, asked))
+        held = ", ".join(f"{name} {value:.1e}" for name, value in checks.items()) or "none"
+        print(f"{run.protocol} | {method.method} | {figures} | off score.py by: {held}", flush=True)
+    print(f"{run.protocol}: {time.monotonic() - began:.0f} s", flush=True)
+
+
+def _written(run: Run, asked: Any) -> tuple[Path, BenchmarkScene]:
+    """The scene in the layout, with all evidence that its runs take."""
+    data = asked.out / "data" / run.layout
+    source = asked.shared / "data" / run.scene
+    if not data.is_dir():
+        write_layout(run.layout, source, data)
+    (scene,) = read_benchmark(run.layout, data)
+    for name in run.evidence:
+        if not (data / "evidence" / scene.name / name).is_dir():
+            write_evidence(read_source(source), scene.capture, name, data / "evidence" / scene.name)
+    return data, scene
+
+
+def _checked(
+    run: Run, scene: BenchmarkScene, method: str, asked: Any
+) -> Iterator[tuple[str, float]]:
+    """By how much figures differ from the independent scorer's."""
+    root = asked.out / "runs"
+    result = load_result(root / "results" / run.protocol / method / f"{scene.name}.json")
+    predicted = root / "predictions" / run.protocol / method / scene.name
+    scorer = asked.shared / "score" / "score.py"
+    truth = asked.out / "truth" / run.protocol / method
+    if scene.tasks and "averaging" in result.switches and predicted.is_dir():
+        worst = 0.0
+        for task in scene.tasks:
+            rows = {row["view"]: row for row in result.rows if row["task"] == task.name}
+            rows = {view: row for view, row in rows.items() if row["found"]}
+            if not rows:
+                continue
+            masks = {one.view: one.read().numpy() for one in task.truth if one.view in rows}
+            folder = _saved({k: v * np.uint8(255) for k, v in masks.items()}, truth / task.name)
+            theirs = _score(scorer, "binary", predicted / task.name, folder)
+            mean = sum(row["iou"] for row in rows.values()) / len(rows)
+            worst = max(worst, abs(mean - theirs["IoU_mean_over_views"]))
+        yield "iou", worst
+    for kind, maps, command, ours, name in (
+        ("classes", scene.semantic, "semantic", "miou", "mIoU"),
+        ("instances", scene.instances, "instances", "pooled_instance_miou", "mIoU"),
+    ):
+        folder = predicted / kind
+        if maps is not None and folder.is_dir():
+            views = [path.stem for path in folder.glob("*.png")]
+            ids = {v: maps.read[v]().ids.clamp_min(0).numpy().astype(np.uint16) for v in views}
+            theirs = _score(scorer, command, folder, _saved(ids, truth / kind))
+            yield ours, abs(result.scores[ours] - theirs[name])
+    points = predicted.with_suffix(".npz")
+    if points.is_file():
+        truth.mkdir(parents=True, exist_ok=True)
+        np.savez(truth / "points.npz", semantic=np.load(points)["truth"])
+        theirs = _score(scorer, "points", points, truth / "points.npz")
+        yield "miou of points", abs(result.scores["miou"] - theirs["mIoU"])
+
+
+def _saved(images: dict[str, np.ndarray], folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in images.items():
+        Image.fromarray(image).save(folder / f"{name}.png")
+    return folder
+
+
+def _score(scorer: Path, command: str, predicted: Path, truth: Path) -> dict[str, Any]:
+    words = [sys.executable, str(scorer), command, "--pred", str(predicted), "--truth", str(truth)]
+    done = subprocess.run(words, check=True, capture_output=True, text=True)
+    return json.loads(done.stdout)
+
+
+if __name__ == "__main__":
+    main()
