@@ -40,7 +40,7 @@ from splatseg.lift import GaussianField
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.points import read_by_words, true_ids_of
-from splatseg.tasks.benchmark.sight import Seen
+from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
 
 _LAYER = "layer"
 _SURFACE = "label"
@@ -71,8 +71,7 @@ def map_scores(job: Job) -> Scores:
     Raises:
         InputError: If the scene has no truth of what the method gives.
     """
-    words = job.method.returns == "features" and job.method.evidence == ("features",)
-    seen = job.seen(words=words)
+    seen = job.seen(words=evidence_wanted(job.protocol, job.method, job.options) == "words")
     layer = job.layer(seen.name)
     if isinstance(layer, Features) and layer.info.head is None:
         truth = _truth(job, true_classes(job), "classes")

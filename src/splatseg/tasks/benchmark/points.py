@@ -29,7 +29,7 @@ from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.lift.heads import ClassifierHead
 from splatseg.tasks.benchmark.job import Job
-from splatseg.tasks.benchmark.sight import Seen
+from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
 from splatseg.tasks.benchmark.spoken import vocabulary_of
 
 _LAYER = "layer"
@@ -99,8 +99,7 @@ def _labels_of_points(
 
 
 def _layer(job: Job) -> tuple[Layer, Seen]:
-    words = job.method.returns == "features" and job.method.evidence == ("features",)
-    seen = job.seen(words=words)
+    seen = job.seen(words=evidence_wanted(job.protocol, job.method, job.options) == "words")
     return job.layer(seen.name), seen
 
 

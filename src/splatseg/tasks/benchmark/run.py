@@ -46,7 +46,7 @@ from splatseg.tasks.benchmark.results import (
     save_result,
     switches_of,
 )
-from splatseg.tasks.benchmark.sight import model_of
+from splatseg.tasks.benchmark.sight import chosen_model, evidence_wanted, model_of
 from splatseg.tasks.benchmark.targets import TargetRun
 
 
@@ -108,6 +108,11 @@ def bench(
     notes = _notes(chosen, scenes)
     for note in notes:
         observer.note(note.rstrip("."))
+    for one in scenes:
+        for method in methods:
+            wanted = evidence_wanted(chosen, method, options)
+            if wanted != "prompts":
+                chosen_model(method, one, words=wanted == "words", options=options)
     prompter, grounder = _models(chosen, options, observer)
     found: dict[str, list[SceneResult]] = {method.name: [] for method in methods}
     kept = 0

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast
 
 from splatseg.core import Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
+from splatseg.evaluate.protocols import Protocol, TargetSwitches
 from splatseg.io.evidence import TEXT_FILE, EvidenceKind, open_evidence
 from splatseg.methods import Method
 from splatseg.models import LoadOptions, What, find_family, find_model, model_names
@@ -113,6 +114,45 @@ def seen_for(
     Raises:
         InputError: If no model gives it.
     """
+    choice = chosen_model(method, bench, words=words, options=options)
+    model = None if choice.folder is not None else model_of(choice.named, options, observer)
+    recorded = choice.folder is not None
+    seen = see(
+        scene,
+        str(choice.folder) if model is None else model,
+        _slug(choice.folder.name if choice.folder is not None else name_of(choice.named)),
+        options=SeeOptions(
+            what=() if recorded else (cast(What, choice.what),), allow_missing=recorded
+        ),
+        backend=backend,
+        observer=observer,
+    )
+    return Seen(
+        name=seen.folder.name, model=choice.named, kind=choice.kind, what=choice.what, made=model
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """A model that gives what a method takes."""
+
+    named: str
+    folder: Path | None
+    """Where it is recorded evidence."""
+
+    kind: EvidenceKind
+    what: str
+
+
+def chosen_model(
+    method: Method, bench: BenchmarkScene, *, words: bool, options: BenchOptions
+) -> Choice:
+    """The first model that gives what a method takes; nothing is loaded.
+
+    Raises:
+        InputError: If none does.
+        MissingFileError: If recorded evidence is not there.
+    """
     for named in options.models:
         path = Path(named.replace("{scene}", bench.name))
         recorded = name_of(named) not in model_names()
@@ -121,27 +161,26 @@ def seen_for(
             if recorded
             else _of_model(named, method, words=words)
         )
-        if found is None:
-            continue
-        kind, what = found
-        model = None if recorded else model_of(named, options, observer)
-        name = _slug(path.name if recorded else name_of(named))
-        seen = see(
-            scene,
-            str(path) if model is None else model,
-            name,
-            options=SeeOptions(
-                what=() if recorded else (cast(What, what),), allow_missing=recorded
-            ),
-            backend=backend,
-            observer=observer,
-        )
-        return Seen(name=seen.folder.name, model=named, kind=kind, what=what, made=model)
+        if found is not None:
+            kind, what = found
+            return Choice(named=named, folder=path if recorded else None, kind=kind, what=what)
     wanted = "features of words" if words else " or ".join(method.evidence)
     raise InputError(
         f"method {method.name}: expected a model that gives {wanted}, got "
         f"{', '.join(options.models) or 'no model'}; name one with `models`."
     )
+
+
+def evidence_wanted(
+    protocol: Protocol, method: Method, options: BenchOptions
+) -> Literal["prompts", "words", "any"]:
+    """What a method is given: prompts alone, features of words, or any that it takes."""
+    switches = protocol.switches
+    if not isinstance(switches, TargetSwitches):
+        return "words" if method.evidence == ("features",) else "any"
+    if switches.prompt == "words" and options.grounder is None:
+        return "words"
+    return "prompts" if "labels" in method.evidence else "any"
 
 
 def _of_folder(path: Path, method: Method, *, words: bool) -> tuple[EvidenceKind, str] | None:
