@@ -68,6 +68,12 @@ RUNS = (
         evidence=(_PANOPTIC,)),
     Run(protocol="scannet-19", layout="scannet", scene="office", methods=("uplift", "features"),
         evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
+    Run(protocol="scannet-15", layout="scannet", scene="office", methods=("uplift", "features"),
+        evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
+    Run(protocol="scannet-views", layout="scannet", scene="office",
+        methods=("uplift", "associate"), evidence=(_CLASSES, _PANOPTIC)),
+    Run(protocol="scannet-gaga", layout="scannet", scene="office", methods=("associate",),
+        evidence=(_PANOPTIC,)),
     Run(protocol="scannet-10", layout="scannet", scene="office", methods=("uplift", "features"),
         evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
 )  # fmt: skip
