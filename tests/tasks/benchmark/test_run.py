@@ -22,7 +22,9 @@ from splatseg.core import (
     View,
 )
 from splatseg.core.models import TextMasks
-from splatseg.errors import InputError, MissingFileError
+from splatseg.errors import InputError, MissingFileError, RangeError
+from splatseg.evaluate.protocols import find_protocol
+from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.images import save_png
 from splatseg.io.scene import load_scene, save_scene
 from splatseg.methods import Method, MethodInputs, _registry, register_method
@@ -30,6 +32,7 @@ from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.render import render
 from splatseg.tasks import SILENT
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
+from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.sight import model_of
 from support.benchmark_layouts.sparse import write_sparse
 
@@ -216,6 +219,38 @@ def test_a_fit_that_learned_from_held_out_views_is_refused(tiny, run, tmp_path) 
         fitted=str(tmp_path / "{scene}"),
     )
     assert held_out.methods[0].scores["iou"] > 0.8
+
+
+def test_fits_go_on_and_are_kept_apart(run, tmp_path) -> None:
+    fitted = {"fitted": None, "max_gaussians": 300}
+    one = run(steps=4, **fitted)
+    (scene,) = (tmp_path / "out/scenes").glob("*/wall")
+    written = (scene / "gaussians.ply").stat().st_mtime_ns
+    assert run(steps=4, methods=("uplift", "vote"), **fitted).kept == 1
+    assert (scene / "gaussians.ply").stat().st_mtime_ns == written, "one fit for all methods"
+    assert one.methods[0].scenes[0].made["gaussians"]
+    with pytest.raises(InputError, match=r"expected a fit with these options.*steps 4 there, 5 no"):
+        run(steps=5, **fitted)
+    with pytest.raises(InputError, match="learned from 1 views, got one of another split, which"):
+        run(steps=4, switches=("scored_in_training=no",), **fitted)
+
+
+def test_what_is_held_out(tiny) -> None:
+    """Scored views of things; the data set's split of maps, or every so many views without one."""
+    (scene,) = read_benchmark("spin-nerf", tiny[0])
+    spin = find_protocol("spin-nerf")
+    assert held_out_views(scene, spin) == frozenset()
+    assert held_out_views(scene, spin.with_switches({"scored_in_training": False})) == {"b", "c"}
+    maps = find_protocol("scannet-views")
+    assert held_out_views(scene, maps) == {"a"}
+    assert held_out_views(scene, maps.with_switches({"hold_out_every": 2})) == {"a", "c"}
+    views = tuple(
+        replace(v, split="test" if v.name == "b" else "train") for v in scene.capture.views
+    )
+    own = replace(scene, capture=replace(scene.capture, views=views))
+    assert held_out_views(own, maps) == {"b"}
+    with pytest.raises(RangeError, match="hold_out_every: expected 2 or more"):
+        maps.with_switches({"hold_out_every": 1})
 
 
 def test_options_of_models() -> None:

@@ -120,12 +120,18 @@ class MapSwitches(Switches):
     zero_is_instance: bool = False
     """Whether pixels without an instance are one more, as in Gaga's evaluation."""
 
+    hold_out_every: int = 8
+    """Of a data set without a split of its own, every so many views by name are held out and
+    scored, the first among them."""
+
     void_rule: Literal["coco", "strict"] = "coco"
     """Which segments of an image without a match are false in PQ of images. strict: all. coco: not
     those with more than half of their pixels where the truth is void."""
 
     def __post_init__(self) -> None:
         Switches.__post_init__(self)
+        if self.hold_out_every < 2:
+            raise RangeError(f"hold_out_every: expected 2 or more, got {self.hold_out_every}.")
         check_choice("void_rule", self.void_rule, ("coco", "strict"))
 
 

@@ -9,7 +9,7 @@ from splatseg.core import Capture, PointCloud, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError
-from splatseg.evaluate.protocols import PointSwitches, Protocol, TargetSwitches
+from splatseg.evaluate.protocols import MapSwitches, PointSwitches, Protocol, TargetSwitches
 from splatseg.io.paths import path_inside
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
@@ -45,9 +45,10 @@ def fitted_scene(
     fit_options = options.fit_options(fixed=fixed)
     kind = f"{bench.layout}-fixed" if fixed else bench.layout
     folder = path_inside(root, SCENES_FOLDER, kind, bench.name)
+    capture = _capture(bench, protocol, fixed=fixed)
     if not is_scene(folder) or (folder / CHECKPOINT_FILE).is_file():
         fit_capture(
-            _capture(bench, protocol, fixed=fixed),
+            capture,
             folder,
             options=MakeSceneOptions(
                 preset=options.preset, resume=(folder / CHECKPOINT_FILE).is_file()
@@ -59,18 +60,22 @@ def fitted_scene(
         )
     scene = load_scene(folder)
     _check_options(scene, plain_object("options", asdict(fit_options)))
+    _check_split(scene, capture)
     return scene
 
 
 def held_out_views(bench: BenchmarkScene, protocol: Protocol) -> frozenset[str]:
     """Names of the views that a fit must not learn from.
 
-    Of things that are asked for they are the scored ones, else those of the data set's split.
+    Of things that are asked for they are the scored ones, else those of the data set's split, or
+    every so many where it has none.
     """
     if protocol.switches.scored_in_training:
         return frozenset()
-    if not isinstance(protocol.switches, TargetSwitches):
-        return frozenset(view.name for view in bench.capture.test_views)
+    if isinstance(protocol.switches, MapSwitches):
+        own = frozenset(view.name for view in bench.capture.test_views)
+        names = sorted(view.name for view in bench.capture.views)
+        return own or frozenset(names[:: protocol.switches.hold_out_every])
     prompts = {
         one.view
         for task in bench.tasks
@@ -94,12 +99,18 @@ def _capture(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> Captu
     if isinstance(protocol.switches, PointSwitches) and protocol.switches.frame_step > 1:
         views = capture.views[:: protocol.switches.frame_step]
         capture = replace(capture, views=views)
-    if protocol.switches.scored_in_training or isinstance(protocol.switches, TargetSwitches):
-        out = held_out_views(bench, protocol)
-        views = tuple(
-            replace(view, split="test" if view.name in out else "train") for view in capture.views
-        )
-        capture = replace(capture, views=views)
+    out = held_out_views(bench, protocol)
+    # Views that are neither, as Replica's between two that count, stay so.
+    own = not (
+        protocol.switches.scored_in_training or isinstance(protocol.switches, TargetSwitches)
+    )
+    views = tuple(
+        replace(view, split="test")
+        if view.name in out
+        else replace(view, split="train" if view.split == "test" or not own else view.split)
+        for view in capture.views
+    )
+    capture = replace(capture, views=views)
     if not fixed:
         return capture
     if bench.points is None:
@@ -129,6 +140,17 @@ def _check_views(scene: Scene, bench: BenchmarkScene, protocol: Protocol) -> Non
             f"{scene.root}: expected a fit that did not learn from the {len(held_out)} views that "
             f"{protocol.name} holds out, got one that learned from {len(learned)} of them "
             f"({learned[0]})."
+        )
+
+
+def _check_split(scene: Scene, capture: Capture) -> None:
+    """Refuse a fit of another split: it learned from more views, or from fewer."""
+    there = {view.name for view in scene.train_views}
+    wanted = {view.name for view in capture.train_views}
+    if there != wanted:
+        raise InputError(
+            f"{scene.root}: expected a fit that learned from {len(wanted)} views, got one of "
+            f"another split, which learned from {len(there)}; choose another output."
         )
 
 
