@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from splatseg.io.scene import load_scene, save_scene
 from splatseg.methods import Method, MethodInputs, _registry, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.render import render
-from splatseg.tasks import SILENT
+from splatseg.tasks import SILENT, Observer
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.sight import model_of
@@ -233,6 +234,33 @@ def test_fits_go_on_and_are_kept_apart(run, tmp_path) -> None:
         run(steps=5, **fitted)
     with pytest.raises(InputError, match="learned from 1 views, got one of another split, which"):
         run(steps=4, switches=("scored_in_training=no",), **fitted)
+
+
+class StopsOnce(Observer):
+    """Ctrl-C in the middle of the first fit."""
+
+    stopped = False
+
+    @contextmanager
+    def fit_stage(self):
+        def step(now) -> None:
+            if now.step == 3 and not self.stopped:
+                self.stopped = True
+                raise KeyboardInterrupt
+
+        yield step
+
+
+def test_a_fit_that_was_stopped_is_not_measured_and_goes_on(tiny, tmp_path) -> None:
+    options = BenchOptions(steps=6, max_gaussians=300)
+    observer = StopsOnce()
+    with pytest.raises(KeyboardInterrupt, match="goes on when the same is asked for again"):
+        bench("spin-nerf", tiny[0], tmp_path / "out", options=options, observer=observer)
+    assert not (tmp_path / "out/results").exists()
+    found = bench("spin-nerf", tiny[0], tmp_path / "out", options=options)
+    whole = bench("spin-nerf", tiny[0], tmp_path / "whole", options=options)
+    made = [one.methods[0].scenes[0].made["gaussians"] for one in (found, whole)]
+    assert made[0] == made[1], "as if it had not been stopped"
 
 
 def test_what_is_held_out(tiny) -> None:

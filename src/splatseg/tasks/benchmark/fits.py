@@ -34,6 +34,7 @@ def fitted_scene(
     """The scene with Gaussians; fitted, gone on with, or taken as it is.
 
     Raises:
+        KeyboardInterrupt: If the fit was stopped; the next call goes on with it.
         InputError: If the folder holds a fit with other options, or a scene that was fitted before
             learned from views that the protocol holds out.
     """
@@ -47,7 +48,7 @@ def fitted_scene(
     folder = path_inside(root, SCENES_FOLDER, kind, bench.name)
     capture = _capture(bench, protocol, fixed=fixed)
     if not is_scene(folder) or (folder / CHECKPOINT_FILE).is_file():
-        fit_capture(
+        made = fit_capture(
             capture,
             folder,
             options=MakeSceneOptions(
@@ -58,6 +59,8 @@ def fitted_scene(
             command=command,
             observer=observer,
         )
+        if made.interrupted:  # it wrote what there is, which is no fit to measure
+            raise KeyboardInterrupt(f"{folder}: the fit goes on when the same is asked for again")
     scene = load_scene(folder)
     _check_options(scene, plain_object("options", asdict(fit_options)))
     _check_split(scene, capture)
