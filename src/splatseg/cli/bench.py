@@ -161,5 +161,5 @@ def _print_table(done: BenchRun) -> None:
     for column in table.columns[1:-1]:
         column.justify = "right"
     for row in rows:
-        table.add_row(*(f"{cell:.1f}" if isinstance(cell, float) else str(cell) for cell in row))
+        table.add_row(*(f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row))
     Console(highlight=False).print(table)

@@ -22,7 +22,7 @@ def bench_table(
 ) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
     """Names of columns, and a row a method: measured ones first, then published ones.
 
-    Scores are in percent, PSNR in decibels; an empty cell was not measured, or not published.
+    Scores are shares in [0, 1], PSNR in decibels; an empty cell was not measured, or not published.
 
     Args:
         run: What was measured.
@@ -84,8 +84,8 @@ def _measured(
     oracle = f", oracle {' and '.join(method.oracle)}" if method.oracle else ""
     return (
         method.method,
-        *(_figure(name, method.scores.get(name)) for name in measures),
-        *(_figure(run.protocol.measure, own.get(scene)) for scene in scenes),
+        *(_figure(method.scores.get(name)) for name in measures),
+        *(_figure(own.get(scene)) for scene in scenes),
         f"{MEASURED}{oracle}",
     )
 
@@ -107,16 +107,14 @@ def _published(
     note = f"; {mean.note}" if mean.note and notes else ""
     return (
         mean.method,
-        *(_figure(name, mean.scores.get(name)) for name in measures),
-        *(_figure(run.protocol.measure, own.get(scene)) for scene in scenes),
+        *(_figure(mean.scores.get(name)) for name in measures),
+        *(_figure(own.get(scene)) for scene in scenes),
         f"{mean.source}{'' if mean.verified else _UNVERIFIED}{note}",
     )
 
 
-def _figure(name: str, value: float | None) -> Cell:
-    if value is None:
-        return ""
-    return round(value if name == "psnr" else 100 * value, 2)
+def _figure(value: float | None) -> Cell:
+    return "" if value is None else value
 
 
 def _report(run: BenchRun, command: str) -> Report:
