@@ -104,8 +104,11 @@ class Checkpoints(dict[str, Path]):
         """The folder of a kind."""
         sys.path.insert(0, str(ROOT / "tests"))
         from support.checkpoints import saved
+        from support.checkpoints_labels import save_tokenizer
 
         self[kind] = saved(kind, self._folder)
+        if kind == "oneformer":
+            save_tokenizer(self[kind])
         return self[kind]
 
 
