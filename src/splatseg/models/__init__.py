@@ -8,7 +8,6 @@ from splatseg.models._family import Checkpoint as Checkpoint
 from splatseg.models._family import Loading as Loading
 from splatseg.models._family import LoadOptions as LoadOptions
 from splatseg.models._family import ModelFamily as ModelFamily
-from splatseg.models._record import SeenEvidence as SeenEvidence
 from splatseg.models._record import record_evidence as record_evidence
 from splatseg.models._registry import ENTRY_POINT_GROUP as ENTRY_POINT_GROUP
 from splatseg.models._registry import find_family as find_family
@@ -16,4 +15,5 @@ from splatseg.models._registry import find_model as find_model
 from splatseg.models._registry import model_names as model_names
 from splatseg.models._seeds import TrackingOptions as TrackingOptions
 from splatseg.models._sources import What as What
+from splatseg.models._target import SeenEvidence as SeenEvidence
 from splatseg.models.recorded import recorded_model as recorded_model
