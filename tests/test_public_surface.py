@@ -86,6 +86,7 @@ PACKAGES = {
     "core",
     "edit",
     "evaluate",
+    "prompting",
     "selection",
     "fit",
     "importing",

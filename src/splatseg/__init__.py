@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from splatseg import models as models
     from splatseg import neighbours as neighbours
     from splatseg import pose as pose
+    from splatseg import prompting as prompting
     from splatseg import raycast as raycast
     from splatseg import render as render
     from splatseg import report as report
@@ -144,6 +145,7 @@ _PACKAGES = frozenset(
         "models",
         "neighbours",
         "pose",
+        "prompting",
         "raycast",
         "render",
         "report",

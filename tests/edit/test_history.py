@@ -33,7 +33,7 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.io.scene import load_scene
 from splatseg.lift import CutOptions
 from splatseg.render import render
-from splatseg.selection import Where, ids_named, select
+from splatseg.selection import Where, ids_named, select_where
 
 from .conftest import BACKEND, camera, layers_of, random_gaussians
 from .test_operations import same, turned
@@ -274,7 +274,7 @@ def test_what_is_selected(document) -> None:
         (Where(layer="objects", ids=(3,), box=box), three & left),
         (Where(layer="picked", box=box, invert=True), ~(picked & left)),
     ):
-        assert torch.equal(select(gaussians, layers, where).mask, expected)
+        assert torch.equal(select_where(gaussians, layers, where).mask, expected)
     assert ids_named(layers["objects"], ["chair"]) == (3,)
     with pytest.raises(InputError, match=r"names: expected names of the layer \(chair\), got 'x'"):
         ids_named(layers["objects"], ["x"])

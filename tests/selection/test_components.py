@@ -6,7 +6,7 @@ import torch
 
 from splatseg.core import Gaussians, Labels, Selection
 from splatseg.errors import RangeError, ShapeError
-from splatseg.selection import Where, components, leftovers, select
+from splatseg.selection import Where, components, leftovers, select_where
 
 
 def balls(*groups: tuple[tuple[float, float, float], int]) -> Gaussians:
@@ -71,13 +71,13 @@ def test_pieces_agree_with_a_search_by_hand(rng: np.random.Generator) -> None:
 def test_one_piece_is_selected() -> None:
     g = balls(((0, 0, 0), 3), ((0, 9, 0), 5), ((0, 18, 0), 2))
     high = (0.0, -1.0, -1.0, 1.0, 10.0, 1.0)
-    largest = select(g, {}, Where(box=high, largest_component=True))
+    largest = select_where(g, {}, Where(box=high, largest_component=True))
     assert largest.ids.tolist() == [3, 4, 5, 6, 7]
-    near = select(g, {}, Where(box=high, component_at=(0, 17, 0)))
+    near = select_where(g, {}, Where(box=high, component_at=(0, 17, 0)))
     assert near.ids.tolist() == [3, 4, 5, 6, 7], "what does not fit is not asked"
-    first = select(g, {}, Where(opacity=(0, 1), component_at=(0.1, 1, 0), invert=True))
+    first = select_where(g, {}, Where(opacity=(0, 1), component_at=(0.1, 1, 0), invert=True))
     assert first.ids.tolist() == [3, 4, 5, 6, 7, 8, 9]
-    nothing = select(g, {}, Where(opacity=(0.9, 1), largest_component=True))
+    nothing = select_where(g, {}, Where(opacity=(0.9, 1), largest_component=True))
     assert nothing.count == 0
 
 

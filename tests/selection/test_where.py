@@ -9,7 +9,7 @@ import torch
 
 from splatseg.core import Gaussians, Labels, Selection
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.selection import Where, select
+from splatseg.selection import Where, select_where
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_each_condition(gaussians, layers) -> None:
     for where, fits in conditions.items():
         expected = row_by_row(g, fits)
         assert 0 < sum(expected) < 200, where
-        assert select(g, layers, where).mask.tolist() == expected, where
+        assert select_where(g, layers, where).mask.tolist() == expected, where
         assert Where.from_json(json.loads(json.dumps(where.to_json(), allow_nan=False))) == where
 
 
@@ -65,17 +65,19 @@ def test_combinations(gaussians, layers) -> None:
     """(1 or within the ball) and not faint, and all others instead; to JSON and back."""
     one, ball = Where(layer="objects", ids=(1,)), Where(sphere=(0, 0, 0, 0.5))
     solid, faint = Where(opacity=(0.5, 1)), Where(opacity=(0, 0.2), invert=True)
-    found = {w: select(gaussians, layers, w).mask for w in (one, ball, solid, faint)}
+    found = {w: select_where(gaussians, layers, w).mask for w in (one, ball, solid, faint)}
     both = Where(any_of=(one, ball), opacity=(0.5, 1))
     expected = (found[one] | found[ball]) & found[solid]
     assert 0 < int(expected.sum()) < 200
-    assert torch.equal(select(gaussians, layers, both).mask, expected)
+    assert torch.equal(select_where(gaussians, layers, both).mask, expected)
     nested = Where(any_of=(Where(any_of=(both, faint)),), layer="picked", invert=True)
     expected = ~((expected | found[faint]) & layers["picked"].mask)
-    assert torch.equal(select(gaussians, layers, nested).mask, expected)
+    assert torch.equal(select_where(gaussians, layers, nested).mask, expected)
     assert Where.from_json(json.loads(json.dumps(nested.to_json()))) == nested
     some = Selection(mask=torch.arange(200) < 100)
-    assert torch.equal(select(gaussians, layers, ball, among=some).mask, found[ball] & some.mask)
+    assert torch.equal(
+        select_where(gaussians, layers, ball, among=some).mask, found[ball] & some.mask
+    )
 
 
 @pytest.mark.parametrize(
@@ -122,4 +124,4 @@ def test_hostile_json(content, message) -> None:
 def test_layers_of_other_gaussians(gaussians) -> None:
     layers = {"few": Selection(mask=torch.ones(3).bool())}
     with pytest.raises(ShapeError, match="expected 200 rows, got 3"):
-        select(gaussians, layers, Where(layer="few"))
+        select_where(gaussians, layers, Where(layer="few"))

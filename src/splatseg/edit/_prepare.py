@@ -26,7 +26,7 @@ from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import label_map
 from splatseg.lift.boundaries.box import cut_box
 from splatseg.lift.boundaries.cut import cut_masks
-from splatseg.selection import Where, layer_called, leftovers, select
+from splatseg.selection import Where, layer_called, leftovers, select_where
 
 Progress = Callable[[int, int], None]
 MOVES = ("duplicate", "transform", "merge", "remove", "extract")
@@ -92,7 +92,7 @@ def prepare(
     if where is None:
         return Prepared(document=document, selection=None, split=0)
     gaussians = document.scene.gaussians
-    chosen = select(gaussians, document.layers, where)
+    chosen = select_where(gaussians, document.layers, where)
     if operation.cut is None:
         _check_some(chosen, where)
         ready = Prepared(document=document, selection=chosen, split=0)
@@ -139,7 +139,7 @@ def _split_at(task: _Task) -> Prepared:
     inside, split = Selection(mask=torch.ones(len(document.scene.gaussians)).bool()), 0
     if where.layer is not None:
         # The boundary of what is not selected is that of what is.
-        named = select(
+        named = select_where(
             document.scene.gaussians, document.layers, replace(where, box=None, invert=False)
         )
         edited, inside, split = _cut_layer(task, named)
@@ -161,7 +161,7 @@ def _split_at(task: _Task) -> Prepared:
         # What the cut has decided is not asked again.
         rest = replace(where, layer=None, ids=(), box=None)
         now = document.scene.gaussians
-        selection = select(now, document.layers, rest, among=inside)
+        selection = select_where(now, document.layers, rest, among=inside)
     _check_some(selection, where)
     return Prepared(document=document, selection=selection, split=split)
 

@@ -15,7 +15,7 @@ from splatseg.edit import (
 )
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.scene_folder import is_scene
-from splatseg.selection import Where, ids_named, layer_called, select
+from splatseg.selection import Where, ids_named, layer_called, select_where
 from splatseg.tasks._edit_cut import Cut, cut_of
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.edit_options import EditOptions
@@ -105,7 +105,7 @@ def operations_of(
 def _median(document: Document, where: Where | None) -> torch.Tensor:
     gaussians = document.scene.gaussians
     if where is not None:
-        chosen = select(gaussians, document.layers, where)
+        chosen = select_where(gaussians, document.layers, where)
         gaussians = gaussians[chosen.mask] if chosen.count else gaussians
     return gaussians.means.double().median(dim=0).values
 

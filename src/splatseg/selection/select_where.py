@@ -23,7 +23,7 @@ from splatseg.selection.where import Where
 
 
 @boundary
-def select(
+def select_where(
     gaussians: Gaussians,
     layers: Mapping[str, Layer],
     where: Where,
@@ -76,7 +76,7 @@ def _fitting(gaussians: Gaussians, layers: Mapping[str, Layer], where: Where) ->
         if interval is not None:
             mask &= (values >= interval[0]) & (values <= interval[1])
     if where.any_of:
-        found = [select(gaussians, layers, part).mask for part in where.any_of]
+        found = [select_where(gaussians, layers, part).mask for part in where.any_of]
         mask &= torch.stack(found).any(dim=0)
     return mask
 

@@ -1,0 +1,1 @@
+"""Prompts become selections: points, boxes, scribbles, masks, solids, and things like another."""
