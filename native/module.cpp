@@ -22,6 +22,7 @@ void register_loss(nb::module_& m);
 void register_adam(nb::module_& m);
 void register_product(nb::module_& m);
 void register_csr(nb::module_& m);
+void register_memberships(nb::module_& m);
 void register_neighbours(nb::module_& m);
 }  // namespace splatseg
 
@@ -394,5 +395,6 @@ NB_MODULE(_native, m) {
   register_adam(m);
   register_product(m);
   register_csr(m);
+  register_memberships(m);
   register_neighbours(m);
 }

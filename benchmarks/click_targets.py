@@ -1,0 +1,171 @@
+"""What `benchmarks/clicks.py` clicks at: things of a scene of known truth, and where."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import scipy.ndimage
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from splatseg.core import Gaussians, Scene, Selection, View
+from splatseg.lift.field_layers import selection_labels
+from splatseg.lift.label_maps import label_map
+
+MIN_PIXELS = 400
+MIN_TEST_VIEWS = 3
+RIM = 5
+
+Mask = NDArray[np.bool_]
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ClickTarget:
+    """A thing, and how it is shown in one train view."""
+
+    id: int
+    name: str
+    view: View
+    mask: Mask
+    point: Point
+    """The pixel of its largest region that is farthest from the rim."""
+
+    noisy: Point
+    """A pixel of it up to 5 pixels from the rim."""
+
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """x0, y0, x1, y1 of the mask."""
+        rows, columns = np.nonzero(self.mask)
+        return (
+            float(columns.min()),
+            float(rows.min()),
+            float(columns.max() + 1),
+            float(rows.max() + 1),
+        )
+
+    @property
+    def stroke(self) -> Mask:
+        """Straight strokes from the middle to the farthest of the inner pixels, 3 pixels wide."""
+        depth = _depth(self.mask)
+        inner = np.argwhere(depth >= min(3.0, 0.5 * depth.max()))
+        middle = np.array([int(self.point[1]), int(self.point[0])])
+        drawn = np.zeros(self.mask.shape, bool)
+        ends = [inner[np.argmax(np.abs(inner - middle).sum(axis=1))]]
+        ends.append(inner[np.argmax(np.abs(inner - ends[0]).sum(axis=1))])
+        for end in ends:
+            steps = int(np.abs(end - middle).max()) + 1
+            path = np.round(middle + np.linspace(0, 1, steps)[:, None] * (end - middle)).astype(int)
+            drawn[path[:, 0], path[:, 1]] = True
+        return scipy.ndimage.binary_dilation(drawn, np.ones((3, 3))) & self.mask
+
+
+class Targets:
+    """Things that at least three test views show, each with its click.
+
+    Args:
+        scene: The scene.
+        data: Its capture, with true maps.
+        seed: Draws the views.
+        limit: So many things, evenly through all; None takes all.
+    """
+
+    def __init__(
+        self, scene: Scene, data: Path, *, seed: int = 0, limit: int | None = None
+    ) -> None:
+        self._data = data
+        self._scene = scene
+        facts = json.loads((data / "metadata.json").read_text())
+        names = {row["id"]: row["name"] for row in facts["instances"] if row["isthing"]}
+        tests = [view for view in scene.views if view.split == "test"]
+        shown = np.zeros(max(names) + 1, np.int64)
+        for view in tests:
+            ids = np.unique(self.truth(view))
+            shown[ids[ids < len(shown)]] += 1
+        wanted = [id for id in sorted(names) if shown[id] >= MIN_TEST_VIEWS]
+        self._areas = np.stack(
+            [
+                np.bincount(self.truth(view).ravel(), minlength=65536)[wanted]
+                for view in scene.train_views
+            ]
+        )
+        self._column = {id: index for index, id in enumerate(wanted)}
+        rng = np.random.default_rng(seed)
+        found = [self._target(id, names[id], rng) for id in wanted]
+        if limit is not None and limit < len(found):
+            found = [found[i] for i in np.linspace(0, len(found) - 1, limit).round().astype(int)]
+        self.objects: Sequence[ClickTarget] = found
+
+    def truth(self, view: View) -> NDArray[np.int64]:
+        """True instances of a view."""
+        return _map(self._data / "instance" / f"{view.name}.png")
+
+    def best_views(self, id: int, count: int) -> Sequence[View]:
+        """Train views that show most of a thing."""
+        areas = self._areas[:, self._column[id]]
+        order = np.argsort(-areas, kind="stable")[:count]
+        return [self._scene.train_views[i] for i in order if areas[i] > 0]
+
+    def largest_error(
+        self, gaussians: Gaussians, selection: Selection, id: int, views: Sequence[View]
+    ) -> tuple[View, Point, bool] | None:
+        """Middle of the largest wrong region in some views, and whether it is the thing."""
+        best, found = 0.0, None
+        labels = selection_labels(selection)
+        for view in views:
+            drawn = label_map(gaussians, view.camera, labels).ids.numpy() == 1
+            true = self.truth(view) == id
+            for wrong, positive in ((true & ~drawn, True), (drawn & ~true, False)):
+                regions, count = scipy.ndimage.label(wrong)
+                if not count:
+                    continue
+                sizes = np.bincount(regions.ravel())[1:]
+                if sizes.max() > best:
+                    best = float(sizes.max())
+                    found = view, _middle(regions == sizes.argmax() + 1), positive
+        return found
+
+    def _target(self, id: int, name: str, rng: np.random.Generator) -> ClickTarget:
+        areas = self._areas[:, self._column[id]]
+        enough = np.flatnonzero(areas >= MIN_PIXELS)
+        index = int(rng.choice(enough)) if len(enough) else int(areas.argmax())
+        view = self._scene.train_views[index]
+        mask = self.truth(view) == id
+        regions, _ = scipy.ndimage.label(mask)
+        largest = regions == np.bincount(regions.ravel())[1:].argmax() + 1
+        depth = _depth(largest)
+        rim = np.argwhere(largest & (depth <= RIM))
+        row, column = rim[int(rng.integers(len(rim)))]
+        return ClickTarget(
+            id=id,
+            name=name,
+            view=view,
+            mask=mask,
+            point=_middle(largest),
+            noisy=(column + 0.5, row + 0.5),
+        )
+
+
+def _middle(region: Mask) -> Point:
+    row, column = np.unravel_index(int(_depth(region).argmax()), region.shape)
+    return float(column) + 0.5, float(row) + 0.5
+
+
+def _depth(mask: Mask) -> NDArray[np.float64]:
+    """Distance to the rim; the border of the picture is one."""
+    return scipy.ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+
+
+@lru_cache(maxsize=512)
+def _map(path: Path) -> NDArray[np.int64]:
+    return np.asarray(Image.open(path)).astype(np.int64)
+
+
+def as_mask(pixels: Mask) -> torch.Tensor:
+    """As prompts want it."""
+    return torch.from_numpy(np.ascontiguousarray(pixels))
