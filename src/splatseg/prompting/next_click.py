@@ -37,6 +37,12 @@ from splatseg._check import check_range, check_values
 from splatseg.core import Camera, Gaussians, Selection, View, camera_of_map
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.prompting.image_regions import (
+    detached_regions,
+    enclosed_regions,
+    largest_region,
+    without_regions,
+)
 from splatseg.prompting.view_choice import choose_views
 from splatseg.render import render
 
@@ -244,14 +250,14 @@ def _regions(
         ("uncertain", wrong >= options.min_uncertainty, wrong)
     ]
     if options.detached_error > 0:
-        mask = _without(detached(selected, clicked), asked)
+        mask = without_regions(detached_regions(selected, clicked), asked)
         kinds.append(("detached", mask, np.maximum(wrong, options.detached_error)))
     if options.hole_error > 0:
-        mask = _without(holes_of(selected), asked)
+        mask = without_regions(enclosed_regions(selected), asked)
         kinds.append(("hole", mask, np.maximum(wrong, options.hole_error)))
     across, down = window.across, window.down
     for kind, mask, error in kinds:
-        found = _worst_region(mask, error, min_pixels=options.min_area / (across * down))
+        found = largest_region(mask, error, min_pixels=options.min_area / (across * down))
         if found is None:
             continue
         row, column = found.pixel
@@ -261,72 +267,5 @@ def _regions(
             kind=kind,
             probability=float(np.clip(probability[row, column], 0, 1)),
             area=found.pixels * across * down,
-            expected_error=found.error * across * down,
+            expected_error=found.total * across * down,
         )
-
-
-def detached(selected: NDArray[np.bool_], clicked: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Selected pixels apart from the region that shows most of what was clicked.
-
-    Without any clicked pixel that is the largest region.
-    """
-    from scipy import ndimage
-
-    regions, count = ndimage.label(selected)
-    if count < 2:
-        return np.zeros_like(selected)
-    shown = np.bincount(regions.ravel(), weights=clicked.ravel(), minlength=count + 1)
-    sizes = np.bincount(regions.ravel(), minlength=count + 1)
-    shown[0], sizes[0] = 0, 0
-    own = int(shown.argmax()) if shown.any() else int(sizes.argmax())
-    return selected & (regions != own)
-
-
-def holes_of(selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels that are not selected and surrounded by selected ones."""
-    from scipy import ndimage
-
-    return ndimage.binary_fill_holes(selected) & ~selected
-
-
-def _without(mask: NDArray[np.bool_], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The connected regions of a mask that have no pixel that was asked already."""
-    from scipy import ndimage
-
-    regions, _ = ndimage.label(mask)
-    return mask & ~np.isin(regions, np.unique(regions[mask & asked]))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Region:
-    """A connected region of pixels."""
-
-    pixel: tuple[int, int]
-    """Row and column of its pixel farthest from its rim."""
-
-    pixels: int
-    error: float
-
-
-def _worst_region(
-    mask: NDArray[np.bool_], error: NDArray[np.float64], *, min_pixels: float
-) -> _Region | None:
-    """The connected region of largest summed error, if there is one that is large enough."""
-    from scipy import ndimage
-
-    regions, count = ndimage.label(mask)
-    if not count:
-        return None
-    sums = np.bincount(regions.ravel(), weights=error.ravel(), minlength=count + 1)
-    sizes = np.bincount(regions.ravel(), minlength=count + 1)
-    sums[0] = 0
-    sums[sizes < min_pixels] = 0
-    worst = int(sums.argmax())
-    if not sums[worst] > 0:
-        return None
-    # The edge of the image is a rim too: nobody sees what goes on behind it.
-    depth = ndimage.distance_transform_edt(np.pad(regions == worst, 1))[1:-1, 1:-1]
-    row, column = np.unravel_index(int(depth.argmax()), depth.shape)
-    return _Region(
-        pixel=(int(row), int(column)), pixels=int(sizes[worst]), error=float(sums[worst])
-    )
