@@ -9,8 +9,6 @@ _MAX_CAPACITY = 2**30 - 1
 """Largest capacity: a residual capacity is up to twice one, and SciPy's are int32."""
 
 _MAX_FLOW = 2**31 - 1
-_FINEST_UNIT = 1e-5
-"""Capacities are whole numbers of this unit of the energy, or of a larger one that fits."""
 
 
 def minimum_cut(
@@ -64,7 +62,6 @@ def _scale(unary: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     # No flow is more than what leaves the source, or what enters the sink.
     flow = min(float(np.maximum(unary, 0).sum()), float(np.maximum(-unary, 0).sum()))
     return min(
-        1 / _FINEST_UNIT,
         _MAX_CAPACITY / max(largest, 1e-300),
         (_MAX_FLOW - len(unary)) / max(flow, 1e-300),
     )
