@@ -44,12 +44,18 @@ class HoleOptions:
     max_speck: int = 20
     """Most Gaussians of a speck that is removed; 0 removes none."""
 
-    spread_steps: int = 50
+    spread_steps: int = 20
     """Steps over the graph that memberships spread to hidden Gaussians; at least 1."""
+
+    min_member: float = 0.25
+    """Membership, in (0, 0.5], of a Gaussian from which it spreads to hidden ones; those that
+    none so likely leads to are out. The lower, the more of the scene is looked at."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
         check_range("min_enclosed", self.min_enclosed, 0.0, 1.0)
+        if not 0 < self.min_member <= 0.5:
+            raise RangeError(f"min_member: expected a value in (0, 0.5], got {self.min_member}.")
         for name, least in (("max_hole", 0), ("max_speck", 0), ("spread_steps", 1)):
             if getattr(self, name) < least:
                 raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
@@ -192,7 +198,8 @@ def complete_membership(
         options: How far memberships spread.
 
     Returns:
-        The memberships, with those of hidden Gaussians the share that arrived; 0 where none did.
+        The memberships, with those of hidden Gaussians the share that arrived; 0 where only hidden
+        and unlikely ones are around.
 
     Raises:
         ShapeError: If a value is not of the graph's Gaussians.
@@ -215,7 +222,7 @@ def complete_membership(
     unknown = hidden.cpu()
     values = torch.where(unknown, 0.0, membership.detach().cpu().double())
     check_values("membership", values, 0.0, 1.0)
-    rows = _near_members(graph, values > 0, unknown, options.spread_steps)
+    rows = _near_members(graph, values >= options.min_member, unknown, options.spread_steps)
     if not len(rows):
         return values.float()
     transition = transition_matrix(graph.strengths[rows.numpy()])
