@@ -23,7 +23,7 @@ def all_of(count: int) -> Selection:
 
 
 def three():
-    """One left of the middle, one a little right of it (a third of it is left), one on the right."""
+    """One left of the middle, one a little right of it, a third of which is left, one right."""
     return balls_at([[-2, 0, 0], [0.13, 0, 0], [2, 0, 0]], scale=0.3)
 
 
