@@ -35,13 +35,13 @@ from splatseg.selection import pieces
 class HoleOptions:
     """Which pieces are holes, specks and hidden Gaussians."""
 
-    max_hole: int = 50
+    max_hole: int = 20
     """Most Gaussians of a hole that is filled; 0 fills none."""
 
-    min_enclosed: float = 0.8
+    min_enclosed: float = 0.9
     """Minimum share, in [0, 1], of the neighbours around a hole that are selected."""
 
-    max_speck: int = 20
+    max_speck: int = 10
     """Most Gaussians of a speck that is removed; 0 removes none."""
 
     spread_steps: int = 20

@@ -46,9 +46,6 @@ from splatseg.prompting.image_regions import (
 from splatseg.prompting.view_choice import choose_views
 from splatseg.render import render
 
-_MIN_SHOWN = 0.05
-"""Membership of what a view is looked through for."""
-
 _NEAR = 1e-6
 
 _MIN_ASKED = 0.25
@@ -161,7 +158,10 @@ def next_click(
     plain = gaussians.replace(sh=gaussians.sh[:, :1])
     best: NextClick | None = None
     doubtful = torch.maximum(wrong, max(options.hole_error, options.detached_error) * p)
-    shown = gaussians[torch.nonzero(p > _MIN_SHOWN).squeeze(1)]
+    # What is surely out makes no pixel uncertain, and what holes show lies between what is in.
+    likely = p >= options.min_uncertainty
+    doubtful = torch.where(likely, doubtful, 0.0)
+    shown = gaussians[torch.nonzero(likely).squeeze(1)]
     for view in choose_views(gaussians, views, doubtful, most=options.max_views):
         window = _window(view, shown, options.longest)
         if window is None:
