@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.core import Camera, Gaussians, LabelMap, Labels, View
+from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, View
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import CutOptions, UpliftOptions, cut_box, cut_labels, cut_masks, uplift
@@ -72,6 +72,19 @@ def test_the_direction_is_across_the_boundary() -> None:
         g = torch.nn.functional.normalize(sides.direction[0], dim=0)
         expected = torch.nn.functional.normalize(torch.tensor([-1.0, slope, 0.0]).double(), dim=0)
         torch.testing.assert_close(g, expected, atol=0.03, rtol=0)
+
+
+def test_only_those_among_are_split_at_masks() -> None:
+    """Two balls in the middle of the boundary, of which one may be split."""
+    balls = gaussians_at([[0, 0, 0], [0, 0.1, 0]], [0.4, 0.4, 0.4])
+    views = views_of(camera())
+    one = Selection(mask=torch.tensor([False, True]))
+    cut = cut_masks(balls, views, Halves(views), [1], among=one, options=ALL)
+    assert cut.split == 1
+    assert cut.edited.rows.tolist().count(0) == 1
+    assert cut.edited.rows.tolist().count(1) >= 3
+    with pytest.raises(ShapeError, match="among: expected 2 rows, got 1"):
+        cut_masks(balls, views, Halves(views), [1], among=one[:1], options=ALL)
 
 
 def test_the_direction_knows_the_shape_and_the_turn_of_the_gaussian(rng) -> None:

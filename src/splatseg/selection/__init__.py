@@ -6,6 +6,8 @@ share them, so that a selection means the same everywhere.
 
 from splatseg.selection.components import components as components
 from splatseg.selection.components import leftovers as leftovers
+from splatseg.selection.components import pieces as pieces
+from splatseg.selection.components import touching as touching
 from splatseg.selection.select_where import ids_named as ids_named
 from splatseg.selection.select_where import layer_called as layer_called
 from splatseg.selection.select_where import select_where as select_where

@@ -17,6 +17,9 @@ from splatseg.neighbours import NeighbourIndex
 NEIGHBOURS = 16
 REACH = 2.0
 
+_PAIRS = 1 << 20
+"""Pairs looked at together."""
+
 
 def components(gaussians: Gaussians, among: Selection) -> Int64[Tensor, "n"]:
     """The connected piece of each Gaussian that is among some, numbered from 0; -1 for others.
@@ -28,9 +31,9 @@ def components(gaussians: Gaussians, among: Selection) -> Int64[Tensor, "n"]:
     """
     _check_length("among", among, gaussians)
     rows = among.ids
-    first, second = _touching(gaussians[rows])
+    first, second = _touching_pairs(gaussians[rows])
     result = torch.full((len(gaussians),), -1, dtype=torch.int64)
-    result[rows] = _pieces(len(rows), first, second)
+    result[rows] = pieces(len(rows), first, second)
     return result
 
 
@@ -65,10 +68,10 @@ def leftovers(
     none = torch.zeros(len(gaussians), dtype=torch.bool)
     if not most or not removed.count or removed.count == len(gaussians):
         return Selection(mask=none)
-    first, second = _touching(gaussians)
+    first, second = _touching_pairs(gaussians)
     gone = removed.mask
     both = ~gone[first] & ~gone[second]
-    piece_of = _pieces(len(gaussians), first[both], second[both])
+    piece_of = pieces(len(gaussians), first[both], second[both])
     sizes = torch.bincount(piece_of, minlength=len(gaussians))
     at_removed = torch.zeros(len(gaussians), dtype=torch.bool)
     for one, other in ((first, second), (second, first)):
@@ -97,26 +100,40 @@ def _own_things(
     return own[piece_of]
 
 
-def _touching(gaussians: Gaussians) -> tuple[Int64[Tensor, "pairs"], Int64[Tensor, "pairs"]]:
+def _touching_pairs(gaussians: Gaussians) -> tuple[Int64[Tensor, "pairs"], Int64[Tensor, "pairs"]]:
     """Pairs of rows that touch; each pair may come in both orders."""
     found = NeighbourIndex(gaussians).nearest_others(NEIGHBOURS)
     first = torch.arange(len(gaussians)).repeat_interleave(found.indices.shape[1])
-    second, apart = found.indices.reshape(-1), found.distances.reshape(-1)
+    second = found.indices.reshape(-1)
     there = second >= 0
-    first, second, apart = first[there], second[there], apart[there]
-    axes = rotation_from_quaternion(gaussians.rotations) * gaussians.scales.unsqueeze(1)
-    means = gaussians.means
-    lines = means[second] - means[first]
-    lines /= torch.linalg.vector_norm(lines, dim=1, keepdim=True).clamp_min(1e-30)
-    reach = sum(
-        torch.linalg.vector_norm((axes[rows] * lines.unsqueeze(2)).sum(dim=1), dim=1)
-        for rows in (first, second)
-    )
-    close = apart <= REACH * reach
+    first, second = first[there], second[there]
+    close = touching(gaussians, first, second)
     return first[close], second[close]
 
 
-def _pieces(count: int, first: Tensor, second: Tensor) -> Int64[Tensor, "n"]:
+def touching(
+    gaussians: Gaussians, first: Int64[Tensor, "pairs"], second: Int64[Tensor, "pairs"]
+) -> Bool[Tensor, "pairs"]:
+    """Which pairs of rows touch along the line between their centres."""
+    axes = rotation_from_quaternion(gaussians.rotations) * gaussians.scales.unsqueeze(1)
+    means = gaussians.means
+    parts: list[Tensor] = []
+    for start in range(0, len(first), _PAIRS):
+        pair = (first[start : start + _PAIRS], second[start : start + _PAIRS])
+        lines = means[pair[1]].double() - means[pair[0]].double()
+        apart = torch.linalg.vector_norm(lines, dim=1)
+        lines = (lines / apart.unsqueeze(1).clamp_min(1e-30)).to(axes)
+        reach = sum(
+            torch.linalg.vector_norm((axes[rows] * lines.unsqueeze(2)).sum(dim=1), dim=1)
+            for rows in pair
+        )
+        parts.append(apart <= REACH * reach)
+    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.bool)
+
+
+def pieces(
+    count: int, first: Int64[Tensor, "pairs"], second: Int64[Tensor, "pairs"]
+) -> Int64[Tensor, "n"]:
     """Connected components of a graph of rows, numbered by their first row."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -125,8 +142,8 @@ def _pieces(count: int, first: Tensor, second: Tensor) -> Int64[Tensor, "n"]:
     # Graphs of older SciPy have indices of 32 bits; there are never 2^31 Gaussians.
     pairs = (first.int().numpy(), second.int().numpy())
     graph = coo_array((ones, pairs), shape=(count, count))
-    _, pieces = connected_components(graph, directed=False)
-    labels = torch.from_numpy(pieces).long()
+    _, found = connected_components(graph, directed=False)
+    labels = torch.from_numpy(found).long()
     firsts = torch.full((count,), count, dtype=torch.int64)
     firsts.scatter_reduce_(0, labels, torch.arange(count), "amin")
     return torch.unique(firsts[labels], return_inverse=True)[1]

@@ -134,6 +134,7 @@ def cut_masks(
     evidence: LabelSource,
     ids: Sequence[int],
     *,
+    among: Selection | None = None,
     options: CutOptions | None = None,
     render_options: RenderOptions | None = None,
     backend: str = "auto",
@@ -146,6 +147,7 @@ def cut_masks(
         views: Those that vote, best all that the layer was lifted from.
         evidence: Label maps of them; pixels at -1 do not count.
         ids: The ids that are inside.
+        among: Only these are split; None is all.
         options: Which are split, and how.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
@@ -157,8 +159,11 @@ def cut_masks(
 
     Raises:
         InputError: If there are no views or ids, or no view shows any of the ids.
+        ShapeError: If `among` is of other Gaussians.
     """
     options = options or CutOptions()
+    if among is not None and len(among) != len(gaussians):
+        raise ShapeError(f"among: expected {len(gaussians)} rows, got {len(among)}.")
     _check_views(views, evidence)
     if not ids:
         raise InputError("ids: expected at least one, got none.")
@@ -171,7 +176,7 @@ def cut_masks(
         backend=backend,
         progress=progress,
     )
-    edited, sides, count = _split_in_rounds(gaussians, scan)
+    edited, sides, count = _split_in_rounds(gaussians, scan, among)
     if not bool((sides.inside > 0).any()):
         shown = ", ".join(map(str, ids))
         raise InputError(f"ids: none of {len(views)} views shows a Gaussian with id {shown}.")
@@ -275,12 +280,16 @@ def _relabelled(
     )
 
 
-def _split_in_rounds(gaussians: Gaussians, scan: "_Scan") -> tuple[Edited, Sides, int]:
+def _split_in_rounds(
+    gaussians: Gaussians, scan: "_Scan", among: Selection | None
+) -> tuple[Edited, Sides, int]:
     """Measure, split, measure again; ends with a measurement of what came out."""
     edited, count = Edited.unchanged(gaussians), 0
     for round_index in range(scan.options.rounds):
         sides = scan.inside_outside(edited.gaussians)
         straddling = scan.straddling(edited.gaussians, sides)
+        if among is not None:
+            straddling = straddling & among[edited.rows]
         if round_index == 0:
             count = straddling.count
         if not straddling.count:

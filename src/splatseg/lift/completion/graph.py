@@ -5,10 +5,13 @@ Nodes are Gaussians, edges their nearest neighbours. An edge is as strong as its
 .. math:: w_{ij} = \exp\Bigl(-\frac{|x_i - x_j|^2}{2\,\sigma_i \sigma_j}
               - \frac{|c_i - c_j|^2}{2\,\sigma_c^2}\Bigr)
               \; \exp\Bigl(-\frac{|f_i - f_j|^2}{b\, m^2}\Bigr)
+              \; \exp\Bigl(-\frac{|n_i \times n_j|^2}{2\,\sigma_n^2}\Bigr)
 
 with :math:`\sigma_i` the distance to node i's farthest neighbour, so that the graph does not
 depend on the unit of length, c colours in [0, 1], f features of unit length and m the median
-:math:`|f_i - f_j|` of all edges.
+:math:`|f_i - f_j|` of all edges. A Gaussian's normal n is its shortest axis, as long as the
+Gaussian is flat (`flat_normals`), so that :math:`|n_i \times n_j|` is the sine between two flat
+ones whichever way either axis points, and 0 where one of them is round.
 
 Shares of ids are kept sparsely, a few a node, so that memory does not grow with the number of
 ids.
@@ -26,6 +29,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatseg.core import Gaussians
+from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.neighbours import NeighbourIndex
 
 _ROWS = 65536
@@ -44,9 +49,32 @@ class NodeAttributes:
     features: NDArray[np.float32] | None = None
     """Of any length; a row of zeros is a node of which nothing is known."""
 
+    normals: NDArray[np.float32] | None = None
+    """n, as long as a node is flat, in [0, 1]; the sign means nothing. See `flat_normals`."""
+
+
+def flat_normals(gaussians: Gaussians) -> NDArray[np.float32]:
+    r"""Shortest axis of each Gaussian (n, 3), as long as it is flat.
+
+    .. math:: |n| = 1 - s_{min} / s_{mid}
+
+    of the least and the middle scale: 1 for a disc, 0 for a ball or a needle.
+    """
+    scales, order = gaussians.scales.detach().cpu().double().sort(dim=1)
+    middle = scales[:, 1]
+    flatness = torch.where(middle > 0, 1 - scales[:, 0] / middle.clamp_min(1e-300), 0.0)
+    axes = rotation_from_quaternion(gaussians.rotations.detach().cpu().double())
+    shortest = axes.gather(2, order[:, :1, None].expand(-1, 3, 1)).squeeze(2)
+    return (shortest * flatness.unsqueeze(1)).float().numpy()
+
 
 def neighbour_graph(
-    nodes: NodeAttributes, *, neighbours: int, colour_width: float, feature_width: float
+    nodes: NodeAttributes,
+    *,
+    neighbours: int,
+    colour_width: float,
+    feature_width: float,
+    normal_width: float = 1.0,
 ) -> Any:
     """Symmetric edge strengths, scipy sparse rows (n, n), nothing on the diagonal.
 
@@ -58,6 +86,7 @@ def neighbour_graph(
         neighbours: Nearest neighbours of a node, itself not counted, at least 1.
         colour_width: Standard deviation of colours that count as alike.
         feature_width: The factor b of the squared median distance of features.
+        normal_width: Standard deviation of the sine between normals that count as alike.
     """
     import scipy.sparse
 
@@ -75,6 +104,9 @@ def neighbour_graph(
         if nodes.colours is not None:
             squared = _squared(nodes.colours, rows, nearest[rows])
             exponent[rows] += squared / (2 * colour_width**2)
+        if nodes.normals is not None:
+            squared = _squared_sines(nodes.normals, rows, nearest[rows])
+            exponent[rows] += squared / (2 * normal_width**2)
     if nodes.features is not None:
         exponent += _feature_distances(nodes.features, nearest) / feature_width
     # Beyond this float32 would leave a node with unlike neighbours without any.
@@ -111,6 +143,17 @@ def _squared(
     for channel in range(values.shape[1]):
         column = values[:, channel]
         total += (column[rows, None] - column[nearest]) ** 2
+    return total
+
+
+def _squared_sines(
+    normals: NDArray[np.float32], rows: slice, nearest: NDArray[np.int32]
+) -> NDArray[np.float32]:
+    """Squared length of the cross products with the neighbours, a component at a time."""
+    total = np.zeros(nearest.shape, dtype=np.float32)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        own_i, own_j = normals[rows, i, None], normals[rows, j, None]
+        total += (own_i * normals[:, j][nearest] - own_j * normals[:, i][nearest]) ** 2
     return total
 
 
