@@ -20,7 +20,8 @@ def wall(opacities: list[float]) -> tuple[Gaussians, Camera]:
     means = torch.zeros(count, 3)
     means[:, 2] = 2 + torch.arange(count)
     gaussians = Gaussians(
-        means=means, rotations=torch.eye(4)[:1].expand(count, 4), scales=torch.full((count, 3), 9.0),
+        means=means, rotations=torch.eye(4)[:1].expand(count, 4),
+        scales=torch.full((count, 3), 9.0),
         opacities=torch.tensor(opacities), sh=torch.zeros(count, 1, 3),
     )  # fmt: skip
     camera = Camera(
