@@ -11,13 +11,13 @@ comes from the layer: with the evidence :math:`s_{in}` for the ids that were cho
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Gaussians, InstanceTree, Labels, Layer, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
-from splatseg.prompting._layer_regions import best_ids, region_counts
+from splatseg.prompting._layer_regions import RegionCounts, best_ids, region_counts
 from splatseg.prompting._tree_choice import TreeChoice
 from splatseg.prompting.seen import SeenPrompt
 from splatseg.prompting.view_cache import ViewCache
@@ -69,7 +69,10 @@ class LayerSource:
         self._layer = layer
         self._name = name
         self._labels = layer.labels if isinstance(layer, InstanceTree) else layer
-        self._views = views or ViewCache(gaussians, capacity=1)
+        self._rows = _RowsById(self._labels.ids.unsqueeze(1))
+        several = self._labels.candidates
+        self._candidate_rows = self._rows if several is None else _RowsById(several)
+        self._views = ViewCache(gaussians, capacity=1) if views is None else views
 
     @boundary
     def membership(
@@ -85,16 +88,12 @@ class LayerSource:
         hidden = self._shown(prompts, positive=False)
         if isinstance(self._layer, InstanceTree):
             choice = TreeChoice(self._layer, name=self._name)
-            regions = [
-                choice.best_node(region_counts(self._labels, self._views, one), granularity)
-                for one in _with_regions(prompts)
-            ]
-            return self._of_ids(choice.ids(shown, hidden, regions, granularity))
+            nodes = [choice.best_node(counts, granularity) for counts in self._regions(prompts)]
+            return self._of_ids(choice.ids(shown, hidden, nodes, granularity))
         ids = set(shown)
-        for one in _with_regions(prompts):
-            ids |= set(best_ids(region_counts(self._labels, self._views, one), one.guessed))
-        self._check_any(ids)
-        if not ids - set(hidden):
+        for counts in self._regions(prompts):
+            ids |= set(best_ids(counts))
+        if ids and not ids - set(hidden):
             both = sorted(ids & set(hidden))[0]
             raise InputError(
                 f"layer {self._name!r}: expected positive and negative prompts on different ids, "
@@ -153,11 +152,13 @@ class LayerSource:
             found |= dict.fromkeys(id for id in values[enough].tolist() if id != UNLABELLED)
         return list(found)
 
-    def _check_any(self, ids: set[int]) -> None:
-        if not ids:
-            raise InputError(
-                f"layer {self._name!r}: expected a label where the positive prompts are, got none."
-            )
+    def _regions(self, prompts: Sequence[SeenPrompt]) -> list[RegionCounts]:
+        """How the layer lies in the masks and boxes that say by themselves where the thing is."""
+        return [
+            region_counts(self._labels, self._views, one.view, one.inside, boxed=one.guessed)
+            for one in prompts
+            if one.inside is not None and one.dense and bool(one.positive.any())
+        ]
 
     def _of_ids(self, ids: set[int]) -> Float[Tensor, "n"]:
         """The confidence of all that has one of the ids."""
@@ -166,17 +167,48 @@ class LayerSource:
             raise InputError(
                 f"layer {self._name!r}: expected a label where the positive prompts are, got none."
             )
-        wanted = torch.tensor(sorted(ids), dtype=torch.int32, device=labels.ids.device)
-        mask = torch.isin(labels.ids, wanted)
+        confidence = torch.zeros(len(labels), device=labels.ids.device)
+        mask = torch.zeros(len(labels), dtype=torch.bool, device=labels.ids.device)
+        own = self._rows.of(ids)
+        mask[own] = True
         if labels.candidates is None or labels.shares is None:
-            return torch.where(mask, labels.confidence.float().clamp(_MIN_SURE, 1), 0.0)
-        chosen = torch.isin(labels.candidates, wanted)
-        named = labels.candidates != UNLABELLED
-        shares = labels.shares.float() * named
+            confidence[own] = labels.confidence[own].float().clamp(_MIN_SURE, 1)
+            return confidence
+        # What no candidate of is chosen, which is nearly everything, has confidence 0.
+        some = torch.unique(torch.cat((own, self._candidate_rows.of(ids))))
+        candidates, mask = labels.candidates[some], mask[some]
+        wanted = torch.tensor(sorted(ids), dtype=candidates.dtype, device=candidates.device)
+        chosen = torch.isin(candidates, wanted)
+        shares = labels.shares[some].float() * (candidates != UNLABELLED)
         within = (shares * chosen).sum(dim=1)
         beside = (shares * ~chosen).amax(dim=1)
-        confidence = within / (within + beside).clamp_min(1e-12)
-        return torch.where(mask, confidence.clamp(_MIN_SURE, 1), confidence.clamp(0, 0.5))
+        share = within / (within + beside).clamp_min(1e-12)
+        confidence[some] = torch.where(mask, share.clamp(_MIN_SURE, 1), share.clamp(0, 0.5))
+        return confidence
+
+
+class _RowsById:
+    """Rows of a table of ids by id, so that those of an id are found without a look at the rest.
+
+    Args:
+        ids: One or more a row, -1 for none.
+    """
+
+    def __init__(self, ids: Int[Tensor, "n k"]) -> None:
+        ordered, order = torch.sort(ids.flatten(), stable=True)
+        self._rows = order // max(ids.shape[1], 1)
+        self._ids, counts = torch.unique_consecutive(ordered, return_counts=True)
+        self._ends = counts.cumsum(0)
+
+    def of(self, ids: set[int]) -> Int64[Tensor, "m"]:
+        """All rows that have one of the ids; one that has several comes as often."""
+        found = [self._rows[:0]]
+        for id in sorted(ids):
+            index = int(torch.searchsorted(self._ids, id))
+            if index < len(self._ids) and int(self._ids[index]) == id:
+                start = int(self._ends[index - 1]) if index else 0
+                found.append(self._rows[start : int(self._ends[index])])
+        return torch.cat(found)
 
 
 def shown_ids(labels: Labels, rows: SparseWeights) -> Int64[Tensor, "p"]:
@@ -197,10 +229,3 @@ def shown_ids(labels: Labels, rows: SparseWeights) -> Int64[Tensor, "p"]:
     if not len(ids):
         return torch.full((len(rows),), UNLABELLED, dtype=torch.int64)
     return ids[sums.reshape(len(rows), len(ids)).argmax(dim=1)]
-
-
-def _with_regions(prompts: Sequence[SeenPrompt]) -> list[SeenPrompt]:
-    """Prompts whose mask or box says by itself where the thing is."""
-    return [
-        one for one in prompts if one.inside is not None and one.dense and bool(one.positive.any())
-    ]

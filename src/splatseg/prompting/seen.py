@@ -136,7 +136,7 @@ def see_prompts(
     options = options or PromptOptions()
     if not prompts:
         raise InputError("prompts: expected at least one, got none.")
-    cache = views or ViewCache(gaussians, backend=backend, capacity=1)
+    cache = ViewCache(gaussians, backend=backend, capacity=1) if views is None else views
     try:
         seen = tuple(one for prompt in prompts for one in _seen(cache, prompt, options))
     finally:
