@@ -69,6 +69,7 @@ class LayerSource:
         self._layer = layer
         self._name = name
         self._labels = layer.labels if isinstance(layer, InstanceTree) else layer
+        self._choice = TreeChoice(layer, name=name) if isinstance(layer, InstanceTree) else None
         self._rows = _RowsById(self._labels.ids.unsqueeze(1))
         several = self._labels.candidates
         self._candidate_rows = self._rows if several is None else _RowsById(several)
@@ -86,8 +87,8 @@ class LayerSource:
         """
         shown = self._shown(prompts, positive=True)
         hidden = self._shown(prompts, positive=False)
-        if isinstance(self._layer, InstanceTree):
-            choice = TreeChoice(self._layer, name=self._name)
+        choice = self._choice
+        if choice is not None:
             nodes = [choice.best_node(counts, granularity) for counts in self._regions(prompts)]
             return self._of_ids(choice.ids(shown, hidden, nodes, granularity))
         ids = set(shown)
@@ -135,8 +136,8 @@ class LayerSource:
             )
         else:
             alike = {id}
-        if isinstance(self._layer, InstanceTree):
-            alike = TreeChoice(self._layer, name=self._name).below(alike)
+        if self._choice is not None:
+            alike = self._choice.below(alike)
         return self._of_ids(alike)
 
     def _shown(self, prompts: Sequence[SeenPrompt], *, positive: bool) -> list[int]:
