@@ -154,9 +154,10 @@ def test_a_source_of_ones_own_is_told_the_granularity(world, granularity, level)
 
 
 @pytest.mark.parametrize("granularity", ["fine", "1.5", -1.0])
-def test_a_granularity_that_is_none(granularity) -> None:
+def test_a_granularity_that_is_none(world, granularity) -> None:
+    options = SelectOptions(granularity=granularity)
     with pytest.raises(InputError, match="granularity: expected auto, group, object, part or"):
-        SelectOptions(granularity=granularity)
+        select(world.scene, world.click(IN_1), options=options)
 
 
 def test_more_like_this(world) -> None:

@@ -60,11 +60,14 @@ class SelectOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        self.level  # noqa: B018  (checks the granularity)
 
     @property
     def level(self) -> float | None:
-        """The granularity as a number, None for the source's choice."""
+        """The granularity as a number, None for the source's choice.
+
+        Raises:
+            InputError: If it is neither a level nor a number from 0 to 1.
+        """
         if self.granularity == "auto":
             return None
         try:

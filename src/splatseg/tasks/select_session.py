@@ -88,6 +88,7 @@ class SelectionSession:
     ) -> None:
         self._scene = scene
         self._options = options or SelectOptions()
+        self._options.level  # noqa: B018  (an error before anything is opened)
         self._layers = layers
         self._observer = observer
         self._views = ViewCache(scene.gaussians, backend=backend)
