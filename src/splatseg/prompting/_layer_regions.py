@@ -65,7 +65,7 @@ def region_counts(
     shown = view_label_map(views.prepared(view), labels).ids.cpu().long()
     ids, index = torch.unique(shown, return_inverse=True)
     flat, mask = index.flatten(), inside.cpu().flatten()
-    boxes = torch.stack([outline(shown == id) for id in ids.tolist()])
+    boxes = _outlines(index, len(ids))
     known = ids != UNLABELLED
     return RegionCounts(
         ids=ids[known],
@@ -90,6 +90,21 @@ def best_ids(counts: RegionCounts) -> tuple[int, ...]:
     if counts.boxed or not bool(mostly.any()):
         return (int(counts.ids[iou.argmax()]),)
     return tuple(counts.ids[mostly].tolist())
+
+
+def _outlines(index: Int64[Tensor, "height width"], count: int) -> Int64[Tensor, "m 4"]:
+    """The box round the pixels of each of `count` numbers, all of which occur."""
+    flat = index.flatten()
+    sides: list[Tensor] = []
+    for axis in (1, 0):
+        steps = torch.arange(index.shape[axis])
+        place = (steps if axis == 1 else steps.unsqueeze(1)).expand(index.shape).flatten()
+        start = torch.zeros(count, dtype=torch.int64)
+        low = start.scatter_reduce(0, flat, place, "amin", include_self=False)
+        high = start.scatter_reduce(0, flat, place, "amax", include_self=False) + 1
+        sides += [low, high]
+    left, right, top, bottom = sides
+    return torch.stack((left, top, right, bottom), dim=1)
 
 
 def outline(mask: Tensor) -> Int64[Tensor, "4"]:
