@@ -89,6 +89,7 @@ if TYPE_CHECKING:
     from splatseg.tasks import RenderingOptions as RenderingOptions
     from splatseg.tasks import SeeOptions as SeeOptions
     from splatseg.tasks import SegmentOptions as SegmentOptions
+    from splatseg.tasks import SelectOptions as SelectOptions
     from splatseg.tasks import SharpenSceneOptions as SharpenSceneOptions
     from splatseg.tasks import attach_layers as attach_layers
     from splatseg.tasks import bench as bench
@@ -100,11 +101,13 @@ if TYPE_CHECKING:
     from splatseg.tasks import fit_capture as fit_capture
     from splatseg.tasks import import_scene as import_scene
     from splatseg.tasks import make_demo as make_demo
+    from splatseg.tasks import open_selector as open_selector
     from splatseg.tasks import render_truth as render_truth
     from splatseg.tasks import render_views as render_views
     from splatseg.tasks import save_segmentation as save_segmentation
     from splatseg.tasks import see as see
     from splatseg.tasks import segment as segment
+    from splatseg.tasks import select as select
     from splatseg.tasks import sharpen_scene as sharpen_scene
 
 # What the block above says to type checkers, for the interpreter; a test holds the two equal.
@@ -126,9 +129,11 @@ _HOMES = {
     "splatseg.tasks": (
         "AttachLayersOptions BenchOptions CheckpointOptions DemoOptions EditOptions "
         "EvaluationOptions ExportOptions ImportOptions MakeSceneOptions RenderingOptions "
-        "SeeOptions SegmentOptions SharpenSceneOptions attach_layers bench describe edit_scene "
+        "SeeOptions SegmentOptions SelectOptions SharpenSceneOptions attach_layers bench "
+        "describe edit_scene "
         "evaluate_scene examine_capture export_scene fit_capture import_scene make_demo "
-        "render_truth render_views save_segmentation see segment sharpen_scene"
+        "open_selector render_truth render_views save_segmentation see segment select "
+        "sharpen_scene"
     ),
 }
 _PACKAGES = frozenset(

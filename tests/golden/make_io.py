@@ -2,7 +2,8 @@
 
 Run from the project's root: ``python tests/golden/make_io.py``. It makes what is not there:
 scene-v1, a scene folder with one view of each lens and evidence of each kind that is written; and
-layers-v3, a layer of each kind, with a record that says something in every field; and
+layers-v3, a layer of each kind, with a record that says something in every field; layers-v4, a
+selection with confidence, which alone is of that version; and
 evidence-v2, features of three blocks with a class token. A version's
 files are made once and then kept: later versions of splatseg must read them. The layers in
 scene-v1 are of version 1 and the one in layers-v2 of version 2, as the scripts of then made them;
@@ -46,6 +47,7 @@ from splatseg.io.scene import VERSION, save_scene, save_scene_layer
 from splatseg.io.scene_folder import CAMERAS_FILE, SCENE_FILE
 
 ROOT = Path(__file__).parent / f"scene-v{VERSION}"
+LAYERS_3 = Path(__file__).parent / "layers-v3"
 LAYERS = Path(__file__).parent / f"layers-v{LAYER_VERSION}"
 EVIDENCE = Path(__file__).parent / f"evidence-v{EVIDENCE_VERSION}"
 CLASSES = ClassTable(
@@ -183,6 +185,15 @@ def golden_layers_of_version_3() -> dict[str, Layer]:
     return {name: with_info(layer, full_info()) for name, layer in layers.items()}
 
 
+def golden_soft_selection() -> Selection:
+    """A selection that says how likely each Gaussian belongs to it, the border among them."""
+    return Selection(
+        mask=torch.tensor([True, False, True, False]),
+        confidence=torch.tensor([0.875, 0.25, 0.5, 0.5]),
+        info=full_info(),
+    )
+
+
 def golden_evidence() -> tuple[LabelMap, MaskSet, FeatureMap]:
     """A label map, masks and features of the view left/1."""
     ids = torch.full((6, 8), -1, dtype=torch.int32)
@@ -223,10 +234,13 @@ def main() -> None:
         EVIDENCE.mkdir()
         create_evidence(EVIDENCE / "features", kind="features", metadata={"model": "a"})
         save_features(golden_deep_features(), EVIDENCE / "features", "left/1")
+    if not LAYERS_3.exists():
+        LAYERS_3.mkdir()
+        for name, layer in golden_layers_of_version_3().items():
+            save_layer(layer, LAYERS_3 / f"{name}.npz")
     if not LAYERS.exists():
         LAYERS.mkdir()
-        for name, layer in golden_layers_of_version_3().items():
-            save_layer(layer, LAYERS / f"{name}.npz")
+        save_layer(golden_soft_selection(), LAYERS / "chosen.npz")
 
 
 def make_scene() -> None:

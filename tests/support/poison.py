@@ -13,6 +13,7 @@ from splatseg import core, edit, evaluate, pose, selection, synthetic
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, Similarity, View
 from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import GaussianField
+from splatseg.prompting.prompts import AxisBox
 
 COUNT, WIDTH, HEIGHT = 6, 12, 9
 
@@ -270,6 +271,8 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     byte = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
     return {
         **inner(world, by_type),
+        "tasks.select.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
+        "tasks.draw_selection.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
         "core.apply_rows.layer": world.labels,
         "core.map_ids.ids": ids,
         "core.map_ids.values": {1: 2},

@@ -69,6 +69,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.segment",
         summary="evidence (label maps, masks, features) -> a layer of the scene",
     ),
+    "select": CommandEntry(
+        module="splatseg.cli.select",
+        summary="clicks, boxes, strokes, masks, places -> a selection of Gaussians",
+    ),
     "render": CommandEntry(
         module="splatseg.cli.render",
         summary="pictures, depth and label maps of a scene's views",

@@ -83,7 +83,8 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
         others = [note for note in notes if not _is_argument(note)]
         if kind is bool and field.default is False:
             others.append(tyro.conf.FlagCreatePairsOff)  # --no-x would say what is so anyway
-        if kind in _LISTS:
+        # A flag that is given again and again has one item each time, commas and all.
+        if kind in _LISTS and tyro.conf.UseAppendAction not in others:
             others.append(_list_of(_LISTS[kind]))
         annotated: Any = Annotated[kind, argument]
         for note in others:

@@ -85,6 +85,15 @@ SplitOrPath: TypeAlias = Annotated[
     ),
 ]
 
+SelectLevel: TypeAlias = Annotated[
+    str,
+    _named(
+        "LEVEL",
+        "How much a click means: group, object, part, or a number from 0 (groups) by 0.5 (objects) "
+        "to 1 (the finest parts). auto lets the source choose.",
+    ),
+]
+
 Frames: TypeAlias = Annotated[int, _named("N", "Views of --split path.")]
 
 Json: TypeAlias = Annotated[

@@ -150,7 +150,9 @@ def apply_rows(layer: Layer, edited: Edited) -> Layer:
                 weights=_shared(_filled_or_none(taken.weights, new, 0), fractions),
             )
         case Selection():
-            return replace(taken, mask=taken.mask & ~new)
+            return replace(
+                taken, mask=taken.mask & ~new, confidence=_filled_or_none(taken.confidence, new, 0)
+            )
 
 
 def _filled(column: Tensor, where: Tensor, value: float) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
@@ -145,14 +145,32 @@ class Features:
 class Selection:
     """A set of Gaussians. Immutable; ``& | ^ - ~`` give new ones.
 
+    With confidences c and d these are, as in fuzzy sets,
+
+        ``a & b``  min(c, d)          ``~a``     1 - c
+        ``a | b``  max(c, d)          ``a - b``  min(c, 1 - d)
+        ``a ^ b``  max(min(c, 1 - d), min(d, 1 - c))
+
+    where a side without confidence counts as 1 inside and 0 outside.
+
+    Raises:
+        RangeError: If a confidence is outside [0, 1], or on the other side of 0.5 than its mask.
+
     Example:
         >>> a = Selection(mask=torch.tensor([True, True, False]))
         >>> (a - ~a).ids
         tensor([0, 1])
+        >>> b = Selection.of_confidence(torch.tensor([0.25, 0.75, 0.75]))
+        >>> (a & b).confidence
+        tensor([0.2500, 0.7500, 0.0000])
     """
 
     mask: Bool[Tensor, "n"]
     """True where a Gaussian is selected."""
+
+    confidence: Float[Tensor, "n"] | None = None
+    """Probability in [0, 1] that a Gaussian belongs to the set: 0.5 or more where it is selected,
+    0.5 or less elsewhere. None where nothing is known but the mask."""
 
     info: LayerInfo = field(default_factory=LayerInfo)
     """How it was made. Algebra drops it."""
@@ -163,17 +181,42 @@ class Selection:
         check_layer_info("info", self.info)
         if self.mask.dtype != torch.bool:
             raise InputError(f"mask: expected booleans, got {self.mask.dtype}.")
+        if self.confidence is not None:
+            check_shape("confidence", self.confidence, (len(self.mask),))
+            check_values("confidence", self.confidence, 0, 1)
+            # 0.5 itself may be on either side: it is its own complement.
+            wrong = torch.where(self.mask, self.confidence < 0.5, self.confidence > 0.5)
+            if bool(wrong.any()):
+                raise RangeError(
+                    "confidence: expected 0.5 or more where the mask is true and 0.5 or less "
+                    f"elsewhere, got {int(wrong.sum())} of {len(self.mask)} that contradict it."
+                )
+
+    @classmethod
+    def of_confidence(
+        cls, confidence: Float[Tensor, "n"], *, info: LayerInfo | None = None
+    ) -> "Selection":
+        """What more likely than not belongs to the set: a confidence above 0.5.
+
+        Args:
+            confidence: Probabilities in [0, 1].
+            info: How they were made.
+        """
+        return cls(mask=confidence > 0.5, confidence=confidence, info=info or LayerInfo())
 
     def __len__(self) -> int:
         return len(self.mask)
 
     def __repr__(self) -> str:
-        return f"Selection({self.count:,} of {len(self):,})"
+        mean = self.mean_confidence
+        sure = "" if mean is None else f", confidence {mean:.2f}"
+        return f"Selection({self.count:,} of {len(self):,}{sure})"
 
     def __getitem__(self, index: slice | Tensor) -> "Selection":
         """Rows, in step with `Gaussians.__getitem__`."""
         index = as_rows("index", index, len(self))
-        return Selection(mask=self.mask[index], info=self.info)
+        confidence = None if self.confidence is None else self.confidence[index]
+        return Selection(mask=self.mask[index], confidence=confidence, info=self.info)
 
     @property
     def count(self) -> int:
@@ -185,20 +228,44 @@ class Selection:
         """Rows of the selected Gaussians, ascending."""
         return torch.nonzero(self.mask).squeeze(1)
 
+    @property
+    def mean_confidence(self) -> float | None:
+        """Mean confidence of the selected Gaussians; None without one, or with nothing selected."""
+        if self.confidence is None or not bool(self.mask.any()):
+            return None
+        return float(self.confidence[self.mask].double().mean())
+
     def __and__(self, other: "Selection") -> "Selection":
-        return Selection(mask=self.mask & self._same_length(other))
+        mask = self.mask & self._same_length(other)
+        pair = self._confidences(other)
+        return Selection(mask=mask, confidence=None if pair is None else torch.minimum(*pair))
 
     def __or__(self, other: "Selection") -> "Selection":
-        return Selection(mask=self.mask | self._same_length(other))
+        mask = self.mask | self._same_length(other)
+        pair = self._confidences(other)
+        return Selection(mask=mask, confidence=None if pair is None else torch.maximum(*pair))
 
     def __xor__(self, other: "Selection") -> "Selection":
-        return Selection(mask=self.mask ^ self._same_length(other))
+        self._same_length(other)
+        return (self - other) | (other - self)
 
     def __sub__(self, other: "Selection") -> "Selection":
-        return Selection(mask=self.mask & ~self._same_length(other))
+        self._same_length(other)
+        return self & ~other
 
     def __invert__(self) -> "Selection":
-        return Selection(mask=~self.mask)
+        confidence = None if self.confidence is None else 1 - self.confidence
+        return Selection(mask=~self.mask, confidence=confidence)
+
+    def _confidences(self, other: "Selection") -> tuple[Tensor, Tensor] | None:
+        """Both sides as probabilities; None where neither says more than its mask."""
+        if self.confidence is None and other.confidence is None:
+            return None
+        first, second = (
+            selection.mask.float() if selection.confidence is None else selection.confidence.float()
+            for selection in (self, other)
+        )
+        return first, second
 
     @boundary
     def _same_length(self, other: "Selection") -> Tensor:

@@ -1,5 +1,6 @@
 """Views, captures and scenes: what was photographed, and what was made of it."""
 
+import difflib
 from abc import ABC
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -174,9 +175,11 @@ class _WithViews(ABC):
         for view in self.views:
             if view.name == name:
                 return view
-        shown = ", ".join(view.name for view in self.views[:5])
+        close = difflib.get_close_matches(name, [view.name for view in self.views], n=3)
+        shown = ", ".join(close or [*(view.name for view in self.views[:5]), "..."])
         raise InputError(
-            f"view: there is no {name!r} among {len(self.views)} views ({shown}, ...)."
+            f"view: there is no {name!r} among {len(self.views)} views "
+            f"({'close to it: ' if close else ''}{shown})."
         )
 
 

@@ -65,7 +65,7 @@ def _joined(name: str, own: Layer, other: Layer, edited: Edited, behind: Edited)
             return _joined_trees(own, other, edited, behind)
         case Selection(), Selection():
             first, second = apply_rows(own, edited), apply_rows(other, behind)
-            return replace(first, mask=first.mask | second.mask)
+            return replace(first | second, info=first.info)
         case Features(), Features() if own.values.shape[1] == other.values.shape[1]:
             first, second = apply_rows(own, edited), apply_rows(other, behind)
             return replace(

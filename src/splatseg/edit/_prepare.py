@@ -229,7 +229,7 @@ def _relabelled(document: Document, where: Where, inside: Selection) -> Document
     whole = document.layers[name]
     match layer:
         case Selection():
-            changed: Layer = replace(layer, mask=inside.mask)
+            changed: Layer = _selected_by_side(layer, inside)
         case Labels():
             changed = _labels_by_side(layer, where.ids, inside)
             if isinstance(whole, InstanceTree):
@@ -237,6 +237,15 @@ def _relabelled(document: Document, where: Where, inside: Selection) -> Document
         case _:
             return document
     return replace(document, layers={**document.layers, name: changed})
+
+
+def _selected_by_side(selection: Selection, inside: Selection) -> Selection:
+    """The selection with what lies on the other side of the cut moved there, surely."""
+    if selection.confidence is None:
+        return replace(selection, mask=inside.mask)
+    stays = selection.mask == inside.mask
+    confidence = torch.where(stays, selection.confidence, inside.mask.to(selection.confidence))
+    return replace(selection, mask=inside.mask, confidence=confidence)
 
 
 def _labels_by_side(labels: Labels, ids: Sequence[int], inside: Selection) -> Labels:

@@ -36,8 +36,12 @@ from splatseg.io.npz import open_npz
 from splatseg.io.npz_writing import save_arrays
 
 FORMAT = "splatseg-layer"
-VERSION = 3
-"""Versions up to it are read. Trees came with version 2, and `LayerInfo` with version 3."""
+VERSION = 4
+"""Versions up to it are read. Trees came with version 2, `LayerInfo` with version 3, and the
+confidence of selections with version 4. A file is of the first version that has all it holds, so
+that older programs refuse no layer that they can read whole."""
+
+_WITHOUT_CONFIDENCE = 3
 
 _INFO_VERSION = 3
 """Files before it have a flat object of any keys instead, under ``metadata``."""
@@ -63,7 +67,11 @@ def save_layer(layer: Layer, path: Path) -> None:
         InputError: If an id is 0 (ids in use start at 1).
         MissingFileError: If the folder of `path` does not exist.
     """
-    header: dict[str, Any] = {"format": FORMAT, "version": VERSION, "count": len(layer)}
+    header: dict[str, Any] = {
+        "format": FORMAT,
+        "version": _WITHOUT_CONFIDENCE,
+        "count": len(layer),
+    }
     match layer:
         case Labels():
             header |= {"kind": "labels", "background": _void(layer.background)}
@@ -101,6 +109,9 @@ def save_layer(layer: Layer, path: Path) -> None:
         case Selection():
             header |= {"kind": "selection"}
             arrays = {"mask": layer.mask.cpu().numpy()}
+            if layer.confidence is not None:
+                header |= {"version": VERSION}
+                arrays |= {"confidence": _floats(layer.confidence.float())}
     header["info"] = layer_info_to_json(layer.info)
     with atomic_file(path, durable=True) as temporary:
         save_arrays(header, arrays, temporary, name=path)
@@ -164,7 +175,12 @@ def _layer(
             return _tree(path, header, arrays, info)
         case "selection":
             mask = torch.from_numpy(_array(path, arrays, "mask", "?", (count,)))
-            return Selection(mask=mask, info=info)
+            confidence = (
+                torch.from_numpy(_array(path, arrays, "confidence", "f4", (count,)))
+                if int(header["version"]) > _WITHOUT_CONFIDENCE and "confidence" in arrays
+                else None
+            )
+            return Selection(mask=mask, confidence=confidence, info=info)
         case kind:
             raise FileFormatError(
                 f"{path}: expected a layer of labels, features, a tree or a selection, "

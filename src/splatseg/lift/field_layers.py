@@ -96,9 +96,22 @@ def field_layer(layers: Mapping[str, Layer], address: str) -> FieldLayer:
 
 
 def selection_labels(selection: Selection) -> Labels:
-    """A selection as labels, 1 inside and none outside, to be rendered as a mask."""
+    """A selection as labels, 1 inside and none outside, to be rendered as a mask.
+
+    Where it has confidences the labels are soft: a pixel is inside where the blended probability
+    is more than half of all its light, the transmittance behind all Gaussians counting as outside.
+    """
     ids = torch.where(selection.mask, 1, UNLABELLED)
-    return Labels(ids=ids, confidence=selection.mask.float(), info=selection.info)
+    if selection.confidence is None:
+        return Labels(ids=ids, confidence=selection.mask.float(), info=selection.info)
+    shares = selection.confidence.float()
+    return Labels(
+        ids=ids,
+        confidence=shares,
+        candidates=torch.ones_like(ids, dtype=torch.int32).unsqueeze(1),
+        shares=shares.unsqueeze(1),
+        info=selection.info,
+    )
 
 
 def _of_features(name: str, layer: Features, readout: str) -> FieldLayer:

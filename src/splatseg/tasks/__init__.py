@@ -45,6 +45,15 @@ from splatseg.tasks.segment import Segmentation as Segmentation
 from splatseg.tasks.segment import SegmentOptions as SegmentOptions
 from splatseg.tasks.segment import save_segmentation as save_segmentation
 from splatseg.tasks.segment import segment as segment
+from splatseg.tasks.select import open_selector as open_selector
+from splatseg.tasks.select import select as select
+from splatseg.tasks.select_options import SelectMode as SelectMode
+from splatseg.tasks.select_options import SelectOptions as SelectOptions
+from splatseg.tasks.select_outputs import check_selection_file as check_selection_file
+from splatseg.tasks.select_outputs import draw_selection as draw_selection
+from splatseg.tasks.select_outputs import save_selected_splats as save_selected_splats
+from splatseg.tasks.select_session import Selected as Selected
+from splatseg.tasks.select_session import SelectionSession as SelectionSession
 from splatseg.tasks.sharpen import SharpenedScene as SharpenedScene
 from splatseg.tasks.sharpen import SharpenSceneOptions as SharpenSceneOptions
 from splatseg.tasks.sharpen import sharpen_scene as sharpen_scene

@@ -93,7 +93,7 @@ def open_job(
     if options.layer is not None:
         layer = layer_of(scene, options.layer, layers)
         if isinstance(layer, Selection):
-            selection = layer
+            selection = _sure_selection(layer, options.min_confidence)
         elif isinstance(layer, Labels):
             classes = _sure(layer, options.min_confidence)
         else:
@@ -125,10 +125,21 @@ def _sure(labels: Labels, min_confidence: float) -> Labels:
     return replace(labels, ids=torch.where(unsure, UNLABELLED, labels.ids))
 
 
+def _sure_selection(selection: Selection, min_confidence: float) -> Selection:
+    """The selection without what is less sure than that to belong to it."""
+    if not min_confidence > 0 or selection.confidence is None:
+        return selection
+    mask = selection.mask & (selection.confidence >= min_confidence)
+    confidence = torch.where(mask, selection.confidence, selection.confidence.clamp_max(0.5))
+    return replace(selection, mask=mask, confidence=confidence)
+
+
 def _labels_of_selection(selection: Selection, name: str) -> Labels:
     return Labels(
         ids=torch.where(selection.mask, _SELECTED, UNLABELLED),
-        confidence=selection.mask.float(),
+        confidence=selection.mask.float()
+        if selection.confidence is None
+        else selection.confidence.float(),
         info=LayerInfo(names={_SELECTED: name}),
     )
 

@@ -30,7 +30,10 @@ from splatseg.tasks.import_scene import read_with_notes
 from splatseg.tasks.label_columns import label_tables
 from splatseg.tasks.scene_parts import layer_of, whole_layer
 
-_LABEL_COLUMNS = ("class_id", "confidence", "instance_id", "instance_confidence", "selected")
+_LABEL_COLUMNS = (
+    "class_id", "confidence", "instance_id", "instance_confidence", "selected",
+    "selected_confidence",
+)  # fmt: skip
 _NO_COLUMNS = (".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
 
 

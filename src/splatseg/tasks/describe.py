@@ -221,7 +221,8 @@ def _layer_kind(layer: Layer) -> str:
         levels = Counter(node.level for node in layer.nodes)
         counts = ", ".join(f"{levels[level]} {level}s" for level in TREE_LEVELS)
         return f"tree of {len(layer.nodes)} nodes ({counts})"
-    return f"selection of {layer.count}"
+    mean = layer.mean_confidence
+    return f"selection of {layer.count}" + ("" if mean is None else f", confidence {mean:.2f}")
 
 
 def _evidence_facts(evidence: Evidence) -> dict[str, Any]:

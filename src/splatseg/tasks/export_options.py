@@ -17,7 +17,8 @@ class ExportOptions:
     """What is exported, and how."""
 
     layer: str | None = None
-    """Layer of labels for class_id and confidence; a selection becomes the column selected."""
+    """Layer of labels for class_id and confidence; a selection becomes the columns selected and,
+    where it has a confidence, selected_confidence."""
 
     instances: str | None = None
     """Layer of labels for instance_id and instance_confidence. With it, its ids are the objects

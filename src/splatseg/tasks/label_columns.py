@@ -29,9 +29,10 @@ def label_tables(
 ) -> dict[str, Any]:
     """The entry of the column that a layer becomes: where it is from and what its ids mean."""
     if isinstance(layer, Selection):
-        return {
-            "selected": {"layer": name, "meaning": "1 for selected Gaussians, 0 for others"},
-        }
+        entry = {"layer": name, "meaning": "1 for selected Gaussians, 0 for others"}
+        if layer.confidence is not None:
+            entry["confidence"] = "selected_confidence"
+        return {"selected": entry}
     return {
         f"{kind}_id": {
             "layer": name,

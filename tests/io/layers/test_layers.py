@@ -71,6 +71,7 @@ LAYERS = {
         ),
     ),
     "selection": Selection(mask=torch.tensor([True, False, True]), info=INFO),
+    "soft selection": Selection.of_confidence(torch.tensor([0.75, 0.5, 1.0, 1 / 3]), info=INFO),
     "empty": Labels(ids=torch.zeros(0, dtype=torch.int32), confidence=torch.zeros(0)),
     "none": Selection(mask=torch.zeros(0, dtype=torch.bool)),
 }
@@ -123,6 +124,26 @@ def test_layers_of_version_3_are_read_and_written_as_they_were(
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
 
 
+def test_selections_with_confidence_of_version_4_are_read_and_written_as_they_were(
+    golden, project_root, tmp_path
+) -> None:
+    path = project_root / "tests/golden/layers-v4/chosen.npz"
+    layer = load_layer(path)
+    same(golden.golden_soft_selection(), layer)
+    save_layer(layer, tmp_path / "again.npz")
+    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
+
+
+def test_a_confidence_that_contradicts_its_mask_is_refused(tmp_path) -> None:
+    path = tmp_path / "a.npz"
+    save_layer(LAYERS["soft selection"], path)
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    np.savez(path, **arrays | {"mask": ~arrays["mask"]})
+    with pytest.raises(FileFormatError, match=r"a\.npz.*contradict"):
+        load_layer(path)
+
+
 def test_records_as_deep_as_they_may_be_have_a_place_in_files(tmp_path) -> None:
     deep: list = []
     for _ in range(89):
@@ -154,8 +175,8 @@ def test_a_record_of_version_0_is_that_of_a_file_without_its_version(tmp_path) -
 
 
 def test_layers_of_a_later_version_are_refused(tmp_path) -> None:
-    path = changed(tmp_path, lambda h, a: h.update(version=4), layer="tree")
-    with pytest.raises(FileFormatError, match="version 3 or less, got version 4"):
+    path = changed(tmp_path, lambda h, a: h.update(version=5), layer="tree")
+    with pytest.raises(FileFormatError, match="version 4 or less, got version 5"):
         load_layer(path)
 
 
@@ -222,7 +243,7 @@ def changed(tmp_path, change, layer="soft"):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h, a: h.update(version=4), "version 3 or less, got version 4; a later splatseg"),
+        (lambda h, a: h.update(version=5), "version 4 or less, got version 5; a later splatseg"),
         (lambda h, a: h.update(version=0), "got version 0"),
         (lambda h, a: h.update(format="other"), "expected a layer, got 'other'"),
         (lambda h, a: h.update(kind="voxels"), "got 'voxels'"),

@@ -28,10 +28,14 @@ def label_columns(
     """A layer as columns: ``class_id`` (int32, 0 for none) and ``confidence`` (float32).
 
     Of kind ``instance`` they are ``instance_id`` and ``instance_confidence``. A selection is
-    the one column ``selected`` (int32, 1 or 0).
+    the column ``selected`` (int32, 1 or 0), and ``selected_confidence`` (float32, the probability
+    that a Gaussian belongs to it) where it has one.
     """
     if isinstance(layer, Selection):
-        return {"selected": layer.mask.to(torch.int32)}
+        columns = {"selected": layer.mask.to(torch.int32)}
+        if layer.confidence is not None:
+            columns["selected_confidence"] = layer.confidence.float()
+        return columns
     confidence = "confidence" if kind == "class" else "instance_confidence"
     return {
         f"{kind}_id": torch.where(layer.ids == UNLABELLED, NONE, layer.ids).int(),

@@ -30,6 +30,7 @@ _DESCRIPTIONS = {
     "confidence": "of the class, 0 to 1",
     "instance_confidence": "of the object, 0 to 1",
     "selected": "1 for selected",
+    "selected_confidence": "probability of being selected",
 }
 
 

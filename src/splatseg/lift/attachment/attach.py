@@ -354,7 +354,11 @@ def _carried(layer: Layer, rows: Tensor) -> Layer:
                 weights=_gathered_if(layer.weights, rows, 0.0),
             )
         case Selection():
-            return replace(layer, mask=_gathered(layer.mask, rows, False))  # noqa: FBT003
+            return replace(
+                layer,
+                mask=_gathered(layer.mask, rows, False),  # noqa: FBT003  (a value)
+                confidence=_gathered_if(layer.confidence, rows, 0.0),
+            )
         case InstanceTree():
             return replace(layer, labels=cast("Labels", _carried(layer.labels, rows)))
 

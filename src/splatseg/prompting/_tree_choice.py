@@ -1,0 +1,138 @@
+"""Which node of a tree prompts mean."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import torch
+
+from splatseg.core import InstanceTree
+from splatseg.errors import InputError
+from splatseg.prompting._layer_regions import RegionCounts
+
+_OBJECT = 0.5
+
+
+class TreeChoice:
+    """Chooses nodes by the prompts on them.
+
+    Args:
+        tree: The tree.
+        name: What the layer is called, for messages.
+    """
+
+    def __init__(self, tree: InstanceTree, *, name: str) -> None:
+        self._name = name
+        self._paths = {node.id: tree.path(node.id) for node in tree.nodes}
+        self._fineness = tree.granularity()
+
+    def ids(
+        self,
+        positive: Sequence[int],
+        negative: Sequence[int],
+        regions: Sequence[int | None],
+        granularity: float | None,
+    ) -> set[int]:
+        """Ids of all nodes at and below those that are meant.
+
+        Args:
+            positive: Deepest nodes at positive points.
+            negative: Deepest nodes at negative points.
+            regions: Nodes that masks and boxes mean.
+            granularity: 0 for groups, 0.5 for objects, 1 for the finest parts, None for the
+                smallest node that holds all positive points, yet an object at least.
+
+        Raises:
+            InputError: If nothing positive is on a node, or negative points are on the same.
+        """
+        chosen = {node for node in regions if node is not None}
+        chosen |= self._meant(positive, negative, granularity)
+        if not chosen:
+            raise InputError(
+                f"layer {self._name!r}: expected a label where the positive prompts are, got none."
+            )
+        removed = {
+            self._removed(leaf, chosen) for leaf in negative if chosen & set(self._paths[leaf])
+        }
+        return self.below(chosen) - self.below(removed)
+
+    def below(self, nodes: Iterable[int]) -> set[int]:
+        """The nodes themselves, and all inside them."""
+        above = set(nodes)
+        return {id for id, path in self._paths.items() if above & set(path)}
+
+    def best_node(self, counts: RegionCounts, granularity: float | None) -> int | None:
+        """The node that fits a mask or box best; None where none is there.
+
+        Args:
+            counts: Where the deepest nodes lie in the view.
+            granularity: Nodes finer than that do not compete; None lets all.
+        """
+        best: tuple[float, int] | None = None
+        for node in sorted(self._paths, key=lambda id: (self._fineness[id], id)):
+            if granularity is not None and not self._allowed(node, granularity):
+                continue
+            members = torch.isin(counts.ids, torch.tensor(sorted(self.below({node}))))
+            if not bool(members.any()):
+                continue
+            fit = float(_together(counts, members).iou()[0])
+            if fit > 0 and (best is None or fit > best[0]):
+                best = (fit, node)
+        return None if best is None else best[1]
+
+    def _allowed(self, node: int, granularity: float) -> bool:
+        """Whether a cut at the granularity has this node."""
+        path = self._paths[node]
+        deepest = [id for id in path if self._fineness[id] <= granularity]
+        return node == (deepest[-1] if deepest else path[0])
+
+    def _meant(
+        self, positive: Sequence[int], negative: Sequence[int], granularity: float | None
+    ) -> set[int]:
+        """The node that holds all positive points and no negative one, or one for each point."""
+        if not positive:
+            return set()
+        taken = {node for leaf in negative for node in self._paths[leaf]}
+        paths = [self._paths[leaf] for leaf in positive]
+        common = [node for node in paths[0] if all(node in path for path in paths)]
+        held = [node for node in common if node not in taken]
+        if held and (granularity is None or len(positive) == 1):
+            return {self._of_path(held, granularity)}
+        for leaf in positive:
+            if leaf in negative:
+                raise self._same(leaf)
+        # What is around both at its finest is taken, and the negative part of it cut out.
+        free = [[node for node in path if node not in taken] or path[-1:] for path in paths]
+        return {self._of_path(path, granularity) for path in free}
+
+    def _of_path(self, path: Sequence[int], granularity: float | None) -> int:
+        """The node of a path, coarse to fine, that fits a granularity."""
+        if granularity is None:
+            return next((id for id in path if self._fineness[id] >= _OBJECT), path[-1])
+        fitting = [id for id in path if self._fineness[id] <= granularity]
+        return fitting[-1] if fitting else path[0]
+
+    def _removed(self, leaf: int, chosen: set[int]) -> int:
+        """The largest node around a negative point that is inside what is chosen."""
+        path = self._paths[leaf]
+        last = max(i for i, node in enumerate(path) if node in chosen)
+        if last + 1 == len(path):
+            raise self._same(leaf)
+        return path[last + 1]
+
+    def _same(self, node: int) -> InputError:
+        return InputError(
+            f"layer {self._name!r}: expected positive and negative prompts on different nodes, got "
+            f"both on {node}; a finer layer may tell them apart."
+        )
+
+
+def _together(counts: RegionCounts, members: torch.Tensor) -> RegionCounts:
+    """The counts of several ids as if they were one."""
+    boxes = counts.boxes[members]
+    return replace(
+        counts,
+        ids=counts.ids[members][:1],
+        inside=counts.inside[members].sum().reshape(1),
+        total=counts.total[members].sum().reshape(1),
+        boxes=torch.cat((boxes[:, :2].amin(dim=0), boxes[:, 2:].amax(dim=0))).reshape(1, 4),
+    )

@@ -1,0 +1,232 @@
+r"""A layer as a source: what belongs together was decided when the scene was segmented.
+
+A click means the id that its pixel shows, the one with the largest blending weight in its row of
+W, as in a label map. Of a tree it means a node on the path of that id. How sure the answer is
+comes from the layer: with the evidence :math:`s_{in}` for the ids that were chosen and
+:math:`s_{out}` for the strongest other one,
+
+.. math:: c = \frac{s_{in}}{s_{in} + s_{out}}.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int, Int64
+from torch import Tensor
+
+from splatseg.core import UNLABELLED, Gaussians, InstanceTree, Labels, Layer, Selection
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, ShapeError
+from splatseg.prompting._layer_regions import RegionCounts, best_ids, region_counts
+from splatseg.prompting._tree_choice import TreeChoice
+from splatseg.prompting.seen import SeenPrompt
+from splatseg.prompting.view_cache import ViewCache
+from splatseg.render import SparseWeights
+
+_MIN_STROKE_SHARE = 0.2
+"""Least share of a stroke's pixels that an id must have to be meant: strokes slip over borders."""
+
+_MIN_SURE = 0.501
+"""Confidence of what was chosen by a hair; above 0.5, so that the ids chosen are all selected."""
+
+
+class LayerSource:
+    """Answers prompts by the ids of a layer of labels, or the nodes of a tree.
+
+    Of labels, several positive points mean all their ids, and negative ones take theirs away. Of
+    a tree, they mean the smallest node that holds all positive points and no negative one, yet no
+    finer than is asked for (objects, where nothing is). A mask means the ids that it shows most
+    of, a box the id or node whose outline fits it best; points in the same prompts are added.
+
+    Args:
+        layer: Labels, or a tree.
+        gaussians: The Gaussians that it is of.
+        name: What the layer is called, for messages.
+        views: Views of the Gaussians that are prepared already; None prepares them.
+
+    Raises:
+        InputError: If the layer has no ids.
+        ShapeError: If it is of another scene.
+    """
+
+    @boundary
+    def __init__(
+        self,
+        layer: Layer,
+        gaussians: Gaussians,
+        *,
+        name: str = "layer",
+        views: ViewCache | None = None,
+    ) -> None:
+        if not isinstance(layer, Labels | InstanceTree):
+            kind = type(layer).__name__.lower()
+            raise InputError(f"layer {name!r}: expected labels or a tree, got {kind}.")
+        if len(layer) != len(gaussians):
+            raise ShapeError(
+                f"layer {name!r}: expected {len(gaussians)} rows, one a Gaussian of the scene, got "
+                f"{len(layer)}; it is of another scene."
+            )
+        self._layer = layer
+        self._name = name
+        self._labels = layer.labels if isinstance(layer, InstanceTree) else layer
+        self._choice = TreeChoice(layer, name=name) if isinstance(layer, InstanceTree) else None
+        self._rows = _RowsById(self._labels.ids.unsqueeze(1))
+        several = self._labels.candidates
+        self._candidate_rows = self._rows if several is None else _RowsById(several)
+        self._views = ViewCache(gaussians, capacity=1) if views is None else views
+
+    @boundary
+    def membership(
+        self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
+    ) -> Float[Tensor, "n"]:
+        """How likely each Gaussian belongs to what is shown, see `sources.MembershipSource`.
+
+        Raises:
+            InputError: If no positive prompt is on anything that the layer has a label for, or
+                the layer cannot tell positive prompts from negative ones.
+        """
+        shown = self._shown(prompts, positive=True)
+        hidden = self._shown(prompts, positive=False)
+        choice = self._choice
+        if choice is not None:
+            nodes = [choice.best_node(counts, granularity) for counts in self._regions(prompts)]
+            return self._of_ids(choice.ids(shown, hidden, nodes, granularity))
+        ids = set(shown)
+        for counts in self._regions(prompts):
+            ids |= set(best_ids(counts))
+        if ids and not ids - set(hidden):
+            both = sorted(ids & set(hidden))[0]
+            raise InputError(
+                f"layer {self._name!r}: expected positive and negative prompts on different ids, "
+                f"got both on {both}; a finer layer may tell them apart."
+            )
+        return self._of_ids(ids - set(hidden))
+
+    @boundary
+    def similar(self, selection: Selection) -> Float[Tensor, "n"]:
+        """How likely each Gaussian is of a thing of the same class as what is selected.
+
+        Classes are those that the layer's record or its tree gives to ids; where none has one,
+        ids of labels are taken for classes themselves.
+
+        Raises:
+            InputError: If what is selected has no label here, or a tree knows no class of it.
+            ShapeError: If the selection is of another scene.
+        """
+        if len(selection) != len(self._labels):
+            raise ShapeError(
+                f"similar: expected a selection of {len(self._labels)} Gaussians, those of the "
+                f"scene, got one of {len(selection)}; it is of another scene."
+            )
+        labels = self._layer.cut() if isinstance(self._layer, InstanceTree) else self._layer
+        ids = labels.ids[selection.mask]
+        ids = ids[ids != UNLABELLED]
+        if not len(ids):
+            raise InputError(
+                f"layer {self._name!r}: expected labels where something is selected, got none."
+            )
+        id = int(torch.mode(ids).values)
+        class_of = labels.info.class_of
+        if id in class_of:
+            alike = {other for other, its in class_of.items() if its == class_of[id]}
+        elif isinstance(self._layer, InstanceTree) or class_of:
+            raise InputError(
+                f"layer {self._name!r}: expected a class of id {id}, by which others are like it, "
+                "got none."
+            )
+        else:
+            alike = {id}
+        if self._choice is not None:
+            alike = self._choice.below(alike)
+        return self._of_ids(alike)
+
+    def _shown(self, prompts: Sequence[SeenPrompt], *, positive: bool) -> list[int]:
+        """Ids at points and under strokes of one sign, each once; -1 is not among them."""
+        found: dict[int, None] = {}
+        for one in prompts:
+            # What a mask or a box shows is decided by all of its pixels.
+            if one.dense and one.inside is not None and positive:
+                continue
+            ids = shown_ids(self._labels, one.positive_rows if positive else one.negative_rows)
+            values, counts = torch.unique(ids, return_counts=True)
+            enough = counts >= (_MIN_STROKE_SHARE * len(ids) if one.dense else 1)
+            found |= dict.fromkeys(id for id in values[enough].tolist() if id != UNLABELLED)
+        return list(found)
+
+    def _regions(self, prompts: Sequence[SeenPrompt]) -> list[RegionCounts]:
+        """How the layer lies in the masks and boxes that say by themselves where the thing is."""
+        return [
+            region_counts(self._labels, self._views, one.view, one.inside, boxed=one.guessed)
+            for one in prompts
+            if one.inside is not None and one.dense and bool(one.positive.any())
+        ]
+
+    def _of_ids(self, ids: set[int]) -> Float[Tensor, "n"]:
+        """The confidence of all that has one of the ids."""
+        labels = self._labels
+        if not ids:
+            raise InputError(
+                f"layer {self._name!r}: expected a label where the positive prompts are, got none."
+            )
+        confidence = torch.zeros(len(labels), device=labels.ids.device)
+        mask = torch.zeros(len(labels), dtype=torch.bool, device=labels.ids.device)
+        own = self._rows.of(ids)
+        mask[own] = True
+        if labels.candidates is None or labels.shares is None:
+            confidence[own] = labels.confidence[own].float().clamp(_MIN_SURE, 1)
+            return confidence
+        # What no candidate of is chosen, which is nearly everything, has confidence 0.
+        some = torch.unique(torch.cat((own, self._candidate_rows.of(ids))))
+        candidates, mask = labels.candidates[some], mask[some]
+        wanted = torch.tensor(sorted(ids), dtype=candidates.dtype, device=candidates.device)
+        chosen = torch.isin(candidates, wanted)
+        shares = labels.shares[some].float() * (candidates != UNLABELLED)
+        within = (shares * chosen).sum(dim=1)
+        beside = (shares * ~chosen).amax(dim=1)
+        share = within / (within + beside).clamp_min(1e-12)
+        confidence[some] = torch.where(mask, share.clamp(_MIN_SURE, 1), share.clamp(0, 0.5))
+        return confidence
+
+
+class _RowsById:
+    """Rows of a table of ids by id, so that those of an id are found without a look at the rest.
+
+    Args:
+        ids: One or more a row, -1 for none.
+    """
+
+    def __init__(self, ids: Int[Tensor, "n k"]) -> None:
+        ordered, order = torch.sort(ids.flatten(), stable=True)
+        self._rows = order // max(ids.shape[1], 1)
+        self._ids, counts = torch.unique_consecutive(ordered, return_counts=True)
+        self._ends = counts.cumsum(0)
+
+    def of(self, ids: set[int]) -> Int64[Tensor, "m"]:
+        """All rows that have one of the ids; one that has several comes as often."""
+        found = [self._rows[:0]]
+        for id in sorted(ids):
+            index = int(torch.searchsorted(self._ids, id))
+            if index < len(self._ids) and int(self._ids[index]) == id:
+                start = int(self._ends[index - 1]) if index else 0
+                found.append(self._rows[start : int(self._ends[index])])
+        return torch.cat(found)
+
+
+def shown_ids(labels: Labels, rows: SparseWeights) -> Int64[Tensor, "p"]:
+    """The id of each row of W: the one with the largest weight, -1 competing; ties to the lowest.
+
+    Args:
+        labels: One id a Gaussian.
+        rows: Rows of pixels.
+    """
+    rows = rows.to("cpu")
+    if not len(rows):
+        return torch.zeros(0, dtype=torch.int64)
+    ids, index = torch.unique(labels.ids.cpu()[rows.ids.long()].long(), return_inverse=True)
+    row = torch.repeat_interleave(torch.arange(len(rows)), rows.indptr.diff())
+    sums = torch.bincount(
+        row * len(ids) + index, weights=rows.weights.double(), minlength=len(rows) * len(ids)
+    )
+    if not len(ids):
+        return torch.full((len(rows),), UNLABELLED, dtype=torch.int64)
+    return ids[sums.reshape(len(rows), len(ids)).argmax(dim=1)]

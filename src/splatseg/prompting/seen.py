@@ -1,0 +1,284 @@
+r"""Prompts resolved to Gaussians: the rows of W of the pixels that a person shows.
+
+Row p of W has the blending weight :math:`w_{pi}` of every Gaussian i in the pixel. What a prompt
+means in the scene is therefore known without a threshold or a depth: by its rows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from splatseg._check import check_range, check_shape
+from splatseg.core import Gaussians, View
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.errors import InputError, RangeError
+from splatseg.prompting._contradictions import check_contradictions
+from splatseg.prompting.prompts import ViewPrompt, pixels_in_box
+from splatseg.prompting.view_cache import ViewCache
+from splatseg.render import SparseWeights
+
+_CENTRAL = 0.5
+"""Sides of the central part of a box, as a share of its own."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PromptOptions:
+    """How prompts are read."""
+
+    max_pixels: int = 1024
+    """Most pixels that a mask, a box or strokes are thinned to; 1 or more. They stay spread over
+    all of it."""
+
+    min_alpha: float = 0.02
+    """Least alpha of a pixel that shows something, in [0, 1]; what has less is sky."""
+
+    max_overlap: float = 0.9
+    """Largest share of light that a positive and a negative point may have from the same
+    Gaussians, in [0, 1]; with more they contradict each other."""
+
+    seed: int = 0
+    """Of the pixels that masks, boxes and strokes are thinned to."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        if self.max_pixels < 1:
+            raise RangeError(f"max_pixels: expected 1 or more, got {self.max_pixels}.")
+        check_range("min_alpha", self.min_alpha, 0, 1)
+        check_range("max_overlap", self.max_overlap, 0, 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenPrompt:
+    """What a prompt shows in its view: pixels, and the Gaussians seen in them."""
+
+    view: View
+
+    rows: SparseWeights
+    """Rows (p, n) of W, one a pixel: the Gaussians that it shows, with their blending weights."""
+
+    pixels: Int64[Tensor, "p 2"]
+    """Column and row of each."""
+
+    positive: Bool[Tensor, "p"]
+    """Whether each pixel shows the thing, or something else.
+
+    Points and strokes say it of their own pixels, a mask of those inside; nothing is said of what
+    is outside. A box says only that the thing lies `inside`: where it comes alone, the positive
+    pixels are those of its central part, half as wide and half as high, which is a guess that a
+    source may overrule.
+    """
+
+    dense: bool
+    """True for the pixels of masks, strokes or boxes, of which some may be beside the thing;
+    False for points, each of which was meant."""
+
+    inside: Bool[Tensor, "height width"] | None = None
+    """The box or mask that the thing lies inside in this view, all its pixels."""
+
+    guessed: bool = False
+    """Whether the positive pixels are those in the middle of a box, and nobody showed them."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        count = len(self.rows)
+        check_shape("pixels", self.pixels, (count, 2))
+        check_shape("positive", self.positive, (count,))
+        if self.inside is not None:
+            check_shape("inside", self.inside, (self.view.camera.height, self.view.camera.width))
+
+    def __len__(self) -> int:
+        """Pixels."""
+        return len(self.rows)
+
+    @property
+    def positive_rows(self) -> SparseWeights:
+        """Rows of the pixels that show the thing."""
+        return self.rows.select(torch.nonzero(self.positive).squeeze(1))
+
+    @property
+    def negative_rows(self) -> SparseWeights:
+        """Rows of the pixels that show something else."""
+        return self.rows.select(torch.nonzero(~self.positive).squeeze(1))
+
+
+@boundary
+def see_prompts(
+    gaussians: Gaussians,
+    prompts: Sequence[ViewPrompt],
+    *,
+    options: PromptOptions | None = None,
+    views: ViewCache | None = None,
+    backend: str = "auto",
+) -> tuple[SeenPrompt, ...]:
+    """The Gaussians that prompts show.
+
+    Points keep one row each. Masks and strokes are thinned to `PromptOptions.max_pixels` pixels,
+    one at random in each cell of a grid, and pixels that show nothing are left out; the same seed
+    gives the same pixels.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        prompts: What is shown, in any views; several may be of one view.
+        options: How they are read.
+        views: Views of the same Gaussians that were prepared before; None prepares them.
+        backend: Who renders, where `views` is None.
+
+    Returns:
+        One a prompt and kind of pixels: points first, then strokes and masks.
+
+    Raises:
+        InputError: If a point shows the sky, a mask nothing else, nothing is shown of the thing
+            itself, or positive and negative prompts show the same Gaussians.
+    """
+    options = options or PromptOptions()
+    if not prompts:
+        raise InputError("prompts: expected at least one, got none.")
+    cache = ViewCache(gaussians, backend=backend, capacity=1) if views is None else views
+    try:
+        seen = tuple(one for prompt in prompts for one in _seen(cache, prompt, options))
+    finally:
+        if views is None:
+            cache.close()
+    if not any(bool(one.positive.any()) for one in seen):
+        raise InputError("prompts: expected a positive point, a box, a mask or strokes, got none.")
+    check_contradictions(seen, options.max_overlap)
+    return seen
+
+
+def _seen(cache: ViewCache, prompt: ViewPrompt, options: PromptOptions) -> list[SeenPrompt]:
+    """The points of a prompt, and what else it shows."""
+    inside = _inside(prompt)
+    found: list[SeenPrompt] = []
+    if len(prompt.points):
+        found.append(_seen_points(cache, prompt, inside, options))
+    shown = _shown(prompt)
+    if shown:
+        found.append(_seen_region(cache, prompt, inside, shown, options))
+    return found
+
+
+def _inside(prompt: ViewPrompt) -> Tensor | None:
+    """Where the box and the mask allow the thing to be."""
+    inside = prompt.mask
+    if prompt.box is not None:
+        camera = prompt.view.camera
+        within = pixels_in_box(prompt.box, camera.height, camera.width)
+        inside = within if inside is None else within & inside
+        if not bool(inside.any()):
+            raise InputError(
+                f"prompt: expected a mask and a box that meet in view {prompt.view.name}, "
+                "got two apart."
+            )
+    return inside
+
+
+def _shown(prompt: ViewPrompt) -> list[tuple[str, Tensor, bool]]:
+    """Regions of pixels by name, and whether they show the thing."""
+    shown: list[tuple[str, Tensor, bool]] = []
+    if prompt.mask is not None:
+        shown.append(("mask", prompt.mask, True))
+    if prompt.scribble is not None:
+        shown.append(("scribble", prompt.scribble, True))
+    if prompt.negative_scribble is not None:
+        shown.append(("negative_scribble", prompt.negative_scribble, False))
+    told = any(positive for _, _, positive in shown) or bool(prompt.signs.any())
+    if prompt.box is not None and not told:
+        shown.append(("box", _central(prompt.box, prompt.view), True))
+    return shown
+
+
+def _central(box: Float[Tensor, "4"], view: View) -> Tensor:
+    """Pixels of the central part of a box; all of it where that has none."""
+    height, width = view.camera.height, view.camera.width
+    within = pixels_in_box(box, height, width)
+    rows, columns = within.any(dim=1).nonzero(), within.any(dim=0).nonzero()
+    low = torch.tensor([float(columns.min()), float(rows.min())])
+    high = torch.tensor([float(columns.max()) + 1, float(rows.max()) + 1])
+    margin = (1 - _CENTRAL) / 2 * (high - low)
+    central = pixels_in_box(torch.cat((low + margin, high - margin)), height, width)
+    return central if bool(central.any()) else within
+
+
+def _seen_points(
+    cache: ViewCache, prompt: ViewPrompt, inside: Tensor | None, options: PromptOptions
+) -> SeenPrompt:
+    pixels = prompt.points.floor().long()
+    rows = cache.prepared(prompt.view).weights(pixels)
+    dark = rows.row_sums() < options.min_alpha
+    if bool(dark.any()):
+        x, y = prompt.points[dark.to(prompt.points.device)][0].tolist()
+        raise InputError(
+            f"points: expected one on something, got ({x:g}, {y:g}) in view {prompt.view.name}, "
+            "where no Gaussian stops the light (the sky)."
+        )
+    return SeenPrompt(
+        view=prompt.view,
+        rows=rows,
+        pixels=pixels,
+        positive=prompt.signs,
+        dense=False,
+        inside=inside,
+    )
+
+
+def _seen_region(
+    cache: ViewCache,
+    prompt: ViewPrompt,
+    inside: Tensor | None,
+    shown: list[tuple[str, Tensor, bool]],
+    options: PromptOptions,
+) -> SeenPrompt:
+    prepared = cache.prepared(prompt.view)
+    generator = torch.Generator().manual_seed(options.seed)
+    parts: list[tuple[SparseWeights, Tensor, bool]] = []
+    for name, region, positive in shown:
+        pixels = thinned(region, options.max_pixels, generator)
+        rows = prepared.weights(pixels)
+        lit = torch.nonzero(rows.row_sums() >= options.min_alpha).squeeze(1)
+        if not len(lit):
+            raise InputError(
+                f"{name}: expected pixels on something in view {prompt.view.name}, got none where "
+                "a Gaussian stops the light (the sky)."
+            )
+        parts.append((rows.select(lit), pixels[lit.to(pixels.device)], positive))
+    return SeenPrompt(
+        view=prompt.view,
+        rows=SparseWeights.concatenate([rows for rows, _, _ in parts]),
+        pixels=torch.cat([pixels for _, pixels, _ in parts]),
+        positive=torch.cat([torch.full((len(pixels),), on) for _, pixels, on in parts]),
+        dense=True,
+        inside=inside,
+        guessed=any(name == "box" for name, _, _ in shown),
+    )
+
+
+def thinned(
+    region: Bool[Tensor, "height width"], count: int, generator: torch.Generator
+) -> Int64[Tensor, "p 2"]:
+    """At most `count` pixels of a region, spread over it: column and row, row by row.
+
+    One at random is taken in every cell of the finest square grid that has few enough cells with
+    pixels of the region.
+    """
+    rows, columns = torch.nonzero(region, as_tuple=True)
+    if len(rows) > count:
+        order = torch.argsort(torch.rand(len(rows), generator=generator), stable=True)
+        side = max(1, int((len(rows) / count) ** 0.5))
+        kept = order
+        while len(kept) > count:
+            kept = _first_of_each((rows // side) * region.shape[1] + columns // side, order)
+            side += 1
+        rows, columns = rows[kept], columns[kept]
+    return torch.stack((columns, rows), dim=1)
+
+
+def _first_of_each(cells: Int64[Tensor, "p"], order: Int64[Tensor, "p"]) -> Int64[Tensor, "q"]:
+    """The index that comes first in an order in each cell, ascending."""
+    by_cell = order[torch.argsort(cells[order], stable=True)]
+    sorted_cells = cells[by_cell]
+    first = torch.ones(len(cells), dtype=torch.bool)
+    first[1:] = sorted_cells[1:] != sorted_cells[:-1]
+    return by_cell[first].sort().values

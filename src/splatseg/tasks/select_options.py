@@ -1,0 +1,85 @@
+"""What a selection is made from, and what follows."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from splatseg.core import tree_level
+from splatseg.core.boundary import convert_fields
+from splatseg.errors import InputError
+from splatseg.prompting.pipeline import StepName
+
+SelectMode = Literal["new", "add", "subtract", "intersect"]
+
+_LEVELS = {"group": 0.0, "object": 0.5, "part": 1.0}
+_STEPS: tuple[StepName, ...] = ("filter", "grow", "refine", "fill_holes", "hidden")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SelectOptions:
+    """What a selection is made from, and what follows."""
+
+    source: str = "auto"
+    """What says which Gaussians belong together: features, masks or layer. auto takes the first
+    of these that the scene has."""
+
+    from_layer: str | None = None
+    """Name of the layer of features, labels or a tree that the source takes. Without it, the one
+    of its kind that fits best: a tree before labels of instances before other labels."""
+
+    evidence: str | None = None
+    """Name of the masks that the source takes, where there are several."""
+
+    granularity: str | float = "auto"
+    """How much a click means: group, object, part, or a number from 0 (groups) by 0.5 (objects)
+    to 1 (the finest parts). auto lets the source choose."""
+
+    mode: SelectMode = "new"
+    """What becomes of a selection that was there before: it is replaced, added to, subtracted
+    from, or intersected with."""
+
+    filter: bool = True
+    """Leave out specks and outliers."""
+
+    grow: bool = True
+    """Add what is near enough to what is surely selected."""
+
+    refine: bool = True
+    """Decide the border anew between what the prompts say is in and out."""
+
+    fill_holes: bool = True
+    """Close gaps inside."""
+
+    hidden: bool = True
+    """Add what no view shows, where it is inside."""
+
+    max_pixels: int = 1024
+    """Most pixels that a mask, a box or strokes are thinned to."""
+
+    seed: int = 0
+    """Seed of random choices, recorded in the layer."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+
+    @property
+    def level(self) -> float | None:
+        """The granularity as a number, None for the source's choice.
+
+        Raises:
+            InputError: If it is neither a level nor a number from 0 to 1.
+        """
+        if self.granularity == "auto":
+            return None
+        try:
+            level = tree_level(str(self.granularity))
+        except InputError:
+            raise InputError(
+                "granularity: expected auto, group, object, part or a number from 0 to 1, "
+                f"got {self.granularity!r}."
+            ) from None
+        return _LEVELS[level] if isinstance(level, str) else level
+
+    @property
+    def steps(self) -> tuple[StepName, ...]:
+        """Steps that follow the source."""
+        return tuple(name for name in _STEPS if getattr(self, name))

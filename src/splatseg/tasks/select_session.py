@@ -1,0 +1,316 @@
+"""A session of selecting: what is kept from one selection to the next, and how one is made."""
+
+import importlib.metadata
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import JSON, Layer, LayerInfo, Scene, Selection
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, ShapeError
+from splatseg.prompting.pipeline import (
+    NextClickHint,
+    SelectionContext,
+    checked_membership,
+    next_click,
+    postprocess,
+)
+from splatseg.prompting.prompts import (
+    AxisBox,
+    Ball,
+    Lasso,
+    SelectionPrompt,
+    Similar,
+    Solid,
+    ViewPrompt,
+)
+from splatseg.prompting.seen import PromptOptions, SeenPrompt, see_prompts
+from splatseg.prompting.sources import MembershipSource, SimilaritySource
+from splatseg.prompting.view_cache import ViewCache
+from splatseg.render import BackendName
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._select_record import prompt_record
+from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
+from splatseg.tasks.select_options import SelectOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Selected:
+    """A selection, and how it came to be."""
+
+    selection: Selection
+    """With the confidence of each Gaussian, and a record of the prompts."""
+
+    seconds: Mapping[str, float]
+    """By stage: open (the source), see (the prompts), the source's name, and each step."""
+
+    source: str
+    """What said which Gaussians belong together; empty where places alone did."""
+
+    next_click: NextClickHint | None = None
+    """Where one more click would help most; None where nobody asked, or nothing is uncertain."""
+
+    warnings: tuple[str, ...] = ()
+    """What should be known of it, in sentences."""
+
+
+class SelectionSession:
+    """Selects again and again in one scene; a context that releases what it holds.
+
+    It holds the source and the views that were clicked in, and nothing of one selection is left
+    for the next: each is made of its prompts alone. `open_selector` makes it.
+
+    Args:
+        scene: The scene; it must stay as it is.
+        options: What holds for selections that say nothing else.
+        source: Says which Gaussians belong together; None opens what `options` ask for, when the
+            first prompt needs it.
+        layers: Layers at hand; others are read from the scene's folder.
+        backend: Who renders.
+        observer: Is told of what is opened.
+    """
+
+    @boundary
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        options: SelectOptions | None = None,
+        source: MembershipSource | None = None,
+        layers: Mapping[str, Layer] | None = None,
+        backend: BackendName = "auto",
+        observer: Observer = SILENT,
+    ) -> None:
+        self._scene = scene
+        self._options = options or SelectOptions()
+        self._options.level  # noqa: B018  (an error before anything is opened)
+        self._layers = layers
+        self._observer = observer
+        self._views = ViewCache(scene.gaussians, backend=backend)
+        self._opened = (
+            None if source is None else OpenedSource(source=source, name=type(source).__name__)
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the views that it holds."""
+        self._views.close()
+
+    @property
+    def source(self) -> MembershipSource:
+        """What says which Gaussians belong together.
+
+        Raises:
+            InputError: If the scene has nothing to select by.
+        """
+        return self._open().source
+
+    @boundary
+    def select(
+        self,
+        prompts: SelectionPrompt | Sequence[SelectionPrompt],
+        *,
+        base: Selection | None = None,
+        options: SelectOptions | None = None,
+        advise: bool = True,
+    ) -> Selected:
+        """See `splatseg.tasks.select`.
+
+        Args:
+            prompts: What to select by.
+            base: A selection that this one adds to, is subtracted from or intersected with.
+            options: Instead of the session's; they may not ask for another source.
+            advise: Whether to look for where the next click would help most.
+
+        Raises:
+            InputError: If the options ask for another source than the session has.
+        """
+        options = options or self._options
+        self._check_source(options)
+        given = _as_prompts(prompts)
+        _check_base(self._scene, base, options)
+        seconds: dict[str, float] = {}
+        shown = [prompt for prompt in given if isinstance(prompt, ViewPrompt)]
+        similar = [prompt for prompt in given if isinstance(prompt, Similar)]
+        solids = [prompt for prompt in given if isinstance(prompt, AxisBox | Ball | Lasso)]
+        if shown or similar:
+            began = time.perf_counter()
+            self._open()
+            seconds["open"] = time.perf_counter() - began
+        context = self._seen(shown, options, seconds)
+        confidence = self._membership(context, similar, seconds)
+        if shown or similar:
+            confidence, steps = postprocess(confidence, context, enabled=options.steps)
+            seconds |= steps
+        confidence = _within(confidence, solids, context)
+        selection = self._described(confidence, given, base, options)
+        hint = None
+        if advise and shown and selection.confidence is not None:
+            began = time.perf_counter()
+            hint = next_click(selection.confidence, context)
+            seconds["next_click"] = time.perf_counter() - began
+        return Selected(
+            selection=selection,
+            seconds=seconds,
+            source=context.source,
+            next_click=hint,
+            warnings=() if selection.count else ("Nothing is selected.",),
+        )
+
+    def _open(self) -> OpenedSource:
+        if self._opened is None:
+            self._opened = open_source(
+                Offer(
+                    scene=self._scene,
+                    options=self._options,
+                    views=self._views,
+                    layers=self._layers,
+                    observer=self._observer,
+                )
+            )
+        return self._opened
+
+    def _check_source(self, options: SelectOptions) -> None:
+        for name in ("source", "from_layer", "evidence"):
+            ours, theirs = getattr(self._options, name), getattr(options, name)
+            if ours != theirs:
+                raise InputError(
+                    f"{name}: expected {ours!r} as the session was opened with, got {theirs!r}; "
+                    "open another session."
+                )
+
+    def _seen(
+        self, shown: Sequence[ViewPrompt], options: SelectOptions, seconds: dict[str, float]
+    ) -> SelectionContext:
+        """What prompts in views show."""
+        seen: tuple[SeenPrompt, ...] = ()
+        if shown:
+            began = time.perf_counter()
+            how = PromptOptions(max_pixels=options.max_pixels, seed=options.seed)
+            seen = see_prompts(self._scene.gaussians, shown, options=how, views=self._views)
+            seconds["see"] = time.perf_counter() - began
+        return SelectionContext(
+            gaussians=self._scene.gaussians,
+            prompts=seen,
+            views=self._views,
+            scene_views=self._scene.train_views,
+            source="" if self._opened is None else self._opened.name,
+            granularity=options.level,
+            seed=options.seed,
+        )
+
+    def _membership(
+        self, context: SelectionContext, similar: Sequence[Similar], seconds: dict[str, float]
+    ) -> Float[Tensor, "n"]:
+        """What the source says; everything where only places are given."""
+        gaussians = context.gaussians
+        confidence = torch.ones(len(gaussians), device=gaussians.device)
+        if not (context.prompts or similar):
+            return confidence
+        began = time.perf_counter()
+        source, name = self.source, context.source
+        found: list[Tensor] = []
+        if context.prompts:
+            found.append(source.membership(context.prompts, granularity=context.granularity))
+        if similar and not isinstance(source, SimilaritySource):
+            raise InputError(
+                f"similar: expected a source that knows which things are alike, {name} does not; "
+                "a layer with classes does."
+            )
+        if isinstance(source, SimilaritySource):
+            found += [source.similar(prompt.selection) for prompt in similar]
+        checked = [checked_membership(one, gaussians, source=name) for one in found]
+        # What is shown and what is like another are one set together.
+        confidence = torch.stack(checked).amax(dim=0)
+        seconds[name] = time.perf_counter() - began
+        return confidence
+
+    def _described(
+        self,
+        confidence: Tensor,
+        prompts: Sequence[SelectionPrompt],
+        base: Selection | None,
+        options: SelectOptions,
+    ) -> Selection:
+        """The selection with what it adds to, and the record of both."""
+        selection = Selection.of_confidence(confidence)
+        if base is not None:
+            match options.mode:
+                case "add":
+                    selection = base | selection
+                case "subtract":
+                    selection = base - selection
+                case "intersect":
+                    selection = base & selection
+                case "new":
+                    pass
+        opened = self._opened
+        details: dict[str, JSON] = {"prompts": [prompt_record(prompt) for prompt in prompts]}
+        if base is not None:
+            details["mode"] = options.mode
+            details["base"] = base.info.details.get("prompts", [])
+        views = dict.fromkeys(p.view.name for p in prompts if isinstance(p, ViewPrompt | Lasso))
+        info = LayerInfo(
+            method="select",
+            options={
+                "source": "" if opened is None else opened.name,
+                "layer": None if opened is None else opened.layer,
+                "granularity": options.level,
+                "steps": list(options.steps),
+            },
+            evidence=None if opened is None else opened.evidence,
+            views=tuple(views),
+            seed=options.seed,
+            versions={
+                "splatseg": importlib.metadata.version("splatseg"),
+                "torch": str(torch.__version__),
+            },
+            details=details,
+        )
+        return replace(selection, info=info)
+
+
+def _as_prompts(
+    prompts: SelectionPrompt | Sequence[SelectionPrompt],
+) -> tuple[SelectionPrompt, ...]:
+    given = (
+        (prompts,)
+        if isinstance(prompts, ViewPrompt | AxisBox | Ball | Lasso | Similar)
+        else tuple(prompts)
+    )
+    if not given:
+        raise InputError("prompts: expected at least one, got none.")
+    return given
+
+
+def _check_base(scene: Scene, base: Selection | None, options: SelectOptions) -> None:
+    if (base is None) != (options.mode == "new"):
+        raise InputError(
+            "base: expected a selection with mode add, subtract or intersect and none with new, "
+            f"got {'none' if base is None else 'one'} with {options.mode}."
+        )
+    if base is not None and len(base) != len(scene.gaussians):
+        raise ShapeError(
+            f"base: expected a selection of {len(scene.gaussians)} Gaussians, those of the scene, "
+            f"got one of {len(base)}; it is of another scene."
+        )
+
+
+def _within(
+    confidence: Tensor, solids: Sequence[Solid], context: SelectionContext
+) -> Float[Tensor, "n"]:
+    """Confidences inside all places, 0 outside."""
+    for solid in solids:
+        inside = solid.contains(context.gaussians).to(confidence.device)
+        confidence = torch.where(inside, confidence, 0.0)
+    return confidence
