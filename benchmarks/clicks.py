@@ -4,11 +4,11 @@
         [--evidence masks_sam] [--rows click clicks3 mask ...] [--seed 0] [--work DIR] [--json FILE]
 
 For every thing instance that at least three test views show, one train view is drawn by the seed
-among those in which it covers at least 400 pixels (or the one that shows most of it), and clicked at
-the pixel of its largest region there that is farthest from the rim; nothing is tuned by eye. What
-is selected is rendered into the test views, as `splatseg render --what SELECTION` does it, and scored
-as `score.py binary` does it: IoU is the mean over views, of which those in which neither is anything
-count 1; pooled sums intersections and unions over the views first. Rows:
+among those in which it covers at least 400 pixels (or the one that shows most of it), and clicked
+at the pixel of its largest region there that is farthest from the rim; nothing is tuned by eye.
+What is selected is rendered into the test views, as `splatseg render --what SELECTION` does it, and
+scored as `score.py binary` does it: IoU is the mean over views, of which those in which neither is
+anything count 1; pooled sums intersections and unions over the views first. Rows:
 
 - `click`: one click, object granularity; `auto`: granularity left at its default.
 - `noisy`: one click up to 5 pixels from the rim; `scribble`: a stroke; `box`: its bounding box.
@@ -18,8 +18,8 @@ count 1; pooled sums intersections and unions over the views first. Rows:
 - `single`: the true mask of that view projected alone (SAGA's Table 2): each Gaussian of which the
   view shows most inside the mask.
 - `part`: clicks on parts, against the parts that recorded masks can tell.
-- `robot`: clicks at the middle of the largest error in ten train views: number of clicks to an IoU of
-  0.85 and 0.90 (NoC), at most ten.
+- `robot`: clicks at the middle of the largest error in ten train views: number of clicks to an IoU
+  of 0.85 and 0.90 (NoC), at most ten.
 
 `--check N` has the first N objects of each row scored by ../shared/score/score.py too.
 """
@@ -166,7 +166,7 @@ def _fields(options: SelectOptions) -> dict[str, Any]:
 
 
 def _steps(args: argparse.Namespace) -> dict[str, bool]:
-    return {name: False for name in args.without}
+    return dict.fromkeys(args.without, False)
 
 
 def _point(view: View, point: Sequence[float], *, positive: bool = True) -> ViewPrompt:

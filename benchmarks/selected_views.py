@@ -56,7 +56,7 @@ class TestViews:
         ]
 
     def masks(self, selections: Sequence[Selection]) -> list[NDArray[np.bool_]]:
-        """(height, width, selections) of each view: where more than half of the light is selected."""
+        """(height, width, selections) of each view: where most of the light is selected."""
         columns = [
             one.mask.float() if one.confidence is None else one.confidence.float()
             for one in selections

@@ -251,6 +251,26 @@ def adam_rows(
     epsilon: float,
 ) -> None: ...
 
+class Memberships:
+    def __init__(
+        self,
+        row_begin: NDArray[Any],
+        row_ids: NDArray[Any],
+        row_weights: NDArray[Any],
+        column_begin: NDArray[Any],
+        column_ids: NDArray[Any],
+        column_weights: NDArray[Any],
+        candidate_begin: NDArray[Any],
+        candidates: NDArray[Any],
+        shown_begin: NDArray[Any],
+        shown: NDArray[Any],
+        /,
+    ) -> None: ...
+    def shown_values(self, values: NDArray[Any], out: Array, /) -> None: ...
+    def step(
+        self, label: NDArray[Any], step: Array, residuals: Array, values: Array, /
+    ) -> None: ...
+
 class NeighbourIndex:
     nbytes: int
     def __init__(self, points: Tensor, /) -> None: ...

@@ -13,6 +13,7 @@ from splatseg.core.evidence import UNLABELLED
 from splatseg.core.late import preview
 from splatseg.core.layer_info import InstanceFacts, LayerInfo
 from splatseg.core.layers import Features, Labels, Selection
+from splatseg.core.soft_labels import merged_candidates
 from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
 from splatseg.core.tree_levels import TreeLevel as TreeLevel
 from splatseg.errors import InputError, RangeError
@@ -199,14 +200,17 @@ class InstanceTree:
 
         labels = self.labels
         ids = relabelled(labels.ids)
+        candidates, shares = None, None
+        if labels.candidates is not None and labels.shares is not None:
+            candidates, shares = merged_candidates(relabelled(labels.candidates), labels.shares)
         background = int(relabelled(torch.tensor([labels.background]))[0])
         return replace(
             labels,
             ids=ids,
             confidence=torch.where(ids == UNLABELLED, 0.0, labels.confidence),
             background=background,
-            candidates=None,
-            shares=None,
+            candidates=candidates,
+            shares=shares,
             info=self._cut_info(level, set(wanted.values())),
         )
 

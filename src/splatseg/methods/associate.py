@@ -26,6 +26,7 @@ first, and a group that mostly covers what is taken already is left out.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -46,15 +47,22 @@ from splatseg.core import (
 )
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
+from splatseg.lift.memberships import DEFAULT_MEMBERSHIPS, MembershipOptions
 from splatseg.lift.segments.ballots import by_mass, majority, view_counts
 from splatseg.lift.segments.clustering import Agreement, cluster
 from splatseg.lift.segments.flatten import chosen_groups
 from splatseg.lift.segments.nesting import nesting
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.lift.segments.separate import separated_levels
+from splatseg.lift.segments.soft_tree import soft_votes
 from splatseg.lift.segments.table import SegmentTable, segment_table
 from splatseg.lift.segments.tree import segment_tree
-from splatseg.lift.segments.tree_labels import category_of, instance_tree, tree_votes
+from splatseg.lift.segments.tree_labels import (
+    TreeVotes,
+    category_of,
+    instance_tree,
+    tree_votes,
+)
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import RenderOptions
 
@@ -128,6 +136,7 @@ def associate(
     *,
     options: AssociateOptions | None = None,
     confusion: ConfusionOptions | None = DEFAULT_CONFUSION,
+    memberships: MembershipOptions | None = DEFAULT_MEMBERSHIPS,
     classes: ClassTable | None = None,
     render_options: RenderOptions | None = None,
     backend: str = "auto",
@@ -144,6 +153,8 @@ def associate(
         source: Their segments.
         options: How segments become instances.
         confusion: How segments err, see `correct_confusion`. None takes the majority of the votes.
+        memberships: Of a tree, how votes are sharpened (`lift.segments.soft_tree`): the layer says
+            how much of each Gaussian belongs to which node. None leaves them as they are.
         classes: Names of the categories of segments; instances are named after theirs.
         render_options: Switches of the blending model.
         backend: Name of the rendering backend.
@@ -172,7 +183,22 @@ def associate(
     )
     agreement = table.agreement()
     if source.overlapping and options.overlapping == "tree":
-        tree = _tree(table, agreement, options, confusion, classes)
+        sharpened = None
+        if memberships is not None:
+            sharpened = partial(
+                soft_votes,
+                gaussians,
+                sorted(views, key=lambda view: view.name),
+                source,
+                table,
+                options=memberships,
+                longest_side=options.longest_side,
+                render_options=render_options,
+                backend=backend,
+            )
+        tree = _tree(
+            table, agreement, options, confusion=confusion, classes=classes, sharpened=sharpened
+        )
         return tree if options.level == "tree" else tree.cut(tree_level(options.level))
     group = cluster(agreement, options.agreement)
     group = _seen_often(table, group, min(options.min_views, len(table.views)))
@@ -207,8 +233,10 @@ def _tree(
     table: SegmentTable,
     agreement: Agreement,
     options: AssociateOptions,
+    *,
     confusion: ConfusionOptions | None,
     classes: ClassTable | None,
+    sharpened: Callable[[TreeVotes], TreeVotes] | None,
 ) -> InstanceTree:
     """Groups, objects and parts of segments that lie inside each other."""
     nested = nesting(agreement, table.level)
@@ -231,6 +259,8 @@ def _tree(
     votes = tree_votes(
         table, found, level, _say(table, found.node, options.small_things), confusion=confusion
     )
+    if sharpened is not None:
+        votes = sharpened(votes)
     tree = instance_tree(table, found, level, votes, classes)
     account = _account(table, found.node, tracked=False) | {"instances": len(votes.object_rows)}
     info = replace(
@@ -322,6 +352,13 @@ class AssociateMethodOptions:
     confusion: ConfusionOptions = field(default_factory=ConfusionOptions)
     """How the evidence errs."""
 
+    sharpen_votes: bool = True
+    """Of masks that may overlap: solve for how much of each Gaussian belongs to which object, so
+    that pixels at borders come out as labelled. Costs about as much as the association."""
+
+    memberships: MembershipOptions = field(default_factory=MembershipOptions)
+    """How votes are sharpened."""
+
 
 def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels | InstanceTree:
     """Join segments of views, see `associate`."""
@@ -331,6 +368,7 @@ def run(inputs: MethodInputs, options: AssociateMethodOptions) -> Labels | Insta
         EvidenceSegments(evidence=inputs.evidence),
         options=options.association,
         confusion=options.confusion if options.correct_confusion else None,
+        memberships=options.memberships if options.sharpen_votes else None,
         classes=inputs.categories,
         backend=inputs.backend,
         progress=inputs.progress,

@@ -23,7 +23,7 @@ _SHOWN = 0.3
 class MembershipOptions:
     """How memberships are solved for."""
 
-    pixels: int = 6000
+    pixels: int = 12_000
     """Pixels of each view."""
 
     border_share: float = 0.67
@@ -32,14 +32,15 @@ class MembershipOptions:
     min_weight: float = 0.01
     """Blending weight in [0, 1] below which a Gaussian is left out of a pixel."""
 
-    min_share: float = 0.03
+    min_votes: float = 0.03
     """Least share of a Gaussian's votes, in [0, 1], that makes an id possible for it."""
 
-    rounds: int = 3
+    rounds: int = 1
     """How often views are held against what all of them say."""
 
-    steps: int = 5
-    """Steps of the solver after each time."""
+    solver_steps: int = 4
+    """Steps of the solver after each time. Few are better where labels err near borders: the
+    more, the nearer the solution comes to their errors."""
 
     min_agreement: float = 0.5
     """Intersection over union, in [0, 1], of an id in a view with what all views say of it there;
@@ -47,11 +48,14 @@ class MembershipOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        for name in ("pixels", "rounds", "steps"):
+        for name in ("pixels", "rounds", "solver_steps"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        for name in ("border_share", "min_weight", "min_share", "min_agreement"):
+        for name in ("border_share", "min_weight", "min_votes", "min_agreement"):
             check_range(name, getattr(self, name), 0.0, 1.0)
+
+
+DEFAULT_MEMBERSHIPS = MembershipOptions()
 
 
 def fit_memberships(
@@ -103,7 +107,7 @@ def fit_memberships(
     view_of = np.repeat(np.arange(len(views)), [len(pixels) for _, pixels in drawn])
     for _ in range(options.rounds):
         kept = _agreeing(problem, view_of, start.shape[1], options.min_agreement)
-        problem.run(kept, options.steps)
+        problem.run(kept, options.solver_steps)
     return problem.memberships()
 
 

@@ -90,7 +90,7 @@ class MembershipProblem:
         return best, value
 
     def memberships(self) -> Any:
-        """scipy rows (Gaussians, ids): the values as they are now."""
+        """Scipy rows (Gaussians, ids): the values as they are now."""
         return scipy.sparse.csr_matrix(
             (self.values.copy(), self._start.indices, self._start.indptr), shape=self._start.shape
         )

@@ -6,6 +6,7 @@ inside their parents whatever the single masks did.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,6 +40,17 @@ class TreeVotes:
 
     object_rows: NDArray[np.int64]
     """Rows of the nodes that are objects and have a vote, in the order of their ids."""
+
+    object_of_segment: NDArray[np.int64]
+    """(segments,): place in `object_rows` of the object that each segment is or lies in, -1 for
+    none."""
+
+    own: Any
+    """Sparse (Gaussians, objects): votes of each Gaussian for each object."""
+
+    soft: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
+    """Rows of nodes (Gaussians, k), -1 where there are fewer, and each Gaussian's membership in
+    them; no two of a Gaussian are inside each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -116,7 +128,13 @@ def tree_votes(
     ids = labels.ids.numpy()
     node = np.where(ids == UNLABELLED, -1, np.append(rows, -1)[ids - 1])
     node = _parts(ballot, node, object_of, top_part[tree.node])
-    return TreeVotes(objects=labels, node=_deeper(ballot, node), object_rows=rows)
+    return TreeVotes(
+        objects=labels,
+        node=_deeper(ballot, node),
+        object_rows=rows,
+        object_of_segment=rank[group],
+        own=table.votes(rank[group], weight),
+    )
 
 
 def _compact(row: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -228,6 +246,8 @@ def instance_tree(
     Objects have the ids from 1 on, then come groups, then parts, each the largest first.
     """
     used = set(votes.node[votes.node >= 0].tolist())
+    if votes.soft is not None:
+        used |= set(np.unique(votes.soft[0][votes.soft[0] >= 0]).tolist())
     for row in reversed(tree.top_down()):
         if row in used and tree.parent[row] >= 0:
             used.add(int(tree.parent[row]))
@@ -243,8 +263,8 @@ def instance_tree(
     labels = replace(
         votes.objects,
         ids=torch.from_numpy(ids[votes.node].astype(np.int32)),
-        candidates=None,
-        shares=None,
+        candidates=None if votes.soft is None else torch.from_numpy(ids[votes.soft[0]]),
+        shares=None if votes.soft is None else torch.from_numpy(votes.soft[1]),
     )
     return InstanceTree(nodes=nodes, labels=labels)
 
