@@ -23,6 +23,7 @@ void register_adam(nb::module_& m);
 void register_product(nb::module_& m);
 void register_csr(nb::module_& m);
 void register_neighbours(nb::module_& m);
+void register_retrieve(nb::module_& m);
 }  // namespace splatseg
 
 namespace splatseg {
@@ -395,4 +396,5 @@ NB_MODULE(_native, m) {
   register_product(m);
   register_csr(m);
   register_neighbours(m);
+  register_retrieve(m);
 }
