@@ -18,8 +18,11 @@ namespace {
 
 constexpr int kInterpolated = 6;  // steps of a search by interpolation, before it is by halving
 constexpr int kHalved = 24;       // steps by halving values, before it is by halving their bits
-// Where more could be neighbours of a leaf than this many times those wanted, each member of the
-// leaf looks for its own.
+// Members that the first bounds are taken from, for each one wanted: more cost time, and give
+// bounds that are nearer to the truth.
+constexpr int64_t kAround = 4;
+// Where more than these could be neighbours of a leaf's members (kMany for each one wanted), each
+// of them looks for its own.
 constexpr int64_t kMany = 64, kManyMore = 2048;
 
 // Numbers of the lanes of each set of eight, in order.
@@ -82,11 +85,11 @@ int64_t count_up_to(const float* values, int64_t count, float bound) {
   return found;
 }
 
-// Where the first k of the values end: exactly `below` < k of them are at most `low`, `upto` >= k
-// at most `high`. If upto > k, the rest of the first k are equal to `high`.
+// Where the first k of the values end: fewer than k are at most `low` (unless that is 0), and
+// `upto` >= k at most `high`. If upto > k + slack, no float is between the two.
 struct Cut {
   float low, high;
-  int64_t below, upto;
+  int64_t upto;
 };
 
 inline float halfway_bits(float low, float high) {
@@ -101,13 +104,13 @@ inline float halfway_bits(float low, float high) {
 // Ends the search when at most `slack` more than k are at most `high`. Values are at least 0, all
 // at most `high`, k <= count, and infinities pad them to whole vectors.
 Cut cut_at(const float* values, int64_t count, int64_t k, float high, int64_t slack) {
-  Cut cut{0.0f, high, count_up_to(values, count, 0.0f), count};
-  if (cut.below >= k) return {0.0f, 0.0f, 0, cut.below};
+  Cut cut{0.0f, high, count};
+  int64_t below = 0;
   for (int step = 0; cut.upto > k + slack; ++step) {
     float middle = 0.5f * cut.low + 0.5f * cut.high;
     if (step < kInterpolated) {
-      const float share = (static_cast<float>(k - cut.below) + 0.5f * static_cast<float>(slack)) /
-                          static_cast<float>(cut.upto - cut.below);
+      const float share = (static_cast<float>(k - below) + 0.5f * static_cast<float>(slack)) /
+                          static_cast<float>(cut.upto - below);
       middle = cut.low + (cut.high - cut.low) * std::min(share, 0.97f);
     } else if (step > kHalved) {
       middle = halfway_bits(cut.low, cut.high);
@@ -120,7 +123,7 @@ Cut cut_at(const float* values, int64_t count, int64_t k, float high, int64_t sl
       cut.upto = found;
     } else {
       cut.low = middle;
-      cut.below = found;
+      below = found;
     }
   }
   return cut;
@@ -130,21 +133,55 @@ Cut cut_at(const float* values, int64_t count, int64_t k, float high, int64_t sl
 float sum_of_first(const float* values, int64_t count, int64_t k, float high) {
   const Cut cut = cut_at(values, count, k, high, 0);
   const bool whole = cut.upto == k;
-  const float last = whole ? cut.high : cut.low;
-  const int64_t below = whole ? k : cut.below;
+  // Otherwise several are equal to `high`, and only some of them are among the first.
+  const int64_t below = whole ? k : std::min(k, count_up_to(values, count, cut.low));
+  const Vec last = set(whole ? cut.high : cut.low);
   Vec total = set(0.0f);
-  if (below)
-    for (int64_t at = 0; at < count; at += kLanes) {
-      const Vec value = load(values + at);
-      total = total + keep(le(value, set(last)), sqrt(value));
-    }
+  for (int64_t at = 0; at < count; at += kLanes) {
+    const Vec value = load(values + at);
+    total = total + keep(le(value, last), sqrt(value));
+  }
   return sum(total) + static_cast<float>(k - below) * std::sqrt(cut.high);
+}
+
+// The second smallest squared distance: a member that asks is itself the nearest.
+float second_smallest(const float* const* columns, int64_t count, const float* query) {
+  const Vec far = set(std::numeric_limits<float>::infinity());
+  Vec first = far, second = far;
+  int64_t at = 0;
+  for (; at + kLanes <= count; at += kLanes) {
+    const Vec value = squared_to(columns, at, query);
+    second = min(second, max(first, value));
+    first = min(first, value);
+  }
+  alignas(64) float lanes[3 * kLanes];
+  store(lanes, first);
+  store(lanes + kLanes, second);
+  if (at < count) store(lanes + 2 * kLanes, squared_to(columns, at, query));
+  const int64_t held = 2 * kLanes + (count - at);
+  float least = lanes[0], next = std::numeric_limits<float>::infinity();
+  for (int64_t i = 1; i < held; ++i) {
+    next = std::min(next, std::max(least, lanes[i]));
+    least = std::min(least, lanes[i]);
+  }
+  return next;
 }
 
 inline void pad(float* held, int64_t count) {
   store(held + count, set(std::numeric_limits<float>::infinity()));
 }
 
+#if defined(__AVX2__)
+inline __m128 three(const float* p) { return _mm_blend_ps(_mm_loadu_ps(p), _mm_setzero_ps(), 8); }
+inline float box_to_box(const SubsetNode& a, const SubsetNode& b) {
+  const __m128 above = _mm_sub_ps(three(a.low), three(b.high));
+  const __m128 below = _mm_sub_ps(three(b.low), three(a.high));
+  const __m128 apart = _mm_max_ps(_mm_max_ps(above, below), _mm_setzero_ps());
+  const __m128 squared = _mm_mul_ps(apart, apart);
+  const __m128 two = _mm_add_ss(squared, _mm_movehdup_ps(squared));
+  return _mm_cvtss_f32(_mm_add_ss(two, _mm_movehl_ps(squared, squared)));
+}
+#else
 inline float box_to_box(const SubsetNode& a, const SubsetNode& b) {
   float total = 0;
   for (int axis = 0; axis < 3; ++axis) {
@@ -153,6 +190,7 @@ inline float box_to_box(const SubsetNode& a, const SubsetNode& b) {
   }
   return total;
 }
+#endif
 
 inline float box_to_point(const SubsetNode& a, const float* point) {
   float total = 0;
@@ -179,7 +217,7 @@ struct LeafSearch {
   // Bounds of the k-th distance from the members of an ancestor.
   void bound() {
     const SubsetNode* around = &leaf;
-    const int64_t wanted = std::min(tree.count, k + std::max<int64_t>(k / 2, kLanes));
+    const int64_t wanted = std::min(tree.count, kAround * k + kLanes);
     while (around->end - around->begin < wanted) around = tree.nodes + around->parent;
     const int64_t begin = around->begin, count = around->end - begin;
     float* squared = scratch.squared.resize(count + 2 * kPad);
@@ -187,6 +225,13 @@ struct LeafSearch {
     for (int64_t at = leaf.begin; at < leaf.end; ++at) {
       float query[3];
       point(at, query);
+      if (k == 2) {
+        const float* from[3] = {tree.columns[0] + begin, tree.columns[1] + begin,
+                                tree.columns[2] + begin};
+        bounds[at - leaf.begin] = second_smallest(from, count, query);
+        widest = std::max(widest, bounds[at - leaf.begin]);
+        continue;
+      }
       Vec farthest = set(0.0f);
       for (int64_t i = 0; i < count; i += kLanes) {
         const Vec value = squared_to(tree.columns, begin + i, query);
@@ -198,7 +243,7 @@ struct LeafSearch {
       store(lanes, farthest);
       float high = *std::max_element(lanes, lanes + kLanes);
       for (int64_t i = count / kLanes * kLanes; i < count; ++i) high = std::max(high, squared[i]);
-      bounds[at - leaf.begin] = cut_at(squared, count, k, high, k / 8).high;
+      bounds[at - leaf.begin] = cut_at(squared, count, k, high, k / 4).high;
       widest = std::max(widest, bounds[at - leaf.begin]);
     }
   }
@@ -252,6 +297,7 @@ struct LeafSearch {
     float* held = scratch.squared.resize(count + 2 * kPad);
     const float* columns[3];
     for (int axis = 0; axis < 3; ++axis) columns[axis] = scratch.near[axis].data();
+    if (k == 2) return std::sqrt(second_smallest(columns, count, query));
     const int64_t found = append_near(columns, 0, count, query, bound, held, 0);
     pad(held, found);
     return sum_of_first(held, found, k, bound);

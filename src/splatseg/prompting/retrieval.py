@@ -39,7 +39,7 @@ class StoredFeatures:
     r"""Features of all Gaussians, as the kernel reads them.
 
     Made by `StoredFeatures.of`. Rows lie in panels of 16, channel after channel, so that a vector
-    instruction works on 16 Gaussians at once; this is a copy, and the only one that retrieval needs.
+    instruction works on 16 Gaussians at once; it is a copy, the only one that retrieval needs.
     With int8 every row has a scale of its own: its largest component becomes 127. Against a scale
     for every channel that halves the error, and it is exact about the length of a row.
     """
@@ -165,8 +165,7 @@ def scores(
     folded = _folded("queries", features, queries, gate)
     if not len(folded):
         raise ShapeError("queries: expected at least one query, got none.")
-    none = folded[:0]
-    _match(features, folded, none, gate, math.inf, (result, None, None))
+    _match(features, folded, folded[:0], gate=gate, threshold=math.inf, out=(result, None, None))
     return result
 
 
@@ -202,7 +201,7 @@ def retrieve(
     above = torch.empty(features.rows)
     below = torch.empty(features.rows) if len(against) else None
     mask = torch.empty(features.rows, dtype=torch.uint8)
-    _match(features, asked, against, gate, threshold, (above, below, mask))
+    _match(features, asked, against, gate=gate, threshold=threshold, out=(above, below, mask))
     return Retrieved(mask=mask.view(torch.bool), positive=above, negative=below)
 
 
@@ -255,6 +254,7 @@ def _match(
     features: StoredFeatures,
     positive: Tensor,
     negative: Tensor,
+    *,
     gate: Tensor | None,
     threshold: float,
     out: tuple[Tensor, Tensor | None, Tensor | None],
