@@ -9,6 +9,7 @@
 #include <stdexcept>
 
 #include "neighbours.h"
+#include "subset.h"
 
 namespace nb = nanobind;
 
@@ -19,6 +20,7 @@ template <typename T, int Axes>
 using Array = nb::ndarray<T, nb::ndim<Axes>, nb::c_contig, nb::device::cpu>;
 using Points = Array<const double, 2>;
 using Rows = Array<const int64_t, 1>;
+using Marks = Array<const uint8_t, 1>;
 
 void expect(bool holds, const char* what) {
   if (!holds) throw std::invalid_argument(what);
@@ -52,6 +54,49 @@ struct Asked {
     }
   }
 };
+
+void expect_marks(const NeighbourIndex& index, const Marks& marks) {
+  expect(static_cast<int64_t>(marks.size()) == index.count(), "neighbours: a mark for each point");
+}
+
+void register_subset(nb::module_& module) {
+  nb::class_<Subset>(module, "Subset")
+      .def("__init__",
+           [](Subset* self, const NeighbourIndex& index, const Marks& members) {
+             expect(index.dimensions() == 3, "neighbours: a subset has three columns");
+             expect_marks(index, members);
+             nb::gil_scoped_release released;
+             new (self) Subset(index, members.data());
+           })
+      .def("mean_distances",
+           [](const Subset& self, int64_t k, const Array<float, 1>& means) {
+             expect(k >= 1 && static_cast<int64_t>(means.size()) == self.of(),
+                    "neighbours: output size");
+             nb::gil_scoped_release released;
+             self.mean_distances(k, means.data());
+           },
+           nb::arg("k"), nb::arg("means"))
+      .def("near",
+           [](const Subset& self, const NeighbourIndex& index, const std::optional<Marks>& among,
+              double max_squared, const Array<uint8_t, 1>& marks) {
+             if (among) expect_marks(index, *among);
+             expect(self.of() == index.count() && static_cast<int64_t>(marks.size()) == self.of(),
+                    "neighbours: output size");
+             nb::gil_scoped_release released;
+             self.near(index, among ? among->data() : nullptr, max_squared, marks.data());
+           },
+           nb::arg("index"), nb::arg("among").none(), nb::arg("max_squared"), nb::arg("marks"))
+      .def("connected",
+           [](const Subset& self, const Marks& seeds, double max_squared,
+              const Array<uint8_t, 1>& marks) {
+             expect(static_cast<int64_t>(seeds.size()) == self.of() && seeds.size() == marks.size(),
+                    "neighbours: output size");
+             nb::gil_scoped_release released;
+             self.connected(seeds.data(), max_squared, marks.data());
+           },
+           nb::arg("seeds"), nb::arg("max_squared"), nb::arg("marks"))
+      .def_prop_ro("count", &Subset::count);
+}
 
 }  // namespace
 
@@ -115,6 +160,7 @@ void register_neighbours(nb::module_& module) {
            nb::arg("queries").none(), nb::arg("rows").none(), nb::arg("max_squared"),
            nb::arg("starts"), nb::arg("indices"), nb::arg("squared"))
       .def_prop_ro("nbytes", &NeighbourIndex::bytes);
+  register_subset(module);
 }
 
 }  // namespace splatseg

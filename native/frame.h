@@ -102,6 +102,10 @@ struct ChannelSums {
   int32_t used;
 };
 struct CellTree;    // neighbours.h
+struct SubsetTree;  // subset.h
+struct SubsetScratch;
+struct Matching;    // retrieve.h
+struct Matched;
 struct Bundle;
 struct Candidates;
 
@@ -213,6 +217,16 @@ struct Kernels {
   void (*points_within)(const CellTree&, int dimensions, const Bundle&, int64_t begin, int64_t end,
                         double max_squared, const int64_t* starts, Candidates&, int64_t* indices,
                         double* squared);
+
+  // Mean distance of the members of leaves [begin, end) of a subset to their k nearest others;
+  // members [begin, end), 32 at most, within sqrt(max_squared) of a query, a bit each. See subset.h.
+  void (*mean_distances)(const SubsetTree&, int64_t begin, int64_t end, int64_t k, SubsetScratch&,
+                         float* means);
+  uint32_t (*points_near)(const SubsetTree&, int32_t begin, int32_t end, const float* query,
+                          double max_squared);
+
+  // Scores of the rows of panels [begin, end) against queries, see retrieve.h.
+  void (*match_panels)(const Matching&, int64_t begin, int64_t end, const Matched&);
 };
 
 // The kernels chosen for this machine, or by set_isa.

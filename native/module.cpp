@@ -24,6 +24,7 @@ void register_product(nb::module_& m);
 void register_csr(nb::module_& m);
 void register_memberships(nb::module_& m);
 void register_neighbours(nb::module_& m);
+void register_retrieve(nb::module_& m);
 }  // namespace splatseg
 
 namespace splatseg {
@@ -397,4 +398,5 @@ NB_MODULE(_native, m) {
   register_csr(m);
   register_memberships(m);
   register_neighbours(m);
+  register_retrieve(m);
 }

@@ -70,6 +70,7 @@ class NeighbourIndex {
   int64_t count() const { return count_; }
   int dimensions() const { return dimensions_; }
   int64_t bytes() const;
+  CellTree tree() const;
 
   // The k nearest of each query within sqrt(max_squared): indices (m, k), -1 where there are
   // fewer, and squared distances, infinite there. With `queries` null, m points of the index
@@ -89,7 +90,6 @@ class NeighbourIndex {
  private:
   template <int D>
   friend class CellBuilder;
-  CellTree tree() const;
   // Calls answer(bundle, first row, rows) for all queries, a block at a time, in an order in
   // which near ones follow each other.
   void in_blocks(const double* queries, const int64_t* points, int64_t m,

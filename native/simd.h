@@ -75,6 +75,10 @@ inline void store_half(uint16_t* p, Vec a) {
 inline Vec load_half(const uint16_t* p) {
   return {_mm512_cvtph_ps(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(p)))};
 }
+inline Vec load_bytes(const int8_t* p) {
+  return {_mm512_cvtepi32_ps(
+      _mm512_cvtepi8_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p))))};
+}
 
 inline __mmask16 first_lanes(int count) { return static_cast<__mmask16>((1u << count) - 1); }
 inline Vec load_some(const float* p, int count) {
@@ -161,6 +165,11 @@ inline void store_half(uint16_t* p, Vec x) {
 inline Vec load_half(const uint16_t* p) {
   return {_mm256_cvtph_ps(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p))),
           _mm256_cvtph_ps(_mm_loadu_si128(reinterpret_cast<const __m128i*>(p + 8)))};
+}
+inline Vec load_bytes(const int8_t* p) {
+  const __m128i all = _mm_loadu_si128(reinterpret_cast<const __m128i*>(p));
+  return {_mm256_cvtepi32_ps(_mm256_cvtepi8_epi32(all)),
+          _mm256_cvtepi32_ps(_mm256_cvtepi8_epi32(_mm_srli_si128(all, 8)))};
 }
 
 inline Vec load_some(const float* p, int count) {
@@ -270,6 +279,7 @@ inline Vec load_half(const uint16_t* p) {
   SPLATSEG_EACH r.v[i] = float_from_half(p[i]);
   return r;
 }
+inline Vec load_bytes(const int8_t* p) { Vec r; SPLATSEG_EACH r.v[i] = p[i]; return r; }
 inline Vec load_some(const float* p, int count) {
   Vec r = set(0.0f);
   std::memcpy(r.v, p, sizeof(float) * static_cast<size_t>(count));

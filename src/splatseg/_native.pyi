@@ -294,3 +294,25 @@ class NeighbourIndex:
         indices: Tensor,
         squared: Tensor,
     ) -> None: ...
+
+class Subset:
+    count: int
+    def __init__(self, index: NeighbourIndex, members: Tensor, /) -> None: ...
+    def mean_distances(self, k: int, means: Tensor) -> None: ...
+    def near(
+        self, index: NeighbourIndex, among: Tensor | None, max_squared: float, marks: Tensor
+    ) -> None: ...
+    def connected(self, seeds: Tensor, max_squared: float, marks: Tensor) -> None: ...
+
+def match_features(
+    panels: Tensor,
+    rows: int,
+    scales: Tensor | None,
+    positive: Tensor,
+    negative: Tensor,
+    gate_squared: Tensor | None,
+    threshold: float,
+    positive_scores: Tensor | None,
+    negative_scores: Tensor | None,
+    member: Tensor | None,
+) -> None: ...

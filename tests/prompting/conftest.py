@@ -1,8 +1,11 @@
-"""A wall of four fields to select on."""
+"""A wall of four fields to select on, and every instruction set that this machine has."""
+
+from collections.abc import Iterator
 
 import pytest
 import torch
 
+from splatseg import _native
 from splatseg.core import Gaussians, InstanceTree, Labels, Scene, TreeNode, View
 from support.wall import camera, field_ids, wall
 
@@ -47,3 +50,13 @@ def tree(gaussians) -> InstanceTree:
 @pytest.fixture
 def scene(gaussians, view, side) -> Scene:
     return Scene(gaussians=gaussians, views=(view, side))
+
+
+@pytest.fixture(params=["avx512", "avx2", "portable"])
+def every_isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Each test that asks for it runs on every instruction set."""
+    before = _native.isa()
+    if not _native.set_isa(request.param):
+        pytest.skip(f"no {request.param} here")
+    yield request.param
+    _native.set_isa(before)

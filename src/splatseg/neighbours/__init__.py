@@ -7,3 +7,4 @@ compares everything with everything.
 from splatseg.neighbours._index import NeighbourIndex as NeighbourIndex
 from splatseg.neighbours._results import NeighbourLists as NeighbourLists
 from splatseg.neighbours._results import Neighbours as Neighbours
+from splatseg.neighbours._subset import Subset as Subset

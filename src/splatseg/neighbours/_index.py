@@ -65,7 +65,10 @@ class NeighbourIndex:
             )
         self._device = given.device
         self._shape = tuple(given.shape)
-        self._native = NativeIndex(_coordinates("points", given))
+        wide = _coordinates("points", given)
+        self._is_double = given.dtype == torch.float64
+        self._extent = float(wide.abs().amax()) if wide.numel() else 0.0
+        self._native = NativeIndex(wide)
 
     def __len__(self) -> int:
         return self._shape[0]
@@ -74,6 +77,21 @@ class NeighbourIndex:
     def dimensions(self) -> int:
         """How many coordinates a point has."""
         return self._shape[1]
+
+    @property
+    def is_double(self) -> bool:
+        """Whether the points came as float64."""
+        return self._is_double
+
+    @property
+    def extent(self) -> float:
+        """The largest magnitude of a coordinate."""
+        return self._extent
+
+    @property
+    def native(self) -> NativeIndex:
+        """What the kernels search in."""
+        return self._native
 
     @property
     def nbytes(self) -> int:

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from splatseg.neighbours._results import NeighbourLists, Neighbours, square_root
@@ -63,6 +63,47 @@ def within(
     return NeighbourLists(
         starts=starts, indices=order[found], distances=square_root(squared[found])
     )
+
+
+def mean_distances(
+    points: Float[Tensor, "n 3"], members: Bool[Tensor, "n"], k: int
+) -> Float64[Tensor, "n"]:
+    """What `Subset.mean_distances` finds, in float64."""
+    chosen = points[members]
+    squared = squared_distances(chosen, chosen)
+    squared.fill_diagonal_(math.inf)
+    others = min(k, len(chosen) - 1)
+    means = torch.full((len(points),), math.nan, dtype=torch.float64)
+    nearest_of = squared.sort(dim=1).values[:, : max(others, 0)]
+    means[members] = nearest_of.sqrt().sum(dim=1) / max(others, 1)
+    return means
+
+
+def near(
+    points: Float[Tensor, "n 3"],
+    members: Bool[Tensor, "n"],
+    radius: float,
+    *,
+    among: Bool[Tensor, "n"] | None = None,
+) -> Bool[Tensor, "n"]:
+    """What `Subset.near` finds."""
+    close = (squared_distances(points, points[members]) <= radius * radius).any(dim=1)
+    return members | (close if among is None else close & among)
+
+
+def connected(
+    points: Float[Tensor, "n 3"],
+    members: Bool[Tensor, "n"],
+    seeds: Bool[Tensor, "n"],
+    radius: float,
+) -> Bool[Tensor, "n"]:
+    """What `Subset.connected` finds: dilation within the members, repeated."""
+    reached = members & seeds
+    while True:
+        grown = near(points, reached, radius, among=members)
+        if torch.equal(grown, reached):
+            return reached
+        reached = grown
 
 
 def _ordered(
