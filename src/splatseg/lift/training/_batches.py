@@ -23,7 +23,8 @@ class BatchGroup:
     def span(self, pixels: int, offset: int, index: int) -> tuple[int, int]:
         """Which of a view's drawn pixels a batch takes.
 
-        They are in random order, and each batch takes an equal part. What does not divide goes to other batches in each view, by the view's offset.
+        They are in random order, and each batch takes an equal part. What does not divide goes
+        to other batches in each view, by the view's offset.
         """
         turned = (index + offset) % self.count
         return pixels * turned // self.count, pixels * (turned + 1) // self.count
