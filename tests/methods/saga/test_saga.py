@@ -65,7 +65,7 @@ def test_one_training_serves_windows_and_walls(walls) -> None:
     ]
     assert between[1] - between[0] > 0.1
     info = features.info
-    assert (info.method, info.seed, info.details["steps"]) == ("saga", 3, 200)
+    assert (info.method, info.seed, info.details["steps"]) == ("saga", 3, 300)
     assert features.weights is not None
     assert bool((features.weights > 0).any())
 
