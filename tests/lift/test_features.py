@@ -8,7 +8,12 @@ import torch
 
 from splatseg.core import FeatureMap, View
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.mass.features import FeatureUpliftOptions, read_grid, uplift_features
+from splatseg.lift.mass.features import (
+    FeatureUpliftOptions,
+    read_features_at,
+    read_grid,
+    uplift_features,
+)
 from splatseg.render.warp import warp_into_photograph
 
 from .conftest import BACKEND, BARREL, camera_at, gaussians_at, matrix_of, random_gaussians
@@ -231,3 +236,16 @@ def test_bad_input_is_refused(rng, views) -> None:
             FeatureUpliftOptions(**wrong)
     with pytest.raises(RangeError, match="channels"):
         FeatureUpliftOptions(channels=1025)
+
+
+@pytest.mark.parametrize("size", [(12, 16), (6, 8)])
+def test_features_at_pixels_are_those_of_the_image(rng, size) -> None:
+    """Also where pixels are counted in a smaller image than the photograph."""
+    view = View(name="v0", camera=camera_at())
+    grid = grid_of(torch.from_numpy(rng.normal(size=(3, 4, 5))).float(), 4)
+    image = read_grid(grid.features, cells=(3, 4), size=size, resampling="bilinear")
+    pixels = torch.from_numpy(rng.choice(size[0] * size[1], 20, replace=False))
+    found = read_features_at(view, grid, size=size, pixels=pixels)
+    torch.testing.assert_close(found, image.reshape(-1, 5)[pixels], rtol=1e-5, atol=1e-5)
+    with pytest.raises(ShapeError):
+        read_features_at(view, grid_of(torch.zeros(9, 9, 2), 4), size=size, pixels=pixels)

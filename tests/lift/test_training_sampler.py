@@ -369,3 +369,23 @@ def test_bad_input_is_refused(rng, views) -> None:
         with pytest.raises(InputError, match="at least one view"):
             sampler_of(gaussians, views, maps).of_views([])
         assert len(drawn) > 1
+
+
+def test_batches_of_few_views_take_all_their_pixels_once(rng, views) -> None:
+    """With two views a batch: pairs of pixels of one view, and each pixel in one batch."""
+    maps = random_maps(rng, views, (1, 2), void=0.1)
+    source = LabelTargets(maps, [view.name for view in views])
+    options = SamplingOptions(pixels=60, views_per_batch=2)
+    sampler = RowSampler(random_gaussians(rng), views, source, options=options, backend=BACKEND)
+    with sampler.draw(np.random.default_rng(3), batch=30) as drawn:
+        batches = [drawn.batch(i) for i in range(len(drawn))]
+        with pytest.raises(InputError, match="expected a batch below 6, got 6"):
+            drawn.batch(6)
+    assert [len(torch.unique(batch.views)) for batch in batches].count(2) == 4
+    assert all(len(batch) == 30 for batch in batches)
+    seen = torch.cat([batch.views * 1000 + batch.pixels for batch in batches])
+    assert len(seen) == len(torch.unique(seen)) == 180
+    with sampler.draw(np.random.default_rng(3), batch=30) as again:
+        assert torch.equal(again.batch(4).pixels, batches[4].pixels)
+    with pytest.raises(RangeError, match="views_per_batch: expected at least 1, got 0"):
+        SamplingOptions(views_per_batch=0)

@@ -122,8 +122,8 @@ class LayerInfo:
     at most 1; None where it was not measured."""
 
     head: Mapping[str, JSON] | None = None
-    """With features: what reads ids out of them, as `lift.heads.ClassifierHead.to_json` writes
-    it."""
+    """With features: what reads them, as `lift.heads.ClassifierHead.to_json` (ids) or
+    `lift.affinity.AffinityHead.to_json` (what belongs together) writes it."""
 
     edits: tuple[LayerEdit, ...] = ()
     """What was done to it since, the first first."""

@@ -25,7 +25,7 @@ from splatseg.core import (
     tree_level,
 )
 from splatseg.errors import InputError
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.heads import ClassifierHead, has_classifier
 from splatseg.lift.label_maps import view_label_map
 from splatseg.lift.point_labels import PointLabelOptions, classified_points, labels_of_points
 from splatseg.lift.view_renderer import ViewRenderer
@@ -120,7 +120,7 @@ def _of_features(name: str, layer: Features, readout: str) -> FieldLayer:
             f"layer {name!r}: expected a readout of features after the @ "
             f"({', '.join(_READOUTS)}), got {readout!r}."
         )
-    if layer.info.head is None:
+    if not has_classifier(layer):
         return _PlainFeatures(name, layer)
     trained = _TrainedLayer(layer)
     return _LabelLayer(name, trained.labels) if readout == "hard" else trained

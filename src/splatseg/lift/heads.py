@@ -219,7 +219,7 @@ class ClassifierHead:
             InputError: If it holds none.
         """
         found = cast("Mapping[str, Any] | None", features.info.head)
-        if found is None or not {"ids", "blend"} <= set(found):
+        if found is None or not has_classifier(features):
             raise InputError("features: expected a layer with a classifier head, got one without.")
         weight, bias = found.get("weight"), found.get("bias")
         try:
@@ -233,6 +233,12 @@ class ClassifierHead:
             raise InputError(
                 f"features: expected a classifier head, got one that cannot be read ({error})."
             ) from error
+
+
+def has_classifier(features: Features) -> bool:
+    """Whether a layer of features holds a classifier head, by which it is read as labels."""
+    found = features.info.head
+    return found is not None and {"ids", "blend"} <= set(found)
 
 
 def _numbers(values: Any) -> Sequence[int]:

@@ -8,7 +8,7 @@ from splatseg.core import ClassTable, Gaussians, Layer, View
 from splatseg.core.boundary import convert_fields
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
-from splatseg.io.evidence import Evidence, EvidenceKind, TrackedEvidence
+from splatseg.io.evidence import Evidence, EvidenceKind, FeatureEvidence, TrackedEvidence
 
 Returns = Literal["labels", "features", "tree", "field"]
 """labels: one id a Gaussian. features: one vector a Gaussian, with the head that reads it. tree:
@@ -25,6 +25,9 @@ class MethodInputs:
 
     evidence: Evidence
     """Of one of the kinds that the method takes."""
+
+    guidance: FeatureEvidence | None = None
+    """Features of the same views, where the method's options name some, see `Method.guidance`."""
 
     classes: ClassTable | None = None
     """Names of the scene's classes."""
@@ -101,6 +104,10 @@ class Method:
     published: Any = None
     """The options of the publication, an instance of `options`; None where the defaults are."""
 
+    guidance: str | None = None
+    """Name of the option that names evidence of features, which the method takes besides; None
+    where it takes none."""
+
     complete: bool = True
     """Whether Gaussians that no view explains take the labels of their neighbours by default."""
 
@@ -115,6 +122,8 @@ class Method:
             raise InputError(
                 f"method {self.name!r}: expected a default for every option ({error})."
             ) from error
+        if self.guidance is not None and self.guidance not in self.option_names():
+            raise InputError(f"method {self.name!r}: expected an option {self.guidance!r}.")
 
     @property
     def published_options(self) -> Any:

@@ -13,7 +13,9 @@ from splatseg.methods._method import Method
 
 ENTRY_POINT_GROUP = "splatseg.methods"
 
-_OWN = ("uplift", "features", "vote", "associate", "identity", "logits", "probabilities")
+_OWN = (
+    "uplift", "features", "vote", "associate", "identity", "saga", "logits", "probabilities",
+)  # fmt: skip
 _REGISTERED: dict[str, Method] = {}
 
 

@@ -24,6 +24,7 @@ from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
     Evidence,
+    FeatureEvidence,
     TrackedEvidence,
     check_map_sizes,
     find_evidence,
@@ -163,6 +164,7 @@ def segment(
         gaussians=scene.gaussians,
         views=_views(scene, evidence, options.views, observer),
         evidence=evidence,
+        guidance=_guidance(scene, method, chosen),
         classes=scene.classes,
         backend=backend,
         seed=options.seed,
@@ -338,6 +340,20 @@ def _evidence(scene: Scene, method: Method, options: SegmentOptions) -> tuple[st
     evidence = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
     method.check_evidence(evidence)
     return folder.name, evidence
+
+
+def _guidance(scene: Scene, method: Method, options: Any) -> FeatureEvidence | None:
+    """The evidence of features that the method's options name besides, if they name some."""
+    asked = None if method.guidance is None else getattr(options, method.guidance)
+    if asked is None:
+        return None
+    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
+    evidence = open_evidence(find_evidence(folders, asked))
+    if not isinstance(evidence, FeatureEvidence):
+        raise InputError(
+            f"{method.guidance}: expected evidence of features, got {asked!r} of {evidence.kind}."
+        )
+    return evidence
 
 
 def _views(

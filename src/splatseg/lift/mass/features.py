@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_choice
@@ -214,6 +214,40 @@ def read_grid(
     # First along the columns of the small grid, then down: the large image is written once.
     resampled = _blend(features, column_taps, dim=1)
     return _blend(resampled, row_taps, dim=0)
+
+
+def read_features_at(
+    view: View,
+    grid: FeatureMap,
+    *,
+    size: tuple[int, int],
+    pixels: Int64[Tensor, "p"],
+) -> Float[Tensor, "p c"]:
+    """A view's features at the centres of some pixels, bilinear between the centres of cells.
+
+    Args:
+        view: The view.
+        grid: Its features, on a grid that covers the photograph.
+        size: Rows and columns of the image that pixels are counted in, in proportion to the
+            photograph.
+        pixels: Numbers of pixels, row by row.
+
+    Raises:
+        InputError: If a feature is not finite.
+        ShapeError: If the grid does not fit its photograph.
+    """
+    covered, _ = _camera_of_grid(view, _checked(view, grid))
+    cells = (covered[0] / grid.stride, covered[1] / grid.stride)
+    features = grid.features.float().cpu()
+    first_row, second_row, down = (
+        taps[pixels // size[1]] for taps in _taps(features.shape[0], cells[0], size[0], "bilinear")
+    )
+    first, second, right = (
+        taps[pixels % size[1]] for taps in _taps(features.shape[1], cells[1], size[1], "bilinear")
+    )
+    upper = torch.lerp(features[first_row, first], features[first_row, second], right[:, None])
+    lower = torch.lerp(features[second_row, first], features[second_row, second], right[:, None])
+    return torch.lerp(upper, lower, down[:, None])
 
 
 _Taps = tuple[Tensor, Tensor, Tensor]

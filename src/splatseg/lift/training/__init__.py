@@ -21,9 +21,12 @@ from splatseg.lift.training._sampler import held_out_views as held_out_views
 from splatseg.lift.training._state import TrainingSummary as TrainingSummary
 from splatseg.lift.training._state import training_summary as training_summary
 from splatseg.lift.training._targets import LabelTargets as LabelTargets
+from splatseg.lift.training._targets import MaskSets as MaskSets
 from splatseg.lift.training._targets import MaskTargets as MaskTargets
 from splatseg.lift.training._targets import PixelChoice as PixelChoice
 from splatseg.lift.training._targets import Ragged as Ragged
+from splatseg.lift.training._targets import Target as Target
+from splatseg.lift.training._targets import Targets as Targets
 from splatseg.lift.training._targets import TargetSource as TargetSource
 from splatseg.lift.training._train import TrainingProgress as TrainingProgress
 from splatseg.lift.training._train import TrainingResult as TrainingResult

@@ -17,6 +17,7 @@ from splatseg.core import Camera, Gaussians, View, camera_of_map
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import voting_views
+from splatseg.lift.training._batches import BatchGroup, batch_groups
 from splatseg.lift.training._pixels import Sampling, draw_by_group, draw_uniformly
 from splatseg.lift.training._store import DrawnView, RowStore
 from splatseg.lift.training._targets import Ragged, Target, Targets, TargetSource
@@ -45,6 +46,10 @@ class SamplingOptions:
     """Blending weight in [0, 1] below which an entry of a row is left out and the row's others
     are scaled to the same sum; 0 keeps all. Half of the entries carry 2 % of the light."""
 
+    views_per_batch: int | None = None
+    """Views that a batch has pixels of. None takes some of every view; losses of pairs of pixels
+    want many pixels of few views."""
+
     memory: int = 1 << 30
     """Bytes of drawn rows that are kept in memory; more go to files."""
 
@@ -58,6 +63,8 @@ class SamplingOptions:
         check_choice("sampling", self.sampling, get_args(Sampling))
         if not 0 <= self.min_weight <= 1:
             raise RangeError(f"min_weight: expected 0 to 1, got {self.min_weight}.")
+        if self.views_per_batch is not None and self.views_per_batch < 1:
+            raise RangeError(f"views_per_batch: expected at least 1, got {self.views_per_batch}.")
         if self.memory < 0:
             raise RangeError(f"memory: expected 0 or more bytes, got {self.memory}.")
         if self.folder is not None and not self.folder.is_dir():
@@ -114,15 +121,16 @@ class Batch:
 class DrawnRows:
     """One draw: pixels of all views, cut into batches that each hold some of every view.
 
+    With groups of views, a batch holds some of every view of its group.
+
     Close it when it is done with, or use it in a ``with`` block: rows beyond the memory budget
     lie in files.
     """
 
     @boundary
-    def __init__(self, store: RowStore, offsets: Sequence[int], count: int) -> None:
+    def __init__(self, store: RowStore, groups: Sequence[BatchGroup]) -> None:
         self._store = store
-        self._offsets = tuple(offsets)
-        self._count = count
+        self._batches = [(group, index) for group in groups for index in range(group.count)]
 
     def __enter__(self) -> "DrawnRows":
         return self
@@ -132,7 +140,7 @@ class DrawnRows:
 
     def __len__(self) -> int:
         """How many batches there are."""
-        return self._count
+        return len(self._batches)
 
     @property
     def pixels(self) -> int:
@@ -156,15 +164,16 @@ class DrawnRows:
 
     def batch(self, index: int) -> Batch:
         """One batch, ready for products."""
+        if not 0 <= index < len(self):
+            raise InputError(f"index: expected a batch below {len(self)}, got {index}.")
+        group, position = self._batches[index]
         parts, views = [], []
-        for view in range(len(self._store)):
+        for view, offset in zip(group.views, group.offsets, strict=True):
             drawn = self._store[view]
-            begin, end = self._span(len(drawn), self._offsets[view], index)
+            begin, end = group.span(len(drawn), offset, position)
             if end > begin:
                 parts.append(drawn.slice(begin, end))
                 views.append(torch.full((end - begin,), view))
-        if not parts:
-            raise InputError(f"index: expected a batch below {self._count}, got {index}.")
         return Batch(
             weights=SparseWeights.concatenate([part.rows for part in parts]).compact(),
             views=torch.cat(views),
@@ -191,14 +200,6 @@ class DrawnRows:
     def close(self) -> None:
         """Forget the rows and remove the files."""
         self._store.close()
-
-    def _span(self, pixels: int, offset: int, index: int) -> tuple[int, int]:
-        """A view's pixels are in random order; each batch takes an equal part of them.
-
-        What does not divide goes to other batches in each view, by the view's offset.
-        """
-        turned = (index + offset) % self._count
-        return pixels * turned // self._count, pixels * (turned + 1) // self._count
 
 
 class RowSampler:
@@ -309,13 +310,10 @@ class RowSampler:
         except BaseException:
             store.close()
             raise
-        total = sum(len(store[i]) for i in range(len(store)))
-        if not total:
+        sizes = [len(store[i]) for i in range(len(store))]
+        if not sum(sizes):
             raise InputError(f"views: expected something to learn in {len(store)}, found none.")
-        count = max(1, min(total, math.ceil(total / batch)))
-        # A view with fewer pixels than there are batches is in some of them only.
-        offsets = rng.integers(count, size=len(store)).tolist()
-        return DrawnRows(store, offsets, count)
+        return DrawnRows(store, batch_groups(sizes, batch, self._options.views_per_batch, rng))
 
     def _drawn(self, view: View, rng: np.random.Generator, count: int) -> DrawnView:
         source, options = self._source, self._options

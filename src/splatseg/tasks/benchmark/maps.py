@@ -37,6 +37,7 @@ from splatseg.evaluate.protocols import MapSwitches
 from splatseg.io.evidence import save_label_map
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
+from splatseg.lift.heads import has_classifier
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.points import read_by_words, true_ids_of
@@ -73,7 +74,7 @@ def map_scores(job: Job) -> Scores:
     """
     seen = job.seen(words=evidence_wanted(job.protocol, job.method, job.options) == "words")
     layer = job.layer(seen.name)
-    if isinstance(layer, Features) and layer.info.head is None:
+    if isinstance(layer, Features) and not has_classifier(layer):
         truth = _truth(job, true_classes(job), "classes")
         if truth.table is None:
             raise InputError(f"scene {job.bench.name}: expected names of its classes, got none.")

@@ -27,7 +27,7 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.npz_writing import save_arrays
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
-from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.heads import ClassifierHead, has_classifier
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
 from splatseg.tasks.benchmark.spoken import vocabulary_of
@@ -85,7 +85,7 @@ def _labels_of_points(
     """Ids of the truth for each point, which points count, and notes."""
     layer, seen = _layer(job)
     notes: list[str] = []
-    if isinstance(layer, Features) and layer.info.head is None:
+    if isinstance(layer, Features) and not has_classifier(layer):
         layer = read_by_words(job, seen, layer, truth.table, wanted.tolist())
     else:
         layer, note = _in_true_ids(job, seen, layer, truth.table)

@@ -33,6 +33,7 @@ from splatseg.io.evidence import create_evidence, save_label_map
 from splatseg.io.images import save_png
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField, TextSpace
+from splatseg.lift.heads import has_classifier
 from splatseg.tasks.benchmark.chosen import (
     Answer,
     ByFeatures,
@@ -130,7 +131,7 @@ class TargetRun:
             return None
         if "labels" in self._job.method.evidence:
             return self._by_prompted_labels(task, prompt)
-        if isinstance(self._layer, Features) and self._layer.info.head is None:
+        if isinstance(self._layer, Features) and not has_classifier(self._layer):
             return self._by_prototype(task, prompt, self._layer)
         return self._by_segments(task, prompt)
 

@@ -1,0 +1,228 @@
+r"""A layer of features that tell which Gaussians belong together, and what reads them.
+
+Such features (SAGA's, `methods.saga`) have no classes: two of them are compared,
+
+.. math:: \cos\bigl(g(s) \odot f_i, \; g(s) \odot f_j\bigr), \qquad g(s) = \sigma(w s + b),
+
+where the gate g keeps the channels that matter at the scale s of what is looked for: 0 the
+smallest things of the scene, 1 the largest. Scales are ranks, so that they mean the same in every
+scene: `AffinityHead.scale_of` has them of lengths.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from splatseg._check import check_finite, check_range, check_shape
+from splatseg.core import JSON, Features
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.errors import InputError, RangeError
+from splatseg.lift.projector import project_features, projector_shapes
+
+KIND = "affinity"
+"""What tells this head from a classifier's in the info of a layer."""
+
+QUANTILES = 101
+"""Numbers that the distribution of scales is kept in: percentiles from 0 to 100."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AffinityHead:
+    """Reads features by comparing them."""
+
+    channels: int
+    """Width of a feature."""
+
+    unit: bool
+    """Whether features were trained as directions of length 1, rather than freely."""
+
+    gate_weight: Float[Tensor, "channels"] | None = None
+    """w of the scale gate; None where there is no gate, and then one scale."""
+
+    gate_bias: Float[Tensor, "channels"] | None = None
+    """b of the scale gate."""
+
+    scale_quantiles: Float64[Tensor, "quantiles"] | None = None
+    """Percentiles of the scales of masks, in scene units, ascending; None where none were
+    measured."""
+
+    levels: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    """The scales, in [0, 1], that stand for groups, objects and their finest parts."""
+
+    projector: Mapping[str, Tensor] = field(default_factory=dict[str, Tensor])
+    """Arrays of the network that projects 2D features, see `lift.projector`; none where the
+    features were trained from masks alone."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        if self.channels < 1:
+            raise RangeError(f"channels: expected at least 1, got {self.channels}.")
+        if (self.gate_weight is None) != (self.gate_bias is None):
+            raise InputError("gate_weight, gate_bias: expected both or none of them.")
+        for name in ("gate_weight", "gate_bias"):
+            if (found := getattr(self, name)) is not None:
+                check_shape(name, found, (self.channels,))
+                check_finite(name, found)
+        if self.scale_quantiles is not None:
+            check_shape("scale_quantiles", self.scale_quantiles, (QUANTILES,))
+            check_finite("scale_quantiles", self.scale_quantiles)
+            if bool((self.scale_quantiles.diff() < 0).any()):
+                raise RangeError("scale_quantiles: expected ascending numbers, got others.")
+        for scale in self.levels:
+            check_range("levels", scale, 0.0, 1.0)
+        if self.projector:
+            _check_projector(self.projector, self.channels)
+
+    @property
+    def gated(self) -> bool:
+        """Whether similarity depends on the scale."""
+        return self.gate_weight is not None
+
+    def scale(self, granularity: float) -> float:
+        """The scale in [0, 1] of a granularity: 0 groups, 0.5 objects, 1 their finest parts.
+
+        Between them it is linear.
+
+        Raises:
+            RangeError: If the granularity is outside [0, 1].
+        """
+        check_range("granularity", granularity, 0.0, 1.0)
+        return float(np.interp(granularity, (0.0, 0.5, 1.0), self.levels))
+
+    def scale_of(self, length: float) -> float:
+        """The scale in [0, 1] of a length in scene units: its rank among the scales of masks.
+
+        Raises:
+            InputError: If no scales were measured.
+            RangeError: If the length is negative or not finite.
+        """
+        if self.scale_quantiles is None:
+            raise InputError("scale_of: expected features with measured scales, got others.")
+        check_range("length", length, 0.0, float(np.finfo(np.float64).max))
+        return scale_rank(self.scale_quantiles, length)
+
+    def gate(self, scale: float) -> Float[Tensor, "channels"]:
+        """The gate g of a scale in [0, 1]; ones where there is none.
+
+        Raises:
+            RangeError: If the scale is outside [0, 1].
+        """
+        check_range("scale", scale, 0.0, 1.0)
+        if self.gate_weight is None or self.gate_bias is None:
+            return torch.ones(self.channels)
+        return torch.sigmoid(self.gate_weight * scale + self.gate_bias)
+
+    def directions(
+        self, features: Float[Tensor, "*batch channels"], scale: float
+    ) -> Float[Tensor, "*batch channels"]:
+        """Gated features with length 1, whose products are similarities in [-1, 1].
+
+        Args:
+            features: Of Gaussians, or rendered; the zero vector stays zero.
+            scale: In [0, 1], see `scale` and `scale_of`.
+        """
+        check_shape("features", features, (*features.shape[:-1], self.channels))
+        return normalize(features * self.gate(scale).to(features), dim=-1)
+
+    def project(self, features: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch channels"]:
+        """2D features, such as a feature map's, in the space of the Gaussians' features.
+
+        Raises:
+            InputError: If the features were trained from masks alone.
+            ShapeError: If the channels are not those that it was trained on.
+        """
+        if not self.projector:
+            raise InputError(
+                "project: expected features trained with the guidance of 2D features, "
+                "got some trained from masks alone."
+            )
+        with torch.no_grad():
+            return project_features(self.projector, features.float())
+
+    def to_json(self) -> dict[str, JSON]:
+        """The head in values that JSON holds, for the info of a layer of features."""
+        return {
+            "kind": KIND,
+            "channels": self.channels,
+            "unit": self.unit,
+            "gate_weight": _listed(self.gate_weight),
+            "gate_bias": _listed(self.gate_bias),
+            "scale_quantiles": _listed(self.scale_quantiles),
+            "levels": list(self.levels),
+            "projector": {name: _listed(value) for name, value in self.projector.items()},
+        }
+
+    @classmethod
+    @boundary
+    def of(cls, features: Features) -> "AffinityHead":
+        """The head that a layer of features holds in its info. Inverse of `to_json`.
+
+        Raises:
+            InputError: If it holds none, or one that cannot be read.
+        """
+        found = cast("Mapping[str, Any] | None", features.info.head)
+        if found is None or found.get("kind") != KIND:
+            raise InputError(
+                "features: expected a layer of affinity features (splatseg segment --method saga), "
+                "got one without their head."
+            )
+        try:
+            return cls(
+                channels=int(found["channels"]),
+                unit=bool(found["unit"]),
+                gate_weight=_floats(found["gate_weight"]),
+                gate_bias=_floats(found["gate_bias"]),
+                scale_quantiles=_doubles(found["scale_quantiles"]),
+                levels=cast("tuple[float, float, float]", tuple(map(float, found["levels"]))),
+                projector={
+                    name: torch.tensor(value, dtype=torch.float32)
+                    for name, value in found["projector"].items()
+                },
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"features: expected an affinity head, got one that cannot be read ({error})."
+            ) from error
+
+
+def scale_rank(quantiles: Float64[Tensor, "quantiles"], length: float) -> float:
+    """Where a length lies among quantiles, in [0, 1], linear between two of them.
+
+    Of equal quantiles the last counts, so that lengths that many masks have are no smaller than
+    each of them.
+    """
+    values = quantiles.numpy()
+    after = int(np.searchsorted(values, length, side="right"))
+    if after == 0:
+        return 0.0
+    if after == len(values):
+        return 1.0
+    low, high = float(values[after - 1]), float(values[after])
+    return (after - 1 + (length - low) / (high - low)) / (len(values) - 1)
+
+
+def _check_projector(arrays: Mapping[str, Tensor], channels: int) -> None:
+    first = arrays.get("weight0")
+    inputs = int(first.shape[-1]) if first is not None and first.ndim else 0
+    expected = projector_shapes(inputs, channels)
+    found = {name: tuple(value.shape) for name, value in arrays.items()}
+    if found != expected:
+        raise InputError("projector: expected the arrays of lift.projector, got others.")
+
+
+def _listed(values: Tensor | None) -> JSON:
+    return None if values is None else cast(JSON, values.tolist())
+
+
+def _floats(values: Any) -> Tensor | None:
+    return None if values is None else torch.tensor(values, dtype=torch.float32)
+
+
+def _doubles(values: Any) -> Tensor | None:
+    return None if values is None else torch.tensor(values, dtype=torch.float64)

@@ -1,0 +1,55 @@
+r"""SAGA: features of Gaussians that tell what belongs together, distilled from masks of views.
+
+Every Gaussian has a feature of 32 channels; geometry and colour stay as they are. As published
+(`SagaOptions.published`), the feature rendered at a pixel is to find each mask that the pixel is in
+by the mask's query, the mean of projected 2D features in it (SAM-guidance loss, eq. 4 to 7), and
+pixels are to be as alike as the sets of their masks (correspondence loss, eq. 8 to 11):
+
+.. math:: \mathcal{L} = \mathcal{L}_{SAM} + \lambda \mathcal{L}_{corr} .
+
+Where the text and the published code differ, this follows the code: both losses are means, negative
+cosines of the correspondence loss count 0, and a tenth of the mean positive product of queries with
+a random tenth of all Gaussians is added. Where there are no 2D features, the query of a mask is the
+mean of what is rendered in it.
+
+By default features are directions, averaged over the nearest Gaussians, and are compared behind a
+gate of the scale that is looked for, so that one training serves parts, objects and groups: at a
+scale, pixels belong together that share a mask up to it (`_losses.together_at`). Decision 0030.
+
+References:
+    Cen et al., Segment Any 3D Gaussians (2023), section 3.3, and its published code for rates,
+    counts and, in its second version, the scale gate.
+"""
+
+from splatseg.core import Features
+from splatseg.methods._method import Method, MethodInputs
+from splatseg.methods._trained_labels import context_of
+from splatseg.methods.saga._options import SagaOptions as SagaOptions
+from splatseg.methods.saga._train import train_saga as train_saga
+
+
+def run(inputs: MethodInputs, options: SagaOptions) -> Features:
+    """Train affinity features, see `train_saga`."""
+    return train_saga(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,
+        features=inputs.guidance,
+        options=options,
+        context=context_of(inputs),
+    )
+
+
+METHOD = Method(
+    name="saga",
+    summary="features that tell what belongs together are trained on masks, with a gate for scale",
+    reference="SAGA (Cen et al. 2023), eq. 3 to 11",
+    evidence=("masks",),
+    options=SagaOptions,
+    run=run,
+    returns="features",
+    seeded=True,
+    resumes=True,
+    published=SagaOptions.published(),
+    guidance="guidance",
+)

@@ -1,0 +1,217 @@
+"""Switches of SAGA, and its published setting."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from splatseg._check import check_choice, check_range
+from splatseg.errors import RangeError
+from splatseg.lift.training import Sampling, SamplingOptions, Schedule, TrainingOptions
+from splatseg.methods._trained_options import check_rate
+
+Correspondence = Literal["scale", "overlap", "none"]
+GateStart = Literal["steps", "random"]
+
+# Cen et al. 2023, section 3.3, and the published code: what `published` is made of.
+PUBLISHED_CHANNELS = 32
+PUBLISHED_RATE = 2.5e-3
+PUBLISHED_EPSILON = 1e-15
+PUBLISHED_CORRESPONDENCE_WEIGHT = 1.0
+PUBLISHED_SPARSITY_WEIGHT = 0.1
+PUBLISHED_SPARSITY_SHARE = 0.1
+PUBLISHED_STEPS = 30_000
+"""Each with one whole picture."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SagaOptions:
+    """How affinity features are trained."""
+
+    guidance: str | None = None
+    """Name of evidence of features (such as features_dino) whose projection queries the masks.
+    None takes masks alone: a mask is queried by the mean of what is rendered in it."""
+
+    guidance_weight: float = 0.0
+    """Weight of the SAM-guidance loss; 0 is without."""
+
+    correspondence: Correspondence = "scale"
+    """Which pixels are to be alike. scale: those that belong together at a scale drawn by
+    chance, compared behind a gate of that scale, hard pairs only. overlap: the more the more
+    masks they share, as published. none: without."""
+
+    correspondence_weight: float = PUBLISHED_CORRESPONDENCE_WEIGHT
+    """Lambda, the weight of the correspondence loss."""
+
+    sparsity_weight: float = 0.0
+    """Weight of the mean positive product of queries with Gaussians anywhere, which goes with
+    the guidance loss; 0 is without."""
+
+    sparsity_share: float = PUBLISHED_SPARSITY_SHARE
+    """Share of all Gaussians that it is estimated from in a step, in (0, 1]."""
+
+    channels: int = PUBLISHED_CHANNELS
+    """Width of a Gaussian's feature."""
+
+    unit: bool = True
+    """Features are directions: each gets length 1 before it is rendered, and what pixels show is
+    to keep it."""
+
+    norm_weight: float = 1.0
+    """Weight of (1 - length of what a pixel shows)^2; goes with `unit`."""
+
+    smoothing: int = 16
+    """Gaussians that a feature is averaged over, itself counted; goes with `unit`. 1 is without."""
+
+    smoothing_drop: float = 0.5
+    """Share of these neighbours that each step of training leaves out by chance, in [0, 1)."""
+
+    scales: int = 4
+    """Scales drawn by chance in a step, besides the smallest and the largest."""
+
+    gate: GateStart = "steps"
+    """What the gate of scales starts as. steps: each channel is open up to a scale of its own, so
+    that fewer things are told apart at larger ones. random: as a linear layer usually does."""
+
+    max_pixel_weight: float = 1.0
+    """What pixels of the smallest masks count in the loss of scales; those of masks of a tenth
+    of the view and more count 1."""
+
+    rate: float = 0.05
+    """Adam's rate for features."""
+
+    gate_rate: float = 0.01
+    """Adam's rate for the scale gate."""
+
+    projector_rate: float = PUBLISHED_RATE
+    """Adam's rate for the network that projects 2D features."""
+
+    epsilon: float = 1e-8
+    """What Adam adds to the root of the mean of squared gradients."""
+
+    steps: int = 1000
+    """Steps of Adam at most."""
+
+    batch: int = 2048
+    """Pixels a step."""
+
+    views_per_batch: int = 8
+    """Views that they are of: pixels are compared with others of their view."""
+
+    pixels: int = 4096
+    """Pixels of each view that are drawn at a time."""
+
+    sampling: Sampling = "groups"
+    """uniform: all pixels alike. groups: equally many of each mask, and of what is in none."""
+
+    passes: int = 4
+    """How often drawn pixels are gone through before new ones are drawn; 0 draws once."""
+
+    min_weight: float = 0.01
+    """Blending weight in [0, 1] below which a Gaussian is left out of a pixel; 0 keeps all."""
+
+    memory: int = 1 << 30
+    """Bytes of drawn rows kept in memory; more go to temporary files."""
+
+    schedule: Schedule = "cosine"
+    """How rates fall: constant, exponential or cosine."""
+
+    final_rate: float = 0.1
+    """Share of the rates that is left at the last step."""
+
+    held_out: float = 0.05
+    """Share of the views that is not learnt from but scored, to stop in time; 0 holds out none
+    and does all steps."""
+
+    score_every: int = 200
+    """Steps from one score to the next."""
+
+    patience: int = 2
+    """Scores in a row without a better one before training stops, and the best is kept; 0
+    never stops."""
+
+    def __post_init__(self) -> None:
+        check_choice("correspondence", self.correspondence, get_args(Correspondence))
+        check_choice("gate", self.gate, get_args(GateStart))
+        for name in ("channels", "smoothing"):
+            if getattr(self, name) < 1:
+                raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
+        if self.scales < 0:
+            raise RangeError(f"scales: expected 0 or more, got {self.scales}.")
+        if not self.max_pixel_weight >= 1:
+            raise RangeError(f"max_pixel_weight: expected 1 or more, got {self.max_pixel_weight}.")
+        for name in (
+            "guidance_weight", "correspondence_weight", "sparsity_weight", "norm_weight", "rate",
+            "gate_rate", "projector_rate",
+        ):  # fmt: skip
+            check_rate(name, getattr(self, name))
+        if not 0 <= self.smoothing_drop < 1:
+            raise RangeError(
+                f"smoothing_drop: expected at least 0 and less than 1, got {self.smoothing_drop}."
+            )
+        check_range("sparsity_share", self.sparsity_share, 0.0, 1.0)
+        if self.sparsity_share == 0:
+            raise RangeError("sparsity_share: expected above 0, got 0.")
+        if self.guidance_weight == 0 and self._without_correspondence:
+            raise RangeError(
+                "guidance_weight, correspondence: expected one of the two losses, got neither."
+            )
+        if self.guidance is not None and self.guidance_weight == 0:
+            raise RangeError(
+                f"guidance_weight: expected above 0 to be guided by {self.guidance}, got 0."
+            )
+        self.training()
+        self.drawing()
+
+    @property
+    def _without_correspondence(self) -> bool:
+        return self.correspondence == "none" or self.correspondence_weight == 0
+
+    @classmethod
+    def published(cls, *, steps: int = 2000) -> "SagaOptions":
+        """The published setting: its two losses and rates, features free and not smoothed.
+
+        Nothing is held out and all steps are done. A step takes one view, as there, but sampled
+        pixels where the published code takes its 64 x 64 grid, and there are fewer of them
+        (`PUBLISHED_STEPS` there), so that it ends within minutes.
+        """
+        return cls(
+            guidance_weight=1.0,
+            correspondence="overlap",
+            sparsity_weight=PUBLISHED_SPARSITY_WEIGHT,
+            unit=False,
+            norm_weight=0.0,
+            smoothing=1,
+            rate=PUBLISHED_RATE,
+            epsilon=PUBLISHED_EPSILON,
+            steps=steps,
+            batch=2048,
+            views_per_batch=1,
+            sampling="uniform",
+            min_weight=0.0,
+            schedule="constant",
+            held_out=0.0,
+            patience=0,
+        )
+
+    def training(self) -> TrainingOptions:
+        """How training goes."""
+        return TrainingOptions(
+            steps=self.steps,
+            batch=self.batch,
+            passes=self.passes,
+            schedule=self.schedule,
+            final_rate=self.final_rate,
+            epsilon=self.epsilon,
+            held_out=self.held_out,
+            score_every=self.score_every,
+            patience=self.patience,
+        )
+
+    def drawing(self) -> SamplingOptions:
+        """Which pixels are drawn."""
+        return SamplingOptions(
+            pixels=self.pixels,
+            sampling=self.sampling,
+            min_weight=self.min_weight,
+            views_per_batch=self.views_per_batch,
+            memory=self.memory,
+        )

@@ -1,0 +1,158 @@
+"""Each loss against its equation, pair by pair, in float64."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.methods.saga._losses import (
+    contrast_loss,
+    correspondence_loss,
+    guidance_loss,
+    masked_means,
+    members,
+    norm_loss,
+    pixel_weights,
+    together_at,
+)
+from splatseg.methods.saga._overlap import best_overlap
+
+
+@pytest.fixture
+def drawn(rng):
+    """Nine pixels' features, the masks they are in (two pixels in none), and their weights."""
+    seen = torch.from_numpy(rng.normal(size=(9, 5))).float()
+    inside = torch.from_numpy(rng.random((9, 4)) < 0.4)
+    inside[:2] = False
+    inside[2, 0] = True
+    return seen, inside, torch.from_numpy(rng.uniform(1, 5, 9)).float()
+
+
+def cosine(a, b) -> float:
+    return float(a @ b / (a.norm() * b.norm()))
+
+
+def test_the_query_of_a_mask_is_the_mean_in_it(drawn) -> None:
+    """Equation 5, pixels counting as many as they stand for."""
+    seen, inside, weight = drawn
+    found = masked_means(seen, inside, weight)
+    for mask in range(4):
+        if not bool(inside[:, mask].any()):
+            continue
+        pixels = torch.nonzero(inside[:, mask]).squeeze(1)
+        expected = sum(weight[p] * seen[p] for p in pixels) / sum(weight[p] for p in pixels)
+        torch.testing.assert_close(found[mask], expected)
+
+
+def test_the_guidance_loss_is_equation_7(drawn, rng) -> None:
+    seen, inside, _ = drawn
+    queries = torch.from_numpy(rng.normal(size=(4, 5))).float()
+    total = 0.0
+    for p in range(9):
+        for mask in range(4):
+            chance = 1 / (1 + math.exp(-float(queries[mask] @ seen[p])))
+            total -= math.log(chance if inside[p, mask] else 1 - chance)
+    assert float(guidance_loss(queries, seen, inside)) == pytest.approx(total / 36, rel=1e-5)
+
+
+def test_the_correspondence_loss_is_equations_8_to_10(drawn) -> None:
+    """Also its gradient, which is taken without keeping the pairs."""
+    seen, inside, _ = drawn
+    leaf = seen.double().requires_grad_()
+    total = torch.zeros((), dtype=torch.float64)
+    for p in range(9):
+        for q in range(9):
+            shared = int((inside[p] & inside[q]).sum())
+            union = int((inside[p] | inside[q]).sum())
+            overlap = shared / union if shared else -1.0
+            similarity = leaf[p] @ leaf[q] / (leaf[p].norm() * leaf[q].norm())
+            total = total - overlap * torch.relu(similarity) / 81
+    total.backward()
+    mine = seen.clone().requires_grad_()
+    loss = correspondence_loss(mine, inside)
+    loss.backward()
+    assert float(loss.detach()) == pytest.approx(float(total.detach()), rel=1e-4)
+    torch.testing.assert_close(mine.grad.double(), leaf.grad, rtol=1e-3, atol=1e-6)
+
+
+def test_pixels_belong_to_masks_up_to_the_scale() -> None:
+    """A window in a wall, and the wall's pixels beside it; one pixel is in no mask."""
+    #                       wall   window
+    inside = torch.tensor([[True, True], [True, False], [True, False], [False, False]])
+    ranks = torch.tensor([0.8, 0.3])
+    # Below the window's scale both masks are too large, and each pixel takes what it has.
+    together, apart = together_at(inside, ranks, 0.1)
+    assert together[0].tolist() == [True, True, True, False]
+    # At the window's own, its pixels leave the wall to the others.
+    together, apart = together_at(inside, ranks, 0.5)
+    assert together.tolist() == [
+        [True, False, False, False],
+        [False, True, True, False],
+        [False, True, True, False],
+        [False, False, False, False],
+    ]
+    assert apart[0].tolist() == [False, True, True, True]
+    assert apart[3].tolist() == [True, True, True, False]  # of itself nothing is known
+    # At the wall's, all three are wall.
+    together, apart = together_at(inside, ranks, 0.8)
+    assert bool(together[:3, :3].all())
+    assert not bool(apart[:3, :3].any())
+
+
+def test_only_hard_pairs_are_moved(drawn) -> None:
+    """The mean of 1 - S over pairs together below 0.75, and of S over pairs apart above 0.5."""
+    _, inside, weight = drawn
+    angles = torch.tensor([0.0, 0.1, 0.4, 0.8, 1.2, 1.7, 2.4, 3.0, 3.1])
+    directions = torch.stack((torch.cos(angles), torch.sin(angles)), dim=1)
+    together, apart = together_at(inside, torch.tensor([0.1, 0.4, 0.6, 0.9]), 0.5)
+    pulled = pushed = pulled_weight = pushed_weight = 0.0
+    for p in range(9):
+        for q in range(9):
+            pair, similarity = float(weight[p] * weight[q]), cosine(directions[p], directions[q])
+            if together[p, q] and similarity < 0.75:
+                pulled += pair * (1 - similarity)
+                pulled_weight += pair
+            if apart[p, q] and similarity > 0.5:
+                pushed += pair * similarity
+                pushed_weight += pair
+    assert min(pulled_weight, pushed_weight) > 0
+    expected = pulled / pulled_weight + pushed / pushed_weight
+    found = contrast_loss(directions, together, apart, weight)
+    assert float(found) == pytest.approx(expected, rel=1e-4)
+    easy = torch.tensor([[1.0, 0.0], [0.99, 0.14], [0.0, 1.0]])
+    same = torch.tensor([[True, True, False], [True, True, False], [False, False, True]])
+    assert float(contrast_loss(easy, same, ~same, torch.ones(3))) == 0.0
+
+
+def test_the_norm_loss_asks_for_length_one() -> None:
+    assert float(norm_loss(torch.tensor([[0.6, 0.8], [0.0, 0.5]]))) == pytest.approx(0.125)
+
+
+def test_pixels_of_small_masks_count_more() -> None:
+    inside = torch.tensor([[True, False], [True, True], [False, False]])
+    areas = torch.tensor([0.2, 0.025])
+    found = pixel_weights(inside, areas, reference=0.1, max_weight=10)
+    assert found.tolist() == pytest.approx([1, 4, 1])
+    capped = pixel_weights(inside, areas, reference=0.1, max_weight=3)
+    assert capped.tolist() == pytest.approx([1, 3, 1])
+    assert pixel_weights(inside[:, :0], areas[:0], reference=0.1, max_weight=3).tolist() == [1] * 3
+
+
+def test_members_name_the_masks_that_occur() -> None:
+    inside, numbers = members(torch.tensor([0, 2, 2]), torch.tensor([7, 7, 4]), 3)
+    assert numbers.tolist() == [4, 7]
+    assert inside.tolist() == [[False, True], [False, False], [True, True]]
+
+
+def test_the_best_overlap_is_that_of_all_thresholds(rng) -> None:
+    similarity = torch.from_numpy(np.round(rng.random(40), 1))
+    inside = torch.from_numpy(rng.random(40) < 0.3)
+    weight = torch.from_numpy(rng.uniform(1, 3, 40)).float()
+    expected = 0.0
+    for threshold in similarity.tolist():
+        found = similarity >= threshold
+        shared = float(weight[found & inside].sum())
+        expected = max(expected, shared / float(weight[found | inside].sum()))
+    assert best_overlap(similarity, inside, weight) == pytest.approx(expected, rel=1e-5)
+    assert best_overlap(similarity, torch.zeros(40, dtype=torch.bool), weight) == 0.0

@@ -1,0 +1,289 @@
+"""Training of affinity features: what is found, what options do, and that bits repeat."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg import _native
+from splatseg.core import Features, MaskSet
+from splatseg.core.checkpoints import Checkpoints
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.io.layers import load_layer, save_layer
+from splatseg.lift.affinity import AffinityHead
+from splatseg.lift.heads import ClassifierHead
+from splatseg.methods import MethodInputs, find_method
+from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods.saga import SagaOptions, train_saga
+
+from .conftest import Grids, Masks
+
+DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
+QUICK = {
+    "steps": 60, "batch": 200, "pixels": 200, "views_per_batch": 1, "held_out": 0.0, "smoothing": 4,
+}  # fmt: skip
+
+
+def context(**changes) -> TrainingContext:
+    return TrainingContext(backend=DRAWN_BY, **{"seed": 3} | changes)
+
+
+def trained(walls, *, features=None, **changes) -> Features:
+    options = SagaOptions(**QUICK | changes)
+    return train_saga(
+        walls.gaussians, walls.views, walls.evidence, features=features, options=options,
+        context=context(),
+    )  # fmt: skip
+
+
+def separation(features: Features, ids: torch.Tensor, scale: float) -> tuple[float, float]:
+    """Mean similarity of Gaussians of one id, and of different ones, behind the gate of a scale."""
+    directions = AffinityHead.of(features).directions(features.values, scale)
+    similarity = directions @ directions.T
+    same = ids[:, None] == ids[None, :]
+    return float(similarity[same].mean()), float(similarity[~same].mean())
+
+
+def test_one_training_serves_windows_and_walls(walls) -> None:
+    """At the scale of windows these part from their walls; at that of walls they are one."""
+    features = trained(walls, steps=300, smoothing=1)
+    head = AffinityHead.of(features)
+    assert head.gated
+    assert head.unit
+    assert head.levels[0] > head.levels[2]
+    # Every window is smaller than every half; between them ranks are 0.5.
+    small, large = 0.5, 1.0
+    assert head.scale(1.0) < small < head.scale(0.0)
+    same, other = separation(features, walls.half, large)
+    assert same - other > 0.4
+    window, wall = walls.part == 1, walls.part == 0
+    between = [
+        float((d[window] @ d[wall].T).mean())
+        for d in (head.directions(features.values, s) for s in (small, large))
+    ]
+    assert between[1] - between[0] > 0.1
+    info = features.info
+    assert (info.method, info.seed, info.details["steps"]) == ("saga", 3, 300)
+    assert features.weights is not None
+    assert bool((features.weights > 0).any())
+
+
+@pytest.mark.parametrize("guided", [True, False])
+def test_the_published_losses_part_the_walls(walls, guided) -> None:
+    """With 2D features and from masks alone; rates raised, as steps are few."""
+    published = SagaOptions.published(steps=150)
+    options = replace(published, rate=0.05, pixels=200, batch=200, min_weight=0.001)
+    features = train_saga(
+        walls.gaussians, walls.views, walls.evidence, features=walls.grids if guided else None,
+        options=options, context=context(),
+    )  # fmt: skip
+    head = AffinityHead.of(features)
+    assert (head.gated, head.unit, bool(head.projector)) == (False, False, guided)
+    same, other = separation(features, walls.half, 0.5)
+    assert same - other > 0.3
+    if guided:  # projected 2D features find the Gaussians of what they are of
+        cells = walls.grids.features("v1").features
+        queries = head.project(cells)[3, [1, 6]]
+        scores = features.values @ queries.T
+        middle = walls.means[:, 0].abs() > 0.3
+        assert float((scores.argmax(dim=1) == walls.half)[middle].float().mean()) > 0.8
+    else:
+        with pytest.raises(InputError, match="trained from masks alone"):
+            head.project(torch.zeros(1, 4))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"correspondence": "overlap"},
+        {"guidance_weight": 1.0},
+        {"correspondence": "none", "guidance_weight": 1.0},
+        {"correspondence_weight": 0.3},
+        {"unit": False},
+        {"norm_weight": 0.0},
+        {"smoothing": 1},
+        {"smoothing": 9},
+        {"smoothing_drop": 0.0},
+        {"scales": 1},
+        {"max_pixel_weight": 10.0},
+        {"rate": 0.01},
+        {"gate": "random"},
+        {"gate_rate": 0.1},
+        {"epsilon": 1e-3},
+        {"steps": 50},
+        {"batch": 100},
+        {"views_per_batch": 2},
+        {"pixels": 150},
+        {"sampling": "uniform"},
+        {"passes": 1},
+        {"min_weight": 0.3},
+        {"schedule": "constant"},
+        {"final_rate": 0.5},
+        {"held_out": 0.4},
+    ],
+    ids=lambda change: "-".join(f"{key}={value}" for key, value in change.items()),
+)
+def test_every_option_changes_what_is_trained(walls, plain, change) -> None:
+    assert not torch.equal(trained(walls, **change).values, plain.values)
+
+
+@pytest.fixture(scope="module")
+def plain(walls) -> Features:
+    return trained(walls)
+
+
+def test_memory_changes_nothing(walls, plain) -> None:
+    assert torch.equal(trained(walls, memory=0).values, plain.values)
+
+
+def test_the_width_and_what_goes_with_guidance(walls) -> None:
+    assert trained(walls, channels=7).values.shape == (96, 7)
+    guided = {"guidance": "grids", "guidance_weight": 1.0}
+    first = trained(walls, features=walls.grids, **guided)
+    assert not torch.equal(trained(walls, features=None, guidance_weight=1.0).values, first.values)
+    for change in (
+        {"projector_rate": 0.1},
+        {"sparsity_weight": 0.5},
+    ):
+        other = trained(walls, features=walls.grids, **guided, **change)
+        assert not torch.equal(other.values, first.values)
+    tenth = trained(walls, guidance_weight=1.0, sparsity_weight=0.5)
+    half = trained(walls, guidance_weight=1.0, sparsity_weight=0.5, sparsity_share=0.5)
+    assert not torch.equal(tenth.values, half.values)
+
+
+def test_early_stopping_keeps_the_best(walls) -> None:
+    features = trained(
+        walls, held_out=0.4, score_every=5, patience=2, steps=200, rate=0.5, schedule="constant"
+    )
+    details = features.info.details
+    scores = dict(details["scores"])
+    assert details["best_step"] == max(scores, key=lambda step: (scores[step], -step))
+    assert 0.5 < scores[details["best_step"]] <= 1
+    never = trained(walls, held_out=0.4, score_every=20, patience=0, steps=60)
+    assert never.info.details["best_step"] == 60
+
+
+def test_same_seed_same_bits_on_any_number_of_threads(walls, plain) -> None:
+    before = _native.threads(), torch.get_num_threads()
+    try:
+        for count in (1, 3):
+            _native.set_threads(count)
+            torch.set_num_threads(count)
+            assert torch.equal(trained(walls).values, plain.values)
+    finally:
+        _native.set_threads(before[0])
+        torch.set_num_threads(before[1])
+
+
+def test_the_order_of_views_does_not_matter(walls, plain) -> None:
+    backwards = train_saga(
+        walls.gaussians, walls.views[::-1], walls.evidence, options=SagaOptions(**QUICK),
+        context=context(),
+    )  # fmt: skip
+    assert torch.equal(backwards.values, plain.values)
+    other = train_saga(
+        walls.gaussians, walls.views, walls.evidence, options=SagaOptions(**QUICK),
+        context=context(seed=4),
+    )  # fmt: skip
+    assert not torch.equal(other.values, plain.values)
+
+
+def test_what_was_interrupted_goes_on_to_the_same_bits(walls, plain, tmp_path) -> None:
+    path = tmp_path / "saga.npz"
+    stop = threading.Event()
+
+    def tell(progress) -> None:
+        if progress.step == 25:
+            stop.set()
+
+    options = SagaOptions(**QUICK)
+    first = context(checkpoints=Checkpoints(path=path), progress=tell, cancelled=stop.is_set)
+    with pytest.raises(KeyboardInterrupt):
+        train_saga(walls.gaussians, walls.views, walls.evidence, options=options, context=first)
+    again = context(checkpoints=Checkpoints(path=path, resume=True))
+    done = train_saga(walls.gaussians, walls.views, walls.evidence, options=options, context=again)
+    assert torch.equal(done.values, plain.values)
+    changed = replace(options, scales=2)
+    with pytest.raises(InputError, match="scales"):
+        train_saga(walls.gaussians, walls.views, walls.evidence, options=changed, context=again)
+    with pytest.raises(InputError, match="evidence"):
+        train_saga(
+            walls.gaussians, walls.views, walls.evidence, features=walls.grids, options=options,
+            context=again,
+        )  # fmt: skip
+
+
+def test_the_layer_and_its_head_go_through_a_file(plain, tmp_path) -> None:
+    save_layer(plain, tmp_path / "saga.npz")
+    read = load_layer(tmp_path / "saga.npz")
+    assert torch.equal(read.values, plain.values)
+    assert AffinityHead.of(read).to_json() == AffinityHead.of(plain).to_json()
+    with pytest.raises(InputError, match="expected a layer with a classifier head"):
+        ClassifierHead.of(read)
+
+
+def test_the_method_is_declared(walls) -> None:
+    method = find_method("saga")
+    assert (method.evidence, method.returns, method.guidance) == (
+        ("masks",),
+        "features",
+        "guidance",
+    )
+    assert method.published_options == SagaOptions.published()
+    inputs = MethodInputs(
+        gaussians=walls.gaussians, views=tuple(walls.views), evidence=walls.evidence,
+        guidance=walls.grids, backend=DRAWN_BY, seed=3,
+    )  # fmt: skip
+    options = SagaOptions(**QUICK, guidance="grids", guidance_weight=1.0)
+    layer = method.run(inputs, options)
+    expected = trained(walls, features=walls.grids, guidance="grids", guidance_weight=1.0)
+    assert torch.equal(layer.values, expected.values)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"correspondence": "some"}, "correspondence: expected"),
+        ({"gate": "some"}, "gate: expected"),
+        ({"channels": 0}, "channels: expected at least 1, got 0"),
+        ({"smoothing": 0}, "smoothing: expected at least 1, got 0"),
+        ({"scales": -1}, "scales: expected 0 or more, got -1"),
+        ({"max_pixel_weight": 0.5}, "max_pixel_weight: expected 1 or more"),
+        ({"rate": -1.0}, "rate: expected 0 or more"),
+        ({"smoothing_drop": 1.0}, "smoothing_drop: expected at least 0 and less than 1"),
+        ({"sparsity_share": 0.0}, "sparsity_share: expected above 0"),
+        ({"correspondence": "none"}, "expected one of the two losses, got neither"),
+        ({"guidance": "features"}, "guidance_weight: expected above 0"),
+        ({"views_per_batch": 0}, "views_per_batch: expected at least 1"),
+    ],
+)
+def test_options_out_of_range_are_refused(change, message) -> None:
+    with pytest.raises((RangeError, InputError), match=message):
+        SagaOptions(**change)
+
+
+def test_what_does_not_fit_is_refused(walls) -> None:
+    options = SagaOptions(**QUICK, guidance_weight=1.0)
+    fewer = Grids({name: walls.grids.features(name) for name in ("v0", "v1")})
+    wide = Grids(walls.grids.maps | {"v2": grid_with(walls.grids.features("v2"), 6)})
+    none = MaskSet.from_dense(torch.zeros(1, 24, 32, dtype=torch.bool))
+    empty = Masks(dict.fromkeys(walls.evidence.sets, none))
+    for evidence, features, error, message in (
+        (walls.evidence, fewer, InputError, "expected 2D features of every view"),
+        (walls.evidence, wide, ShapeError, "expected 4 channels of view v2"),
+        (empty, None, InputError, "expected a mask in 3 views"),
+    ):
+        with pytest.raises(error, match=message):
+            train_saga(
+                walls.gaussians, walls.views, evidence, features=features, options=options,
+                context=context(),
+            )  # fmt: skip
+
+
+def grid_with(grid, channels: int):
+    shape = (*grid.features.shape[:2], channels)
+    values = torch.from_numpy(np.zeros(shape, dtype=np.float32))
+    return replace(grid, features=values)
