@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.prompting.context import SceneIndex
 from splatseg.prompting.pipeline import (
     SelectionContext,
     checked_membership,
@@ -15,7 +16,12 @@ from splatseg.prompting.view_cache import ViewCache
 
 @pytest.fixture
 def context(gaussians) -> SelectionContext:
-    return SelectionContext(gaussians=gaussians, prompts=(), views=ViewCache(gaussians))
+    return SelectionContext(
+        gaussians=gaussians,
+        prompts=(),
+        views=ViewCache(gaussians),
+        neighbours=SceneIndex(gaussians),
+    )
 
 
 def test_steps_run_in_their_order_if_they_are_on(context) -> None:

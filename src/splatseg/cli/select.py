@@ -148,6 +148,8 @@ def run(command: Command) -> None:
             backend=command.backend,
             observer=observer,
         )
+        for name, layer in made.made_layers.items():
+            save_scene_layer(layer, command.scene, name)
         path = save_scene_layer(made.selection, command.scene, command.layer)
     facts = _facts(made, command.layer, path)
     lines = [*_lines(made), str(path)]

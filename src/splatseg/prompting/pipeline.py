@@ -6,7 +6,6 @@ order of `STEPS`, those that are switched on.
 
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias
 
 import torch
@@ -17,38 +16,12 @@ from splatseg._check import check_values
 from splatseg.core import Gaussians, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
-from splatseg.prompting.seen import SeenPrompt
-from splatseg.prompting.view_cache import ViewCache
+from splatseg.prompting.context import SelectionContext as SelectionContext
+from splatseg.prompting.steps import advised, completed, filled, filtered, grown, refined
 
 StepName: TypeAlias = Literal["filter", "grow", "refine", "fill_holes", "hidden"]
 """filter: specks and outliers go. grow: what is near enough joins. refine: the border between in
 and out. fill_holes: gaps inside close. hidden: what no view shows joins what is around it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SelectionContext:
-    """What steps may look at."""
-
-    gaussians: Gaussians
-    """Of the scene."""
-
-    prompts: tuple[SeenPrompt, ...]
-    """What was shown."""
-
-    views: ViewCache
-    """Prepared views of the Gaussians."""
-
-    scene_views: tuple[View, ...] = ()
-    """Training views, in which a next click may be asked for."""
-
-    source: str = ""
-    """What the confidences come from: features, masks, layer, or another name."""
-
-    granularity: float | None = None
-    """What was asked for, see `sources.MembershipSource`."""
-
-    seed: int = 0
-    """Of random choices."""
 
 
 Step: TypeAlias = Callable[[Float[Tensor, "n"], SelectionContext], Float[Tensor, "n"]]
@@ -77,10 +50,16 @@ class NextClickHint(Protocol):
 Adviser: TypeAlias = Callable[[Float[Tensor, "n"], SelectionContext], NextClickHint | None]
 """From the final confidences to the next click; None where nothing is uncertain."""
 
-STEPS: tuple[tuple[StepName, Step], ...] = ()
+STEPS: tuple[tuple[StepName, Step], ...] = (
+    ("filter", filtered),
+    ("grow", grown),
+    ("refine", refined),
+    ("fill_holes", filled),
+    ("hidden", completed),
+)
 """Steps in the order that they run in."""
 
-ADVISERS: tuple[Adviser, ...] = ()
+ADVISERS: tuple[Adviser, ...] = (advised,)
 """Who is asked for the next click; the first who has an answer gives it."""
 
 

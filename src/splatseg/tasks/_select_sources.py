@@ -1,16 +1,21 @@
 """What a scene offers to select by: the sources, each opened by name."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from splatseg.core import InstanceTree, Labels, Layer, Scene
+from splatseg.core import FeatureMap, Features, InstanceTree, Labels, Layer, Scene, View
 from splatseg.errors import InputError
+from splatseg.io.evidence import evidence_names, find_evidence, open_evidence
 from splatseg.io.scene import scene_layer_names
+from splatseg.lift.affinity import KIND
+from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions
 from splatseg.prompting.layer_source import LayerSource
 from splatseg.prompting.sources import MembershipSource
 from splatseg.prompting.view_cache import ViewCache
+from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.scene_parts import whole_layer
+from splatseg.tasks.segment import SegmentOptions, segment
 from splatseg.tasks.select_options import SelectOptions
 
 
@@ -28,6 +33,9 @@ class OpenedSource:
     evidence: str | None = None
     """The evidence that it reads."""
 
+    made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
+    """Layers that were made to open it, by the names to keep them under."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Offer:
@@ -40,6 +48,7 @@ class Offer:
     """Layers at hand; others are in the scene's folder."""
 
     observer: Observer
+    backend: BackendName = "auto"
 
 
 Opener = Callable[[Offer], OpenedSource | None]
@@ -113,5 +122,110 @@ def _layer_names(offer: Offer) -> list[str]:
     return sorted(names)
 
 
-OPENERS: dict[str, Opener] = {"layer": _open_layer}
+def _open_features(offer: Offer) -> OpenedSource | None:
+    """The layer of features that is named, or the first with affinity features."""
+    name = offer.options.from_layer or _affinity_layer(offer)
+    if name is None:
+        return None
+    layer = whole_layer(offer.scene, name, offer.layers)
+    if not isinstance(layer, Features):
+        if offer.options.source == "auto":
+            return None
+        kind = type(layer).__name__.lower()
+        raise InputError(f"from_layer: expected features, {name!r} is of {kind}.")
+    source = FeatureSource(
+        layer,
+        offer.scene.gaussians,
+        options=FeatureSourceOptions(seed=offer.options.seed),
+        guidance=_guidance(offer, layer),
+    )
+    offer.observer.note(f"selecting by features {name}")
+    return OpenedSource(source=source, name="features", layer=name)
+
+
+def _affinity_layer(offer: Offer) -> str | None:
+    for name in _layer_names(offer):
+        layer = whole_layer(offer.scene, name, offer.layers)
+        if isinstance(layer, Features) and (layer.info.head or {}).get("kind") == KIND:
+            return name
+    return None
+
+
+def _guidance(offer: Offer, layer: Features) -> Callable[[View], FeatureMap | None] | None:
+    """Feature maps that features were trained with, where they are still at hand."""
+    name = layer.info.options.get("guidance")
+    if not isinstance(name, str):
+        return None
+    folders = [folder for folder in (offer.scene.root, offer.scene.source) if folder is not None]
+    try:
+        evidence = open_evidence(find_evidence(folders, name))
+    except InputError:
+        return None
+    known = set(evidence.view_names)
+
+    def feature_map(view: View) -> FeatureMap | None:
+        return evidence.features(view.name) if view.name in known else None
+
+    return feature_map
+
+
+def _open_masks(offer: Offer) -> OpenedSource | None:
+    """The tree that masks associate to: one of the scene that was made of them, or made now."""
+    if offer.options.from_layer is not None and offer.options.source == "auto":
+        return None
+    scene = offer.scene
+    evidence = _masks(offer)
+    if evidence is None:
+        return None
+    for name in _layer_names(offer):
+        layer = whole_layer(scene, name, offer.layers)
+        if isinstance(layer, InstanceTree) and layer.info.evidence == evidence:
+            source = LayerSource(layer, scene.gaussians, name=name, views=offer.views)
+            offer.observer.note(f"selecting by masks {evidence}, associated in layer {name}")
+            return OpenedSource(source=source, name="masks", layer=name, evidence=evidence)
+    offer.observer.note(f"masks {evidence} are associated first; the next selection is immediate")
+    made = segment(
+        scene,
+        "associate",
+        options=SegmentOptions(evidence=evidence),
+        backend=offer.backend,
+        observer=offer.observer,
+    )
+    name = evidence if evidence not in _layer_names(offer) else f"{evidence}_tree"
+    source = LayerSource(made.layer, scene.gaussians, name=name, views=offer.views)
+    return OpenedSource(
+        source=source,
+        name="masks",
+        layer=name,
+        evidence=evidence,
+        made_layers={name: made.layer},
+    )
+
+
+def _masks(offer: Offer) -> str | None:
+    """Name of the masks of the scene or its capture: those asked for, or the only ones."""
+    scene, wanted = offer.scene, offer.options.evidence
+    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+    if wanted is not None:
+        found = open_evidence(find_evidence(folders, wanted))
+        if found.kind != "masks":
+            raise InputError(f"evidence: expected masks, {wanted!r} has {found.kind}.")
+        return wanted
+    names = [
+        name
+        for name in evidence_names(folders)
+        if open_evidence(find_evidence(folders, name)).kind == "masks"
+    ]
+    if len(names) > 1 and offer.options.source == "masks":
+        raise InputError(
+            f"evidence: expected the name of one of {', '.join(names)}, got none (see --evidence)."
+        )
+    return names[0] if len(names) == 1 else None
+
+
+OPENERS: dict[str, Opener] = {
+    "features": _open_features,
+    "layer": _open_layer,
+    "masks": _open_masks,
+}
 """Sources by name, in the order that ``auto`` tries them."""

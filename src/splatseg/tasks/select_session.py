@@ -3,7 +3,7 @@
 import importlib.metadata
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from splatseg.core import JSON, Layer, LayerInfo, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
+from splatseg.prompting.context import SceneIndex
 from splatseg.prompting.pipeline import (
     NextClickHint,
     SelectionContext,
@@ -58,6 +59,10 @@ class Selected:
     warnings: tuple[str, ...] = ()
     """What should be known of it, in sentences."""
 
+    made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
+    """Layers that opening the source made, by the names to keep them under: with them the next
+    selection opens at once."""
+
 
 class SelectionSession:
     """Selects again and again in one scene; a context that releases what it holds.
@@ -90,8 +95,10 @@ class SelectionSession:
         self._options = options or SelectOptions()
         self._options.level  # noqa: B018  (an error before anything is opened)
         self._layers = layers
+        self._backend: BackendName = backend
         self._observer = observer
         self._views = ViewCache(scene.gaussians, backend=backend)
+        self._neighbours = SceneIndex(scene.gaussians)
         self._opened = (
             None if source is None else OpenedSource(source=source, name=type(source).__name__)
         )
@@ -165,6 +172,7 @@ class SelectionSession:
             source=context.source,
             next_click=hint,
             warnings=() if selection.count else ("Nothing is selected.",),
+            made_layers={} if self._opened is None else self._opened.made_layers,
         )
 
     def _open(self) -> OpenedSource:
@@ -176,6 +184,7 @@ class SelectionSession:
                     views=self._views,
                     layers=self._layers,
                     observer=self._observer,
+                    backend=self._backend,
                 )
             )
         return self._opened
@@ -203,6 +212,8 @@ class SelectionSession:
             gaussians=self._scene.gaussians,
             prompts=seen,
             views=self._views,
+            neighbours=self._neighbours,
+            unseen=None if self._opened is None else getattr(self._opened.source, "unseen", None),
             scene_views=self._scene.train_views,
             source="" if self._opened is None else self._opened.name,
             granularity=options.level,

@@ -1,0 +1,202 @@
+r"""Features as a source of selections: SAGA's section 3.4.
+
+The query of a point is the feature that its pixel shows, that of strokes, masks and boxes are five
+centres of k-means over the features of their pixels. A Gaussian's score is its largest similarity
+with a positive query; it belongs to the target if that exceeds the one with negative queries, and a
+threshold. Features with a scale gate (`lift.AffinityHead`) are compared at the scale of what is
+asked for. The confidence is 0.5 at the threshold and at equal scores, and 1 at a similarity of 1.
+
+With the projector of features that were trained under guidance, a mask is asked in the space of 2D
+features: the mean of its projected features is the query if the pixels that it finds in the view
+cover 90 % of the mask, centres of k-means over them otherwise (SAM-based prompts, eq. 12).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatseg._check import check_choice, check_range
+from splatseg.core import FeatureMap, Features, Gaussians, View
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift.affinity import AffinityHead
+from splatseg.prompting.retrieval import (
+    StoredFeatures,
+    deviation_threshold,
+    mean_threshold,
+    scores,
+)
+from splatseg.prompting.seen import SeenPrompt
+from splatseg.render import SparseWeights
+
+ThresholdRule = Literal["fixed", "mean", "deviation"]
+_COVERED = 0.9
+_OBJECT = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureSourceOptions:
+    """How features answer prompts."""
+
+    precision: Literal["float32", "float16", "int8"] = "float16"
+    """What features are held in: int8 takes half of the memory and flips a few of a hundred
+    Gaussians near the threshold."""
+
+    clusters: int = 5
+    """Queries that strokes and masks are reduced to by k-means."""
+
+    rule: ThresholdRule = "fixed"
+    """What a score must exceed. fixed: `threshold`. mean: the mean of the scores, as the paper has
+    it for points, strokes and masks. deviation: mean and one standard deviation, as it has them for
+    SAM-based prompts."""
+
+    threshold: float = 0.75
+    """Similarity in [-1, 1] of the fixed rule."""
+
+    seed: int = 0
+    """Of k-means."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_choice("precision", self.precision, ("float32", "float16", "int8"))
+        check_choice("rule", self.rule, ("fixed", "mean", "deviation"))
+        check_range("threshold", self.threshold, -1.0, 1.0)
+        if self.clusters < 1:
+            raise RangeError(f"clusters: expected at least 1, got {self.clusters}.")
+
+
+class FeatureSource:
+    """Answers prompts by the features of Gaussians.
+
+    Args:
+        features: One feature a Gaussian: affinity features with their head, or any others.
+        gaussians: The Gaussians that they are of.
+        options: How they answer.
+        guidance: Feature maps that affinity features were trained with, by view; None asks masks
+            as strokes are asked.
+
+    Raises:
+        ShapeError: If the features are of another scene.
+    """
+
+    @boundary
+    def __init__(
+        self,
+        features: Features,
+        gaussians: Gaussians,
+        *,
+        options: FeatureSourceOptions | None = None,
+        guidance: Callable[[View], FeatureMap | None] | None = None,
+    ) -> None:
+        if len(features) != len(gaussians):
+            raise ShapeError(
+                f"features: expected {len(gaussians)} rows, one a Gaussian of the scene, got "
+                f"{len(features)}; they are of another scene."
+            )
+        self._options = options or FeatureSourceOptions()
+        self._values = features.values.detach().cpu().float()
+        self._seen = None if features.weights is None else features.weights.cpu() > 0
+        self._head = AffinityHead.of(features) if features.info.head is not None else None
+        self._stored = StoredFeatures.of(self._values, precision=self._options.precision)
+        self._guidance = guidance
+
+    @property
+    def unseen(self) -> Bool[Tensor, "n"] | None:
+        """Gaussians that no view showed when the features were made; None where that is unknown."""
+        return None if self._seen is None else ~self._seen
+
+    @boundary
+    def membership(
+        self, prompts: Sequence[SeenPrompt], *, granularity: float | None = None
+    ) -> Float[Tensor, "n"]:
+        """How likely each Gaussian belongs to what is shown, see `sources.MembershipSource`.
+
+        Raises:
+            InputError: If the prompts show nothing that has a feature.
+        """
+        positive = self._queries(prompts, positive=True)
+        negative = self._queries(prompts, positive=False)
+        if not len(positive):
+            raise InputError("features: expected features where the prompts are, got none.")
+        gate = self._gate(granularity)
+        found = scores(self._stored, positive, gate=gate)
+        limit = self._limit(found)
+        confidence = _around(found, limit)
+        if len(negative):
+            against = scores(self._stored, negative, gate=gate)
+            # Equally like what is meant and what is not is the border as well.
+            confidence = torch.minimum(confidence, (0.5 + (found - against)).clamp(0, 1))
+        return confidence if self._seen is None else confidence.where(self._seen, 0.0)
+
+    def _limit(self, found: Tensor) -> float:
+        match self._options.rule:
+            case "fixed":
+                return self._options.threshold
+            case "mean":
+                return mean_threshold(found)
+            case "deviation":
+                return deviation_threshold(found)
+
+    def _gate(self, granularity: float | None) -> Tensor | None:
+        head = self._head
+        if head is None or not head.gated:
+            return None
+        return head.gate(head.scale(_OBJECT if granularity is None else granularity))
+
+    def _queries(self, prompts: Sequence[SeenPrompt], *, positive: bool) -> Float[Tensor, "q d"]:
+        """Queries of all prompts of one sign."""
+        found: list[Tensor] = [self._values[:0]]
+        for prompt in prompts:
+            if positive and prompt.dense and prompt.inside is not None and not prompt.guessed:
+                asked = self._mask_queries(prompt)
+                if asked is not None:
+                    found.append(asked)
+                    continue
+            shown = self._shown(prompt.positive_rows if positive else prompt.negative_rows)
+            if prompt.dense and len(shown) > self._options.clusters:
+                shown = self._centres(shown)
+            found.append(shown)
+        return torch.cat(found)
+
+    def _shown(self, rows: SparseWeights) -> Float[Tensor, "p d"]:
+        """Features that pixels show; pixels that show none are left out."""
+        shown = rows.to("cpu").product(self._values)
+        return shown[torch.linalg.vector_norm(shown, dim=1) > 0]
+
+    def _mask_queries(self, prompt: SeenPrompt) -> Float[Tensor, "q d"] | None:
+        """Queries of a mask by 2D features; None where there are none."""
+        head = self._head
+        if head is None or not head.projector or self._guidance is None or prompt.inside is None:
+            return None
+        given = self._guidance(prompt.view)
+        if given is None:
+            return None
+        cells = prompt.pixels.cpu() // given.stride
+        projected = head.project(given.features[cells[:, 1], cells[:, 0]])
+        query = projected.mean(dim=0, keepdim=True)
+        shown = prompt.rows.to("cpu").product(self._values)
+        covered = float(((shown @ query.T) > 0).float().mean())
+        if covered >= _COVERED or len(projected) <= self._options.clusters:
+            return query
+        return self._centres(projected)
+
+    def _centres(self, values: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
+        """Centres of k-means."""
+        from sklearn.cluster import KMeans
+
+        count = min(self._options.clusters, len(np.unique(values.numpy(), axis=0)))
+        made = KMeans(n_clusters=count, random_state=self._options.seed)
+        made.fit(values.double().numpy())
+        return torch.from_numpy(made.cluster_centers_).float()
+
+
+def _around(found: Tensor, limit: float) -> Tensor:
+    """Confidences in [0, 1], 0.5 at the limit, linear on both sides."""
+    above = 0.5 + 0.5 * (found - limit) / max(1 - limit, 1e-6)
+    below = 0.5 - 0.5 * (limit - found) / max(1 + limit, 1e-6)
+    return torch.where(found > limit, above, below).clamp(0, 1)
