@@ -267,7 +267,10 @@ class _Run:
         return np.random.default_rng((self._seed, kind, *numbers))
 
     def _draw(self, number: int) -> DrawnRows:
-        return self._sampler.draw(self._rng(_DRAW, number), batch=self._options.batch)
+        # Many small sums: sharing each among threads costs more than it saves, and where the
+        # machine is busy many times more. Rows are found by the library's own threads.
+        with one_torch_thread():
+            return self._sampler.draw(self._rng(_DRAW, number), batch=self._options.batch)
 
     def _next_batch(self) -> Batch:
         state, passes = self.state, self._options.passes

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians, MaskSet, View, camera_of_map
-from splatseg.core.threads import one_torch_thread
 from splatseg.lift.affinity import QUANTILES, scale_rank
 from splatseg.lift.training import MaskSets
 from splatseg.render import RenderOptions, options_for, render
@@ -146,7 +145,7 @@ def _world_points(
     camera = camera_of_map(view, masks.height, masks.width)
     # Depth alone is asked for; one channel is the least that is rendered.
     signal = torch.zeros(len(gaussians), 1, device=gaussians.means.device)
-    with torch.no_grad(), one_torch_thread():
+    with torch.no_grad():
         drawn = render(gaussians, camera, signal, options=options, backend=backend, warp="nearest")
         depth = drawn.depth.detach().cpu().double()
         known = (drawn.alpha.detach().cpu() > MIN_ALPHA) & (depth > 0)
@@ -159,8 +158,8 @@ def _roles(dense: Sequence[NDArray[np.bool_]]) -> NDArray[np.int64]:
     if not dense:
         return np.zeros(0, dtype=np.int64)
     # Every second pixel is enough to tell what lies in what.
-    small = np.stack([mask[::2, ::2].reshape(-1) for mask in dense]).astype(np.float32)
-    shared = small @ small.T
+    small = torch.from_numpy(np.stack([mask[::2, ::2].reshape(-1) for mask in dense])).float()
+    shared = (small @ small.T).numpy()
     area = np.maximum(np.diagonal(shared), 1.0)
     held = (shared >= INSIDE * area[:, None]) & (area[:, None] <= SMALLER * area[None, :])
     role = np.ones(len(dense), dtype=np.int64)

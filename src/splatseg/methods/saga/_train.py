@@ -9,6 +9,7 @@ from torch import Tensor
 
 from splatseg.core import Features, FeatureSource, Gaussians, LayerInfo, View
 from splatseg.core.boundary import boundary
+from splatseg.core.threads import one_torch_thread
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training import MaskSets, RowSampler, TrainingResult, train
@@ -60,14 +61,16 @@ def train_saga(
     options, context = options or SagaOptions(), context or TrainingContext()
     ordered = voting_views(views, evidence, "masks")
     kept = KeptMasks(evidence)
-    masks = mask_table(
-        gaussians,
-        ordered,
-        kept,
-        render_options=context.render_options,
-        backend=context.backend,
-    )
-    source = SagaTargets(kept, ordered, masks.first, features)
+    # Sums in one order, and no threads for the many small ones.
+    with one_torch_thread():
+        masks = mask_table(
+            gaussians,
+            ordered,
+            kept,
+            render_options=context.render_options,
+            backend=context.backend,
+        )
+        source = SagaTargets(kept, ordered, masks.first, features)
     sampler = RowSampler(
         gaussians,
         ordered,
