@@ -182,9 +182,7 @@ class LayerSource:
         chosen = torch.isin(candidates, wanted)
         shares = labels.shares[some].float() * (candidates != UNLABELLED)
         within = (shares * chosen).sum(dim=1)
-        beside = (shares * ~chosen).amax(dim=1)
-        share = within / (within + beside).clamp_min(1e-12)
-        confidence[some] = torch.where(mask, share.clamp(_MIN_SURE, 1), share.clamp(0, 0.5))
+        confidence[some] = within.clamp(0, 1)
         return confidence
 
 
