@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
@@ -38,9 +39,8 @@ from splatseg.io.npz_writing import save_arrays
 FORMAT = "splatseg-layer"
 VERSION = 4
 """Versions up to it are read. Trees came with version 2, `LayerInfo` with version 3, the confidence
-of selections and the shares of trees with version 4. A file is of the first version that has all it
-holds, so
-that older programs refuse no layer that they can read whole."""
+of selections and the shares of trees with version 4. A file is of the first version that has all
+it holds, so that older programs refuse no layer that they can read whole."""
 
 _WITHOUT_CONFIDENCE = 3
 
