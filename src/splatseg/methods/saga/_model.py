@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from splatseg.lift.projector import project_features, projector_start
 from splatseg.lift.training import Batch, Parameter, Values
 from splatseg.methods._label_models import linear_start
+from splatseg.methods.saga._association import OBJECT_END, PART_END, divisions, level_cut
 from splatseg.methods.saga._losses import (
     contrast_loss,
     correspondence_loss,
@@ -30,7 +31,10 @@ PROJECTOR = "projector."
 """What names of the projector's arrays begin with among the shared parameters."""
 
 _STEEPNESS = 10.0
-"""How fast a channel of the gate closes at first, about its end."""
+"""How fast a channel of the gate closes at first, about its end, where each has one of its own."""
+
+_LEVEL_STEEPNESS = 24.0
+"""The same where ends lie between levels: 0.998 open and 0.002 at the scales of levels."""
 
 _LAST_STEP = 1.5
 """The scale up to which the last channel is open at first."""
@@ -172,7 +176,8 @@ class SagaModel:
             )
         total = seen.new_zeros(())
         for scale in scales:
-            together, apart = together_at(inside, ranks, scale)
+            cut = level_cut(scale) if options.by_level else scale
+            together, apart = together_at(inside, ranks, cut)
             directions = normalize(seen * self._gate(scale, values), dim=1)
             total = total + contrast_loss(directions, together, apart, weights)
         return options.correspondence_weight * total / len(scales)
@@ -233,15 +238,20 @@ def gate_start(
 ) -> tuple[Float[Tensor, "channels"], Float[Tensor, "channels"]]:
     r"""What the gate's weight and bias start as.
 
-    Steps: channel c is open up to a scale of its own and closed beyond,
-    :math:`\sigma(\kappa (t_c - s))`, with :math:`t_c` evenly from 0 to 1.5, so that a third of the
-    channels is open at all scales.
+    Channel c is open up to a scale of its own and closed beyond,
+    :math:`\sigma(\kappa (t_c - s))`. Steps: :math:`t_c` goes evenly from 0 to 1.5, so that a third
+    of the channels is open at all scales. Levels: it lies between the scales of parts and objects
+    for the first third, between those of objects and groups for the second, beyond 1 for the third.
     """
     if kind == "random":
         weight, bias = linear_start(1, channels, rng)
         return weight[:, 0].contiguous(), bias
-    ends = torch.linspace(0.0, _LAST_STEP, channels)
-    return torch.full((channels,), -_STEEPNESS), _STEEPNESS * ends
+    ends, steepness = torch.linspace(0.0, _LAST_STEP, channels), _STEEPNESS
+    if kind == "levels":
+        steepness = _LEVEL_STEEPNESS
+        for where, end in zip(divisions(channels), (PART_END, OBJECT_END, _LAST_STEP), strict=True):
+            ends[where] = end
+    return torch.full((channels,), -steepness), steepness * ends
 
 
 def _by_view(
