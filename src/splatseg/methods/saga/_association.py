@@ -134,22 +134,27 @@ def node_codes(
 def spread_directions(
     count: int, channels: int, rng: np.random.Generator
 ) -> Float[Tensor, "count channels"]:
-    """Directions that point apart: random ones, each then pushed away from those nearest to it.
+    """Directions that have little to do with each other.
+
+    At right angles where there are as many dimensions: opposite ones would be less alike than
+    what has nothing in common. Otherwise random ones, each pushed away from those nearest to it.
 
     Args:
         count: How many.
-        channels: In how many dimensions; with fewer than `count` some must be alike.
+        channels: In how many dimensions.
         rng: Draws the random ones.
     """
-    drawn = rng.standard_normal((count, channels))
-    found: Float64[Tensor, "count channels"] = normalize(torch.from_numpy(drawn), dim=1)
-    if count < 2 or channels < 2:
-        return found.float()
-    for step in range(_STEPS):
+    drawn: Float64[Tensor, "count channels"] = torch.from_numpy(
+        rng.standard_normal((count, channels))
+    )
+    if count <= channels:
+        return torch.linalg.qr(drawn.T)[0].T.float().contiguous()
+    found = normalize(drawn, dim=1)
+    for step in range(_STEPS if channels > 1 else 0):
         cosine = found @ found.T
         cosine.fill_diagonal_(-torch.inf)
-        push = torch.softmax(_SHARPNESS * cosine, dim=1) @ found
-        found = normalize(found - 0.5 * (1 - step / _STEPS) * push, dim=1)
+        nearness = torch.softmax(_SHARPNESS * cosine, dim=1) * cosine.clamp_min(0)
+        found = normalize(found - (1 - step / _STEPS) * nearness @ found, dim=1)
     return found.float()
 
 
