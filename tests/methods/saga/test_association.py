@@ -13,6 +13,7 @@ from splatseg.methods.saga._association import (
     association_start,
     divisions,
     level_cut,
+    level_masks,
     level_scales,
     node_codes,
     spread_directions,
@@ -135,6 +136,30 @@ def test_a_scale_counts_all_masks_of_the_level_that_it_stands_for() -> None:
     assert [level_cut(s) for s in (0.0, 0.2, 0.3, 0.5, 0.7, 0.8, 1.0)] == [
         0.0, 0.2, 0.5, 0.5, 0.5, 1.0, 1.0,
     ]  # fmt: skip
+
+
+def test_masks_of_parts_stand_for_their_object() -> None:
+    """Two parts, the table, the group, and a mask that is no node, over six pixels."""
+    found = level_masks(tree_of([1]), torch.tensor([5, 6, 3, 4, -1, 1]))
+    numbers = torch.tensor([0, 1, 2, 3, 4])
+    inside = torch.tensor(
+        [
+            [1, 0, 0, 0, 0],
+            [0, 1, 0, 1, 0],
+            [0, 0, 1, 0, 0],
+            [0, 0, 0, 1, 0],
+            [0, 0, 0, 0, 1],
+            [0, 0, 0, 0, 0],
+        ]
+    ).bool()
+    shown, scales, known = found.at(inside, numbers, 0.5)
+    assert scales.tolist() == [0.5, 0.5, 1.0]  # the lamp by its parts, the table, the group
+    assert shown[:, 0].tolist() == [True, True, False, False, False, False]
+    assert known.tolist() == [True, True, True, True, False, True]
+    shown, scales, _ = found.at(inside, numbers, 0.1)
+    assert sorted(scales.tolist()) == [0.0, 0.0, 0.5, 1.0]
+    shown, scales, _ = found.at(inside, numbers, 0.9)
+    assert (sorted(scales.tolist()), int(shown.sum())) == ([0.5, 1.0], 4)
 
 
 def test_each_mask_is_told_its_node(walls) -> None:

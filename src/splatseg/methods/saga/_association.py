@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -158,6 +158,74 @@ def spread_directions(
     return found.float()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LevelMasks:
+    """What the masks of all views are at each level: the part, the object, the group."""
+
+    nodes: Int64[Tensor, "levels masks"]
+    """Of parts, objects and groups: the node that each mask is or lies in there, or the mask's
+    own where that is of a coarser level; -1 where the mask is no node."""
+
+    scales: Float[Tensor, "levels masks"]
+    """The scales of these nodes; 0 where there is none."""
+
+    def at(
+        self, inside: Bool[Tensor, "pixels masks"], numbers: Int64[Tensor, "masks"], scale: float
+    ) -> tuple[Bool[Tensor, "pixels nodes"], Float[Tensor, "nodes"], Bool[Tensor, "pixels"]]:
+        """Which pixels each node of a view contains at a scale, by all of its masks together.
+
+        A mask of a part stands for its object, too, where that has no mask of its own.
+
+        Args:
+            inside: Which pixels each mask contains.
+            numbers: The masks' numbers.
+            scale: The scale that is asked about.
+
+        Returns:
+            The pixels of nodes, the scales of these, and the pixels of which something is known:
+            those in a mask that is a node, and those in no mask.
+        """
+        level = 0 if scale < PART_END else 1 if scale < OBJECT_END else 2
+        nodes, column = torch.unique(self.nodes[level, numbers], return_inverse=True)
+        shown = torch.zeros(len(inside), len(nodes), dtype=torch.bool)
+        scales = torch.zeros(len(nodes))
+        for mask, place in enumerate(column.tolist()):
+            shown[:, place] |= inside[:, mask]
+            scales[place] = self.scales[level, numbers[mask]]
+        there = nodes != UNLABELLED
+        shown, scales = shown[:, there], scales[there]
+        return shown, scales, shown.any(dim=1) | ~inside.any(dim=1)
+
+
+def level_masks(tree: InstanceTree, nodes: Int64[Tensor, "masks"]) -> LevelMasks:
+    """What masks are at each level.
+
+    Args:
+        tree: The nodes.
+        nodes: Id of the node of each mask, -1 for none.
+    """
+    scale = node_scales(tree)
+    lifted = {UNLABELLED: (UNLABELLED,) * 3}
+    level = {node.id: node.level for node in tree.nodes}
+    for node in tree.nodes:
+        path = tree.path(node.id)
+        objects = [id for id in path if level[id] == "object"]
+        lifted[node.id] = node.id, (objects or [node.id])[0], path[0]
+    found = torch.tensor([lifted[id] for id in nodes.tolist()], dtype=torch.int64).reshape(-1, 3)
+    scales = [[scale.get(id, 0.0) for id in row] for row in found.T.tolist()]
+    return LevelMasks(nodes=found.T.contiguous(), scales=torch.tensor(scales))
+
+
+def node_scales(tree: InstanceTree) -> dict[int, float]:
+    """The scale of each node by its level, from 0 for parts over objects to 1 for groups."""
+    parents = {node.parent for node in tree.nodes}
+    found: dict[int, float] = {}
+    for node in tree.nodes:
+        part = PARTED_SCALE if node.id in parents else PART_SCALE
+        found[node.id] = {"group": GROUP_SCALE, "object": OBJECT_SCALE, "part": part}[node.level]
+    return found
+
+
 def level_scales(
     tree: InstanceTree, nodes: Int64[Tensor, "masks"], sizes: Float64[Tensor, "masks"]
 ) -> Float[Tensor, "masks"]:
@@ -171,11 +239,7 @@ def level_scales(
         nodes: Id of the node of each mask, -1 for none.
         sizes: How large each mask is in 3D, scene units.
     """
-    parents = {node.parent for node in tree.nodes}
-    scale = {UNLABELLED: OBJECT_SCALE}
-    for node in tree.nodes:
-        part = PARTED_SCALE if node.id in parents else PART_SCALE
-        scale[node.id] = {"group": GROUP_SCALE, "object": OBJECT_SCALE, "part": part}[node.level]
+    scale = {UNLABELLED: OBJECT_SCALE} | node_scales(tree)
     found: NDArray[np.float64] = np.array([scale[id] for id in nodes.tolist()], dtype=np.float64)
     known = nodes.numpy() != UNLABELLED
     if known.any() and not known.all():

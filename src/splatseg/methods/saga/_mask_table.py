@@ -29,6 +29,8 @@ from splatseg.methods.saga._association import (
     GROUP_SCALE,
     OBJECT_SCALE,
     PART_SCALE,
+    LevelMasks,
+    level_masks,
     level_scales,
 )
 from splatseg.render import RenderOptions, options_for, render
@@ -70,6 +72,9 @@ class MaskTable:
     both, and of those that are held: groups, objects and parts. The median of all, 0.5, where
     there are none."""
 
+    nodes: LevelMasks | None = None
+    """What masks are at each level, where scales are levels."""
+
     def __len__(self) -> int:
         return len(self.areas)
 
@@ -80,6 +85,7 @@ class MaskTable:
         return replace(
             self,
             ranks=level_scales(found.tree, torch.from_numpy(nodes), self.scales),
+            nodes=level_masks(found.tree, torch.from_numpy(nodes)),
             quantiles=None,
             levels=(GROUP_SCALE, OBJECT_SCALE, PART_SCALE),
         )

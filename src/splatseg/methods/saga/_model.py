@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from splatseg.core import UNLABELLED
 from splatseg.lift.projector import project_features, projector_start
 from splatseg.lift.training import Batch, Parameter, Values
 from splatseg.methods._label_models import linear_start
@@ -24,7 +25,7 @@ from splatseg.methods.saga._losses import (
 )
 from splatseg.methods.saga._mask_table import MaskTable
 from splatseg.methods.saga._options import GateStart, SagaOptions
-from splatseg.methods.saga._overlap import best_overlap
+from splatseg.methods.saga._overlap import mean_overlap
 from splatseg.methods.saga._smoothing import Smoother
 
 PROJECTOR = "projector."
@@ -38,6 +39,12 @@ _LEVEL_STEEPNESS = 24.0
 
 _LAST_STEP = 1.5
 """The scale up to which the last channel is open at first."""
+
+SELECTED = 0.75
+"""Similarity from which on a pixel counts as found in scores."""
+
+_ASKED = 4
+"""Pixels of a mask that it is looked for by."""
 
 _LARGE = 0.1
 """Share of a view from which on a mask's pixels count 1."""
@@ -114,20 +121,25 @@ class SagaModel:
         return loss
 
     def score(self, batches: Sequence[Batch], values: Values) -> float:
-        """How well masks of held-out views are found by their own mean: the mean best overlap.
+        """How well masks of held-out views are found by single pixels of theirs: the mean overlap.
 
-        For each mask, the best intersection over union, of any threshold, of the pixels that are
-        similar to its mean with those inside, behind the gate of its own scale. The similarity is
-        the cosine.
+        For each mask, the intersection over union of its pixels with those whose cosine with one
+        of them exceeds `SELECTED`, behind the gate of the mask's own scale; the mean over a few of
+        its pixels, evenly through them. Where scales are levels, masks that are nodes count.
         """
         overlaps: list[float] = []
+        nodes = self._masks.nodes
         for seen, inside, numbers, stands_for in self._whole_views(batches, values):
             for column, number in enumerate(numbers.tolist()):
+                if nodes is not None and int(nodes.nodes[0, number]) == UNLABELLED:
+                    continue
                 gated = seen * self._gate(float(self._masks.ranks[number]), values)
+                own = inside[:, column]
                 directions = normalize(gated, dim=1)
-                query = masked_means(gated, inside[:, column : column + 1], stands_for)
-                similarity = directions @ normalize(query, dim=1)[0]
-                overlaps.append(best_overlap(similarity, inside[:, column], stands_for))
+                pixels = torch.nonzero(own).squeeze(1)
+                asked = pixels[(torch.arange(_ASKED) * 2 + 1) * len(pixels) // (2 * _ASKED)]
+                found = directions @ directions[asked].T > SELECTED
+                overlaps.append(mean_overlap(found, own, stands_for))
         return float(np.mean(overlaps)) if overlaps else 0.0
 
     def _rendered(
@@ -176,8 +188,11 @@ class SagaModel:
             )
         total = seen.new_zeros(())
         for scale in scales:
-            cut = level_cut(scale) if options.by_level else scale
-            together, apart = together_at(inside, ranks, cut)
+            if self._masks.nodes is None:
+                together, apart = together_at(inside, ranks, scale)
+            else:
+                shown, levels, known = self._masks.nodes.at(inside, numbers, scale)
+                together, apart = together_at(shown, levels, level_cut(scale), known=known)
             directions = normalize(seen * self._gate(scale, values), dim=1)
             total = total + contrast_loss(directions, together, apart, weights)
         return options.correspondence_weight * total / len(scales)
