@@ -40,7 +40,7 @@ _LEVEL_STEEPNESS = 24.0
 _LAST_STEP = 1.5
 """The scale up to which the last channel is open at first."""
 
-SELECTED = 0.75
+SELECTED = 0.85
 """Similarity from which on a pixel counts as found in scores."""
 
 _ASKED = 4

@@ -69,8 +69,9 @@ class SagaOptions:
     norm_weight: float = 1.0
     """Weight of (1 - length of what a pixel shows)^2; goes with `unit`."""
 
-    smoothing: int = 16
-    """Gaussians that a feature is averaged over, itself counted; goes with `unit`. 1 is without."""
+    smoothing: int = 1
+    """Gaussians that a feature is averaged over, itself counted; goes with `unit`. 1 is without;
+    the published code has 16, which a random start needs."""
 
     smoothing_drop: float = 0.5
     """Share of these neighbours that each step of training leaves out by chance, in [0, 1)."""
@@ -87,7 +88,7 @@ class SagaOptions:
     """What pixels of the smallest masks count in the loss of scales; those of masks of a tenth
     of the view and more count 1."""
 
-    rate: float = 0.05
+    rate: float = 0.002
     """Adam's rate for features."""
 
     gate_rate: float = 0.01
@@ -99,7 +100,7 @@ class SagaOptions:
     epsilon: float = 1e-8
     """What Adam adds to the root of the mean of squared gradients."""
 
-    steps: int = 1000
+    steps: int = 400
     """Steps of Adam at most."""
 
     batch: int = 2048
@@ -133,7 +134,7 @@ class SagaOptions:
     """Share of the views that is not learnt from but scored, to stop in time; 0 holds out none
     and does all steps."""
 
-    score_every: int = 200
+    score_every: int = 50
     """Steps from one score to the next."""
 
     patience: int = 2
