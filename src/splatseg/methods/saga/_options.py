@@ -100,7 +100,7 @@ class SagaOptions:
     epsilon: float = 1e-8
     """What Adam adds to the root of the mean of squared gradients."""
 
-    steps: int = 400
+    steps: int = 200
     """Steps of Adam at most."""
 
     batch: int = 2048
