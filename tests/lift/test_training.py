@@ -220,6 +220,27 @@ def test_early_stopping_by_hand(rng) -> None:
     assert (result.stopped, result.best_step, len(result.losses)) == ("steps", 10, 10)
 
 
+def test_a_start_that_is_scored_is_the_result_where_nothing_is_better(rng) -> None:
+    sampler = many_views(rng, 6)
+    options = TrainingOptions(
+        steps=20, batch=50, held_out=0.34, score_every=5, patience=2, score_start=True
+    )
+    worse = train(Regression(scores=[3.0, 2.0, 2.5]), sampler, options=options)
+    assert [step for step, _ in worse.scores] == [0, 5, 10]
+    assert (worse.best_step, worse.stopped) == (0, "patience")
+    start = Regression().row_parameters["values"].start
+    assert torch.equal(worse.rows["values"], start)
+    better = train(Regression(scores=[3.0, 4.0, 2.5, 2.0]), sampler, options=options)
+    assert better.best_step == 5
+    assert not torch.equal(better.rows["values"], start)
+    without = train(
+        Regression(scores=[2.0, 2.5, 2.0, 2.0]),
+        sampler,
+        options=replace(options, score_start=False),
+    )
+    assert [step for step, _ in without.scores] == [5, 10, 15, 20]
+
+
 def test_no_view_is_held_out_of_too_few(sampler) -> None:
     model = Regression()
     result = train(model, sampler, options=TrainingOptions(steps=5, batch=50, score_every=1))
@@ -245,7 +266,7 @@ def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
     sampler = many_views(rng, 6)
     options = TrainingOptions(
         steps=25, batch=50, passes=passes, held_out=0.34, score_every=4, patience=9,
-        schedule="cosine", warmup=3, held_out_pixels=10,
+        schedule="cosine", warmup=3, held_out_pixels=10, score_start=True,
     )  # fmt: skip
     whole_model = Regression()
     whole = train(whole_model, sampler, options=options, seed=5)

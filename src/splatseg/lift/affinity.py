@@ -5,8 +5,8 @@ Such features (SAGA's, `methods.saga`) have no classes: two of them are compared
 .. math:: \cos\bigl(g(s) \odot f_i, \; g(s) \odot f_j\bigr), \qquad g(s) = \sigma(w s + b),
 
 where the gate g keeps the channels that matter at the scale s of what is looked for: 0 the
-smallest things of the scene, 1 the largest. Scales are ranks, so that they mean the same in every
-scene: `AffinityHead.scale_of` has them of lengths.
+smallest things of the scene, 1 the largest. Scales mean the same in every scene: they are levels
+(0 parts, 0.5 objects, 1 groups), or ranks of size: `AffinityHead.scale_of` has these of lengths.
 """
 
 from collections.abc import Mapping
@@ -50,7 +50,7 @@ class AffinityHead:
 
     scale_quantiles: Float64[Tensor, "quantiles"] | None = None
     """Percentiles of the scales of masks, in scene units, ascending; None where none were
-    measured."""
+    measured, or scales are levels."""
 
     levels: tuple[float, float, float] = (0.5, 0.5, 0.5)
     """The scales, in [0, 1], that stand for groups, objects and their finest parts."""

@@ -23,33 +23,29 @@ are taken one after another, those that most of the views that could have seen t
 first, and a group that mostly covers what is taken already is left out.
 """
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatseg._check import check_range
 from splatseg.core import (
+    UNLABELLED,
     ClassTable,
     Gaussians,
-    InstanceFacts,
     InstanceTree,
     Labels,
-    LayerInfo,
+    MaskSet,
     SegmentSource,
     View,
     tree_level,
     with_info,
 )
-from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.confusion import DEFAULT_CONFUSION, ConfusionOptions, correct_confusion
 from splatseg.lift.memberships import DEFAULT_MEMBERSHIPS, MembershipOptions
 from splatseg.lift.segments.ballots import by_mass, majority, view_counts
-from splatseg.lift.segments.clustering import Agreement, cluster
+from splatseg.lift.segments.clustering import cluster
 from splatseg.lift.segments.flatten import chosen_groups
 from splatseg.lift.segments.nesting import nesting
 from splatseg.lift.segments.recorded import EvidenceSegments
@@ -59,74 +55,16 @@ from splatseg.lift.segments.table import SegmentTable, segment_table
 from splatseg.lift.segments.tree import segment_tree
 from splatseg.lift.segments.tree_labels import (
     TreeVotes,
-    category_of,
     instance_tree,
     tree_votes,
 )
+from splatseg.methods._associate_options import AssociateOptions as AssociateOptions
+from splatseg.methods._association_info import account, with_instances
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.render import RenderOptions
 
-Overlapping = Literal["tree", "flat"]
-"""What overlapping masks become: a tree of levels, or one label a Gaussian."""
-
 _SURE_SEGMENTS = 3
 """Groups of fewer segments are too few to speak for a small thing: they may be accidents."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AssociateOptions:
-    """How segments of views become instances."""
-
-    agreement: float = 0.2
-    """Least overlap, in (0, 1], at which two groups of segments are one instance: intersection
-    over union on the Gaussians that the views of both see, averaged over all pairs of segments
-    of the two groups. Lower joins more."""
-
-    small_things: float = 0.0
-    """Exponent with which small instances outweigh large ones where views contradict each other;
-    0 treats all alike. 0.25 does most of what correcting confusion does, without it."""
-
-    min_views: int = 2
-    """An instance needs segments in so many views, or in all there are if they are fewer."""
-
-    overlapping: Overlapping = "tree"
-    """What masks that may overlap become. tree: groups, objects and parts, each in its parent.
-    flat: objects alone, whatever level most of the masks have."""
-
-    level: str = "tree"
-    """Of a tree, what is given: tree is all of it; group, object or part, or a granularity from 0
-    (groups) over 0.5 (objects) to 1 (the finest parts), are one cut of it as labels."""
-
-    min_support: float = 0.3
-    """Of a tree: a group of segments is a node if this share, in [0, 1], of the views that could
-    have seen it has a segment of it. Higher leaves out what few masks speak for."""
-
-    overlap: float = 0.7
-    """Of overlapping masks: a node lies in another if more than this share of it does, in
-    [0, 1]; with flat, a group is left out if more than this share of it is covered by groups
-    that were taken before."""
-
-    max_views: int = 50
-    """Views of each Gaussian that are compared, those that see most of it; bounds memory and
-    time."""
-
-    longest_side: int = 640
-    """Segments of larger photographs are read at this many pixels along their longest side;
-    bounds time. What is thinner than a pixel there may be missed."""
-
-    def __post_init__(self) -> None:
-        check_range("agreement", self.agreement, 0.0, 1.0)
-        if not (math.isfinite(self.small_things) and self.small_things >= 0):
-            raise RangeError(f"small_things: expected 0 or more, got {self.small_things}.")
-        check_range("overlap", self.overlap, 0.0, 1.0)
-        check_range("min_support", self.min_support, 0.0, 1.0)
-        if self.overlapping not in get_args(Overlapping):
-            raise InputError(f"overlapping: expected tree or flat, got {self.overlapping!r}.")
-        if self.level != "tree":
-            tree_level(self.level)
-        for name in ("min_views", "max_views", "longest_side"):
-            if getattr(self, name) < 1:
-                raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
 
 
 def associate(
@@ -181,11 +119,15 @@ def associate(
         backend=backend,
         progress=progress,
     )
-    agreement = table.agreement()
     if source.overlapping and options.overlapping == "tree":
-        sharpened = None
-        if memberships is not None:
-            sharpened = partial(
+        tree, _ = _tree(
+            table,
+            options,
+            confusion=confusion,
+            classes=classes,
+            sharpened=None
+            if memberships is None
+            else partial(
                 soft_votes,
                 gaussians,
                 sorted(views, key=lambda view: view.name),
@@ -195,11 +137,10 @@ def associate(
                 longest_side=options.longest_side,
                 render_options=render_options,
                 backend=backend,
-            )
-        tree = _tree(
-            table, agreement, options, confusion=confusion, classes=classes, sharpened=sharpened
+            ),
         )
         return tree if options.level == "tree" else tree.cut(tree_level(options.level))
+    agreement = table.agreement()
     group = cluster(agreement, options.agreement)
     group = _seen_often(table, group, min(options.min_views, len(table.views)))
     if source.overlapping:
@@ -213,14 +154,14 @@ def associate(
         labels,
         candidates=None,
         shares=None,
-        info=_with_instances(
+        info=with_instances(
             replace(
                 labels.info,
                 method="associate",
                 options=asdict(options),
                 views=tuple(table.views),
                 details=dict(labels.info.details)
-                | {"associate": _account(table, group, tracked=source.persistent)},
+                | {"associate": account(table, group, tracked=source.persistent)},
             ),
             table,
             group,
@@ -229,16 +170,83 @@ def associate(
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AssociatedMasks:
+    """A tree of instances, and which mask is which of its nodes."""
+
+    tree: InstanceTree
+
+    nodes: Mapping[str, NDArray[np.int64]]
+    """Of each view the ids of the nodes of its masks, (masks,), -1 for none."""
+
+
+def associate_masks(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    source: SegmentSource,
+    *,
+    render_options: RenderOptions | None = None,
+    backend: str = "auto",
+) -> AssociatedMasks:
+    """The tree that `associate` makes of masks by default, and the node of each mask.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Those whose masks count.
+        source: Their masks, which may overlap.
+        render_options: Switches of the blending model.
+        backend: Name of the rendering backend.
+
+    Raises:
+        InputError: If there are no views, if one has no masks, or none has any.
+        ShapeError: If masks do not have their photograph's proportions.
+    """
+    options = AssociateOptions()
+    table = segment_table(
+        gaussians,
+        views,
+        source,
+        max_views=options.max_views,
+        longest_side=options.longest_side,
+        render_options=render_options,
+        backend=backend,
+    )
+    tree, node = _tree(
+        table,
+        options,
+        confusion=DEFAULT_CONFUSION,
+        classes=None,
+        sharpened=partial(
+            soft_votes,
+            gaussians,
+            sorted(views, key=lambda view: view.name),
+            source,
+            table,
+            options=DEFAULT_MEMBERSHIPS,
+            longest_side=options.longest_side,
+            render_options=render_options,
+            backend=backend,
+        ),
+    )
+    nodes: dict[str, NDArray[np.int64]] = {}
+    for place, name in enumerate(table.views):
+        own = table.view == place
+        masks = source.segments_of(name)
+        nodes[name] = np.full(len(masks) if isinstance(masks, MaskSet) else 0, UNLABELLED)
+        nodes[name][table.name[own]] = node[own]
+    return AssociatedMasks(tree=tree, nodes=nodes)
+
+
 def _tree(
     table: SegmentTable,
-    agreement: Agreement,
     options: AssociateOptions,
     *,
     confusion: ConfusionOptions | None,
     classes: ClassTable | None,
     sharpened: Callable[[TreeVotes], TreeVotes] | None,
-) -> InstanceTree:
-    """Groups, objects and parts of segments that lie inside each other."""
+) -> tuple[InstanceTree, NDArray[np.int64]]:
+    """Groups, objects and parts of segments inside each other, and the node of each segment."""
+    agreement = table.agreement()
     nested = nesting(agreement, table.level)
     group = cluster(nested.agreement, options.agreement, conflicts=nested.conflicts)
     found = segment_tree(
@@ -261,16 +269,16 @@ def _tree(
     )
     if sharpened is not None:
         votes = sharpened(votes)
-    tree = instance_tree(table, found, level, votes, classes)
-    account = _account(table, found.node, tracked=False) | {"instances": len(votes.object_rows)}
+    tree, node = instance_tree(table, found, level, votes, classes)
+    said = account(table, found.node, tracked=False) | {"instances": len(votes.object_rows)}
     info = replace(
         tree.info,
         method="associate",
         options=asdict(options),
         views=tuple(table.views),
-        details=dict(tree.info.details) | {"associate": account | {"nodes": len(tree.nodes)}},
+        details=dict(tree.info.details) | {"associate": said | {"nodes": len(tree.nodes)}},
     )
-    return with_info(tree, info)
+    return with_info(tree, info), node
 
 
 def _seen_often(table: SegmentTable, group: NDArray[np.int64], least: int) -> NDArray[np.int64]:
@@ -290,52 +298,6 @@ def _say(table: SegmentTable, group: NDArray[np.int64], exponent: float) -> NDAr
     largest = float(mean.max())
     size = np.where(members >= _SURE_SEGMENTS, mean, largest) / max(largest, 1e-12)
     return np.where(there, np.maximum(size, 1e-12)[group] ** -exponent, 1.0)
-
-
-def _with_instances(
-    info: LayerInfo, table: SegmentTable, group: NDArray[np.int64], classes: ClassTable | None
-) -> LayerInfo:
-    """The record with the name, the class where it is known, and the facts of each instance."""
-    names: dict[int, str] = {}
-    class_of: dict[int, int] = {}
-    facts: dict[int, InstanceFacts] = {}
-    for index in range(int(group.max(initial=-1)) + 1):
-        id, members = index + 1, np.flatnonzero(group == index)
-        category = category_of(table, members)
-        named = category > 0 and classes is not None
-        name = classes.name_of(category) if named and classes is not None else "object"
-        names[id] = f"{name} {id}"
-        if category > 0:
-            class_of[id] = category
-        views = np.unique(table.view[members])
-        facts[id] = InstanceFacts(segments=len(members), views=len(views))
-    return replace(info, names=names, class_of=class_of, instances=facts)
-
-
-def _account(table: SegmentTable, group: NDArray[np.int64], *, tracked: bool) -> dict[str, Any]:
-    """What became of the segments; of tracks, which were joined and which were divided."""
-    there = group >= 0
-    pairs = np.stack((group[there], table.view[there]))
-    _, counts = np.unique(pairs, axis=1, return_counts=True)
-    said: dict[str, Any] = {
-        "segments": len(group),
-        "instances": int(group.max(initial=-1)) + 1,
-        "left_out": int((~there).sum()),
-        "joined_within_views": int((counts - 1).sum()),
-    }
-    if not tracked:
-        return said
-    of: dict[int, set[int]] = {}
-    names: dict[int, set[int]] = {}
-    for instance, name in zip(group[there].tolist(), table.name[there].tolist(), strict=True):
-        of.setdefault(name, set()).add(instance + 1)
-        names.setdefault(instance + 1, set()).add(name)
-    merged = {i: found for i, found in sorted(names.items()) if len(found) > 1}
-    split = {name: found for name, found in sorted(of.items()) if len(found) > 1}
-    return said | {
-        "merged": [{"id": i, "from": sorted(found)} for i, found in merged.items()],
-        "split": [{"from": name, "ids": sorted(found)} for name, found in split.items()],
-    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -55,8 +55,8 @@ class FeatureSourceOptions:
     it for points, strokes and masks. deviation: mean and one standard deviation, as it has them for
     SAM-based prompts."""
 
-    threshold: float = 0.75
-    """Similarity in [-1, 1] of the fixed rule."""
+    threshold: float = 0.85
+    """Similarity in [-1, 1] of the fixed rule. The published code has 0.75; decision 0030."""
 
     seed: int = 0
     """Of k-means."""

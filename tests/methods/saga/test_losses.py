@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,7 +15,7 @@ from splatseg.methods.saga._losses import (
     pixel_weights,
     together_at,
 )
-from splatseg.methods.saga._overlap import best_overlap
+from splatseg.methods.saga._overlap import mean_overlap
 
 
 @pytest.fixture
@@ -145,14 +144,23 @@ def test_members_name_the_masks_that_occur() -> None:
     assert inside.tolist() == [[False, True], [False, False], [True, True]]
 
 
-def test_the_best_overlap_is_that_of_all_thresholds(rng) -> None:
-    similarity = torch.from_numpy(np.round(rng.random(40), 1))
-    inside = torch.from_numpy(rng.random(40) < 0.3)
-    weight = torch.from_numpy(rng.uniform(1, 3, 40)).float()
-    expected = 0.0
-    for threshold in similarity.tolist():
-        found = similarity >= threshold
-        shared = float(weight[found & inside].sum())
-        expected = max(expected, shared / float(weight[found | inside].sum()))
-    assert best_overlap(similarity, inside, weight) == pytest.approx(expected, rel=1e-5)
-    assert best_overlap(similarity, torch.zeros(40, dtype=torch.bool), weight) == 0.0
+def test_the_overlap_is_the_mean_over_queries(rng) -> None:
+    inside = torch.from_numpy(rng.random(40) < 0.4)
+    found = torch.from_numpy(rng.random((40, 3)) < 0.5)
+    weight = torch.from_numpy(rng.random(40)).float()
+    expected = []
+    for query in range(3):
+        both = sum(float(weight[i]) for i in range(40) if inside[i] and found[i, query])
+        either = sum(float(weight[i]) for i in range(40) if inside[i] or found[i, query])
+        expected.append(both / either)
+    assert mean_overlap(found, inside, weight) == pytest.approx(sum(expected) / 3, rel=1e-5)
+    assert mean_overlap(found, torch.zeros(40, dtype=torch.bool), weight) == 0.0
+
+
+def test_pairs_with_a_pixel_of_which_nothing_is_known_are_not_apart() -> None:
+    inside = torch.tensor([[True, False], [False, True], [True, False], [False, False]])
+    ranks = torch.tensor([0.5, 0.5])
+    known = torch.tensor([True, False, True, True])
+    together, apart = together_at(inside, ranks, 0.5, known=known)
+    assert torch.equal(together, together_at(inside, ranks, 0.5)[0])
+    assert apart.nonzero().tolist() == [[0, 3], [2, 3], [3, 0], [3, 2]]

@@ -48,7 +48,9 @@ def separation(features: Features, ids: torch.Tensor, scale: float) -> tuple[flo
 
 def test_one_training_serves_windows_and_walls(walls) -> None:
     """At the scale of windows these part from their walls; at that of walls they are one."""
-    features = trained(walls, steps=300, smoothing=1)
+    features = trained(
+        walls, steps=300, smoothing=1, start="normal", mask_scale="size", gate="steps", rate=0.05
+    )
     head = AffinityHead.of(features)
     assert head.gated
     assert head.unit
@@ -109,7 +111,10 @@ def test_the_published_losses_part_the_walls(walls, guided) -> None:
         {"scales": 1},
         {"max_pixel_weight": 10.0},
         {"rate": 0.01},
+        {"start": "normal"},
+        {"mask_scale": "size"},
         {"gate": "random"},
+        {"gate": "steps"},
         {"gate_rate": 0.1},
         {"epsilon": 1e-3},
         {"steps": 50},
@@ -248,6 +253,8 @@ def test_the_method_is_declared(walls) -> None:
     [
         ({"correspondence": "some"}, "correspondence: expected"),
         ({"gate": "some"}, "gate: expected"),
+        ({"start": "some"}, "start: expected"),
+        ({"mask_scale": "some"}, "mask_scale: expected"),
         ({"channels": 0}, "channels: expected at least 1, got 0"),
         ({"smoothing": 0}, "smoothing: expected at least 1, got 0"),
         ({"scales": -1}, "scales: expected 0 or more, got -1"),

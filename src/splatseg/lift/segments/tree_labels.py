@@ -240,10 +240,13 @@ def instance_tree(
     level: NDArray[np.int64],
     votes: TreeVotes,
     classes: ClassTable | None,
-) -> InstanceTree:
+) -> tuple[InstanceTree, NDArray[np.int64]]:
     """The tree as a layer: nodes that Gaussians belong to, and those above them.
 
     Objects have the ids from 1 on, then come groups, then parts, each the largest first.
+
+    Returns:
+        The layer, and the id of the node of each segment, -1 for none.
     """
     used = set(votes.node[votes.node >= 0].tolist())
     if votes.soft is not None:
@@ -266,7 +269,7 @@ def instance_tree(
         candidates=None if votes.soft is None else torch.from_numpy(ids[votes.soft[0]]),
         shares=None if votes.soft is None else torch.from_numpy(votes.soft[1]),
     )
-    return InstanceTree(nodes=nodes, labels=labels)
+    return InstanceTree(nodes=nodes, labels=labels), ids[tree.node]
 
 
 def _node(

@@ -53,6 +53,10 @@ class TrainingOptions:
     score_every: int = 100
     """Steps from one score to the next."""
 
+    score_start: bool = False
+    """Score what training starts from, too, before the first step: where nothing learnt is better,
+    the start is the result."""
+
     patience: int = 3
     """Scores in a row that are no better than the best before training stops; the parameters of
     the best are the result. 0 never stops early, and the result is that of the last step."""

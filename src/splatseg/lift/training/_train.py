@@ -223,6 +223,8 @@ class _Run:
     def advance(self) -> None:
         """One step, and a score where it is time for one."""
         state, options = self.state, self._options
+        if self._held_out is not None and options.score_start and not state.step:
+            self._score()
         batch = self._next_batch()
         state.step += 1
         with one_torch_thread():

@@ -12,9 +12,11 @@ cosines of the correspondence loss count 0, and a tenth of the mean positive pro
 a random tenth of all Gaussians is added. Where there are no 2D features, the query of a mask is the
 mean of what is rendered in it.
 
-By default features are directions, averaged over the nearest Gaussians, and are compared behind a
-gate of the scale that is looked for, so that one training serves parts, objects and groups: at a
-scale, pixels belong together that share a mask up to it (`_losses.together_at`). Decision 0030.
+By default features are directions and are compared behind a gate of the scale that is looked for,
+so that one training serves parts, objects and groups: at a scale, pixels belong together that share
+a mask up to it (`_losses.together_at`). The masks are associated first (`methods.associate`):
+features start as codes of the nodes that Gaussians are in (`_association`), the scale of a mask is
+the level of its node, and training is kept as far as it makes held-out views better. Decision 0030.
 
 References:
     Cen et al., Segment Any 3D Gaussians (2023), section 3.3, and its published code for rates,
@@ -42,7 +44,7 @@ def run(inputs: MethodInputs, options: SagaOptions) -> Features:
 
 METHOD = Method(
     name="saga",
-    summary="features that tell what belongs together are trained on masks, with a gate for scale",
+    summary="features of what belongs together, begun from associated masks and trained on them",
     reference="SAGA (Cen et al. 2023), eq. 3 to 11",
     evidence=("masks",),
     options=SagaOptions,

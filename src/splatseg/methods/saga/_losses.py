@@ -71,7 +71,11 @@ def correspondence_loss(
 
 
 def together_at(
-    inside: Bool[Tensor, "pixels masks"], ranks: Float[Tensor, "masks"], scale: float
+    inside: Bool[Tensor, "pixels masks"],
+    ranks: Float[Tensor, "masks"],
+    scale: float,
+    *,
+    known: Bool[Tensor, "pixels"] | None = None,
 ) -> tuple[Bool[Tensor, "pixels pixels"], Bool[Tensor, "pixels pixels"]]:
     """Which pairs of pixels belong together at a scale, and which do not.
 
@@ -83,6 +87,7 @@ def together_at(
         inside: Which pixels each mask contains.
         ranks: The scales of the masks, in [0, 1].
         scale: The scale that is asked about.
+        known: Pixels of which something is known; None for all.
     """
     small = ranks <= scale
     covered = (inside & small).any(dim=1)
@@ -90,7 +95,8 @@ def together_at(
     one = member.float()
     together = (one @ one.T) > 0
     masked = member.any(dim=1)
-    return together, ~together & (masked[:, None] | masked[None, :])
+    apart = ~together & (masked[:, None] | masked[None, :])
+    return together, apart if known is None else apart & known[:, None] & known[None, :]
 
 
 def contrast_loss(

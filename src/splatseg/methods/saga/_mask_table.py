@@ -13,7 +13,7 @@ References:
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,6 +24,15 @@ from torch import Tensor
 from splatseg.core import Gaussians, MaskSet, View, camera_of_map
 from splatseg.lift.affinity import QUANTILES, scale_rank
 from splatseg.lift.training import MaskSets
+from splatseg.methods.associate import AssociatedMasks
+from splatseg.methods.saga._association import (
+    GROUP_SCALE,
+    OBJECT_SCALE,
+    PART_SCALE,
+    LevelMasks,
+    level_masks,
+    level_scales,
+)
 from splatseg.render import RenderOptions, options_for, render
 
 INSIDE = 0.9
@@ -53,18 +62,33 @@ class MaskTable:
     """Scale of each, scene units; the median where no pixel has depth."""
 
     ranks: Float[Tensor, "masks"]
-    """Scales as ranks, in [0, 1]."""
+    """Scales in [0, 1]: ranks by size, or levels."""
 
-    quantiles: Float64[Tensor, "quantiles"]
-    """Percentiles of scales, see `AffinityHead.scale_quantiles`."""
+    quantiles: Float64[Tensor, "quantiles"] | None
+    """Percentiles of scales, see `AffinityHead.scale_quantiles`; None of levels."""
 
     levels: tuple[float, float, float]
     """Median ranks of masks that hold others, of those that neither hold nor are held or do
     both, and of those that are held: groups, objects and parts. The median of all, 0.5, where
     there are none."""
 
+    nodes: LevelMasks | None = None
+    """What masks are at each level, where scales are levels."""
+
     def __len__(self) -> int:
         return len(self.areas)
+
+    def by_level(self, found: AssociatedMasks) -> "MaskTable":
+        """With the levels of associated masks as scales."""
+        names = sorted(self.first, key=lambda name: self.first[name])
+        nodes = np.concatenate([np.zeros(0, dtype=np.int64), *(found.nodes[n] for n in names)])
+        return replace(
+            self,
+            ranks=level_scales(found.tree, torch.from_numpy(nodes), self.scales),
+            nodes=level_masks(found.tree, torch.from_numpy(nodes)),
+            quantiles=None,
+            levels=(GROUP_SCALE, OBJECT_SCALE, PART_SCALE),
+        )
 
 
 def mask_table(

@@ -8,9 +8,11 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from splatseg.core import UNLABELLED
 from splatseg.lift.projector import project_features, projector_start
 from splatseg.lift.training import Batch, Parameter, Values
 from splatseg.methods._label_models import linear_start
+from splatseg.methods.saga._association import OBJECT_END, PART_END, divisions, level_cut
 from splatseg.methods.saga._losses import (
     contrast_loss,
     correspondence_loss,
@@ -23,17 +25,26 @@ from splatseg.methods.saga._losses import (
 )
 from splatseg.methods.saga._mask_table import MaskTable
 from splatseg.methods.saga._options import GateStart, SagaOptions
-from splatseg.methods.saga._overlap import best_overlap
+from splatseg.methods.saga._overlap import mean_overlap
 from splatseg.methods.saga._smoothing import Smoother
 
 PROJECTOR = "projector."
 """What names of the projector's arrays begin with among the shared parameters."""
 
 _STEEPNESS = 10.0
-"""How fast a channel of the gate closes at first, about its end."""
+"""How fast a channel of the gate closes at first, about its end, where each has one of its own."""
+
+_LEVEL_STEEPNESS = 24.0
+"""The same where ends lie between levels: 0.998 open and 0.002 at the scales of levels."""
 
 _LAST_STEP = 1.5
 """The scale up to which the last channel is open at first."""
+
+SELECTED = 0.85
+"""Similarity from which on a pixel counts as found in scores."""
+
+_ASKED = 4
+"""Pixels of a mask that it is looked for by."""
 
 _LARGE = 0.1
 """Share of a view from which on a mask's pixels count 1."""
@@ -110,20 +121,25 @@ class SagaModel:
         return loss
 
     def score(self, batches: Sequence[Batch], values: Values) -> float:
-        """How well masks of held-out views are found by their own mean: the mean best overlap.
+        """How well masks of held-out views are found by single pixels of theirs: the mean overlap.
 
-        For each mask, the best intersection over union, of any threshold, of the pixels that are
-        similar to its mean with those inside, behind the gate of its own scale. The similarity is
-        the cosine.
+        For each mask, the intersection over union of its pixels with those whose cosine with one
+        of them exceeds `SELECTED`, behind the gate of the mask's own scale; the mean over a few of
+        its pixels, evenly through them. Where scales are levels, masks that are nodes count.
         """
         overlaps: list[float] = []
+        nodes = self._masks.nodes
         for seen, inside, numbers, stands_for in self._whole_views(batches, values):
             for column, number in enumerate(numbers.tolist()):
+                if nodes is not None and int(nodes.nodes[0, number]) == UNLABELLED:
+                    continue
                 gated = seen * self._gate(float(self._masks.ranks[number]), values)
+                own = inside[:, column]
                 directions = normalize(gated, dim=1)
-                query = masked_means(gated, inside[:, column : column + 1], stands_for)
-                similarity = directions @ normalize(query, dim=1)[0]
-                overlaps.append(best_overlap(similarity, inside[:, column], stands_for))
+                pixels = torch.nonzero(own).squeeze(1)
+                asked = pixels[(torch.arange(_ASKED) * 2 + 1) * len(pixels) // (2 * _ASKED)]
+                found = directions @ directions[asked].T > SELECTED
+                overlaps.append(mean_overlap(found, own, stands_for))
         return float(np.mean(overlaps)) if overlaps else 0.0
 
     def _rendered(
@@ -172,7 +188,11 @@ class SagaModel:
             )
         total = seen.new_zeros(())
         for scale in scales:
-            together, apart = together_at(inside, ranks, scale)
+            if self._masks.nodes is None:
+                together, apart = together_at(inside, ranks, scale)
+            else:
+                shown, levels, known = self._masks.nodes.at(inside, numbers, scale)
+                together, apart = together_at(shown, levels, level_cut(scale), known=known)
             directions = normalize(seen * self._gate(scale, values), dim=1)
             total = total + contrast_loss(directions, together, apart, weights)
         return options.correspondence_weight * total / len(scales)
@@ -233,15 +253,20 @@ def gate_start(
 ) -> tuple[Float[Tensor, "channels"], Float[Tensor, "channels"]]:
     r"""What the gate's weight and bias start as.
 
-    Steps: channel c is open up to a scale of its own and closed beyond,
-    :math:`\sigma(\kappa (t_c - s))`, with :math:`t_c` evenly from 0 to 1.5, so that a third of the
-    channels is open at all scales.
+    Channel c is open up to a scale of its own and closed beyond,
+    :math:`\sigma(\kappa (t_c - s))`. Steps: :math:`t_c` goes evenly from 0 to 1.5, so that a third
+    of the channels is open at all scales. Levels: it lies between the scales of parts and objects
+    for the first third, between those of objects and groups for the second, beyond 1 for the third.
     """
     if kind == "random":
         weight, bias = linear_start(1, channels, rng)
         return weight[:, 0].contiguous(), bias
-    ends = torch.linspace(0.0, _LAST_STEP, channels)
-    return torch.full((channels,), -_STEEPNESS), _STEEPNESS * ends
+    ends, steepness = torch.linspace(0.0, _LAST_STEP, channels), _STEEPNESS
+    if kind == "levels":
+        steepness = _LEVEL_STEEPNESS
+        for where, end in zip(divisions(channels), (PART_END, OBJECT_END, _LAST_STEP), strict=True):
+            ends[where] = end
+    return torch.full((channels,), -steepness), steepness * ends
 
 
 def _by_view(

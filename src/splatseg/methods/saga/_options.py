@@ -9,7 +9,9 @@ from splatseg.lift.training import Sampling, SamplingOptions, Schedule, Training
 from splatseg.methods._trained_options import check_rate
 
 Correspondence = Literal["scale", "overlap", "none"]
-GateStart = Literal["steps", "random"]
+GateStart = Literal["levels", "steps", "random"]
+Start = Literal["association", "normal"]
+MaskScale = Literal["level", "size"]
 
 # Cen et al. 2023, section 3.3, and the published code: what `published` is made of.
 PUBLISHED_CHANNELS = 32
@@ -48,6 +50,15 @@ class SagaOptions:
     sparsity_share: float = PUBLISHED_SPARSITY_SHARE
     """Share of all Gaussians that it is estimated from in a step, in (0, 1]."""
 
+    start: Start = "association"
+    """What features start as. association: the masks are associated first, and each Gaussian has
+    the code of its part, its object and its group. normal: random numbers, as published."""
+
+    mask_scale: MaskScale = "level"
+    """What the scale of a mask is. level: that of its node among the associated masks, 0 for
+    parts, 0.5 for objects, 1 for groups. size: its rank among all masks by their extent in 3D,
+    as published."""
+
     channels: int = PUBLISHED_CHANNELS
     """Width of a Gaussian's feature."""
 
@@ -58,8 +69,9 @@ class SagaOptions:
     norm_weight: float = 1.0
     """Weight of (1 - length of what a pixel shows)^2; goes with `unit`."""
 
-    smoothing: int = 16
-    """Gaussians that a feature is averaged over, itself counted; goes with `unit`. 1 is without."""
+    smoothing: int = 1
+    """Gaussians that a feature is averaged over, itself counted; goes with `unit`. 1 is without;
+    the published code has 16, which a random start needs."""
 
     smoothing_drop: float = 0.5
     """Share of these neighbours that each step of training leaves out by chance, in [0, 1)."""
@@ -67,15 +79,16 @@ class SagaOptions:
     scales: int = 4
     """Scales drawn by chance in a step, besides the smallest and the largest."""
 
-    gate: GateStart = "steps"
-    """What the gate of scales starts as. steps: each channel is open up to a scale of its own, so
-    that fewer things are told apart at larger ones. random: as a linear layer usually does."""
+    gate: GateStart = "levels"
+    """What the gate of scales starts as. levels: a third of the channels is open up to the scales
+    of parts, a third up to those of objects, a third always. steps: each channel is open up to a
+    scale of its own. random: as a linear layer usually does, as published."""
 
     max_pixel_weight: float = 1.0
     """What pixels of the smallest masks count in the loss of scales; those of masks of a tenth
     of the view and more count 1."""
 
-    rate: float = 0.05
+    rate: float = 0.002
     """Adam's rate for features."""
 
     gate_rate: float = 0.01
@@ -87,7 +100,7 @@ class SagaOptions:
     epsilon: float = 1e-8
     """What Adam adds to the root of the mean of squared gradients."""
 
-    steps: int = 1000
+    steps: int = 200
     """Steps of Adam at most."""
 
     batch: int = 2048
@@ -121,7 +134,7 @@ class SagaOptions:
     """Share of the views that is not learnt from but scored, to stop in time; 0 holds out none
     and does all steps."""
 
-    score_every: int = 200
+    score_every: int = 50
     """Steps from one score to the next."""
 
     patience: int = 2
@@ -131,6 +144,8 @@ class SagaOptions:
     def __post_init__(self) -> None:
         check_choice("correspondence", self.correspondence, get_args(Correspondence))
         check_choice("gate", self.gate, get_args(GateStart))
+        check_choice("start", self.start, get_args(Start))
+        check_choice("mask_scale", self.mask_scale, get_args(MaskScale))
         for name in ("channels", "smoothing"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
@@ -165,6 +180,16 @@ class SagaOptions:
     def _without_correspondence(self) -> bool:
         return self.correspondence == "none" or self.correspondence_weight == 0
 
+    @property
+    def by_level(self) -> bool:
+        """Whether scales of masks are levels; without a gate, none is asked for."""
+        return self.mask_scale == "level" and self.correspondence == "scale"
+
+    @property
+    def associated(self) -> bool:
+        """Whether masks are associated first."""
+        return self.start == "association" or self.by_level
+
     @classmethod
     def published(cls, *, steps: int = 2000) -> "SagaOptions":
         """The published setting: its two losses and rates, features free and not smoothed.
@@ -177,6 +202,9 @@ class SagaOptions:
             guidance_weight=1.0,
             correspondence="overlap",
             sparsity_weight=PUBLISHED_SPARSITY_WEIGHT,
+            start="normal",
+            mask_scale="size",
+            gate="random",
             unit=False,
             norm_weight=0.0,
             smoothing=1,
@@ -203,6 +231,7 @@ class SagaOptions:
             epsilon=self.epsilon,
             held_out=self.held_out,
             score_every=self.score_every,
+            score_start=True,
             patience=self.patience,
         )
 

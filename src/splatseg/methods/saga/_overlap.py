@@ -1,31 +1,24 @@
-"""How well a similarity tells a mask: the best overlap that a threshold gives."""
+"""How well what was found agrees with a mask."""
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def best_overlap(
-    similarity: Float[Tensor, "pixels"],
+def mean_overlap(
+    found: Bool[Tensor, "pixels queries"],
     inside: Bool[Tensor, "pixels"],
     weights: Float[Tensor, "pixels"],
 ) -> float:
-    """The best intersection over union, of any threshold, of similar pixels with a mask.
-
-    Pixels of one similarity come in together.
+    """The mean intersection over union of what queries found with a mask.
 
     Args:
-        similarity: Of each pixel to what is looked for.
+        found: Which pixels each query finds.
         inside: Which pixels the mask contains.
         weights: What each pixel counts.
     """
-    if not bool(inside.any()):
+    if not bool(inside.any()) or not found.shape[1]:
         return 0.0
-    values, order = torch.sort(similarity, descending=True, stable=True)
-    weight = weights[order].double()
-    found = torch.cumsum(weight, dim=0)
-    shared = torch.cumsum(weight * inside[order], dim=0)
-    overlap = shared / (found + shared[-1] - shared)
-    last = torch.ones(len(values), dtype=torch.bool)
-    last[:-1] = values[1:] < values[:-1]
-    return float(overlap[last].max())
+    weight = weights.double()[:, None]
+    both = (weight * (found & inside[:, None])).sum(dim=0)
+    either = (weight * (found | inside[:, None])).sum(dim=0)
+    return float((both / either).mean())

@@ -14,6 +14,8 @@ from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training import MaskSets, RowSampler, TrainingResult, train
 from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods.associate import associate_masks
+from splatseg.methods.saga._association import MaskSegments, association_start
 from splatseg.methods.saga._mask_table import MaskTable, mask_table
 from splatseg.methods.saga._model import PROJECTOR, SagaModel
 from splatseg.methods.saga._options import SagaOptions
@@ -71,6 +73,10 @@ def train_saga(
             backend=context.backend,
         )
         source = SagaTargets(kept, ordered, masks.first, features)
+    rng = np.random.default_rng((context.seed, _START))
+    start, masks = _started(
+        gaussians, ordered, kept, masks, options=options, context=context, rng=rng
+    )
     sampler = RowSampler(
         gaussians,
         ordered,
@@ -82,10 +88,8 @@ def train_saga(
     smoother = None
     if options.unit and options.smoothing > 1:
         smoother = Smoother(gaussians.means.detach().cpu(), neighbours=options.smoothing)
-    rng = np.random.default_rng((context.seed, _START))
-    start = rng.standard_normal((len(gaussians), options.channels), dtype=np.float32)
     model = SagaModel(
-        torch.from_numpy(start),
+        start,
         masks,
         options,
         smoother=smoother,
@@ -109,6 +113,35 @@ def train_saga(
         weights=result.visibility,
         info=_info(options, ordered, result, head, context.seed),
     )
+
+
+def _started(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: KeptMasks,
+    masks: MaskTable,
+    *,
+    options: SagaOptions,
+    context: TrainingContext,
+    rng: np.random.Generator,
+) -> tuple[Tensor, MaskTable]:
+    """What features start as, and the masks with the scales that they are to have."""
+    found = None
+    if options.associated:
+        found = associate_masks(
+            gaussians,
+            views,
+            MaskSegments(evidence),
+            render_options=context.render_options,
+            backend=context.backend,
+        )
+    if found is not None and options.by_level:
+        masks = masks.by_level(found)
+    if found is not None and options.start == "association":
+        with one_torch_thread():
+            return association_start(found.tree, options.channels, rng), masks
+    drawn = rng.standard_normal((len(gaussians), options.channels), dtype=np.float32)
+    return torch.from_numpy(drawn), masks
 
 
 def _settings(options: SagaOptions) -> dict[str, object]:
