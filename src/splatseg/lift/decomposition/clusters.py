@@ -1,18 +1,31 @@
-"""Clusters of directions: found in a sample, given to all by their centres.
+r"""Clusters of directions that hang together in space.
 
-HDBSCAN compares every two of what it clusters, so that it sees a sample. What is not like any
-centre is sampled again: things of which the first sample holds too few have most of the second.
+Neighbours in space are joined as long as the directions that become one have little to lose: Ward's
+method on a graph. Joining clusters of a and b of n samples, with means m, raises the mean squared
+distance of samples from their means by
+
+.. math:: \Delta = \frac{1}{n} \frac{a b}{a + b} \, \| m_a - m_b \|^2 ,
+
+and clusters stay two where that exceeds what is allowed. Density alone (HDBSCAN, as the published
+code of SAGA has it) chains objects together through the Gaussians at their borders, whose features
+lie between: `docs/decisions/0031-decomposition.md`.
+
+References:
+    Ward, Hierarchical Grouping to Optimize an Objective Function (1963).
 """
+
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import normalize
 
-_ROWS = 1 << 15
-"""Directions that are held against all centres at a time."""
+from splatseg.neighbours import NeighbourIndex
+
+_ROWS = 1 << 14
+"""Points that are held against their neighbours at a time."""
 
 
 def sampled(
@@ -30,87 +43,103 @@ def sampled(
         return rows
     # The largest of u^(1/w) are a weighted sample (Efraimidis and Spirakis 2006).
     keys = np.log(rng.random(len(rows))) / weights[rows]
-    return np.sort(rows[np.argpartition(-keys, count)[:count]])
+    return np.sort(rows[np.argpartition(-keys, count - 1)[:count]])
 
 
-def hdbscan(
-    directions: Float[Tensor, "m channels"], *, min_cluster: int, epsilon: float
-) -> Float[Tensor, "clusters channels"]:
-    """Centres of the clusters of some directions: the directions of their means.
+def ward(
+    directions: Float[Tensor, "m channels"],
+    points: Float[Tensor, "m 3"],
+    *,
+    neighbours: int,
+    increase: float,
+) -> NDArray[np.int64]:
+    """The cluster of each sample, counted from 0 in the order of their first samples.
 
     Args:
         directions: Of length 1.
-        min_cluster: Rows that a cluster needs.
-        epsilon: Clusters that are nearer than this distance, of directions as points, are one.
-    """
-    if len(directions) < max(min_cluster, 2):
-        return directions[:0]
-    cluster = _fitted(directions, min_cluster, single=False)
-    if not bool((cluster >= 0).any()):
-        # What is all alike has no clusters but itself.
-        cluster = _fitted(directions, min_cluster, single=True)
-    sizes = torch.bincount(cluster[cluster >= 0]).to(directions)
-    return joined(mean_directions(directions, cluster), sizes, epsilon=epsilon)
-
-
-def _fitted(directions: Tensor, min_cluster: int, *, single: bool) -> Int64[Tensor, "m"]:
-    from sklearn.cluster import HDBSCAN
-
-    # Its own cluster_selection_epsilon fails on some trees (scikit-learn 1.9); `joined` has it.
-    found = HDBSCAN(
-        min_cluster_size=min_cluster, allow_single_cluster=single, copy=True
-    ).fit_predict(directions.double().numpy())
-    return torch.from_numpy(found.astype(np.int64))
-
-
-def joined(
-    centres: Float[Tensor, "clusters channels"], sizes: Float[Tensor, "clusters"], *, epsilon: float
-) -> Float[Tensor, "joined channels"]:
-    """Centres, of which those that are nearer than epsilon to another have become one with it.
-
-    HDBSCAN never answers that all it was given is one cluster, but divides it somewhere.
-
-    Args:
-        centres: Of length 1.
-        sizes: How much each counts in the direction of what it is joined to.
-        epsilon: Distance of directions as points.
+        points: Where the samples are.
+        neighbours: Others nearest to it that a sample may be joined with; what no path of them
+            connects is never joined.
+        increase: Delta that joining two clusters may cost.
     """
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
 
-    near = (2 - 2 * centres @ centres.T).clamp_min(0) < epsilon**2
-    graph = scipy.sparse.csr_matrix(near.numpy())
-    _, of = connected_components(graph, directed=False)
-    return mean_directions(centres * sizes[:, None], torch.from_numpy(of.astype(np.int64)))
+    count = len(directions)
+    if count < 2:
+        return np.zeros(count, dtype=np.int64)
+    k = min(neighbours, count - 1)
+    near = NeighbourIndex(points).nearest_others(k).indices.numpy()
+    edges = (np.ones(count * k), (np.repeat(np.arange(count), k), near.reshape(-1)))
+    graph: Any = scipy.sparse.csr_matrix(edges, shape=(count, count))
+    graph = graph.maximum(graph.T).tocsr()
+    _, piece = connected_components(graph, directed=False)
+    # scikit-learn's distance is sqrt(2 n Delta).
+    limit = float(np.sqrt(2 * count * increase))
+    values = directions.double().numpy()
+    cluster = np.zeros(count, dtype=np.int64)
+    after = 0
+    for rows in np.split(np.argsort(piece, kind="stable"), np.cumsum(np.bincount(piece))[:-1]):
+        cluster[rows] = after + _joined(values[rows], graph[rows][:, rows], limit)
+        after = int(cluster[rows].max()) + 1
+    _, first, found = np.unique(cluster, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[found].astype(np.int64)
 
 
-def mean_directions(
-    directions: Float[Tensor, "m channels"], cluster: Int64[Tensor, "m"]
-) -> Float[Tensor, "clusters channels"]:
-    """The direction of the mean of each cluster.
+def _joined(values: NDArray[np.float64], graph: Any, limit: float) -> NDArray[np.int64]:
+    """Clusters of what one graph connects."""
+    if len(values) < 2:
+        return np.zeros(len(values), dtype=np.int64)
+    from sklearn.cluster import AgglomerativeClustering
+
+    by_distance: Any = None  # its annotation knows numbers only
+    made = AgglomerativeClustering(
+        n_clusters=by_distance, distance_threshold=limit, linkage="ward", connectivity=graph
+    )
+    return made.fit_predict(values).astype(np.int64)
+
+
+def votes(
+    directions: Float[Tensor, "n channels"],
+    points: Float[Tensor, "n 3"],
+    samples: Int64[Tensor, "m"],
+    cluster: NDArray[np.int64],
+    *,
+    voters: int,
+    temperature: float,
+) -> tuple[Int64[Tensor, "n k"], Float[Tensor, "n k"]]:
+    r"""Clusters of all, by votes of the samples nearest to them in space.
+
+    .. math:: a_{ic} \propto \sum_{j \in N_k(i),\; c_j = c} \exp(\langle d_i, d_j \rangle / \tau)
 
     Args:
         directions: Of length 1.
-        cluster: The cluster of each, counted from 0 without gaps, -1 for none.
+        points: Where they are.
+        samples: Rows of the samples.
+        cluster: The cluster of each sample.
+        voters: k, samples that vote; where there are fewer, there are fewer columns.
+        temperature: Tau.
+
+    Returns:
+        Clusters, the one with the largest share first, -1 where there are fewer, and shares, which
+        add up to 1.
     """
-    inside = cluster >= 0
-    sums = directions.new_zeros(int(cluster.max()) + 1 if len(cluster) else 0, directions.shape[1])
-    sums.index_add_(0, cluster[inside], directions[inside])
-    return normalize(sums, dim=1)
-
-
-def nearest(
-    directions: Float[Tensor, "n channels"], centres: Float[Tensor, "clusters channels"], k: int
-) -> tuple[Float[Tensor, "n k"], Int64[Tensor, "n k"]]:
-    """Similarities of each direction with the k centres most like it, and which these are.
-
-    Where there are fewer centres, there are fewer columns; the first of equal ones comes first.
-    """
-    k = min(k, len(centres))
-    similarity = directions.new_zeros(len(directions), k)
-    index = torch.zeros(len(directions), k, dtype=torch.int64)
-    for start in range(0, len(directions), _ROWS):
+    k = min(voters, len(samples))
+    near = NeighbourIndex(points[samples]).nearest(points, k).indices
+    index = torch.full((len(points), k), -1)
+    shares = torch.zeros(len(points), k)
+    known, of = directions[samples], torch.from_numpy(cluster)
+    for start in range(0, len(points), _ROWS):
         rows = slice(start, start + _ROWS)
-        values, order = (directions[rows] @ centres.T).sort(dim=1, descending=True, stable=True)
-        similarity[rows], index[rows] = values[:, :k], order[:, :k]
-    return similarity, index
+        similarity = torch.einsum("nc,nkc->nk", directions[rows], known[near[rows]])
+        vote = torch.softmax(similarity / temperature, dim=1)
+        found = of[near[rows]]
+        same = found[:, :, None] == found[:, None, :]
+        total = (vote[:, None, :] * same).sum(dim=2)
+        # Of the voters of one cluster the nearest stands for all.
+        later = torch.tril(same, diagonal=-1).any(dim=2)
+        total = torch.where(later, -1.0, total)
+        total, order = total.sort(dim=1, descending=True, stable=True)
+        index[rows] = torch.where(total < 0, -1, found.gather(1, order))
+        shares[rows] = total.clamp_min(0)
+    return index, shares

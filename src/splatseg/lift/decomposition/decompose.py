@@ -1,20 +1,14 @@
 r"""Affinity features become a tree of groups, objects and parts, without a prompt.
 
-Directions of Gaussians behind the gate of objects cluster (HDBSCAN on a sample, as SAGA), and every
-Gaussian belongs to the cluster whose centre is most like its own direction,
-
-.. math:: o_i = \arg\max_c \langle d_i, m_c \rangle, \qquad
-          \text{none where } \langle d_i, m_{o_i} \rangle < t .
-
-Parts are the same at the scale of parts, within the Gaussians of one object; groups are clusters at
-the scale of groups that hold most of two or more objects. So children lie inside their parents by
-construction, whatever the features say. Similarities with the nearest centres become shares:
-
-.. math:: a_{ic} \propto \exp(\langle d_i, m_c \rangle / \tau) .
+Directions of a sample of Gaussians, behind the gate of objects, are joined to clusters that hang
+together in space (`clusters.ward`), and every Gaussian takes the cluster that the samples around it
+vote for, each by how alike their directions are (`clusters.votes`); votes become shares. Parts are
+the same at the scale of parts, within the Gaussians of one object; groups are clusters at the scale
+of groups that hold most of two or more objects. So children lie inside their parents by
+construction, whatever the features say.
 
 References:
     Cen et al., Segment Any 3D Gaussians (2023): automatic decomposition of its published code.
-    Campello et al., Density-Based Clustering Based on Hierarchical Density Estimates (2013).
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -39,7 +33,7 @@ from splatseg.core import (
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import ShapeError
-from splatseg.lift.decomposition.levels import Clusters, Directed, groups, objects, parts
+from splatseg.lift.decomposition.levels import Directed, Objects, groups, objects, parts
 from splatseg.lift.decomposition.options import DecomposeOptions
 
 _SEED = 0xDEC0
@@ -69,7 +63,7 @@ def decompose(
 
     Returns:
         The tree; objects have the ids from 1 on, the most visible first, then come groups, then
-        parts. The confidence is the similarity with the centre of the object, as 0 to 1.
+        parts. The confidence is the share of the votes for the object, in [0, 1].
 
     Raises:
         ShapeError: If the features are of another scene.
@@ -85,7 +79,7 @@ def decompose(
     options = options or DecomposeOptions()
     rng = np.random.default_rng((seed, _SEED))
     with one_torch_thread():
-        directed = Directed.of(features)
+        directed = Directed.of(gaussians, features)
         found = objects(directed, options, rng)
         part_of, owner = parts(directed, found.own, options, rng)
         group_of = groups(directed, found.own, options, rng)
@@ -93,7 +87,7 @@ def decompose(
         found,
         _Rows(
             part_of=part_of,
-            owner=np.asarray(owner, dtype=np.int64),
+            owner=owner,
             group_of=group_of,
             shown=directed.weights,
         ),
@@ -126,13 +120,13 @@ class _Rows:
 
 
 def _tree(
-    found: Clusters, rows: _Rows, options: DecomposeOptions, info: LayerInfo, seed: int
+    found: Objects, rows: _Rows, options: DecomposeOptions, info: LayerInfo, seed: int
 ) -> InstanceTree:
     things, sets, _ = rows.counts
     # Objects have the ids from 1 on, then come groups, then parts.
     deepest = np.where(rows.part_of >= 0, 1 + things + sets + rows.part_of, found.own + 1)
     deepest = np.where(found.own >= 0, deepest, UNLABELLED).astype(np.int32)
-    confidence = np.where(found.own >= 0, found.similarity[:, 0].clamp(0, 1).numpy(), 0.0)
+    confidence = np.where(found.own >= 0, found.shares[:, 0].numpy(), 0.0)
     candidates, shares = _shares(found, deepest, options) if options.candidates else (None, None)
     labels = Labels(
         ids=torch.from_numpy(deepest),
@@ -163,15 +157,13 @@ def _nodes(rows: _Rows) -> tuple[TreeNode, ...]:
 
 
 def _shares(
-    found: Clusters, deepest: NDArray[np.int32], options: DecomposeOptions
+    found: Objects, deepest: NDArray[np.int32], options: DecomposeOptions
 ) -> tuple[Int32[Tensor, "n k"], Float32[Tensor, "n k"]]:
     """Nodes that each Gaussian may belong to, its own first, and their shares.
 
     Of its own object a Gaussian has the deepest node, of others the whole.
     """
-    there = (found.index >= 0) & torch.from_numpy(found.own >= 0)[:, None]
-    logits = torch.where(there, found.similarity / options.temperature, -torch.inf)
-    shares = torch.where(there, torch.softmax(torch.where(there, logits, -1e9), dim=1), 0.0)
-    candidates = torch.where(there, found.index + 1, UNLABELLED).int()
+    kept = slice(0, options.candidates)
+    candidates = torch.where(found.index >= 0, found.index + 1, UNLABELLED)[:, kept].int()
     candidates[:, 0] = torch.from_numpy(deepest)
-    return candidates, shares
+    return candidates, found.shares[:, kept]

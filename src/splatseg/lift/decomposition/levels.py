@@ -5,13 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import Features
+from splatseg.core import Features, Gaussians
 from splatseg.lift.affinity import AffinityHead
-from splatseg.lift.decomposition.clusters import hdbscan, nearest, sampled
+from splatseg.lift.decomposition.clusters import sampled, votes, ward
 from splatseg.lift.decomposition.options import DecomposeOptions
 
 GROUP, OBJECT, PART = 0.0, 0.5, 1.0
@@ -23,13 +23,17 @@ class Directed:
     """Features that can be compared at any granularity."""
 
     values: Float[Tensor, "n channels"]
+
+    points: Float[Tensor, "n 3"]
+    """Centres of the Gaussians."""
+
     head: AffinityHead
 
     weights: NDArray[np.float64]
     """(n,): how much the views show of each Gaussian; 0 of those without a feature."""
 
     @classmethod
-    def of(cls, features: Features) -> "Directed":
+    def of(cls, gaussians: Gaussians, features: Features) -> "Directed":
         """Features with their head, or with none compared as they are."""
         values = features.values.detach().cpu().float()
         channels = values.shape[1]
@@ -41,83 +45,91 @@ class Directed:
         seen = torch.ones(len(values)) if features.weights is None else features.weights.cpu()
         there = (values != 0).any(dim=1)
         weights = torch.where(there, seen.double(), 0.0).clamp_min(0).numpy()
-        return cls(values=values, head=head, weights=weights)
+        return cls(values=values, points=gaussians.means.detach().cpu(), head=head, weights=weights)
 
     def at(self, granularity: float, rows: NDArray[np.int64]) -> Float[Tensor, "m channels"]:
         """Directions of some Gaussians behind the gate of a granularity."""
         some = self.values[torch.from_numpy(rows)]
         return self.head.directions(some, self.head.scale(granularity))
 
+    def clusters(
+        self,
+        granularity: float,
+        rows: NDArray[np.int64],
+        *,
+        count: int,
+        increase: float,
+        options: DecomposeOptions,
+        rng: np.random.Generator,
+    ) -> tuple[Int64[Tensor, "m k"], Float[Tensor, "m k"]]:
+        """Clusters of some Gaussians and their shares, the largest first, see `votes`.
+
+        Args:
+            granularity: At which they are compared.
+            rows: The Gaussians.
+            count: How many of them are sampled.
+            increase: See `ward`.
+            options: Neighbours and votes.
+            rng: Draws the sample.
+        """
+        directions, points = self.at(granularity, rows), self.points[torch.from_numpy(rows)]
+        # By the root: what fills the views would leave nothing of small things.
+        samples = torch.from_numpy(sampled(np.sqrt(self.weights[rows]), count, rng))
+        found = ward(
+            directions[samples], points[samples], neighbours=options.neighbours, increase=increase
+        )
+        return votes(
+            directions,
+            points,
+            samples,
+            found,
+            voters=options.voters,
+            temperature=options.temperature,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Clusters:
-    """Which cluster each Gaussian belongs to."""
+class Objects:
+    """Which object each Gaussian belongs to; objects are numbered by how much they show."""
 
     index: Int64[Tensor, "n k"]
-    """Clusters, the one most like it first; -1 where there are fewer, or it has no direction."""
+    """Objects, the one with the largest share first; -1 where there are fewer."""
 
-    similarity: Float32[Tensor, "n k"]
-    """With their centres."""
+    shares: Float[Tensor, "n k"]
+    """Their shares, which add up to 1 where there are any."""
 
-    own: NDArray[np.int64]
-    """(n,): the first of them if it is alike enough, else -1."""
-
-
-def objects(features: Directed, options: DecomposeOptions, rng: np.random.Generator) -> Clusters:
-    """Clusters at the scale of objects, those that show most first.
-
-    After each round, the Gaussians that are like no centre are sampled once more.
-    """
-    there = np.flatnonzero(features.weights > 0)
-    directions = features.at(OBJECT, there)
-    centres = directions[:0]
-    weights = features.weights[there]
-    left = weights.copy()
-    for _ in range(options.rounds):
-        rows = torch.from_numpy(sampled(left, options.sample, rng))
-        found = hdbscan(directions[rows], min_cluster=options.min_cluster, epsilon=options.epsilon)
-        if not len(found):
-            break
-        centres = torch.cat((centres, found))
-        similarity, _ = nearest(directions, centres, 1)
-        left[similarity[:, 0].numpy() >= options.similarity] = 0
-    return _ordered(_assigned(directions, centres, options), there, features.weights)
+    @property
+    def own(self) -> NDArray[np.int64]:
+        """(n,): the object of each Gaussian, -1 for none."""
+        return self.index[:, 0].numpy()
 
 
-def _assigned(
-    directions: Float[Tensor, "m channels"],
-    centres: Float[Tensor, "clusters channels"],
-    options: DecomposeOptions,
-) -> Clusters:
-    similarity, index = nearest(directions, centres, max(options.candidates, 1))
-    if not len(centres):
-        return Clusters(
-            index=torch.full((len(directions), 1), -1), similarity=torch.zeros(len(directions), 1),
-            own=np.full(len(directions), -1),
-        )  # fmt: skip
-    alike = similarity[:, 0] >= options.similarity
-    return Clusters(
-        index=index, similarity=similarity, own=torch.where(alike, index[:, 0], -1).numpy()
+def objects(features: Directed, options: DecomposeOptions, rng: np.random.Generator) -> Objects:
+    """Clusters at the scale of objects."""
+    total = len(features.values)
+    rows = np.flatnonzero(features.weights > 0)
+    if not len(rows):
+        return Objects(index=torch.full((total, 1), -1), shares=torch.zeros(total, 1))
+    found, votes_of = features.clusters(
+        OBJECT,
+        rows,
+        count=options.sample,
+        increase=options.object_increase,
+        options=options,
+        rng=rng,
     )
-
-
-def _ordered(found: Clusters, rows: NDArray[np.int64], weights: NDArray[np.float64]) -> Clusters:
-    """Clusters of some rows for all, numbered by what they show; those of nobody are dropped."""
-    held = found.own >= 0
-    count = int(found.index.max()) + 1 if found.index.numel() else 0
-    shown = np.bincount(found.own[held], weights[rows][held], minlength=count)
+    count = int(found.max()) + 1
+    shown = np.bincount(found[:, 0].numpy(), features.weights[rows], minlength=count)
+    rank = np.full(count + 1, -1)
+    # Those that are nobody's first come last, and are the nodes of nobody.
     order = np.lexsort((np.arange(count), -shown))
     order = order[shown[order] > 0]
-    rank = np.full(count + 1, -1)
     rank[order] = np.arange(len(order))
-    total, k = len(weights), found.index.shape[1]
-    index = torch.full((total, k), -1)
-    similarity = torch.zeros(total, k)
-    own = np.full(total, -1)
-    index[rows] = torch.from_numpy(rank)[found.index]
-    similarity[rows] = found.similarity
-    own[rows] = rank[found.own]
-    return Clusters(index=index, similarity=similarity, own=own)
+    index = torch.full((total, found.shape[1]), -1)
+    shares = torch.zeros(total, found.shape[1])
+    index[rows] = torch.from_numpy(rank)[found]
+    shares[rows] = torch.where(index[rows] >= 0, votes_of, 0.0)
+    return Objects(index=index, shares=shares)
 
 
 def parts(
@@ -125,7 +137,7 @@ def parts(
     object_of: NDArray[np.int64],
     options: DecomposeOptions,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.int64], list[int]]:
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Clusters at the scale of parts, among the Gaussians of each object alone.
 
     Args:
@@ -138,44 +150,24 @@ def parts(
         The part of each Gaussian, (n,), -1 for none, and the object of each part.
     """
     part_of, owner = np.full(len(object_of), -1), list[int]()
-    if not features.head.gated or options.part_sample == 0:
-        return part_of, owner
-    order = np.argsort(object_of, kind="stable")
-    ends = np.searchsorted(object_of[order], np.arange(int(object_of.max(initial=-1)) + 2))
-    for thing, (start, end) in enumerate(pairwise(ends.tolist())):
-        rows = order[start:end]
-        within = _parts_of(features, rows, options, rng)
-        held = within >= 0
-        part_of[rows[held]] = within[held] + len(owner)
-        owner += [thing] * (int(within.max(initial=-1)) + 1)
-    return part_of, owner
-
-
-def _parts_of(
-    features: Directed,
-    rows: NDArray[np.int64],
-    options: DecomposeOptions,
-    rng: np.random.Generator,
-) -> NDArray[np.int64]:
-    """The part of each Gaussian of one object, -1 for none: two parts at least, or none."""
-    none = np.full(len(rows), -1)
-    weights = features.weights[rows]
-    directions = features.at(PART, rows)
-    sample = torch.from_numpy(sampled(weights, options.part_sample, rng))
-    centres = hdbscan(directions[sample], min_cluster=options.min_cluster, epsilon=options.epsilon)
-    for _ in range(2):  # small parts go, and what was in them to the others
-        if len(centres) < 2:
-            return none
-        found = _assigned(directions, centres, options).own
-        held = found >= 0
-        shown = np.bincount(found[held], weights[held], minlength=len(centres))
-        kept = (shown > 0) & (shown >= options.min_part * weights.sum())
-        if kept.all():
-            break
-        centres = centres[torch.from_numpy(kept)]
-    if len(centres) < 2:
-        return none
-    return _assigned(directions, centres, options).own
+    if features.head.gated and options.part_sample > 0 and options.part_increase > 0:
+        order = np.argsort(object_of, kind="stable")
+        ends = np.searchsorted(object_of[order], np.arange(int(object_of.max(initial=-1)) + 2))
+        for thing, (start, end) in enumerate(pairwise(ends.tolist())):
+            rows = order[start:end]
+            found, _ = features.clusters(
+                PART,
+                rows,
+                count=options.part_sample,
+                increase=options.part_increase,
+                options=options,
+                rng=rng,
+            )
+            names, within = np.unique(found[:, 0].numpy(), return_inverse=True)
+            if len(names) > 1:
+                part_of[rows] = within + len(owner)
+                owner += [thing] * len(names)
+    return part_of, np.asarray(owner, dtype=np.int64)
 
 
 def groups(
@@ -196,22 +188,18 @@ def groups(
         rng: Draws the sample.
     """
     count = int(object_of.max(initial=-1)) + 1
-    if not features.head.gated or not options.groups or count < 2:
+    if not features.head.gated or options.group_increase == 0 or count < 2:
         return np.full(count, -1)
     rows = np.flatnonzero(object_of >= 0)
-    directions = features.at(GROUP, rows)
-    sample = torch.from_numpy(sampled(features.weights[rows], options.sample, rng))
-    centres = hdbscan(directions[sample], min_cluster=options.min_cluster, epsilon=options.epsilon)
-    if not len(centres):
-        return np.full(count, -1)
-    cluster = _assigned(directions, centres, options).own
-    held = np.zeros((count, len(centres) + 1))
-    # The last column is of Gaussians in no group.
+    found, _ = features.clusters(
+        GROUP, rows, count=options.sample, increase=options.group_increase, options=options, rng=rng
+    )
+    cluster = found[:, 0].numpy()
+    held = np.zeros((count, int(cluster.max()) + 1))
     np.add.at(held, (object_of[rows], cluster), features.weights[rows])
     most = held.argmax(axis=1)
-    group = np.where(most < len(centres), most, -1)
-    members = np.bincount(group[group >= 0], minlength=len(centres))
+    members = np.bincount(most)
     shared = np.flatnonzero(members >= 2)
-    rank = np.full(len(centres) + 1, -1)
+    rank = np.full(len(members), -1)
     rank[shared] = np.arange(len(shared))
-    return rank[group]
+    return rank[most]

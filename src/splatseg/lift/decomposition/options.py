@@ -12,46 +12,43 @@ class DecomposeOptions:
     """How features are decomposed into instances."""
 
     sample: int = 8000
-    """Gaussians that are clustered at a time, drawn by how much of them the views show. Time
-    grows with its square."""
-
-    rounds: int = 3
-    """Samples of objects, each of the Gaussians that are like no centre found so far."""
-
-    min_cluster: int = 10
-    """Gaussians of a sample that a cluster needs."""
-
-    epsilon: float = 0.3
-    """Clusters whose directions, as points, are nearer than this are one; at most 2."""
-
-    similarity: float = 0.5
-    """Least similarity in [-1, 1] of a Gaussian with the centre of its cluster."""
+    """Gaussians that are clustered, drawn by how much of them the views show."""
 
     part_sample: int = 500
     """Gaussians of an object among which its parts are looked for; 0 looks for none."""
 
-    min_part: float = 0.05
-    """Least share that a part has of its object, by what the views show of it, in [0, 1]."""
+    neighbours: int = 12
+    """Other samples nearest in space that a sample may be joined with."""
 
-    groups: bool = True
-    """Look for groups of objects."""
+    group_increase: float = 0.005
+    """How much joining two clusters may raise the mean squared distance of directions from the
+    mean of their cluster, at the scale of groups; 0 looks for none."""
+
+    object_increase: float = 0.0006
+    """The same at the scale of objects; above 0. Smaller ones are told apart the smaller it is."""
+
+    part_increase: float = 0.02
+    """The same at the scale of parts, of the Gaussians of one object."""
+
+    voters: int = 8
+    """Samples nearest in space that vote for the object of a Gaussian."""
+
+    temperature: float = 0.1
+    """How quickly votes fall with the similarity of directions."""
 
     candidates: int = 4
     """Nodes of which a Gaussian has shares; 0 gives each all of its own node."""
 
-    temperature: float = 0.05
-    """Tau: how quickly shares fall with similarity."""
-
     def __post_init__(self) -> None:
         convert_fields(self)
         for name, least in (
-            ("sample", 2), ("rounds", 1), ("min_cluster", 2), ("part_sample", 0),
-            ("candidates", 0),
+            ("sample", 1), ("part_sample", 0), ("neighbours", 1), ("voters", 1), ("candidates", 0),
         ):  # fmt: skip
             if getattr(self, name) < least:
                 raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
-        check_range("epsilon", self.epsilon, 0.0, 2.0)
-        check_range("similarity", self.similarity, -1.0, 1.0)
-        check_range("min_part", self.min_part, 0.0, 1.0)
+        for name in ("group_increase", "object_increase", "part_increase"):
+            check_range(name, getattr(self, name), 0.0, 1.0)
+        if self.object_increase == 0:
+            raise RangeError("object_increase: expected above 0, got 0.")
         if not 0 < self.temperature < float("inf"):
             raise RangeError(f"temperature: expected above 0, got {self.temperature}.")
