@@ -67,7 +67,7 @@ def decompose(
 
     Raises:
         ShapeError: If the features are of another scene.
-        RangeError: If a feature is not finite.
+        RangeError: If a feature or a weight is not finite.
         InputError: If the layer's head is not one of affinity features.
     """
     if len(features) != len(gaussians):
@@ -76,6 +76,8 @@ def decompose(
             f"{len(features)}; they are of another scene."
         )
     check_finite("features", features.values)
+    if features.weights is not None:
+        check_finite("weights", features.weights)
     options = options or DecomposeOptions()
     rng = np.random.default_rng((seed, _SEED))
     with one_torch_thread():
