@@ -11,7 +11,7 @@ from splatseg.errors import RangeError
 class DecomposeOptions:
     """How features are decomposed into instances."""
 
-    sample: int = 8000
+    sample: int = 20000
     """Gaussians that are clustered, drawn by how much of them the views show."""
 
     part_sample: int = 500
