@@ -250,10 +250,10 @@ def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
 
 
 def _check_outputs(command: Command, method: Method) -> None:
-    if method.returns not in ("labels", "tree"):
+    gives = method.gives(command.options)
+    if gives not in ("labels", "tree"):
         raise InputError(
-            f"export, report: go with methods that give labels, {method.name} gives "
-            f"{method.returns}."
+            f"export, report: go with methods that give labels, {method.name} gives {gives}."
         )
 
 

@@ -14,7 +14,7 @@ _MAX_DEPTH = MAX_DEPTH - 10
 _Value = TypeVar("_Value")
 
 LayerEditName = Literal[
-    "correct_confusion", "complete", "merge_panoptic", "sharpen", "attach", "merge"
+    "correct_confusion", "complete", "merge_panoptic", "sharpen", "attach", "merge", "decompose"
 ]
 """What this library does to layers, by the names of its functions."""
 

@@ -1,10 +1,10 @@
 """What a method declares of itself; flags, help, documentation and refusals follow from it."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
-from splatseg.core import ClassTable, Gaussians, Layer, View
+from splatseg.core import ClassTable, Features, Gaussians, Layer, View
 from splatseg.core.boundary import convert_fields
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
@@ -28,6 +28,9 @@ class MethodInputs:
 
     guidance: FeatureEvidence | None = None
     """Features of the same views, where the method's options name some, see `Method.guidance`."""
+
+    trained: Features | None = None
+    """What the method made before, where its options name such a layer, see `Method.trained`."""
 
     classes: ClassTable | None = None
     """Names of the scene's classes."""
@@ -108,6 +111,13 @@ class Method:
     """Name of the option that names evidence of features, which the method takes besides; None
     where it takes none."""
 
+    trained: str | None = None
+    """Name of the option that names a layer of features which the method made before, to be read
+    in another way without training again; None where it takes none."""
+
+    readouts: Mapping[str, Returns] = field(default_factory=dict[str, Returns])
+    """What it gives by its option ``readout``, where that is not `returns`."""
+
     complete: bool = True
     """Whether Gaussians that no view explains take the labels of their neighbours by default."""
 
@@ -122,13 +132,22 @@ class Method:
             raise InputError(
                 f"method {self.name!r}: expected a default for every option ({error})."
             ) from error
-        if self.guidance is not None and self.guidance not in self.option_names():
-            raise InputError(f"method {self.name!r}: expected an option {self.guidance!r}.")
+        for option in (self.guidance, self.trained, "readout" if self.readouts else None):
+            if option is not None and option not in self.option_names():
+                raise InputError(f"method {self.name!r}: expected an option {option!r}.")
 
     @property
     def published_options(self) -> Any:
         """The setting of the publication."""
         return self.options() if self.published is None else self.published
+
+    def gives(self, options: Any) -> Returns:
+        """What it returns with some options.
+
+        Args:
+            options: An instance of the method's options.
+        """
+        return self.readouts.get(getattr(options, "readout", ""), self.returns)
 
     def option_names(self) -> tuple[str, ...]:
         """Names of all options, those of nested dataclasses included."""
@@ -145,10 +164,10 @@ class Method:
 
 def _field_names(options: type[Any]) -> list[str]:
     names: list[str] = []
-    for field in fields(options):
-        nested = field.default_factory if callable(field.default_factory) else None
+    for each in fields(options):
+        nested = each.default_factory if callable(each.default_factory) else None
         if isinstance(nested, type) and is_dataclass(nested):
             names += _field_names(nested)
         else:
-            names.append(field.name)
+            names.append(each.name)
     return names

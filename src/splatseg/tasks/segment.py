@@ -157,7 +157,8 @@ def segment(
     options = options or SegmentOptions()
     method = find_method(method) if isinstance(method, str) else method
     chosen = _method_options(method, method_options, options)
-    evidence_name, evidence = _evidence(scene, method, options)
+    trained = _trained(scene, method, chosen, layers)
+    evidence_name, evidence = _evidence(scene, method, options, trained)
     merged = _classes_to_merge(scene, options, evidence, layers)
     check_name("layer", name := options.layer or evidence_name)
     inputs = MethodInputs(
@@ -165,10 +166,15 @@ def segment(
         views=_views(scene, evidence, options.views, observer),
         evidence=evidence,
         guidance=_guidance(scene, method, chosen),
+        trained=trained,
         classes=scene.classes,
         backend=backend,
         seed=options.seed,
-        checkpoints=training_checkpoints(scene, name, method, checkpoints, observer),
+        checkpoints=(
+            training_checkpoints(scene, name, method, checkpoints, observer)
+            if trained is None
+            else None
+        ),
     )
     timings = {"open": time.monotonic() - started}
     warnings = _checked_fit(scene, backend, timings, observer)
@@ -334,12 +340,32 @@ def _classes_to_merge(
     return layer, table
 
 
-def _evidence(scene: Scene, method: Method, options: SegmentOptions) -> tuple[str, Evidence]:
+def _evidence(
+    scene: Scene, method: Method, options: SegmentOptions, trained: Features | None
+) -> tuple[str, Evidence]:
+    """The evidence asked for, or else that of what was trained before, or else the only one."""
     folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
-    folder = find_evidence(folders, options.evidence)
+    asked = options.evidence or (None if trained is None else trained.info.evidence)
+    folder = find_evidence(folders, asked)
     evidence = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
     method.check_evidence(evidence)
     return folder.name, evidence
+
+
+def _trained(
+    scene: Scene, method: Method, options: Any, layers: Mapping[str, Layer] | None
+) -> Features | None:
+    """The layer that the method's options name to be read again, if they name one."""
+    name = None if method.trained is None else getattr(options, method.trained)
+    if name is None:
+        return None
+    layer = layer_of(scene, name, layers)
+    if not isinstance(layer, Features):
+        raise InputError(
+            f"{method.trained}: expected a layer of features, got {name!r} of "
+            f"{type(layer).__name__.lower()}."
+        )
+    return layer
 
 
 def _guidance(scene: Scene, method: Method, options: Any) -> FeatureEvidence | None:

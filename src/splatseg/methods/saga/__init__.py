@@ -23,23 +23,34 @@ References:
     counts and, in its second version, the scale gate.
 """
 
-from splatseg.core import Features
+from dataclasses import replace
+
+from splatseg.core import Features, InstanceTree
+from splatseg.lift.affinity import AffinityHead
+from splatseg.lift.decomposition.decompose import decompose
+from splatseg.lift.decomposition.options import DecomposeOptions
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods._trained_labels import context_of
 from splatseg.methods.saga._options import SagaOptions as SagaOptions
 from splatseg.methods.saga._train import train_saga as train_saga
 
 
-def run(inputs: MethodInputs, options: SagaOptions) -> Features:
-    """Train affinity features, see `train_saga`."""
-    return train_saga(
+def run(inputs: MethodInputs, options: SagaOptions) -> Features | InstanceTree:
+    """Train affinity features, see `train_saga`, and decompose them where a tree is asked for."""
+    # How features are read is no part of their training, and may differ when it is resumed.
+    training = replace(options, readout="features", features=None, decompose=DecomposeOptions())
+    features = inputs.trained or train_saga(
         inputs.gaussians,
         inputs.views,
         inputs.evidence,
         features=inputs.guidance,
-        options=options,
+        options=training,
         context=context_of(inputs),
     )
+    if options.readout == "features":
+        return features
+    AffinityHead.of(features)  # says so of features that are of something else
+    return decompose(inputs.gaussians, features, options=options.decompose, seed=inputs.seed)
 
 
 METHOD = Method(
@@ -54,4 +65,6 @@ METHOD = Method(
     resumes=True,
     published=SagaOptions.published(),
     guidance="guidance",
+    trained="features",
+    readouts={"tree": "tree"},
 )

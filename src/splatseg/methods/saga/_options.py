@@ -1,10 +1,11 @@
 """Switches of SAGA, and its published setting."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from splatseg._check import check_choice, check_range
-from splatseg.errors import RangeError
+from splatseg.errors import InputError, RangeError, quoted
+from splatseg.lift.decomposition.options import DecomposeOptions
 from splatseg.lift.training import Sampling, SamplingOptions, Schedule, TrainingOptions
 from splatseg.methods._trained_options import check_rate
 
@@ -12,6 +13,7 @@ Correspondence = Literal["scale", "overlap", "none"]
 GateStart = Literal["levels", "steps", "random"]
 Start = Literal["association", "normal"]
 MaskScale = Literal["level", "size"]
+SagaReadout = Literal["features", "tree"]
 
 # Cen et al. 2023, section 3.3, and the published code: what `published` is made of.
 PUBLISHED_CHANNELS = 32
@@ -141,7 +143,24 @@ class SagaOptions:
     """Scores in a row without a better one before training stops, and the best is kept; 0
     never stops."""
 
+    readout: SagaReadout = "features"
+    """What is stored. features: what is trained, which selections are made by. tree: what they
+    decompose into without a prompt, groups of objects of parts."""
+
+    features: str | None = None
+    """With the readout tree: name of a layer of such features of the scene, which is decomposed
+    instead of training again; None trains."""
+
+    decompose: DecomposeOptions = field(default_factory=DecomposeOptions)
+    """How features are decomposed."""
+
     def __post_init__(self) -> None:
+        check_choice("readout", self.readout, get_args(SagaReadout))
+        if self.features is not None and self.readout != "tree":
+            raise InputError(
+                f"features: expected --readout tree to decompose {quoted(self.features)}, "
+                f"got {self.readout}."
+            )
         check_choice("correspondence", self.correspondence, get_args(Correspondence))
         check_choice("gate", self.gate, get_args(GateStart))
         check_choice("start", self.start, get_args(Start))

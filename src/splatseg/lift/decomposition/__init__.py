@@ -1,0 +1,1 @@
+"""Affinity features to a tree of instances, without a prompt."""
