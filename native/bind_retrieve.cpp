@@ -44,7 +44,7 @@ void define(nb::module_& m, Stored stored) {
       "match_features",
       [stored](const Array<const Bits, 3>& panels, int64_t rows, const Maybe<const float, 1>& scales,
                const Array<const float, 2>& positive, const Array<const float, 2>& negative,
-               const Maybe<const float, 1>& gate_squared, float threshold,
+               const Maybe<const float, 1>& gate_squared, double threshold,
                const Maybe<float, 1>& positive_scores, const Maybe<float, 1>& negative_scores,
                const Maybe<uint8_t, 1>& member) {
         const int64_t count = static_cast<int64_t>(panels.shape(0));
@@ -68,14 +68,16 @@ void define(nb::module_& m, Stored stored) {
                                 pointer(gate_squared, channels, "match_features: gate")};
         const Matched out{pointer(positive_scores, rows, "match_features: output size"),
                           pointer(negative_scores, rows, "match_features: output size"),
-                          pointer(member, rows, "match_features: output size"), threshold};
+                          pointer(member, rows, "match_features: output size"),
+                          static_cast<float>(threshold)};
         nb::gil_scoped_release released;
         const Kernels& use = kernels();
         parallel_for(count, kPanelsAtOnce, [&](int64_t begin, int64_t end) {
           use.match_panels(matching, begin, end, out);
         });
       },
-      nb::arg("panels"), nb::arg("rows"), nb::arg("scales").none(), nb::arg("positive"),
+      // Converted, panels of one precision would be taken for those of another.
+      nb::arg("panels").noconvert(), nb::arg("rows"), nb::arg("scales").none(), nb::arg("positive"),
       nb::arg("negative"), nb::arg("gate_squared").none(), nb::arg("threshold"),
       nb::arg("positive_scores").none(), nb::arg("negative_scores").none(),
       nb::arg("member").none());

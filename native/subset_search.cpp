@@ -144,31 +144,36 @@ float sum_of_first(const float* values, int64_t count, int64_t k, float high) {
   return sum(total) + static_cast<float>(k - below) * std::sqrt(cut.high);
 }
 
+// Behind the last value, so that whole vectors can be read.
+inline void pad(float* held, int64_t count) {
+  store(held + count, set(std::numeric_limits<float>::infinity()));
+}
+
 // The second smallest squared distance: a member that asks is itself the nearest.
 float second_smallest(const float* const* columns, int64_t count, const float* query) {
   const Vec far = set(std::numeric_limits<float>::infinity());
   Vec first = far, second = far;
-  int64_t at = 0;
-  for (; at + kLanes <= count; at += kLanes) {
-    const Vec value = squared_to(columns, at, query);
+  const auto add = [&](Vec value) {
     second = min(second, max(first, value));
     first = min(first, value);
+  };
+  alignas(64) float one[2 * kLanes], other[kLanes];
+  int64_t at = 0;
+  for (; at + kLanes <= count; at += kLanes) add(squared_to(columns, at, query));
+  if (at < count) {
+    store(one, squared_to(columns, at, query));
+    pad(one, count - at);
+    add(load(one));
   }
-  alignas(64) float lanes[3 * kLanes];
-  store(lanes, first);
-  store(lanes + kLanes, second);
-  if (at < count) store(lanes + 2 * kLanes, squared_to(columns, at, query));
-  const int64_t held = 2 * kLanes + (count - at);
-  float least = lanes[0], next = std::numeric_limits<float>::infinity();
-  for (int64_t i = 1; i < held; ++i) {
-    next = std::min(next, std::max(least, lanes[i]));
-    least = std::min(least, lanes[i]);
-  }
-  return next;
-}
-
-inline void pad(float* held, int64_t count) {
-  store(held + count, set(std::numeric_limits<float>::infinity()));
+  store(one, first);
+  store(other, second);
+  for (int width = kLanes / 2; width; width /= 2)
+    for (int i = 0; i < width; ++i) {
+      const float larger = std::max(one[i], one[i + width]);
+      other[i] = std::min(std::min(other[i], other[i + width]), larger);
+      one[i] = std::min(one[i], one[i + width]);
+    }
+  return other[0];
 }
 
 #if defined(__AVX2__)

@@ -139,7 +139,7 @@ def test_how_sure_it_is_comes_from_the_evidence(gaussians, view, labels) -> None
     shares = torch.tensor([[0.6, 0.2]]).expand(count, 2) * (candidates != -1)
     soft = replace(labels, candidates=candidates, shares=shares)
     found = LayerSource(soft, gaussians).membership(asked(gaussians, view, (1,)))
-    expected = torch.where(labels.ids == 1, 0.75, 0.25)
+    expected = torch.where(labels.ids == 1, 0.6, 0.2)
     torch.testing.assert_close(found, torch.where(labels.ids == -1, 0.0, expected))
     # One that won by a hair, or by fewer than half of the evidence, is selected all the same.
     unsure = replace(labels, confidence=torch.full((count,), 0.3))

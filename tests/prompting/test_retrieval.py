@@ -76,6 +76,17 @@ def test_members_are_above_the_negative_score_and_the_threshold(negatives: int |
             assert found.negative is None
 
 
+@pytest.mark.parametrize("precision", list(LOSS))
+@pytest.mark.parametrize("threshold", [0.25, 0.3])
+def test_thresholds_that_float32_does_not_have(precision: str, threshold: float) -> None:
+    """0.3 has to be rounded on its way to the kernel, which nothing else may be."""
+    values, asked = random(2000, 8, seed=15), random(2, 8, seed=16)
+    found = retrieve(StoredFeatures.of(values, precision=precision), asked, threshold=threshold)
+    far = (reference.scores(values, asked) - threshold).abs() > LOSS[precision]
+    want = reference.retrieve(values, asked, threshold=threshold)
+    assert torch.equal(found.mask[far], want[far])
+
+
 def test_a_gate_is_the_same_as_gated_features() -> None:
     values, asked = random(90, 16, seed=8), random(3, 16, seed=9)
     gate = torch.sigmoid(random(16, seed=10) * 3)

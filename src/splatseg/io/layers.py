@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
@@ -37,9 +38,9 @@ from splatseg.io.npz_writing import save_arrays
 
 FORMAT = "splatseg-layer"
 VERSION = 4
-"""Versions up to it are read. Trees came with version 2, `LayerInfo` with version 3, and the
-confidence of selections with version 4. A file is of the first version that has all it holds, so
-that older programs refuse no layer that they can read whole."""
+"""Versions up to it are read. Trees came with version 2, `LayerInfo` with version 3, the confidence
+of selections and the shares of trees with version 4. A file is of the first version that has all
+it holds, so that older programs refuse no layer that they can read whole."""
 
 _WITHOUT_CONFIDENCE = 3
 
@@ -75,18 +76,7 @@ def save_layer(layer: Layer, path: Path) -> None:
     match layer:
         case Labels():
             header |= {"kind": "labels", "background": _void(layer.background)}
-            arrays = {"ids": _ids(layer.ids), "confidence": _floats(layer.confidence)}
-            if layer.candidates is not None and layer.shares is not None:
-                arrays |= {
-                    "candidates": _ids(layer.candidates),
-                    "shares": _floats(layer.shares),
-                }
-            if layer.evidence is not None:
-                arrays |= {"evidence": _floats(layer.evidence.float())}
-            if layer.effective_views is not None:
-                arrays |= {"effective_views": _floats(layer.effective_views.float())}
-            if layer.inferred is not None:
-                arrays |= {"inferred": layer.inferred.cpu().numpy()}
+            arrays = _label_arrays(layer)
         case Features():
             header |= {"kind": "features"}
             arrays = {"values": _floats(layer.values)}
@@ -99,13 +89,9 @@ def save_layer(layer: Layer, path: Path) -> None:
                 "background": _void(labels.background),
                 "nodes": [node_row(node) for node in layer.nodes],
             }
-            arrays = {"ids": _ids(labels.ids), "confidence": _floats(labels.confidence)}
-            if labels.evidence is not None:
-                arrays |= {"evidence": _floats(labels.evidence.float())}
-            if labels.effective_views is not None:
-                arrays |= {"effective_views": _floats(labels.effective_views.float())}
-            if labels.inferred is not None:
-                arrays |= {"inferred": labels.inferred.cpu().numpy()}
+            if labels.candidates is not None:
+                header |= {"version": VERSION}
+            arrays = _label_arrays(labels)
         case Selection():
             header |= {"kind": "selection"}
             arrays = {"mask": layer.mask.cpu().numpy()}
@@ -115,6 +101,19 @@ def save_layer(layer: Layer, path: Path) -> None:
     header["info"] = layer_info_to_json(layer.info)
     with atomic_file(path, durable=True) as temporary:
         save_arrays(header, arrays, temporary, name=path)
+
+
+def _label_arrays(labels: Labels) -> dict[str, NDArray[Any]]:
+    arrays = {"ids": _ids(labels.ids), "confidence": _floats(labels.confidence)}
+    if labels.candidates is not None and labels.shares is not None:
+        arrays |= {"candidates": _ids(labels.candidates), "shares": _floats(labels.shares.float())}
+    if labels.evidence is not None:
+        arrays |= {"evidence": _floats(labels.evidence.float())}
+    if labels.effective_views is not None:
+        arrays |= {"effective_views": _floats(labels.effective_views.float())}
+    if labels.inferred is not None:
+        arrays |= {"inferred": labels.inferred.cpu().numpy()}
+    return arrays
 
 
 @boundary
@@ -139,30 +138,7 @@ def _layer(
     count = int(header["count"])
     match header.get("kind"):
         case "labels":
-            pair = "candidates" in arrays or "shares" in arrays
-            return Labels(
-                ids=_from_file(_array(path, arrays, "ids", "i4", (count,))),
-                confidence=torch.from_numpy(_array(path, arrays, "confidence", "f4", (count,))),
-                background=_background(path, header),
-                candidates=_from_file(_array(path, arrays, "candidates", "i4", (count, None)))
-                if pair
-                else None,
-                shares=torch.from_numpy(_array(path, arrays, "shares", "f4", (count, None)))
-                if pair
-                else None,
-                evidence=torch.from_numpy(_array(path, arrays, "evidence", "f4", (count,)))
-                if "evidence" in arrays
-                else None,
-                effective_views=torch.from_numpy(
-                    _array(path, arrays, "effective_views", "f4", (count,))
-                )
-                if "effective_views" in arrays
-                else None,
-                inferred=torch.from_numpy(_array(path, arrays, "inferred", "?", (count,)))
-                if "inferred" in arrays
-                else None,
-                info=info,
-            )
+            return _labels(path, header, arrays, info)
         case "features":
             return Features(
                 values=torch.from_numpy(_array(path, arrays, "values", "f", (count, None))),
@@ -188,28 +164,42 @@ def _layer(
             )
 
 
-def _tree(
+def _labels(
     path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
-) -> InstanceTree:
+) -> Labels:
     count = int(header["count"])
-    rows = header.get("nodes")
-    if not isinstance(rows, list):
-        raise FileFormatError(f"{path}: expected a list of nodes, got {type(rows).__name__}.")
-    labels = Labels(
+    # A tree has candidates since version 4; what an older one has of that name is not its own.
+    soft = header.get("kind") != "tree" or int(header["version"]) > _WITHOUT_CONFIDENCE
+    pair = soft and ("candidates" in arrays or "shares" in arrays)
+
+    def optional(name: str, kind: str) -> Tensor | None:
+        found = name in arrays
+        return torch.from_numpy(_array(path, arrays, name, kind, (count,))) if found else None
+
+    return Labels(
         ids=_from_file(_array(path, arrays, "ids", "i4", (count,))),
         confidence=torch.from_numpy(_array(path, arrays, "confidence", "f4", (count,))),
         background=_background(path, header),
-        evidence=torch.from_numpy(_array(path, arrays, "evidence", "f4", (count,)))
-        if "evidence" in arrays
+        candidates=_from_file(_array(path, arrays, "candidates", "i4", (count, None)))
+        if pair
         else None,
-        effective_views=torch.from_numpy(_array(path, arrays, "effective_views", "f4", (count,)))
-        if "effective_views" in arrays
+        shares=torch.from_numpy(_array(path, arrays, "shares", "f4", (count, None)))
+        if pair
         else None,
-        inferred=torch.from_numpy(_array(path, arrays, "inferred", "?", (count,)))
-        if "inferred" in arrays
-        else None,
+        evidence=optional("evidence", "f4"),
+        effective_views=optional("effective_views", "f4"),
+        inferred=optional("inferred", "?"),
         info=info,
     )
+
+
+def _tree(
+    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
+) -> InstanceTree:
+    rows = header.get("nodes")
+    if not isinstance(rows, list):
+        raise FileFormatError(f"{path}: expected a list of nodes, got {type(rows).__name__}.")
+    labels = _labels(path, header, arrays, info)
     try:
         nodes = tuple(_node(row) for row in cast("list[Any]", rows))
         return InstanceTree(nodes=nodes, labels=labels)

@@ -1,0 +1,124 @@
+"""What a scene offers to select by: masks associated on the way, features, layers; their order."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatseg.cli import main
+from splatseg.core import Features, InstanceTree, Labels
+from splatseg.errors import InputError
+from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer, scene_layer_names
+from splatseg.lift.affinity import AffinityHead
+from splatseg.prompting.prompts import ViewPrompt
+from splatseg.tasks import SelectOptions, select
+
+
+@pytest.fixture
+def room(fitted_room: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(fitted_room, tmp_path / "room"))
+
+
+def click(scene):
+    view = scene.train_views[0]
+    middle = torch.tensor([[view.camera.width / 2, view.camera.height / 2]])
+    return ViewPrompt(view=view, points=middle)
+
+
+def affinity(count: int) -> Features:
+    from splatseg.core import LayerInfo
+
+    values = torch.nn.functional.normalize(
+        torch.stack((torch.linspace(0, 1, count), torch.linspace(1, 0, count)), 1), dim=1
+    )
+    return Features(
+        values=values, info=LayerInfo(head=AffinityHead(channels=2, unit=True).to_json())
+    )
+
+
+def masks_of(room: Path) -> str:
+    from splatseg.io.evidence import evidence_names, find_evidence, open_evidence
+
+    scene = load_scene(room)
+    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+    names = [
+        name
+        for name in evidence_names(folders)
+        if open_evidence(find_evidence(folders, name)).kind == "masks"
+    ]
+    return names[0]
+
+
+def test_masks_are_associated_once_and_the_layer_is_handed_out(room) -> None:
+    scene, name = load_scene(room), masks_of(room)
+    options = SelectOptions(source="masks", evidence=name)
+    made = select(scene, click(scene), options=options)
+    assert made.source == "masks"
+    assert list(made.made_layers) == [name]
+    tree = made.made_layers[name]
+    assert isinstance(tree, InstanceTree)
+    assert scene_layer_names(room) == (), "select writes nothing"
+    again = select(scene, click(scene), options=options, layers=made.made_layers)
+    assert again.made_layers == {}
+    assert torch.equal(again.selection.mask, made.selection.mask)
+    info = again.selection.info
+    assert (info.evidence, info.options["layer"]) == (name, name)
+
+
+def test_the_command_keeps_the_layer_that_masks_became(room, capsys) -> None:
+    name = masks_of(room)
+    words = ["select", room, "--view", load_scene(room).train_views[0].name, "--point", "80,60"]
+    words += ["--source", "masks", "--evidence", name, "--layer", "thing", "--json"]
+    assert main([str(word) for word in words]) == 0
+    assert isinstance(load_scene_layer(room, name), InstanceTree)
+    assert "thing" in scene_layer_names(room)
+    first = load_scene_layer(room, "thing")
+    assert main([str(word) for word in words]) == 0
+    assert torch.equal(load_scene_layer(room, "thing").mask, first.mask)
+    capsys.readouterr()
+
+
+def test_features_come_before_layers_and_layers_before_masks(room) -> None:
+    scene = load_scene(room)
+    count = len(scene.gaussians)
+    labels = Labels(ids=torch.ones(count, dtype=torch.int32), confidence=torch.ones(count))
+    layers = {"all": labels, "affinity": affinity(count)}
+    assert select(scene, click(scene), layers=layers).source == "features"
+    assert select(scene, click(scene), layers={"all": labels}).source == "layer"
+    plain = {"dino": Features(values=affinity(count).values)}
+    named = SelectOptions(source="features", from_layer="dino")
+    assert select(scene, click(scene), layers=plain, options=named).source == "features"
+    options = SelectOptions(source="features", from_layer="all")
+    with pytest.raises(InputError, match="expected features, 'all' is of labels"):
+        select(scene, click(scene), layers={"all": labels}, options=options)
+
+
+def test_a_layer_named_decides_the_source(room) -> None:
+    scene = load_scene(room)
+    count = len(scene.gaussians)
+    labels = Labels(ids=torch.ones(count, dtype=torch.int32), confidence=torch.ones(count))
+    layers = {"all": labels, "affinity": affinity(count)}
+    made = select(scene, click(scene), layers=layers, options=SelectOptions(from_layer="all"))
+    assert made.source == "layer"
+
+
+def test_evidence_that_is_no_masks_or_not_there_is_refused(room) -> None:
+    scene = load_scene(room)
+    for name, said in (("labels_semantic", "expected masks"), ("masks_sma", "masks_sma")):
+        with pytest.raises(InputError, match=said):
+            select(scene, click(scene), options=SelectOptions(source="masks", evidence=name))
+
+
+def test_a_scene_without_anything_says_what_to_make(room) -> None:
+    scene = load_scene(room)
+    with pytest.raises(InputError, match="splatseg see"):
+        select(scene, click(scene), options=SelectOptions(source="features"))
+
+
+def test_features_of_the_scene_folder_are_found(room) -> None:
+    scene = load_scene(room)
+    save_scene_layer(affinity(len(scene.gaussians)), room, "affinity")
+    made = select(load_scene(room), click(scene))
+    assert (made.source, made.selection.info.options["layer"]) == ("features", "affinity")
+    assert "next_click" in made.seconds
