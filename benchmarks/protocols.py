@@ -48,12 +48,12 @@ _TEXT, _CLASSES, _PANOPTIC, _MASKS = (
     "features_text", "labels_semantic", "labels_panoptic", "masks_sam",
 )  # fmt: skip
 RUNS = (
-    Run(protocol="nvos", layout="nvos", scene="frontal", methods=("uplift", "associate"),
-        evidence=(_MASKS,)),
+    Run(protocol="nvos", layout="nvos", scene="frontal",
+        methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
     Run(protocol="spin-nerf", layout="spin-nerf", scene="frontal",
-        methods=("uplift", "associate"), evidence=(_MASKS,)),
+        methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
     Run(protocol="spin-nerf-ludvig", layout="spin-nerf", scene="frontal",
-        methods=("uplift", "associate"), evidence=(_MASKS,)),
+        methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
     Run(protocol="lerf-mask", layout="lerf-mask", scene="toys", methods=("features",),
         evidence=(_TEXT,)),
     Run(protocol="lerf-ovs-2d", layout="lerf-ovs", scene="toys", methods=("features",),

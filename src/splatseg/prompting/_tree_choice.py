@@ -10,6 +10,10 @@ from splatseg.errors import InputError
 from splatseg.prompting._layer_regions import RegionCounts
 
 _OBJECT = 0.5
+_MOST = 0.5
+_CLEARLY = 0.1
+"""IoU by which several nodes have to fit better than the best one: their parts that a view hides
+are less surely meant than those of one."""
 
 
 class TreeChoice:
@@ -29,7 +33,7 @@ class TreeChoice:
         self,
         positive: Sequence[int],
         negative: Sequence[int],
-        regions: Sequence[int | None],
+        regions: Iterable[int],
         granularity: float | None,
     ) -> set[int]:
         """Ids of all nodes at and below those that are meant.
@@ -44,7 +48,7 @@ class TreeChoice:
         Raises:
             InputError: If nothing positive is on a node, or negative points are on the same.
         """
-        chosen = {node for node in regions if node is not None}
+        chosen = set(regions)
         chosen |= self._meant(positive, negative, granularity)
         if not chosen:
             raise InputError(
@@ -60,24 +64,41 @@ class TreeChoice:
         above = set(nodes)
         return {id for id, path in self._paths.items() if above & set(path)}
 
-    def best_node(self, counts: RegionCounts, granularity: float | None) -> int | None:
-        """The node that fits a mask or box best; None where none is there.
+    def best_nodes(self, counts: RegionCounts, granularity: float | None) -> set[int]:
+        """Nodes that a mask or box means; none where nothing is there.
+
+        That is the one that fits best. A mask round several things that no node holds together
+        means all that lie mostly in it, if those fit clearly better.
 
         Args:
             counts: Where the deepest nodes lie in the view.
             granularity: Nodes finer than that do not compete; None lets all.
         """
         best: tuple[float, int] | None = None
+        mostly: set[int] = set()
         for node in sorted(self._paths, key=lambda id: (self._fineness[id], id)):
             if granularity is not None and not self._allowed(node, granularity):
                 continue
-            members = torch.isin(counts.ids, torch.tensor(sorted(self.below({node}))))
+            members = self._members(counts, {node})
             if not bool(members.any()):
                 continue
-            fit = float(_together(counts, members).iou()[0])
+            shown = _together(counts, members)
+            fit = float(shown.iou()[0])
             if fit > 0 and (best is None or fit > best[0]):
                 best = (fit, node)
-        return None if best is None else best[1]
+            if int(shown.inside) > _MOST * int(shown.total):
+                mostly.add(node)
+        if best is None:
+            return set()
+        if mostly and not counts.boxed:
+            together = _together(counts, self._members(counts, mostly))
+            if float(together.iou()[0]) > best[0] + _CLEARLY:
+                return mostly
+        return {best[1]}
+
+    def _members(self, counts: RegionCounts, nodes: set[int]) -> torch.Tensor:
+        """Which of the ids in a view are nodes, or inside them."""
+        return torch.isin(counts.ids, torch.tensor(sorted(self.below(nodes))))
 
     def _allowed(self, node: int, granularity: float) -> bool:
         """Whether a cut at the granularity has this node."""

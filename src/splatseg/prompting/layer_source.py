@@ -36,7 +36,8 @@ class LayerSource:
     Of labels, several positive points mean all their ids, and negative ones take theirs away. Of
     a tree, they mean the smallest node that holds all positive points and no negative one, yet no
     finer than is asked for (objects, where nothing is). A mask means the ids that it shows most
-    of, a box the id or node whose outline fits it best; points in the same prompts are added.
+    of, of a tree the node that fits it best or, where none holds all that it shows, several; a box
+    means the id or node whose outline fits it best. Points in the same prompts are added.
 
     Args:
         layer: Labels, or a tree.
@@ -89,7 +90,11 @@ class LayerSource:
         hidden = self._shown(prompts, positive=False)
         choice = self._choice
         if choice is not None:
-            nodes = [choice.best_node(counts, granularity) for counts in self._regions(prompts)]
+            nodes = {
+                node
+                for counts in self._regions(prompts)
+                for node in choice.best_nodes(counts, granularity)
+            }
             return self._of_ids(choice.ids(shown, hidden, nodes, granularity))
         ids = set(shown)
         for counts in self._regions(prompts):

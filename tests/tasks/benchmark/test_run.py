@@ -6,93 +6,28 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from splatseg.cli import main
 from splatseg.core import (
-    Camera,
     Embedding,
-    Gaussians,
     Labels,
     MaskSet,
     Prompt,
-    Scene,
-    View,
 )
 from splatseg.core.models import TextMasks
 from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.evaluate.protocols import find_protocol
 from splatseg.io.benchmarks import read_benchmark
-from splatseg.io.images import save_png
 from splatseg.io.scene import load_scene, save_scene
 from splatseg.methods import Method, MethodInputs, _registry, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
-from splatseg.render import render
 from splatseg.tasks import SILENT, Observer
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.sight import model_of
-from support.benchmark_layouts.sparse import write_sparse
-
-SIZE = 32
-NAMES = ("a", "b", "c")
-
-
-def camera(x: float) -> Camera:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[0, 3] = -x
-    return Camera(width=SIZE, height=SIZE, fx=30, fy=30, cx=16, cy=16, cam_from_world=pose)
-
-
-def wall() -> Gaussians:
-    """A red square before a blue wall; the first 25 Gaussians are the square's."""
-    grid = torch.linspace(-0.4, 0.4, 5)
-    near = torch.stack([*torch.meshgrid(grid, grid, indexing="ij")], -1).reshape(-1, 2)
-    wide = torch.linspace(-3, 3, 25)
-    far = torch.stack([*torch.meshgrid(wide, wide, indexing="ij")], -1).reshape(-1, 2)
-    means = torch.cat(
-        (
-            torch.cat((near, torch.full((len(near), 1), 2.0)), 1),
-            torch.cat((far, torch.full((len(far), 1), 3.0)), 1),
-        )
-    )
-    count, things = len(means), len(near)
-    colours = torch.tensor([[-1.0, -1, 1.5]]).repeat(count, 1)
-    colours[:things] = torch.tensor([1.5, -1, -1])
-    scales = torch.full((count, 3), 0.15)
-    scales[:things] = 0.09
-    rotations = torch.zeros(count, 4)
-    rotations[:, 0] = 1
-    return Gaussians(
-        means=means, rotations=rotations, scales=scales,
-        opacities=torch.full((count,), 0.98), sh=colours[:, None],
-    )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The wall in SPIn-NeRF's layout, the red pixels its masks, and its scene as if fitted."""
-    root = tmp_path_factory.mktemp("tiny")
-    data, gaussians = root / "data", wall()
-    folder = data / "wall"
-    views = []
-    for i, name in enumerate(NAMES):
-        one = camera(0.15 * i)
-        colour = render(gaussians, one).image.clamp(0, 1)
-        (folder / "images").mkdir(parents=True, exist_ok=True)
-        (folder / "masks").mkdir(exist_ok=True)
-        save_png((colour * 255 + 0.5).to(torch.uint8), folder / "images" / f"{name}.png")
-        red = (colour[..., 0] > colour[..., 2]).numpy()
-        Image.fromarray(red.astype(np.uint8) * 255).save(folder / "masks" / f"{name}.png")
-        views.append(View(name=name, camera=one, image=folder / "images" / f"{name}.png"))
-    write_sparse(folder / "sparse/0", views, [f"{name}.png" for name in NAMES], None)
-    scenes = root / "scenes"
-    scenes.mkdir()
-    save_scene(Scene(gaussians=gaussians, views=tuple(views), source=folder), scenes / "wall")
-    return data, scenes
+from support.red_square import save_strokes
 
 
 @pytest.fixture
@@ -289,13 +224,6 @@ def test_options_of_models() -> None:
     assert "0.2, 0.4" in str(other.settings)
 
 
-def strokes(path: Path, where: tuple[slice, slice]) -> None:
-    mask = np.zeros((SIZE, SIZE), np.uint8)
-    mask[where] = 255
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(mask).save(path)
-
-
 class Redness:
     """Finds what is red, if the words say so."""
 
@@ -329,8 +257,8 @@ def test_who_answers_strokes(tiny, tmp_path, monkeypatch) -> None:
     data, scenes = tiny
     folder = tmp_path / "nvos"
     shutil.copytree(data / "wall", folder / "llff" / "wall")
-    strokes(folder / "scribbles/red/pos_0_wall.png", (slice(15, 18), slice(10, 22)))
-    strokes(folder / "scribbles/red/neg_0_wall.png", (slice(2, 3), slice(2, 30)))
+    save_strokes(folder / "scribbles/red/pos_0_wall.png", (slice(15, 18), slice(10, 22)))
+    save_strokes(folder / "scribbles/red/neg_0_wall.png", (slice(2, 3), slice(2, 30)))
     (folder / "masks/red").mkdir(parents=True)
     (folder / "reference_image/red").mkdir(parents=True)
     shutil.copy(data / "wall/masks/b.png", folder / "masks/red/b_mask.png")

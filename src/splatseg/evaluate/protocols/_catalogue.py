@@ -66,6 +66,7 @@ _LERF_MASK = Protocol(
         averaging="scenes",
         prompt="words",
         boundary_ratio=0.02,
+        answered="segments",
         segment_share=0.7,
         negatives=CANONICAL_NEGATIVES,
     ),

@@ -96,15 +96,24 @@ class TargetSwitches(Switches):
     negative_share: float = 0.005
     """Share of the pixels of the skeleton of negative strokes that do."""
 
+    answered: Literal["select", "segments"] = "select"
+    """How layers of instances, trees and affinity features answer. select: as `splatseg select`
+    answers a person. segments: all segments are taken that lie in the prompt's mask."""
+
+    granularity: Literal["auto", "group", "object", "part"] = "auto"
+    """How much a prompt means, where `select` answers."""
+
     segment_share: float = 0.5
     """Share of a segment's pixels in the prompted view that must lie in the prompt's mask for it
-    to be taken, where the method gives segments."""
+    to be taken, where segments answer."""
 
     def __post_init__(self) -> None:
         Switches.__post_init__(self)
         check_choice("prompt", self.prompt, ("scribble", "mask", "words"))
         check_choice("decided", self.decided, ("pixels", "gaussians"))
         check_choice("threshold", self.threshold, ("fixed", "reference", "oracle"))
+        check_choice("answered", self.answered, ("select", "segments"))
+        check_choice("granularity", self.granularity, ("auto", "group", "object", "part"))
         shares = ("silhouette_cut", "relevancy_cut", "segment_share", *_SAMPLED)
         for name in (*shares, *(("boundary_ratio",) if self.boundary_ratio is not None else ())):
             check_range(name, getattr(self, name), 0.0, 1.0)

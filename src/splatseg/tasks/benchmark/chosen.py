@@ -1,14 +1,15 @@
-"""From a layer and a prompt to masks of views: by label, by segments, or by features."""
+"""From a layer and a prompt to masks of views: by label, by selection, or by features."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol, Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatseg.core import Camera, Gaussians, LabelMap
+from splatseg.core import Camera, Features, Gaussians, LabelMap, Selection
 from splatseg.evaluate.protocols import (
     TargetSwitches,
     relevancy_mask,
@@ -23,6 +24,8 @@ _COVERED = 0.02
 CUTS = 100
 """Cuts that are tried where one is chosen."""
 
+_SELECTED = "selected"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answer:
@@ -31,6 +34,32 @@ class Answer:
     mask: Bool[Tensor, "height width"]
     relevancy: Float[Tensor, "height width"] | None = None
     """Where it comes from a map of relevancy, for its peak."""
+
+
+class Answering(Protocol):
+    """Who answers for a thing."""
+
+    def answer(self, camera: Camera) -> Answer:
+        """What is the thing in a view."""
+        ...
+
+
+class Cuttable(Answering, Protocol):
+    """An answer that comes from scores, which are cut."""
+
+    def score_map(self, camera: Camera) -> Float[Tensor, "height width"]:
+        """The score of each pixel of a view."""
+        ...
+
+    def mask_at(
+        self, scores: Float[Tensor, "height width"], cut: float
+    ) -> Bool[Tensor, "height width"]:
+        """What has more than a cut."""
+        ...
+
+    def with_cut(self, cut: float) -> Self:
+        """The same, cut there."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # no slots: it caches
@@ -57,6 +86,54 @@ class ByIds:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)  # no slots: it caches
+class BySelection:
+    """Gaussians that a prompt selected, each as likely as its confidence says.
+
+    A pixel is as likely as the light of its Gaussians has it, what is behind all of them counting
+    as outside; this is how `splatseg render` draws a selection.
+    """
+
+    gaussians: Gaussians
+    selection: Selection
+    switches: TargetSwitches
+    backend: str = "auto"
+    cut: float = 0.5
+    """Probability above which a pixel, or a Gaussian, is taken."""
+
+    def answer(self, camera: Camera) -> Answer:
+        """Pixels that are likely, or the silhouette of the Gaussians that are."""
+        if self.switches.decided == "gaussians":
+            chosen = self.gaussians[self._probabilities > self.cut]
+            return Answer(mask=silhouette(chosen, camera, self.switches))
+        return Answer(mask=self.mask_at(self.score_map(camera), self.cut))
+
+    def score_map(self, camera: Camera) -> Float[Tensor, "height width"]:
+        """Probability of each pixel."""
+        with self._field.view(camera) as view:
+            return view.features(_SELECTED)[..., 0].cpu()
+
+    def mask_at(
+        self, scores: Float[Tensor, "height width"], cut: float
+    ) -> Bool[Tensor, "height width"]:
+        """What is likelier than a cut."""
+        return scores > cut
+
+    def with_cut(self, cut: float) -> Self:
+        """The same, cut there."""
+        return replace(self, cut=cut)
+
+    @property
+    def _probabilities(self) -> Float[Tensor, "n"]:
+        confidence = self.selection.confidence
+        return (self.selection.mask if confidence is None else confidence).float()
+
+    @cached_property
+    def _field(self) -> GaussianField:
+        layer = Features(values=self._probabilities[:, None])
+        return GaussianField(self.gaussians, {_SELECTED: layer}, backend=self.backend)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)  # no slots: it caches
 class ByFeatures:
     """What is more like the thing than like anything else."""
 
@@ -80,12 +157,22 @@ class ByFeatures:
 
     def answer(self, camera: Camera) -> Answer:
         """What is relevant in a view."""
-        found = self.relevancy(camera)
+        found = self.score_map(camera)
         if self.switches.decided == "gaussians":
             return Answer(mask=silhouette(self._chosen, camera, self.switches), relevancy=found)
         return Answer(mask=relevancy_mask(found, self.switches, cut=self.cut), relevancy=found)
 
-    def relevancy(self, camera: Camera) -> Float[Tensor, "height width"]:
+    def mask_at(
+        self, scores: Float[Tensor, "height width"], cut: float
+    ) -> Bool[Tensor, "height width"]:
+        """What is more relevant than a cut, filtered as the protocol has it."""
+        return relevancy_mask(scores, self.switches, cut=cut)
+
+    def with_cut(self, cut: float) -> Self:
+        """The same, cut there."""
+        return replace(self, cut=cut)
+
+    def score_map(self, camera: Camera) -> Float[Tensor, "height width"]:
         """Relevancy of each pixel, filtered; of those that show nothing the least."""
         with self.field.view(camera) as view:
             alpha = view.signals(colour=False).alpha

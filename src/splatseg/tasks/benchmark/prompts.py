@@ -13,6 +13,7 @@ from splatseg.core.models import GroundedMasks, Image
 from splatseg.errors import InputError
 from splatseg.evaluate.protocols import TargetSwitches, resized_mask
 from splatseg.lift import GaussianField
+from splatseg.prompting.prompts import ViewPrompt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,6 +91,43 @@ def worded_mask(
     for mask in found.masks:
         together |= mask.decode()
     return PromptedMask(view=view.name, mask=together)
+
+
+def mask_prompt(scene: Scene, prompt: PromptedMask) -> ViewPrompt:
+    """A mask of a view as `select` takes it."""
+    return ViewPrompt(view=scene.view(prompt.view), mask=prompt.mask)
+
+
+def stroke_prompt(
+    scene: Scene, task: TargetTask, switches: TargetSwitches, *, seed: int
+) -> ViewPrompt:
+    """Strokes as `select` takes them: the pixels that are sampled on their skeletons.
+
+    They stay strokes, of which some pixels may slip over a border, and are no points, each of
+    which was meant.
+
+    Args:
+        scene: The fitted scene.
+        task: What is asked for.
+        switches: The shares of the skeletons that are taken.
+        seed: Of the sample.
+
+    Raises:
+        InputError: If the benchmark gives no strokes, or none on the thing.
+    """
+    if task.scribble is None:
+        raise InputError(f"task {task.name}: expected strokes in one view as prompt, got none.")
+    view = scene.view(task.scribble.view)
+    height, width = view.camera.height, view.camera.width
+    given = scribble_prompt(
+        task.scribble, switches, height=height, width=width, seed=_seed_of(seed, task.name)
+    )
+    drawn = torch.zeros(2, height, width, dtype=torch.bool)
+    columns, rows = given.points.long().unbind(dim=1)
+    drawn[(~given.signs).long(), rows.clamp_max(height - 1), columns.clamp_max(width - 1)] = True
+    return ViewPrompt(
+        view=view, scribble=drawn[0], negative_scribble=drawn[1] if bool(drawn[1].any()) else None
+    )
 
 
 def scribble_prompt(

@@ -1,10 +1,9 @@
 """One thing at a time: a prompt, the method's answer in each view, its agreement with the truth."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import torch
 from jaxtyping import Bool
@@ -25,7 +24,6 @@ from splatseg.evaluate.protocols import (
     MaskRow,
     TargetSwitches,
     peak_in_boxes,
-    relevancy_mask,
     resized_mask,
     score_mask,
 )
@@ -34,16 +32,27 @@ from splatseg.io.images import save_png
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.heads import has_classifier
+from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks.benchmark.chosen import (
     Answer,
+    Answering,
     ByFeatures,
     ByIds,
+    BySelection,
+    Cuttable,
     best_cut,
     ids_mask,
     segments_inside,
 )
 from splatseg.tasks.benchmark.job import Job
-from splatseg.tasks.benchmark.prompts import PromptedMask, prompted_mask, worded_mask
+from splatseg.tasks.benchmark.prompts import (
+    PromptedMask,
+    mask_prompt,
+    prompted_mask,
+    stroke_prompt,
+    worded_mask,
+)
+from splatseg.tasks.benchmark.selecting import LayerSelector, is_affinity
 from splatseg.tasks.benchmark.sight import Seen
 from splatseg.tasks.benchmark.spoken import Vocabulary, vocabulary_of
 
@@ -51,14 +60,17 @@ _LAYER = "layer"
 _THING, _REST = 1, 2
 """Ids of a prompt's mask as evidence."""
 
+_Cut = TypeVar("_Cut", bound=Cuttable)
+
 
 class TargetRun:
     """A method asked for one thing after another in one scene.
 
-    A method that takes label maps is given the prompt's mask as the label map of one view. One
-    that gives segments makes them of machine masks first, and those that lie in the prompt's
-    mask are taken. One that gives features is asked what is more like the inside of the mask than
-    the outside, or more relevant to words than canonical ones.
+    A method that takes label maps is given the prompt's mask as the label map of one view. A layer
+    of instances, a tree or affinity features are made of machine masks first, and `select` answers
+    the prompt from them; where the protocol says so, the segments that lie in the prompt's mask
+    are taken instead. Other features are asked what is more like the inside of the mask than the
+    outside, or more relevant to words than canonical ones.
 
     Args:
         job: The method and the scene.
@@ -67,15 +79,17 @@ class TargetRun:
     def __init__(self, job: Job) -> None:
         self._job = job
         self._switches = cast(TargetSwitches, job.protocol.switches)
+        self._selector = LayerSelector(job)
         self.notes: list[str] = []
         """What should be known of the answers, a sentence each."""
 
     def rows(self, predictions: Path) -> Iterator[MaskRow]:
         """Each task and scored view in turn; masks are written as PNG of 0 and 255."""
-        for task in self._job.bench.tasks:
-            answers = self._answers(task)
-            for true in self.scored(task):
-                yield self._row(task, true, answers, predictions)
+        with self._selector:
+            for task in self._job.bench.tasks:
+                answers = self._answers(task)
+                for true in self.scored(task):
+                    yield self._row(task, true, answers, predictions)
 
     def scored(self, task: TargetTask) -> tuple[TrueMask, ...]:
         """The true masks that count."""
@@ -95,7 +109,7 @@ class TargetRun:
         self,
         task: TargetTask,
         true: TrueMask,
-        answers: ByIds | ByFeatures | None,
+        answers: Answering | None,
         predictions: Path,
     ) -> MaskRow:
         truth = true.read()
@@ -121,10 +135,12 @@ class TargetRun:
             localised=localised,
         )
 
-    def _answers(self, task: TargetTask) -> ByIds | ByFeatures | None:
+    def _answers(self, task: TargetTask) -> Answering | None:
         """Who answers a task; nobody where it cannot be asked."""
         if self._switches.prompt == "words" and self._job.grounder is None:
             return self._by_words(task)
+        if self._selects:
+            return self._by_selection(task)
         prompt = self._prompt(task)
         if prompt is None:
             self.notes.append(f"{task.name}: its words were not found in the first view.")
@@ -134,6 +150,41 @@ class TargetRun:
         if isinstance(self._layer, Features) and not has_classifier(self._layer):
             return self._by_prototype(task, prompt, self._layer)
         return self._by_segments(task, prompt)
+
+    @property
+    def _selects(self) -> bool:
+        """Whether `select` answers: it does for all layers that it can select by."""
+        if self._switches.answered == "segments" or "labels" in self._job.method.evidence:
+            return False
+        layer = self._layer
+        return not isinstance(layer, Features) or has_classifier(layer) or is_affinity(layer)
+
+    def _by_selection(self, task: TargetTask) -> BySelection | None:
+        """What `select` answers to strokes as they are, or to a mask."""
+        asked: ViewPrompt | None
+        if self._switches.prompt == "scribble":
+            asked = stroke_prompt(
+                self._job.scene, task, self._switches, seed=self._job.options.seed
+            )
+            mask = None
+        else:
+            mask = self._prompt(task)
+            asked = None if mask is None else mask_prompt(self._job.scene, mask)
+        if asked is None:
+            self.notes.append(f"{task.name}: its words were not found in the first view.")
+            return None
+        try:
+            selection = self._selector.select(self._layer, asked)
+        except InputError as error:
+            self.notes.append(f"{task.name}: nothing was selected ({error})")
+            return None
+        found = BySelection(
+            gaussians=self._job.scene.gaussians,
+            selection=selection,
+            switches=self._switches,
+            backend=self._job.backend,
+        )
+        return self._with_cut(task, found, mask)
 
     def _prompt(self, task: TargetTask) -> PromptedMask | None:
         if self._job.grounder is not None:
@@ -277,15 +328,15 @@ class TargetRun:
             switches=self._switches,
         )
 
-    def _with_cut(
-        self, task: TargetTask, found: ByFeatures, prompt: PromptedMask | None
-    ) -> ByFeatures:
+    def _with_cut(self, task: TargetTask, found: _Cut, prompt: PromptedMask | None) -> _Cut:
         """With the cut that the protocol chooses, on the prompt's view or by the truth."""
         if self._switches.threshold == "fixed":
             return found
         if self._switches.threshold == "reference":
             if prompt is None:
-                raise InputError("threshold: expected fixed or oracle with words, got reference.")
+                raise InputError(
+                    "threshold: expected fixed or oracle with words and strokes, got reference."
+                )
             given = [(prompt.view, prompt.mask)]
         else:
             given = [(true.view, true.read()) for true in self.scored(task)]
@@ -294,11 +345,9 @@ class TargetRun:
             resized_mask(mask, (camera.height, camera.width))
             for (_, mask), camera in zip(given, views, strict=True)
         ]
-        maps = [found.relevancy(camera) for camera in views]
-        cut = best_cut(
-            lambda cut: [relevancy_mask(one, self._switches, cut=cut) for one in maps], masks
-        )
-        return replace(found, cut=cut)
+        maps = [found.score_map(camera) for camera in views]
+        cut = best_cut(lambda cut: [found.mask_at(one, cut) for one in maps], masks)
+        return found.with_cut(cut)
 
 
 _PROMPT_TABLE = ClassTable(
