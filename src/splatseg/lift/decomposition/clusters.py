@@ -8,7 +8,7 @@ distance of samples from their means by
 
 and clusters stay two where that exceeds what is allowed. Density alone (HDBSCAN, as the published
 code of SAGA has it) chains objects together through the Gaussians at their borders, whose features
-lie between: `docs/decisions/0031-decomposition.md`.
+lie between: `docs/decisions/0032-decomposition.md`.
 
 References:
     Ward, Hierarchical Grouping to Optimize an Objective Function (1963).
