@@ -90,7 +90,7 @@ class SagaOptions:
     """What pixels of the smallest masks count in the loss of scales; those of masks of a tenth
     of the view and more count 1."""
 
-    rate: float = 0.002
+    rate: float = 0.001
     """Adam's rate for features."""
 
     gate_rate: float = 0.01
