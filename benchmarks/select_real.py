@@ -12,7 +12,9 @@ were asked in. Rows:
   that granularity; `clicksN`: N clicks, all but the first where the selection asks for the next
   one, answered by the mask there; `robotN`: clicks at the middle of the largest error in ten views.
 - `mask`, `box`, `scribble`: the mask of the view, its box, a stroke through its middle.
+- `background`: all but what one click on what the object is not selects.
 - `lift`: the mask of the view, projected alone: each Gaussian of which it shows most inside.
+- `ceiling`: the masks of all training views, lifted: what the fit lets any selection reach.
 """
 
 import argparse
@@ -33,7 +35,7 @@ from PIL import Image
 from splatseg.core import LabelMap, Scene, Selection, View
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene
-from splatseg.lift import GaussianField
+from splatseg.lift import GaussianField, complete, uplift
 from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
@@ -84,8 +86,12 @@ class Asker:
             case "scribble":
                 stroke = torch.from_numpy(_stroke(mask))
                 return self._select([ViewPrompt(view=view, scribble=stroke)])
+            case "background":
+                return ~self._select([_click(view, _middle(~mask))])
             case "lift":
                 return self._projected(view, mask)
+            case "ceiling":
+                return self._lifted()
             case _:
                 raise SystemExit(f"there is no row {row!r}")
 
@@ -147,6 +153,28 @@ class Asker:
         own = found.segment == 1
         inside[found.gaussian[own]] = found.weight[own]
         return Selection(mask=(inside > 0.5 * found.visible) & (inside > 0))
+
+    def _lifted(self) -> Selection:
+        maps = {
+            view.name: LabelMap(ids=torch.from_numpy(np.where(self.truth(view), 1, 2)).int())
+            for view in self.scene.train_views
+        }
+        lifted = uplift(self.scene.gaussians, self.scene.train_views, _Masks(maps))
+        return Selection(mask=complete(self.scene.gaussians, lifted).ids == 1)
+
+
+class _Masks:
+    """Label maps by view, as `uplift` reads them."""
+
+    def __init__(self, maps: dict[str, LabelMap]) -> None:
+        self._maps = maps
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return tuple(self._maps)
+
+    def label_map(self, name: str) -> LabelMap:
+        return self._maps[name]
 
 
 def drawn(field: GaussianField, view: View) -> Mask:

@@ -120,7 +120,7 @@ def test_masks_and_boxes_on_a_tree_mean_the_node_that_fits_best(gaussians, view,
 def test_a_mask_round_what_no_node_holds_together_means_several(gaussians, view, tree) -> None:
     """Parts of two objects; a box, which says less, still means one node."""
     source = LayerSource(tree, gaussians)
-    upper = region(slice(10, 20), slice(0, 40))
+    upper = region(slice(10, 19), slice(0, 36))
     assert chosen(source, tree, asked(gaussians, view, (), mask=upper)) == {1, 2}
     # Objects of which half is in the mask are not mostly in it: the group fits as well.
     assert chosen(source, tree, asked(gaussians, view, (), mask=upper), 0.0) == {1, 2, 3, 6}
@@ -128,7 +128,7 @@ def test_a_mask_round_what_no_node_holds_together_means_several(gaussians, view,
     more = region(slice(10, 30), slice(0, 20))
     more[10:13, 20:40] = True
     assert chosen(source, tree, asked(gaussians, view, (), mask=more)) == {1, 3}
-    assert len(chosen(source, tree, asked(gaussians, view, (), box=[0, 10, 36, 20]))) in (2, 4)
+    assert chosen(source, tree, asked(gaussians, view, (), box=[0, 10, 36, 20])) == {1}
 
 
 def test_how_sure_it_is_comes_from_the_evidence(gaussians, view, labels) -> None:
