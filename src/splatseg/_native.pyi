@@ -266,9 +266,14 @@ class Memberships:
         shown: NDArray[Any],
         /,
     ) -> None: ...
-    def shown_values(self, values: NDArray[Any], out: Array, /) -> None: ...
+    def shown_values(self, values: NDArray[Any], out: NDArray[Any], /) -> None: ...
     def step(
-        self, label: NDArray[Any], step: Array, residuals: Array, values: Array, /
+        self,
+        label: NDArray[Any],
+        step: NDArray[Any],
+        residuals: NDArray[Any],
+        values: NDArray[Any],
+        /,
     ) -> None: ...
 
 class NeighbourIndex:
