@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import scipy.ndimage
@@ -12,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatseg.core import Gaussians, Scene, Selection, View
+from splatseg.core import Gaussians, LabelMap, Scene, Selection, View
+from splatseg.io.evidence import open_evidence
 from splatseg.lift.field_layers import selection_labels
 from splatseg.lift.label_maps import label_map
 
@@ -22,6 +24,7 @@ RIM = 5
 
 Mask = NDArray[np.bool_]
 Point = tuple[float, float]
+Level = Literal["instance", "part"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,15 +76,22 @@ class Targets:
         data: Its capture, with true maps.
         seed: Draws the views.
         limit: So many things, evenly through all; None takes all.
+        level: instance: whole things; part: the parts of things that have several.
     """
 
     def __init__(
-        self, scene: Scene, data: Path, *, seed: int = 0, limit: int | None = None
+        self,
+        scene: Scene,
+        data: Path,
+        *,
+        seed: int = 0,
+        limit: int | None = None,
+        level: Level = "instance",
     ) -> None:
         self._data = data
         self._scene = scene
-        facts = json.loads((data / "metadata.json").read_text())
-        names = {row["id"]: row["name"] for row in facts["instances"] if row["isthing"]}
+        self._level = level
+        names = _names(json.loads((data / "metadata.json").read_text()), level)
         tests = [view for view in scene.views if view.split == "test"]
         shown = np.zeros(max(names) + 1, np.int64)
         for view in tests:
@@ -102,8 +112,8 @@ class Targets:
         self.objects: Sequence[ClickTarget] = found
 
     def truth(self, view: View) -> NDArray[np.int64]:
-        """True instances of a view."""
-        return _map(self._data / "instance" / f"{view.name}.png")
+        """True ids of a view."""
+        return _map(self._data / self._level / f"{view.name}.png")
 
     def best_views(self, id: int, count: int) -> Sequence[View]:
         """Train views that show most of a thing."""
@@ -149,6 +159,47 @@ class Targets:
             point=_middle(largest),
             noisy=(column + 0.5, row + 0.5),
         )
+
+
+class GroupedParts:
+    """Label maps of the recorded masks that are of parts, as truth tells: id + 1, all else 1.
+
+    Args:
+        evidence: Recorded masks.
+        truth: What each of them is, a file a view.
+    """
+
+    def __init__(self, evidence: Path, truth: Path) -> None:
+        self._masks = open_evidence(evidence)
+        self._truth = truth
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have masks."""
+        return self._masks.view_names
+
+    def label_map(self, name: str) -> LabelMap:
+        """Of one view; smaller masks lie over larger ones."""
+        masks = self._masks.masks(name)
+        said = json.loads((self._truth / f"{name}.json").read_text())
+        ids = torch.ones(masks.height, masks.width, dtype=torch.int32)
+        areas = [int(masks.dense(index).sum()) for index in range(len(masks))]
+        for index in sorted(range(len(masks)), key=lambda index: -areas[index]):
+            if said[index]["level"] == "part":
+                ids[masks.dense(index)] = said[index]["part"] + 1
+        return LabelMap(ids=ids)
+
+
+def _names(facts: dict[str, Any], level: Level) -> dict[int, str]:
+    """What things, or their parts, are called, by id."""
+    things = {row["id"]: row for row in facts["instances"] if row["isthing"]}
+    if level == "instance":
+        return {id: row["name"] for id, row in things.items()}
+    return {
+        row["id"]: f"{row['name']} of {things[row['instance']]['name']}"
+        for row in facts["parts"]
+        if row["instance"] in things and len(things[row["instance"]]["parts"]) > 1
+    }
 
 
 def _middle(region: Mask) -> Point:

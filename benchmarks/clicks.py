@@ -17,9 +17,14 @@ anything count 1; pooled sums intersections and unions over the views first. Row
   of the recorded masks at the click the one that fits best, as a mask.
 - `single`: the true mask of that view projected alone (SAGA's Table 2): each Gaussian of which the
   view shows most inside the mask.
-- `part`: clicks on parts, against the parts that recorded masks can tell.
+- `per_view`: one recorded mask a view, chosen by what is selected so far (SAGA's Table 3), with
+  its agreement with `click`, for `--limit` objects.
 - `robot`: clicks at the middle of the largest error in ten train views: number of clicks to an IoU
   of 0.85 and 0.90 (NoC), at most ten.
+
+`--level part` asks for parts of things instead, at the granularity of parts; its row `grouped` is
+what the recorded masks of parts say, grouped by truth and lifted (`--grouped FOLDER` of what each
+recorded mask is). `--pictures DIR` draws the ten worst clicks, and says why they are.
 
 `--check N` has the first N objects of each row scored by ../shared/score/score.py too.
 """
@@ -33,14 +38,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from click_targets import ClickTarget, Targets
+from click_targets import ClickTarget, GroupedParts, Targets
 from numpy.typing import NDArray
+from per_view_masks import PerViewMasks
 from selected_views import TestViews
 
-from splatseg.core import Selection, View
+from splatseg.core import LabelMap, Selection, View
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
+from splatseg.lift import uplift
 from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
@@ -55,11 +62,17 @@ class Bench:
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.scene = load_scene(args.scene)
-        self.targets = Targets(self.scene, args.data, seed=args.seed, limit=args.limit)
-        self.views = TestViews(self.scene, args.data)
+        self.targets = Targets(
+            self.scene, args.data, seed=args.seed, limit=args.limit, level=args.level
+        )
+        self.views = TestViews(self.scene, args.data, level=args.level)
+        self.per_view = PerViewMasks(self.scene, args.data / args.evidence)
         self.args = args
         self.options = SelectOptions(
-            source=args.source, from_layer=args.layer, granularity="object", **_steps(args)
+            source=args.source,
+            from_layer=args.layer,
+            granularity="part" if args.level == "part" else "object",
+            **_steps(args),
         )
         self.session = open_selector(self.scene, options=self.options)
         self.seconds: list[float] = []
@@ -113,14 +126,25 @@ class Bench:
 
     def single(self, target: ClickTarget) -> Selection:
         """By what one view alone shows."""
-        from splatseg.core import LabelMap
-
         ids = torch.from_numpy(np.where(target.mask, 1, 0).astype(np.int32))
         found = view_masses(self.scene.gaussians, target.view.camera, LabelMap(ids=ids))
         inside = torch.zeros(len(self.scene.gaussians))
         own = found.segment == 1
         inside[found.gaussian[own]] = found.weight[own]
         return Selection(mask=(inside > 0.5 * found.visible) & (inside > 0))
+
+    def slow(self, target: ClickTarget) -> Selection:
+        """By one recorded mask a view."""
+        began = time.perf_counter()
+        found = self.per_view.select(target)
+        self.seconds.append(time.perf_counter() - began)
+        return found
+
+    def grouped(self) -> Callable[[ClickTarget], Selection]:
+        """By the recorded masks of parts that truth says are of one."""
+        maps = GroupedParts(self.args.data / self.args.evidence, self.args.grouped)
+        ids = uplift(self.scene.gaussians, self.scene.train_views, maps).ids
+        return lambda target: Selection(mask=ids == target.id + 1)
 
     def asked(self, target: ClickTarget, clicks: int) -> Selection:
         """By clicks where the selection asks for them."""
@@ -196,6 +220,7 @@ def rows_of(bench: Bench) -> dict[str, Callable[[ClickTarget], Selection]]:
         "recorded": bench.recorded,
         "sam": lambda target: bench.recorded(target, at_click=True),
         "single": bench.single,
+        "per_view": bench.slow,
     }
 
 
@@ -214,8 +239,17 @@ def run_row(bench: Bench, name: str, select: Callable[[ClickTarget], Selection])
         f"{1000 * float(np.median(seconds or [0])):.0f} ms",
         flush=True,
     )
-    for index in np.argsort(ious)[: bench.args.worst]:
-        print(f"    {ious[index]:.3f} {targets[index].name}")
+    causes: dict[int, str] = {}
+    for place, index in enumerate(np.argsort(ious)[: bench.args.worst]):
+        words = ""
+        if bench.args.pictures:
+            file = bench.args.pictures / name / f"{place:02d}.png"
+            cause = bench.views.picture(selections[index], targets[index], file)
+            words = causes[targets[index].id] = cause.words
+        print(f"    {ious[index]:.3f} {targets[index].name}: {words}")
+    if name == "per_view":
+        fast = [bench.click(target) for target in targets]
+        print(f"    agreement with click {bench.views.agreement(selections, fast).mean():.4f}")
     if bench.args.work and bench.args.check:
         bench.views.check(selections, targets, bench.args.work / name, bench.args.check, scores)
     return {
@@ -224,6 +258,7 @@ def run_row(bench: Bench, name: str, select: Callable[[ClickTarget], Selection])
         "pooled": float(ious.mean()),
         "accuracy": float(scores.accuracy.mean()),
         "milliseconds": 1000 * float(np.median(seconds or [0])),
+        "causes": causes,
         "objects": {t.id: float(v) for t, v in zip(targets, ious, strict=True)},
     }
 
@@ -255,13 +290,18 @@ def main() -> None:
     parser.add_argument("--without", nargs="*", default=[], help="steps that are left out")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--limit", type=int, help="so many objects, evenly through all")
+    parser.add_argument("--level", choices=("instance", "part"), default="instance")
+    parser.add_argument("--grouped", type=Path, help="truth of recorded masks, for that row")
     parser.add_argument("--worst", type=int, default=0)
+    parser.add_argument("--pictures", type=Path, help="where the worst are drawn")
     parser.add_argument("--work", type=Path)
     parser.add_argument("--check", type=int, default=0)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     bench = Bench(args)
     known = rows_of(bench)
+    if "grouped" in args.rows:
+        known["grouped"] = bench.grouped()
     said = [
         run_robot(bench) if name == "robot" else run_row(bench, name, known[name])
         for name in args.rows

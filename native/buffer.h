@@ -24,7 +24,10 @@ class Buffer {
   // Contents are lost when the buffer must grow.
   T* resize(int64_t size) {
     if (size > room_) {
+      // Left empty before memory is asked for: where there is none, the destructor still runs.
       std::free(data_);
+      data_ = nullptr;
+      size_ = room_ = 0;
       data_ = allocate(size);
       room_ = size;
     }
