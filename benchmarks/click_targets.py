@@ -21,6 +21,7 @@ from splatseg.lift.label_maps import label_map
 MIN_PIXELS = 400
 MIN_TEST_VIEWS = 3
 RIM = 5
+NOISY_CLICKS = 5
 
 Mask = NDArray[np.bool_]
 Point = tuple[float, float]
@@ -38,8 +39,8 @@ class ClickTarget:
     point: Point
     """The pixel of its largest region that is farthest from the rim."""
 
-    noisy: Point
-    """A pixel of it up to 5 pixels from the rim."""
+    noisy: tuple[Point, ...]
+    """Pixels of it up to 5 pixels from the rim, drawn by chance."""
 
     @property
     def box(self) -> tuple[float, float, float, float]:
@@ -106,7 +107,8 @@ class Targets:
         )
         self._column = {id: index for index, id in enumerate(wanted)}
         rng = np.random.default_rng(seed)
-        found = [self._target(id, names[id], rng) for id in wanted]
+        noise = np.random.default_rng((seed, 1))
+        found = [self._target(id, names[id], rng, noise) for id in wanted]
         if limit is not None and limit < len(found):
             found = [found[i] for i in np.linspace(0, len(found) - 1, limit).round().astype(int)]
         self.objects: Sequence[ClickTarget] = found
@@ -140,7 +142,9 @@ class Targets:
                     found = view, _middle(regions == sizes.argmax() + 1), positive
         return found
 
-    def _target(self, id: int, name: str, rng: np.random.Generator) -> ClickTarget:
+    def _target(
+        self, id: int, name: str, rng: np.random.Generator, noise: np.random.Generator
+    ) -> ClickTarget:
         areas = self._areas[:, self._column[id]]
         enough = np.flatnonzero(areas >= MIN_PIXELS)
         index = int(rng.choice(enough)) if len(enough) else int(areas.argmax())
@@ -150,14 +154,14 @@ class Targets:
         largest = regions == np.bincount(regions.ravel())[1:].argmax() + 1
         depth = _depth(largest)
         rim = np.argwhere(largest & (depth <= RIM))
-        row, column = rim[int(rng.integers(len(rim)))]
+        drawn = rim[noise.integers(len(rim), size=NOISY_CLICKS)]
         return ClickTarget(
             id=id,
             name=name,
             view=view,
             mask=mask,
             point=_middle(largest),
-            noisy=(column + 0.5, row + 0.5),
+            noisy=tuple((float(column) + 0.5, float(row) + 0.5) for row, column in drawn),
         )
 
 

@@ -11,7 +11,8 @@ scored as `score.py binary` does it: IoU is the mean over views, of which those 
 anything count 1; pooled sums intersections and unions over the views first. Rows:
 
 - `click`: one click, object granularity; `auto`: granularity left at its default.
-- `noisy`: one click up to 5 pixels from the rim; `scribble`: a stroke; `box`: its bounding box.
+- `noisy`: one click up to 5 pixels from the rim, the first of five that are drawn, `noisy1` to
+  `noisy4` the others; `scribble`: a stroke; `box`: its bounding box.
 - `clicks3`: two more clicks where the selection itself asks for them, with the truth's answer.
 - `mask`: the true mask of that view; `recorded`: the recorded mask there that fits it best; `sam`:
   of the recorded masks at the click the one that fits best, as a mask.
@@ -33,12 +34,13 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from click_targets import ClickTarget, GroupedParts, Targets
+from click_targets import NOISY_CLICKS, ClickTarget, GroupedParts, Targets
 from numpy.typing import NDArray
 from per_view_masks import PerViewMasks
 from selected_views import TestViews
@@ -92,9 +94,9 @@ class Bench:
         """By one click in the middle."""
         return self.select([_point(target.view, target.point)], **changes)
 
-    def noisy(self, target: ClickTarget) -> Selection:
+    def noisy(self, target: ClickTarget, draw: int = 0) -> Selection:
         """By one click near the rim."""
-        return self.select([_point(target.view, target.noisy)])
+        return self.select([_point(target.view, target.noisy[draw])])
 
     def scribble(self, target: ClickTarget) -> Selection:
         """By a stroke."""
@@ -213,6 +215,7 @@ def rows_of(bench: Bench) -> dict[str, Callable[[ClickTarget], Selection]]:
             target, filter=False, grow=False, refine=False, fill_holes=False, hidden=False
         ),
         "noisy": bench.noisy,
+        **{f"noisy{draw}": partial(bench.noisy, draw=draw) for draw in range(1, NOISY_CLICKS)},
         "scribble": bench.scribble,
         "box": bench.box,
         "clicks3": lambda target: bench.asked(target, 3),

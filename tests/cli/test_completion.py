@@ -30,7 +30,7 @@ def script(splatseg) -> str:
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_bash(script) -> None:
     assert completed(script, "splatseg", "") == {*COMMANDS, "help"}
-    assert completed(script, "splatseg", "se") == {"see", "segment"}
+    assert completed(script, "splatseg", "se") == {"see", "segment", "select"}
     assert {"--method", "--evidence"} <= completed(script, "splatseg", "segment", "--")
     assert completed(script, "splatseg", "segment", "S", "--evi") == {"--evidence"}
     assert completed(script, "splatseg", "segment", "--method", "vo") == {"vote"}

@@ -17,7 +17,7 @@ from splatseg.io.scene import load_scene_layer
 CLI = Path(cli.__file__).parent
 MAKE = {
     "attach", "bench", "demo", "edit", "evaluate", "export", "fit", "import", "render", "see",
-    "segment", "sharpen",
+    "segment", "select", "sharpen",
 }  # fmt: skip
 TELL = {"doctor", "info"}
 SHARED = {

@@ -101,6 +101,18 @@ def test_a_tree_has_levels_that_find_what_the_default_cut_takes_together(room, r
     assert counts[2] > counts[1]
 
 
+def test_votes_of_masks_are_sharpened_unless_that_is_switched_off(room, run) -> None:
+    masks = ("--method", "associate", "--evidence", "masks_sam", *CPU)
+    run("segment", room, *masks, "--layer", "sharpened")
+    run("segment", room, *masks, "--layer", "votes", "--no-sharpen-votes")
+    sharpened, votes = (load_scene_layer(room, name) for name in ("sharpened", "votes"))
+    assert isinstance(sharpened, InstanceTree)
+    assert isinstance(votes, InstanceTree)
+    assert sharpened.labels.shares is not None
+    assert votes.labels.shares is None
+    assert {node.id for node in sharpened.nodes} == {node.id for node in votes.nodes}
+
+
 def test_masks_of_a_model_become_instances(room, run) -> None:
     some = ("--views", "train_0000,train_0001,train_0002")
     run("see", room, "--model", "classical", "--evidence", "masks", *some)

@@ -13,6 +13,7 @@ from splatseg import core, edit, evaluate, pose, selection, synthetic
 from splatseg.core import Camera, Gaussians, LabelMap, Labels, Selection, Similarity, View
 from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import GaussianField
+from splatseg.neighbours import NeighbourIndex
 from splatseg.prompting.prompts import AxisBox
 
 COUNT, WIDTH, HEIGHT = 6, 12, 9
@@ -369,6 +370,8 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "edit.replay.history": (),
         "edit.save_document.root": world.folder / "document",
         "neighbours.NeighbourIndex.points": torch.rand(9, 3),
+        "neighbours.Subset.index": NeighbourIndex(torch.rand(9, 3)),
+        "neighbours.Subset.members": torch.ones(9, dtype=torch.bool),
         "pose.PoseReport.left_out": (pose.LeftOut(name="c", why="dark"),),
         "pose.PoseReport.tries": (),
         "pose.PoseReport.lenses": (),

@@ -1,6 +1,6 @@
 """Which node of a tree prompts mean."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -63,6 +63,19 @@ class TreeChoice:
         """The nodes themselves, and all inside them."""
         above = set(nodes)
         return {id for id, path in self._paths.items() if above & set(path)}
+
+    def node_at(self, id: int, granularity: float | None) -> int:
+        """The node round an id that fits a granularity, see `ids`."""
+        return self._of_path(self._paths[id], granularity) if id in self._paths else id
+
+    def sizes(self, counts: Mapping[int, int]) -> dict[int, int]:
+        """How many rows each node has with all inside it, from how many are its own."""
+        found = dict(counts)
+        for id, path in self._paths.items():
+            for node in path:
+                if node != id:
+                    found[node] = found.get(node, 0) + counts.get(id, 0)
+        return found
 
     def best_nodes(self, counts: RegionCounts, granularity: float | None) -> set[int]:
         """Nodes that a mask or box means; none where nothing is there.

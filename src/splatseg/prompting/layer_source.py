@@ -1,7 +1,8 @@
 r"""A layer as a source: what belongs together was decided when the scene was segmented.
 
 A click means the id that its pixel shows, the one with the largest blending weight in its row of
-W, as in a label map. Of a tree it means a node on the path of that id. How sure the answer is
+W, as in a label map, unless it is at the rim of something smaller (`_near_click`). Of a tree it
+means a node on the path of that id. How sure the answer is
 comes from the layer: with the evidence :math:`s_{in}` for the ids that were chosen and
 :math:`s_{out}` for the strongest other one,
 
@@ -18,6 +19,7 @@ from splatseg.core import UNLABELLED, Gaussians, InstanceTree, Labels, Layer, Se
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.prompting._layer_regions import RegionCounts, best_ids, region_counts
+from splatseg.prompting._near_click import Claim, agreed, claim, pixels_around
 from splatseg.prompting._tree_choice import TreeChoice
 from splatseg.prompting.seen import SeenPrompt
 from splatseg.prompting.view_cache import ViewCache
@@ -72,6 +74,9 @@ class LayerSource:
         self._labels = layer.labels if isinstance(layer, InstanceTree) else layer
         self._choice = TreeChoice(layer, name=name) if isinstance(layer, InstanceTree) else None
         self._rows = _RowsById(self._labels.ids.unsqueeze(1))
+        self._sizes = self._rows.counts()
+        if self._choice is not None:
+            self._sizes = self._choice.sizes(self._sizes)
         several = self._labels.candidates
         self._candidate_rows = self._rows if several is None else _RowsById(several)
         self._views = ViewCache(gaussians, capacity=1) if views is None else views
@@ -86,8 +91,9 @@ class LayerSource:
             InputError: If no positive prompt is on anything that the layer has a label for, or
                 the layer cannot tell positive prompts from negative ones.
         """
-        shown = self._shown(prompts, positive=True)
         hidden = self._shown(prompts, positive=False)
+        shown = self._clicked(prompts, granularity, set(hidden))
+        shown += self._shown([one for one in prompts if one.dense], positive=True)
         choice = self._choice
         if choice is not None:
             nodes = {
@@ -145,8 +151,42 @@ class LayerSource:
             alike = self._choice.below(alike)
         return self._of_ids(alike)
 
+    def _clicked(
+        self, prompts: Sequence[SeenPrompt], granularity: float | None, hidden: set[int]
+    ) -> list[int]:
+        """Ids that positive points mean, -1 not among them.
+
+        Args:
+            prompts: Of which points count.
+            granularity: How large things are.
+            hidden: Ids at negative points; only a click right on them means them.
+        """
+        claims: list[Claim] = []
+        for one in prompts:
+            for pixel in () if one.dense else one.pixels[one.positive].cpu():
+                camera = one.view.camera
+                pixels, votes = pixels_around(pixel, camera.height, camera.width)
+                ids = shown_ids(self._labels, self._views.prepared(one.view).weights(pixels))
+                own = (pixels == pixel).all(dim=1)
+                said = own | torch.tensor([id not in hidden for id in ids.tolist()])
+                claims.append(
+                    claim(
+                        ids[said].tolist(),
+                        votes[said].tolist(),
+                        thing_of=lambda id: self._thing_of(id, granularity),
+                        sizes=self._sizes,
+                    )
+                )
+        return [id for id in agreed(claims) if id != UNLABELLED]
+
+    def _thing_of(self, id: int, granularity: float | None) -> int:
+        """The node that an id is of at a granularity; the id itself where there is no tree."""
+        if self._choice is None or id == UNLABELLED:
+            return id
+        return self._choice.node_at(id, granularity)
+
     def _shown(self, prompts: Sequence[SeenPrompt], *, positive: bool) -> list[int]:
-        """Ids at points and under strokes of one sign, each once; -1 is not among them."""
+        """Ids right at points and under strokes of one sign, each once; -1 is not among them."""
         found: dict[int, None] = {}
         for one in prompts:
             # What a mask or a box shows is decided by all of its pixels.
@@ -203,6 +243,11 @@ class _RowsById:
         self._rows = order // max(ids.shape[1], 1)
         self._ids, counts = torch.unique_consecutive(ordered, return_counts=True)
         self._ends = counts.cumsum(0)
+
+    def counts(self) -> dict[int, int]:
+        """Rows of each id."""
+        starts = torch.cat((self._ends.new_zeros(1), self._ends))
+        return dict(zip(self._ids.tolist(), starts.diff().tolist(), strict=True))
 
     def of(self, ids: set[int]) -> Int64[Tensor, "m"]:
         """All rows that have one of the ids; one that has several comes as often."""

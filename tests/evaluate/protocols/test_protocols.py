@@ -46,7 +46,10 @@ def test_what_the_field_is_known_to_differ_in() -> None:
         points = find_protocol(f"scannet-{count}").switches
         assert isinstance(points, PointSwitches)
         assert len(points.class_ids) == count
-    assert differences(spin.switches, MapSwitches())[0] == "boundary_ratio 0.02 and absent"
+    assert differences(spin.switches, MapSwitches())[:2] == [
+        "answered 'select' and absent",
+        "boundary_ratio 0.02 and absent",
+    ]
 
 
 def test_a_switch_is_typed_and_changes_the_protocol() -> None:

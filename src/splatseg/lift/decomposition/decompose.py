@@ -19,7 +19,7 @@ from jaxtyping import Float32, Int32
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_finite
+from splatseg._check import check_finite, check_range
 from splatseg.core import (
     UNLABELLED,
     Features,
@@ -67,7 +67,7 @@ def decompose(
 
     Raises:
         ShapeError: If the features are of another scene.
-        RangeError: If a feature or a weight is not finite.
+        RangeError: If a feature or a weight is not finite, or the seed is below 0.
         InputError: If the layer's head is not one of affinity features.
     """
     if len(features) != len(gaussians):
@@ -78,6 +78,7 @@ def decompose(
     check_finite("features", features.values)
     if features.weights is not None:
         check_finite("weights", features.weights)
+    check_range("seed", seed, 0, 2**63 - 1)
     options = options or DecomposeOptions()
     rng = np.random.default_rng((seed, _SEED))
     with one_torch_thread():
