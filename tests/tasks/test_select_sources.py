@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatseg.cli import main
-from splatseg.core import Features, InstanceTree, Labels
+from splatseg.core import Features, InstanceTree, Labels, TreeNode
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer, scene_layer_names
 from splatseg.lift.affinity import AffinityHead
@@ -79,13 +79,44 @@ def test_the_command_keeps_the_layer_that_masks_became(room, capsys) -> None:
     capsys.readouterr()
 
 
-def test_features_come_before_layers_and_layers_before_masks(room) -> None:
+def only_masks(room: Path, wanted: str, monkeypatch) -> None:
+    """Let the scene have no other masks."""
+    from splatseg.tasks import _select_sources as sources
+
+    names = sources.evidence_names
+    others = [name for name in ("masks_sam", "masks_nested") if name != wanted]
+    monkeypatch.setattr(
+        sources, "evidence_names", lambda folders: [n for n in names(folders) if n not in others]
+    )
+
+
+def test_trees_come_first_then_features_then_masks_and_labels_last(room, monkeypatch) -> None:
     scene = load_scene(room)
     count = len(scene.gaussians)
     labels = Labels(ids=torch.ones(count, dtype=torch.int32), confidence=torch.ones(count))
-    layers = {"all": labels, "affinity": affinity(count)}
-    assert select(scene, click(scene), layers=layers).source == "features"
-    assert select(scene, click(scene), layers={"all": labels}).source == "layer"
+    tree = InstanceTree(nodes=(TreeNode(id=1),), labels=labels)
+    layers = {"all": labels, "affinity": affinity(count), "things": tree}
+
+    def taken(*names: str, **options) -> tuple[str, object]:
+        having = {name: layers[name] for name in names}
+        made = select(scene, click(scene), layers=having, options=SelectOptions(**options))
+        return made.source, made.selection.info.options["layer"]
+
+    assert taken("all", "affinity", "things") == ("layer", "things")
+    assert taken("all", "affinity") == ("features", "affinity")
+    assert taken("all") == ("layer", "all")
+    name = masks_of(room)
+    assert taken("all", "affinity", "things", evidence=name) == ("masks", name)
+    with pytest.raises(InputError, match="expected the name of one of masks_nested, masks_sam"):
+        taken()
+    only_masks(room, name, monkeypatch)
+    assert taken("all") == ("masks", name)
+
+
+def test_features_have_to_be_named_or_affinity_features(room) -> None:
+    scene = load_scene(room)
+    count = len(scene.gaussians)
+    labels = Labels(ids=torch.ones(count, dtype=torch.int32), confidence=torch.ones(count))
     plain = {"dino": Features(values=affinity(count).values)}
     named = SelectOptions(source="features", from_layer="dino")
     assert select(scene, click(scene), layers=plain, options=named).source == "features"

@@ -1,6 +1,6 @@
 """What a scene offers to select by: the sources, each opened by name."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from splatseg.core import FeatureMap, Features, InstanceTree, Labels, Layer, Scene, View
@@ -67,10 +67,12 @@ def open_source(offer: Offer) -> OpenedSource:
         if options.source not in OPENERS:
             known = ", ".join(("auto", *OPENERS))
             raise InputError(f"source: expected one of {known}, got {options.source!r}.")
-        openers = {options.source: OPENERS[options.source]}
+        openers: Sequence[Opener] = (OPENERS[options.source],)
+    elif options.evidence is not None:
+        openers = (_open_masks,)
     else:
-        openers = OPENERS
-    for opener in openers.values():
+        openers = AUTO
+    for opener in openers:
         opened = opener(offer)
         if opened is not None:
             return opened
@@ -84,8 +86,10 @@ def open_source(offer: Offer) -> OpenedSource:
 def _open_layer(offer: Offer) -> OpenedSource | None:
     """The layer that is named, or the one that says most of instances."""
     name = offer.options.from_layer or _best_layer(offer)
-    if name is None:
-        return None
+    return None if name is None else _layer_source(offer, name)
+
+
+def _layer_source(offer: Offer, name: str) -> OpenedSource | None:
     layer = whole_layer(offer.scene, name, offer.layers)
     if not isinstance(layer, Labels | InstanceTree):
         if offer.options.source == "auto":
@@ -96,14 +100,22 @@ def _open_layer(offer: Offer) -> OpenedSource | None:
     return OpenedSource(source=source, name="layer", layer=name)
 
 
-def _best_layer(offer: Offer) -> str | None:
+def _open_tree(offer: Offer) -> OpenedSource | None:
+    """A tree of the scene, where no layer is named."""
+    if offer.options.from_layer is not None:
+        return None
+    name = _best_layer(offer, trees_only=True)
+    return None if name is None else _layer_source(offer, name)
+
+
+def _best_layer(offer: Offer, *, trees_only: bool = False) -> str | None:
     """A tree before labels of instances before other labels; of equals the first by name."""
     best: tuple[int, str] | None = None
     for name in _layer_names(offer):
         layer = whole_layer(offer.scene, name, offer.layers)
         if isinstance(layer, InstanceTree):
             rank = 0
-        elif isinstance(layer, Labels):
+        elif isinstance(layer, Labels) and not trees_only:
             rank = 1 if layer.info.instances else 2
         else:
             continue
@@ -216,7 +228,8 @@ def _masks(offer: Offer) -> str | None:
         for name in evidence_names(folders)
         if open_evidence(find_evidence(folders, name)).kind == "masks"
     ]
-    if len(names) > 1 and offer.options.source == "masks":
+    # Labels may still answer where nothing was asked for by name.
+    if len(names) > 1 and (offer.options.source == "masks" or _best_layer(offer) is None):
         raise InputError(
             f"evidence: expected the name of one of {', '.join(names)}, got none (see --evidence)."
         )
@@ -228,4 +241,8 @@ OPENERS: dict[str, Opener] = {
     "layer": _open_layer,
     "masks": _open_masks,
 }
-"""Sources by name, in the order that ``auto`` tries them."""
+"""Sources by name."""
+
+AUTO: Sequence[Opener] = (_open_tree, _open_features, _open_masks, _open_layer)
+"""What ``auto`` tries: what answers best comes first, and what has to be made after what is there;
+labels of classes know no things, and come last (decision 0031)."""

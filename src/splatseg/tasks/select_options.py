@@ -19,15 +19,15 @@ class SelectOptions:
     """What a selection is made from, and what follows."""
 
     source: str = "auto"
-    """What says which Gaussians belong together: features, masks or layer. auto takes the first
-    of these that the scene has."""
+    """What says which Gaussians belong together: features, masks or layer. auto takes a
+    tree, then affinity features, then masks, then labels: the first that the scene has."""
 
     from_layer: str | None = None
     """Name of the layer of features, labels or a tree that the source takes. Without it, the one
     of its kind that fits best: a tree before labels of instances before other labels."""
 
     evidence: str | None = None
-    """Name of the masks that the source takes, where there are several."""
+    """Name of the masks that the source takes, where there are several; auto then takes them."""
 
     granularity: str | float = "auto"
     """How much a click means: group, object, part, or a number from 0 (groups) by 0.5 (objects)
