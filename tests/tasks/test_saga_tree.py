@@ -47,7 +47,7 @@ def test_a_layer_of_features_is_decomposed_without_training(scene, capsys) -> No
     tree, features = load_layer(Path(made["file"])), load_layer(scene / "layers" / "saga.npz")
     assert isinstance(tree, InstanceTree)
     assert isinstance(features, Features)
-    assert made["kind"] == "instancetree"
+    assert made["kind"] == "tree"
     assert (tree.info.method, tree.info.evidence) == ("saga", "masks_sam")
     assert tree.info.views == features.info.views
     own = decompose(

@@ -125,6 +125,20 @@ def test_features_have_to_be_named_or_affinity_features(room) -> None:
         select(scene, click(scene), layers={"all": labels}, options=options)
 
 
+def test_a_layer_that_is_not_there_and_a_tree_where_features_are_asked_for(room) -> None:
+    scene = load_scene(room)
+    count = len(scene.gaussians)
+    labels = Labels(ids=torch.ones(count, dtype=torch.int32), confidence=torch.ones(count))
+    layers = {"things": InstanceTree(nodes=(TreeNode(id=1),), labels=labels)}
+    options = SelectOptions(source="features", from_layer="things")
+    with pytest.raises(InputError, match="expected features, 'things' is of tree"):
+        select(scene, click(scene), layers=layers, options=options)
+    for source in ("features", "layer", "auto"):
+        options = SelectOptions(source=source, from_layer="thinsg")
+        with pytest.raises(InputError, match="from_layer: expected one of .* got 'thinsg'"):
+            select(scene, click(scene), layers=layers, options=options)
+
+
 def test_a_layer_named_decides_the_source(room) -> None:
     scene = load_scene(room)
     count = len(scene.gaussians)

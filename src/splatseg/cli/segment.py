@@ -14,6 +14,7 @@ from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFold
 from splatseg.cli._words import option_value
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import UNLABELLED, Features, Labels, Scene
+from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene_folder import work_on_scene
@@ -235,7 +236,7 @@ def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "layer": result.name,
         "file": path,
-        "kind": type(result.layer).__name__.lower(),
+        "kind": layer_kind(result.layer),
         "views": len(result.views),
         "warnings": list(result.warnings),
         "stage_seconds": {name: round(value, 3) for name, value in result.timings.items()},

@@ -11,6 +11,7 @@ from splatseg.cli._prompt_words import PromptWords
 from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Seed, SelectLevel
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Scene, Selection
+from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.scene import save_scene_layer
 from splatseg.io.scene_folder import work_on_scene
@@ -204,9 +205,9 @@ def _base(command: Command, scene: Scene) -> tuple[Selection | None, SelectMode]
 
 
 def _selection(flag: str, scene: Scene, name: str) -> Selection:
-    layer = whole_layer(scene, name)
+    layer = whole_layer(scene, name, option=flag)
     if not isinstance(layer, Selection):
-        kind = type(layer).__name__.lower()
+        kind = layer_kind(layer)
         raise InputError(f"{flag}: expected a layer that is a selection, {name!r} is of {kind}.")
     return layer
 

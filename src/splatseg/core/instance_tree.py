@@ -307,6 +307,11 @@ def layer_address(text: str) -> tuple[str, TreeLevel | float | None]:
 
 
 @boundary
+def layer_kind(layer: Layer) -> str:
+    """What a layer is called in a sentence: labels, features, selection or tree."""
+    return "tree" if isinstance(layer, InstanceTree) else type(layer).__name__.lower()
+
+
 def flat_layer(layer: Layer, level: TreeLevel | float | None, *, name: str) -> FlatLayer:
     """The layer, or of a tree the cut that is asked for; None asks for objects.
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Gaussians, InstanceTree, Labels, Layer, Selection
 from splatseg.core.boundary import boundary
+from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError, ShapeError
 from splatseg.prompting._layer_regions import RegionCounts, best_ids, region_counts
 from splatseg.prompting._near_click import Claim, agreed, claim, pixels_around
@@ -62,7 +63,7 @@ class LayerSource:
         views: ViewCache | None = None,
     ) -> None:
         if not isinstance(layer, Labels | InstanceTree):
-            kind = type(layer).__name__.lower()
+            kind = layer_kind(layer)
             raise InputError(f"layer {name!r}: expected labels or a tree, got {kind}.")
         if len(layer) != len(gaussians):
             raise ShapeError(

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from splatseg.core import FeatureMap, Features, InstanceTree, Labels, Layer, Scene, View
+from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import evidence_names, find_evidence, open_evidence
 from splatseg.io.scene import scene_layer_names
@@ -90,11 +91,11 @@ def _open_layer(offer: Offer) -> OpenedSource | None:
 
 
 def _layer_source(offer: Offer, name: str) -> OpenedSource | None:
-    layer = whole_layer(offer.scene, name, offer.layers)
+    layer = whole_layer(offer.scene, name, offer.layers, option="from_layer")
     if not isinstance(layer, Labels | InstanceTree):
         if offer.options.source == "auto":
             return None
-        kind = type(layer).__name__.lower()
+        kind = layer_kind(layer)
         raise InputError(f"from_layer: expected labels or a tree, {name!r} is of {kind}.")
     source = LayerSource(layer, offer.scene.gaussians, name=name, views=offer.views)
     return OpenedSource(source=source, name="layer", layer=name)
@@ -139,11 +140,11 @@ def _open_features(offer: Offer) -> OpenedSource | None:
     name = offer.options.from_layer or _affinity_layer(offer)
     if name is None:
         return None
-    layer = whole_layer(offer.scene, name, offer.layers)
+    layer = whole_layer(offer.scene, name, offer.layers, option="from_layer")
     if not isinstance(layer, Features):
         if offer.options.source == "auto":
             return None
-        kind = type(layer).__name__.lower()
+        kind = layer_kind(layer)
         raise InputError(f"from_layer: expected features, {name!r} is of {kind}.")
     source = FeatureSource(
         layer,

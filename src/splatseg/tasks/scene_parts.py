@@ -6,7 +6,7 @@ from splatseg.core import FlatLayer, Layer, LayerInfo, Scene, View, flat_layer, 
 from splatseg.errors import InputError
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.evidence import Evidence
-from splatseg.io.scene import load_scene_layer
+from splatseg.io.scene import load_scene_layer, scene_layer_names
 from splatseg.lift import GaussianField, PointLabelOptions
 from splatseg.render import BackendName
 
@@ -57,12 +57,28 @@ def layer_of(scene: Scene, address: str, layers: Mapping[str, Layer] | None = No
     return flat_layer(whole_layer(scene, name, layers), level, name=name)
 
 
-def whole_layer(scene: Scene, name: str, layers: Mapping[str, Layer] | None = None) -> Layer:
-    """A layer by name with all its levels."""
+def whole_layer(
+    scene: Scene, name: str, layers: Mapping[str, Layer] | None = None, *, option: str = "layer"
+) -> Layer:
+    """A layer by name with all its levels.
+
+    Args:
+        scene: The scene.
+        name: Of the layer.
+        layers: Layers at hand; others are read from the scene's folder.
+        option: Who asks, for messages.
+
+    Raises:
+        InputError: If there is no such layer.
+    """
     if layers is not None and name in layers:
         return layers[name]
     if scene.root is None:
-        raise InputError(f"layer {name!r}: the scene has no folder to read it from.")
+        raise InputError(f"{option} {name!r}: the scene has no folder to read it from.")
+    names = scene_layer_names(scene.root)
+    if name not in names:
+        known = ", ".join(names) if names else "it has none"
+        raise InputError(f"{option}: expected one of {scene.root} ({known}), got {name!r}.")
     return load_scene_layer(scene.root, name)
 
 

@@ -21,6 +21,7 @@ from splatseg.core import (
     with_info,
 )
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
     Evidence,
@@ -111,9 +112,7 @@ class Segmentation:
         if isinstance(self.layer, InstanceTree):
             return self.layer.cut()
         if not isinstance(self.layer, Labels):
-            raise InputError(
-                f"layer {self.name!r}: expected labels, got {type(self.layer).__name__.lower()}."
-            )
+            raise InputError(f"layer {self.name!r}: expected labels, got {layer_kind(self.layer)}.")
         return self.layer
 
 
@@ -362,8 +361,7 @@ def _trained(
     layer = layer_of(scene, name, layers)
     if not isinstance(layer, Features):
         raise InputError(
-            f"{method.trained}: expected a layer of features, got {name!r} of "
-            f"{type(layer).__name__.lower()}."
+            f"{method.trained}: expected a layer of features, got {name!r} of {layer_kind(layer)}."
         )
     return layer
 
