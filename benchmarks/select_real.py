@@ -15,6 +15,10 @@ were asked in. Rows:
 - `background`: all but what one click on what the object is not selects.
 - `lift`: the mask of the view, projected alone: each Gaussian of which it shows most inside.
 - `ceiling`: the masks of all training views, lifted: what the fit lets any selection reach.
+
+`--record NAME` keeps the masks of the training views as evidence NAME of the scene first: the
+stand-in for a mask generator that finds the object, where no weights can be had. Only views that
+are no training views are scored then.
 """
 
 import argparse
@@ -32,8 +36,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatseg.core import LabelMap, Scene, Selection, View
+from splatseg.core import LabelMap, MaskSet, Scene, Selection, View
 from splatseg.errors import InputError
+from splatseg.io.evidence import save_masks
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField, complete, uplift
 from splatseg.lift.mass.segment_masses import view_masses
@@ -203,15 +208,26 @@ def _stroke(mask: Mask) -> Mask:
     return scipy.ndimage.binary_dilation(pieces == pieces[row, column], np.ones((3, 3))) & mask
 
 
-def _scores(asker: Asker, selection: Selection, asked: View, masks: Path, work: Path) -> Any:
-    """What score.py says of all views but the one that was asked in."""
+def _record(scene: Scene, masks: Path, name: str) -> None:
+    """Keep the masks of training views as evidence."""
+    if scene.root is None:
+        raise SystemExit("the scene has no folder")
+    for view in scene.train_views:
+        with Image.open(masks / f"{view.name}.png") as image:
+            mask = torch.from_numpy(np.asarray(image.convert("L")) > 127)
+        one = MaskSet.from_dense(mask[None])
+        save_masks(one, scene.root / "evidence" / name, view.name)
+
+
+def _scores(
+    asker: Asker, selection: Selection, views: Sequence[View], masks: Path, work: Path
+) -> Any:
+    """What score.py says of some views."""
     field = GaussianField(asker.scene.gaussians, {"s": selection})
     with tempfile.TemporaryDirectory(dir=work) as made:
         for kind in ("pred", "truth"):
             (Path(made) / kind).mkdir()
-        for view in asker.scene.views:
-            if view.name == asked.name:
-                continue
+        for view in views:
             picture = Image.fromarray(drawn(field, view).astype(np.uint8) * 255)
             picture.save(Path(made) / "pred" / f"{view.name}.png")
             (Path(made) / "truth" / f"{view.name}.png").symlink_to(
@@ -230,12 +246,16 @@ def main() -> None:
     parser.add_argument("--source", default="masks")
     parser.add_argument("--layer")
     parser.add_argument("--evidence")
+    parser.add_argument("--record", help="name under which true masks become evidence")
     parser.add_argument("--rows", nargs="+", default=["click", "group", "clicks3", "mask", "box"])
     parser.add_argument("--views", type=int, default=3, help="training views that are asked in")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()))
     args = parser.parse_args()
-    options = SelectOptions(source=args.source, from_layer=args.layer, evidence=args.evidence)
+    if args.record:
+        _record(load_scene(args.scene), args.masks, args.record)
+    evidence = args.evidence or args.record
+    options = SelectOptions(source=args.source, from_layer=args.layer, evidence=evidence)
     asker = Asker(load_scene(args.scene), args.masks, options)
     train = asker.scene.train_views
     order = np.random.default_rng(args.seed).permutation(len(train))[: args.views]
@@ -244,7 +264,12 @@ def main() -> None:
         for index in order:
             view = train[index]
             try:
-                said = _scores(asker, asker.answer(row, view), view, args.masks, args.work)
+                scored = [
+                    other
+                    for other in asker.scene.views
+                    if other.name != view.name and (not args.record or other.split != "train")
+                ]
+                said = _scores(asker, asker.answer(row, view), scored, args.masks, args.work)
             except InputError as error:
                 print(f"    {row} in {view.name}: {error}", flush=True)
                 found.append(0.0)
