@@ -25,6 +25,7 @@ from splatseg.tasks import (
     save_selected_splats,
     select,
 )
+from splatseg.tasks.named_models import prompter_of
 from splatseg.tasks.scene_parts import whole_layer
 
 _BASES: dict[str, SelectMode] = {
@@ -116,6 +117,16 @@ class Command:
     intersect: Annotated[str | None, tyro.conf.arg(metavar="LAYER")] = None
     """A selection of which only what is in this one, too, stays."""
 
+    prompter: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    """Who turns points and boxes into masks of their views first: a model that answers points as
+    NAME[=WEIGHTS][,OPTION=VALUE...], such as sam, or recorded masks, by name or folder."""
+
+    download: bool = False
+    """Fetch weights that are not on this machine; what and how much is said before."""
+
+    device: str = "auto"
+    """Where the prompter runs: cpu, cuda, cuda:1. auto takes cuda where there is one."""
+
     save: Path | None = None
     """Also write the selected Gaussians alone: a splat file such as mug.ply, or a folder, in which
     it becomes NAME.ply."""
@@ -139,11 +150,21 @@ def run(command: Command) -> None:
     scene = open_scene(command.scene, command.data)
     prompts = _prompts(command, scene)
     base, mode = _base(command, scene)
+    prompter = None
+    if command.prompter is not None:
+        prompter = prompter_of(
+            command.prompter,
+            scene,
+            download=command.download,
+            device=command.device,
+            report=observer.note,
+        )
     saved = None if command.save is None else check_selection_file(command.save, command.layer)
     with work_on_scene(command.scene, "select", writes=["layers"]):
         made = select(
             scene,
             prompts,
+            prompter=prompter,
             options=replace(command.options, mode=mode),
             base=base,
             backend=command.backend,

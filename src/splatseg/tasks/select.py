@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from splatseg.core import Layer, Scene, Selection
+from splatseg.core import Layer, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.prompting.prompts import SelectionPrompt
 from splatseg.prompting.sources import MembershipSource
@@ -18,6 +18,7 @@ def open_selector(
     *,
     options: SelectOptions | None = None,
     source: MembershipSource | None = None,
+    prompter: PromptableMasks | None = None,
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
@@ -28,6 +29,7 @@ def open_selector(
         scene: The scene; it must stay as it is.
         options: What holds for selections that say nothing else.
         source: Says which Gaussians belong together; None opens what `options` ask for.
+        prompter: Turns points and boxes into masks of their views, such as SAM; None leaves them.
         layers: Layers at hand; others are read from the scene's folder.
         backend: Who renders.
         observer: Is told of what is opened.
@@ -36,7 +38,13 @@ def open_selector(
         InputError: If the scene has nothing to select by, or not what the options ask for.
     """
     session = SelectionSession(
-        scene, options=options, source=source, layers=layers, backend=backend, observer=observer
+        scene,
+        options=options,
+        source=source,
+        prompter=prompter,
+        layers=layers,
+        backend=backend,
+        observer=observer,
     )
     session.source  # noqa: B018  (opens it: whatever takes long is done before the first click)
     return session
@@ -49,6 +57,7 @@ def select(
     *,
     options: SelectOptions | None = None,
     source: MembershipSource | None = None,
+    prompter: PromptableMasks | None = None,
     base: Selection | None = None,
     layers: Mapping[str, Layer] | None = None,
     backend: BackendName = "auto",
@@ -67,6 +76,7 @@ def select(
         prompts: One prompt, or several that mean one thing together.
         options: The source, the granularity, and what follows.
         source: Says which Gaussians belong together; None opens what `options` ask for.
+        prompter: Turns points and boxes into masks of their views, such as SAM; None leaves them.
         base: A selection that `SelectOptions.mode` adds to, subtracts from or intersects with.
         layers: Layers at hand; others are read from the scene's folder.
         backend: Who renders.
@@ -81,6 +91,12 @@ def select(
         ShapeError: If the base or a layer is of another scene.
     """
     with SelectionSession(
-        scene, options=options, source=source, layers=layers, backend=backend, observer=observer
+        scene,
+        options=options,
+        source=source,
+        prompter=prompter,
+        layers=layers,
+        backend=backend,
+        observer=observer,
     ) as session:
         return session.select(prompts, base=base)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import JSON, Layer, LayerInfo, Scene, Selection
+from splatseg.core import JSON, Layer, LayerInfo, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.prompting.context import SceneIndex
@@ -35,6 +35,7 @@ from splatseg.prompting.sources import MembershipSource, SimilaritySource
 from splatseg.prompting.view_cache import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._select_prompter import segmented_prompts
 from splatseg.tasks._select_record import prompt_record
 from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
 from splatseg.tasks.select_options import SelectOptions
@@ -48,7 +49,8 @@ class Selected:
     """With the confidence of each Gaussian, and a record of the prompts."""
 
     seconds: Mapping[str, float]
-    """By stage: open (the source), see (the prompts), the source's name, and each step."""
+    """By stage: prompter (masks at points), open (the source), see (the prompts), the source's
+    name, and each step."""
 
     source: str
     """What said which Gaussians belong together; empty where places alone did."""
@@ -75,6 +77,7 @@ class SelectionSession:
         options: What holds for selections that say nothing else.
         source: Says which Gaussians belong together; None opens what `options` ask for, when the
             first prompt needs it.
+        prompter: Turns points and boxes into masks of their views, such as SAM; None leaves them.
         layers: Layers at hand; others are read from the scene's folder.
         backend: Who renders.
         observer: Is told of what is opened.
@@ -87,6 +90,7 @@ class SelectionSession:
         *,
         options: SelectOptions | None = None,
         source: MembershipSource | None = None,
+        prompter: PromptableMasks | None = None,
         layers: Mapping[str, Layer] | None = None,
         backend: BackendName = "auto",
         observer: Observer = SILENT,
@@ -94,6 +98,7 @@ class SelectionSession:
         self._scene = scene
         self._options = options or SelectOptions()
         self._options.level  # noqa: B018  (an error before anything is opened)
+        self._prompter = prompter
         self._layers = layers
         self._backend: BackendName = backend
         self._observer = observer
@@ -144,9 +149,13 @@ class SelectionSession:
         """
         options = options or self._options
         self._check_source(options)
-        given = _as_prompts(prompts)
+        asked = given = _as_prompts(prompts)
         _check_base(self._scene, base, options)
         seconds: dict[str, float] = {}
+        if self._prompter is not None:
+            began = time.perf_counter()
+            given = segmented_prompts(given, self._prompter, granularity=options.level)
+            seconds["prompter"] = time.perf_counter() - began
         shown = [prompt for prompt in given if isinstance(prompt, ViewPrompt)]
         similar = [prompt for prompt in given if isinstance(prompt, Similar)]
         solids = [prompt for prompt in given if isinstance(prompt, AxisBox | Ball | Lasso)]
@@ -160,7 +169,7 @@ class SelectionSession:
             confidence, steps = postprocess(confidence, context, enabled=options.steps)
             seconds |= steps
         confidence = _within(confidence, solids, context)
-        selection = self._described(confidence, given, base, options)
+        selection = self._described(confidence, asked, base, options)
         hint = None
         if advise and shown and selection.confidence is not None:
             began = time.perf_counter()
@@ -277,6 +286,7 @@ class SelectionSession:
                 "source": "" if opened is None else opened.name,
                 "layer": None if opened is None else opened.layer,
                 "granularity": options.level,
+                "prompter": None if self._prompter is None else self._prompter.name,
                 "steps": list(options.steps),
             },
             evidence=None if opened is None else opened.evidence,

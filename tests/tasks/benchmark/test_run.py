@@ -26,7 +26,7 @@ from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import SILENT, Observer
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import held_out_views
-from splatseg.tasks.benchmark.sight import model_of
+from splatseg.tasks.benchmark.sight import bench_model
 from support.red_square import save_strokes
 
 
@@ -218,8 +218,8 @@ def test_what_is_held_out(tiny) -> None:
 
 def test_options_of_models() -> None:
     """What stands behind a model's name reaches it."""
-    plain = model_of("classical", BenchOptions(), SILENT)
-    other = model_of("classical,cuts=0.2,0.4", BenchOptions(), SILENT)
+    plain = bench_model("classical", BenchOptions(), SILENT)
+    other = bench_model("classical,cuts=0.2,0.4", BenchOptions(), SILENT)
     assert plain.settings != other.settings
     assert "0.2, 0.4" in str(other.settings)
 
@@ -264,7 +264,7 @@ def test_who_answers_strokes(tiny, tmp_path, monkeypatch) -> None:
     shutil.copy(data / "wall/masks/b.png", folder / "masks/red/b_mask.png")
     shutil.copy(data / "wall/images/a.png", folder / "reference_image/red/a.png")
     model = Reds()
-    monkeypatch.setattr("splatseg.tasks.benchmark.run.model_of", lambda *_: model)
+    monkeypatch.setattr("splatseg.tasks.benchmark.run.bench_model", lambda *_: model)
     given = {"fitted": str(scenes / "{scene}"), "prompter": "reds"}
     held = ("scored_in_training=yes",)
     done = bench("nvos", folder, tmp_path / "o", options=BenchOptions(switches=held, **given))
@@ -298,11 +298,11 @@ def test_words_found_in_the_drawn_first_view(tiny, tmp_path, monkeypatch) -> Non
     save_scene(replace(scene, views=views), tmp_path / "wall")
     asked: list[str] = []
 
-    def model_of(named, options, observer):
+    def bench_model(named, options, observer):
         asked.append(named)
         return Redness()
 
-    monkeypatch.setattr("splatseg.tasks.benchmark.run.model_of", model_of)
+    monkeypatch.setattr("splatseg.tasks.benchmark.run.bench_model", bench_model)
     options = BenchOptions(fitted=str(tmp_path / "{scene}"), grounder="redness")
     done = bench("lerf-mask", folder, tmp_path / "o", options=options)
     assert asked == ["redness"]

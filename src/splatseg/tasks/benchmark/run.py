@@ -46,7 +46,7 @@ from splatseg.tasks.benchmark.results import (
     save_result,
     switches_of,
 )
-from splatseg.tasks.benchmark.sight import chosen_model, evidence_wanted, model_of
+from splatseg.tasks.benchmark.sight import bench_model, chosen_model, evidence_wanted
 from splatseg.tasks.benchmark.targets import TargetRun
 
 
@@ -275,10 +275,10 @@ def _models(
     if not isinstance(switches, TargetSwitches):
         return None, None
     if switches.prompt == "scribble":
-        return model_of(options.prompter, options, observer), None
+        return bench_model(options.prompter, options, observer), None
     if switches.prompt != "words" or options.grounder is None:
         return None, None
-    grounder = model_of(options.grounder, options, observer)
+    grounder = bench_model(options.grounder, options, observer)
     if not isinstance(grounder, GroundedMasks):
         raise InputError(f"grounder: expected a model that finds words, got {grounder.name}.")
     return None, grounder

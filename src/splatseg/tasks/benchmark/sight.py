@@ -1,24 +1,21 @@
 """Evidence for the methods of a run, from the models that were named."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
 from splatseg.core import Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
-from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
 from splatseg.evaluate.protocols import Protocol, TargetSwitches
 from splatseg.io.evidence import TEXT_FILE, EvidenceKind, open_evidence
 from splatseg.methods import Method
-from splatseg.models import LoadOptions, What, find_family, find_model, model_names
+from splatseg.models import What, find_family, model_names
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
+from splatseg.tasks.named_models import model_of, name_of
 from splatseg.tasks.see import SeeOptions, see
-
-_LOADING = ("size", "dtype", "batch")
-"""Options of loading that each model may have its own of."""
 
 _KIND_OF: dict[What, EvidenceKind] = {
     "masks": "masks", "labels": "labels", "panoptic": "panoptic", "features": "features",
@@ -44,50 +41,9 @@ class Seen:
     """The model, where it is one that runs."""
 
 
-def model_of(named: str, options: BenchOptions, observer: Observer) -> Model:
-    """The model of ``NAME[=WEIGHTS][,OPTION=VALUE...]``, or a folder.
-
-    What follows a comma without an ``=`` goes on with the value before it.
-
-    Raises:
-        InputError: If there is none, or it has no such option.
-    """
-    name = name_of(named)
-    family = find_family(name) if name in model_names() else None
-    if family is None:
-        return find_model(named, report=observer.note)
-    first, *rest = _pieces(named)
-    weights = first.partition("=")[2]
-    if weights and not family.needs_weights:
-        raise InputError(f"models: {name} has no weights, got {named!r}.")
-    loading = LoadOptions(weights=weights or None, download=options.download, device=options.device)
-    chosen = family.options()
-    for text in rest:
-        if family.needs_weights and text.partition("=")[0] in _LOADING:
-            field, value = typed_field(LoadOptions, text, what=f"model {name}")
-            loading = replace(loading, **{field: value})
-        else:
-            field, value = typed_field(family.options, text, what=f"model {name}")
-            chosen = replace(chosen, **{field: value})
-    return find_model(
-        name, chosen, loading=loading if family.needs_weights else None, report=observer.note
-    )
-
-
-def _pieces(named: str) -> list[str]:
-    """The name with its weights, then each option."""
-    found: list[str] = []
-    for piece in named.split(","):
-        if len(found) > 1 and "=" not in piece:
-            found[-1] += f",{piece}"
-        else:
-            found.append(piece)
-    return found
-
-
-def name_of(named: str) -> str:
-    """The name of a model that was given with weights and options."""
-    return named.split(",")[0].partition("=")[0]
+def bench_model(named: str, options: BenchOptions, observer: Observer) -> Model:
+    """A model of a run, see `model_of`."""
+    return model_of(named, download=options.download, device=options.device, report=observer.note)
 
 
 def seen_for(
@@ -115,7 +71,7 @@ def seen_for(
         InputError: If no model gives it.
     """
     choice = chosen_model(method, bench, words=words, options=options)
-    model = None if choice.folder is not None else model_of(choice.named, options, observer)
+    model = None if choice.folder is not None else bench_model(choice.named, options, observer)
     recorded = choice.folder is not None
     seen = see(
         scene,
