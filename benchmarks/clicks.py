@@ -45,12 +45,13 @@ from numpy.typing import NDArray
 from per_view_masks import PerViewMasks
 from selected_views import TestViews
 
-from splatseg.core import LabelMap, Selection, View
+from splatseg.core import Features, LabelMap, Selection, View
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
-from splatseg.io.scene import load_scene
+from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import uplift
 from splatseg.lift.mass.segment_masses import view_masses
+from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
 
@@ -76,8 +77,23 @@ class Bench:
             granularity="part" if args.level == "part" else "object",
             **_steps(args),
         )
-        self.session = open_selector(self.scene, options=self.options)
+        self.session = open_selector(self.scene, options=self.options, source=self._source())
         self.seconds: list[float] = []
+
+    def _source(self) -> FeatureSource | None:
+        """Features with a threshold of their own, where one is asked for."""
+        args = self.args
+        if args.threshold is None and args.rule is None:
+            return None
+        layer = load_scene_layer(args.scene, args.layer)
+        if not isinstance(layer, Features):
+            raise SystemExit(f"{args.layer}: thresholds are of features")
+        usual = FeatureSourceOptions()
+        options = FeatureSourceOptions(
+            threshold=usual.threshold if args.threshold is None else args.threshold,
+            rule=args.rule or usual.rule,
+        )
+        return FeatureSource(layer, self.scene.gaussians, options=options)
 
     def select(self, prompts: Sequence[ViewPrompt], **changes: Any) -> Any:
         """What prompts select; nothing where the source has no answer."""
@@ -288,6 +304,8 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--source", default="auto")
     parser.add_argument("--layer")
+    parser.add_argument("--threshold", type=float, help="of features, instead of the usual one")
+    parser.add_argument("--rule", choices=("fixed", "mean", "deviation"), help="of features")
     parser.add_argument("--evidence", default="masks_sam")
     parser.add_argument("--rows", nargs="+", default=["click", "auto", "noisy", "mask"])
     parser.add_argument("--without", nargs="*", default=[], help="steps that are left out")

@@ -38,6 +38,7 @@ def table_of(masses: np.ndarray) -> SegmentTable:
         category=np.full(count, -1),
         score=np.ones(count),
         level=np.zeros(count, np.int64),
+        covered=np.ones(len(masses), np.float32),
     )
 
 

@@ -23,7 +23,8 @@ class Labels:
     """int32 ids, -1 where there is none."""
 
     confidence: Float[Tensor, "n"]
-    """The winner's share of the evidence, in [0, 1]; 0 where there was none."""
+    """The winner's share of the evidence, in [0, 1]; 0 where there was none. Above 0 at an id of
+    -1 it says how sure it is that there is none: completion leaves that as it is."""
 
     background: int = UNLABELLED
     """Label of what no Gaussian covers (the sky); -1 is none."""

@@ -48,6 +48,7 @@ from splatseg.lift.segments.ballots import by_mass, majority, view_counts
 from splatseg.lift.segments.clustering import cluster
 from splatseg.lift.segments.flatten import chosen_groups
 from splatseg.lift.segments.nesting import nesting
+from splatseg.lift.segments.outside import without_outside
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.lift.segments.separate import separated_levels
 from splatseg.lift.segments.soft_tree import soft_votes
@@ -269,6 +270,7 @@ def _tree(
     )
     if sharpened is not None:
         votes = sharpened(votes)
+    votes = without_outside(votes, table, found, min_support=options.min_support)
     tree, node = instance_tree(table, found, level, votes, classes)
     said = account(table, found.node, tracked=False) | {"instances": len(votes.object_rows)}
     info = replace(

@@ -223,13 +223,19 @@ def _check(
 
 
 def _known(labels: Labels, options: CompletionOptions) -> NDArray[np.bool_]:
-    """Which Gaussians have a label of their own."""
-    known = labels.ids != UNLABELLED
+    """Which Gaussians have a label of their own, or surely none."""
+    known = (labels.ids != UNLABELLED) | _nothing(labels)
     if labels.inferred is not None:
         known &= ~labels.inferred
     if labels.evidence is not None:
         known &= labels.evidence > options.own_evidence
-    return known.cpu().numpy()
+    # What lies in no mask has no evidence for anything, and is known all the same.
+    return (known | _nothing(labels)).cpu().numpy()
+
+
+def _nothing(labels: Labels) -> Tensor:
+    """Which Gaussians surely belong to nothing."""
+    return (labels.ids == UNLABELLED) & (labels.confidence > 0)
 
 
 def _attributes(gaussians: Gaussians, features: Features | None) -> NodeAttributes:
@@ -251,6 +257,10 @@ def _shares(labels: Labels, known: NDArray[np.bool_]) -> tuple[NDArray[np.int64]
         ids = labels.candidates.cpu().long().numpy()
         values = labels.shares.cpu().float().clamp_min(0).numpy()
     positive = (ids != UNLABELLED) & (values > 0) & known[:, None]
+    # Nothing spreads, too: it is what stands round things that alone have labels.
+    nothing = _nothing(labels).cpu().numpy()
+    values[nothing, 0] = 1
+    positive[nothing, 0] = True
     column_ids, columns = np.unique(ids[positive], return_inverse=True)
     rows = np.nonzero(positive)[0]
     # Nothing known is one column of nothing.
@@ -272,6 +282,7 @@ class _StrongestIds:
 def _strongest_ids(shares: Any, column_ids: NDArray[np.int64], kept: int) -> _StrongestIds:
     columns, shares = ranked(shares, kept)
     ids = np.where(columns >= 0, column_ids[np.maximum(columns, 0)], UNLABELLED)
+    shares = np.where(ids == UNLABELLED, np.float32(0), shares)
     return _StrongestIds(
         ids=torch.from_numpy(ids.astype(np.int32)),
         # Sums in float32 may leave a lone id's share a hair above 1.

@@ -12,7 +12,7 @@ the segments over it. Weights of pixels are half precision and sums double, so t
 weights is exact and rounded once: it depends neither on an order nor on how masks overlap.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,9 @@ class ViewMasses:
 
     visible: Float[Tensor, "n"]
     """Blending weight of every Gaussian summed over all pixels, labelled or not."""
+
+    covered: Float[Tensor, "n"]
+    """The same over the pixels that lie in a segment."""
 
 
 def view_masses(
@@ -101,7 +104,18 @@ def view_masses(
         gaussian=torch.from_numpy(found.indices.astype(np.int64)),
         weight=torch.from_numpy(found.data.astype(np.float32)),
         visible=visible,
+        covered=_covered(pieces, sums, len(gaussians)),
     )
+
+
+def _covered(pieces: Pieces, sums: Sequence[Any], count: int) -> Float[Tensor, "n"]:
+    """What pieces in some segment hold of each Gaussian, each piece once."""
+    inside = np.bincount(pieces.segments.indices, minlength=pieces.segments.shape[1]) > 0
+    total = np.zeros(count)
+    for part in sums:
+        kept = np.repeat(inside, np.diff(part.indptr))
+        total += np.bincount(part.indices[kept], part.data[kept], minlength=count)
+    return torch.from_numpy(total.astype(np.float32))
 
 
 def _sums(

@@ -86,6 +86,10 @@ class SegmentTable:
     level: NDArray[np.int64]
     """(segments,): granularity that the model gave, 0 the finest; all 0 where it gives none."""
 
+    covered: NDArray[np.float32]
+    """(Gaussians,): share of what all views see of each Gaussian that lies in some segment; 1
+    where pixels in no segment tell nothing, and for what no view sees."""
+
     def votes(self, group: NDArray[np.int64], weight: NDArray[np.float64]) -> Any:
         """Sparse (Gaussians, groups): mass by group; segments of group -1 have no vote."""
         return self.masses(group, weight).T.tocsr()
@@ -256,6 +260,7 @@ def segment_table(
     ordered = sorted(views, key=lambda view: view.name)
     entries = SegmentEntries(len(gaussians), max_views)
     rows: list[tuple[int, int, int, float, int]] = []
+    covered, visible = np.zeros((2, len(gaussians)))
     for place, view in enumerate(ordered):
         segments = source.segments_of(view.name)
         names, scores = _in_order(segments)
@@ -273,7 +278,10 @@ def segment_table(
             (place, name, categories.get(name, UNLABELLED), score, _level_of(segments, name))
             for name, score in zip(names, scores, strict=True)
         ]
-        _add(entries, found, names, worth, outside=isinstance(segments, MaskSet))
+        outside = isinstance(segments, MaskSet)
+        _add(entries, found, names, worth, outside=outside)
+        covered += worth * found.covered.numpy()
+        visible += worth * (found.visible if outside else found.covered).numpy()
         if progress is not None:
             progress(place + 1, len(ordered))
     if not rows:
@@ -297,7 +305,14 @@ def segment_table(
         category=category.astype(np.int64),
         score=score.astype(np.float64),
         level=level.astype(np.int64),
+        covered=_shares_of(covered, visible),
     )
+
+
+def _shares_of(covered: NDArray[np.float64], visible: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Shares of what is visible; 1 where next to nothing is."""
+    shares = np.where(visible > _MIN_WEIGHT, covered / np.maximum(visible, _MIN_WEIGHT), 1.0)
+    return shares.clip(0, 1).astype(np.float32)
 
 
 def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
