@@ -24,7 +24,7 @@ class DecomposeOptions:
     """How much joining two clusters may raise the mean squared distance of directions from the
     mean of their cluster, at the scale of groups; 0 looks for none."""
 
-    object_increase: float = 0.0006
+    object_increase: float = 0.00005
     """The same at the scale of objects; above 0. Smaller ones are told apart the smaller it is."""
 
     part_increase: float = 0.02
