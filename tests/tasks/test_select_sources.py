@@ -79,6 +79,16 @@ def test_the_command_keeps_the_layer_that_masks_became(room, capsys) -> None:
     capsys.readouterr()
 
 
+def test_what_masks_became_is_kept_where_the_prompts_have_no_answer(room, capsys) -> None:
+    name = masks_of(room)
+    words = ["select", room, "--view", load_scene(room).train_views[0].name, "--point", "80,60"]
+    words += ["--negative", "80,60", "--source", "masks", "--evidence", name, "--layer", "thing"]
+    assert main([str(word) for word in words]) == 2
+    assert "which contradict each other" in capsys.readouterr().err
+    assert isinstance(load_scene_layer(room, name), InstanceTree)
+    assert "thing" not in scene_layer_names(room)
+
+
 def only_masks(room: Path, wanted: str, monkeypatch) -> None:
     """Let the scene have no other masks."""
     from splatseg.tasks import _select_sources as sources

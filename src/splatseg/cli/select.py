@@ -18,12 +18,12 @@ from splatseg.io.scene_folder import work_on_scene
 from splatseg.prompting.prompts import AxisBox, Ball, SelectionPrompt, Similar
 from splatseg.tasks import (
     Selected,
+    SelectionSession,
     SelectMode,
     SelectOptions,
     check_selection_file,
     draw_selection,
     save_selected_splats,
-    select,
 )
 from splatseg.tasks.named_models import prompter_of
 from splatseg.tasks.scene_parts import whole_layer
@@ -161,17 +161,20 @@ def run(command: Command) -> None:
         )
     saved = None if command.save is None else check_selection_file(command.save, command.layer)
     with work_on_scene(command.scene, "select", writes=["layers"]):
-        made = select(
+        session = SelectionSession(
             scene,
-            prompts,
-            prompter=prompter,
             options=replace(command.options, mode=mode),
-            base=base,
+            prompter=prompter,
             backend=command.backend,
             observer=observer,
         )
-        for name, layer in made.made_layers.items():
-            save_scene_layer(layer, command.scene, name)
+        try:
+            with session:
+                made = session.select(prompts, base=base)
+        finally:
+            # Masks take a while to associate: their tree is kept, even where it has no answer.
+            for name, layer in session.made_layers.items():
+                save_scene_layer(layer, command.scene, name)
         path = save_scene_layer(made.selection, command.scene, command.layer)
     facts = _facts(made, command.layer, path)
     lines = [*_lines(made), str(path)]

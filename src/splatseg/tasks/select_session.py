@@ -127,6 +127,11 @@ class SelectionSession:
         """
         return self._open().source
 
+    @property
+    def made_layers(self) -> Mapping[str, Layer]:
+        """Layers that opening the source made, by the names to keep them under; see `Selected`."""
+        return {} if self._opened is None else self._opened.made_layers
+
     @boundary
     def select(
         self,
@@ -181,7 +186,7 @@ class SelectionSession:
             source=context.source,
             next_click=hint,
             warnings=() if selection.count else ("Nothing is selected.",),
-            made_layers={} if self._opened is None else self._opened.made_layers,
+            made_layers=self.made_layers,
         )
 
     def _open(self) -> OpenedSource:
