@@ -71,6 +71,10 @@ def test_strokes_masks_and_boxes_on_labels(gaussians, view, labels) -> None:
     # A tenth of the stroke slips into the field below.
     stroke = region(slice(12, 21), slice(5, 12))
     assert chosen(source, labels, asked(gaussians, view, (), scribble=stroke)) == {1}
+    # A seventh of what the stroke shows most of is a slip, a third is meant.
+    assert chosen(
+        source, labels, asked(gaussians, view, (), scribble=region(slice(12, 24), slice(5, 12)))
+    ) == {1, 3}
     both = region(slice(10, 30), slice(0, 20))
     assert chosen(source, labels, asked(gaussians, view, (), mask=both)) == {1, 3}
     little = region(slice(14, 18), slice(5, 12))
@@ -129,6 +133,16 @@ def test_a_mask_round_what_no_node_holds_together_means_several(gaussians, view,
     more[10:13, 20:40] = True
     assert chosen(source, tree, asked(gaussians, view, (), mask=more)) == {1, 3}
     assert chosen(source, tree, asked(gaussians, view, (), box=[0, 10, 36, 20])) == {1}
+
+
+def test_a_stroke_over_many_small_things_means_them_all(gaussians, view, labels) -> None:
+    x = gaussians.means[:, 0]
+    stripes = replace(labels, ids=(1 + ((x + 2.5) / 0.5).long().clamp(0, 9)).int())
+    stroke = region(slice(14, 16), slice(5, 35))
+    found = chosen(
+        LayerSource(stripes, gaussians), stripes, asked(gaussians, view, (), scribble=stroke)
+    )
+    assert found == {3, 4, 5, 6, 7, 8}
 
 
 def test_how_sure_it_is_comes_from_the_evidence(gaussians, view, labels) -> None:

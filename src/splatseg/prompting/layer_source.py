@@ -27,7 +27,8 @@ from splatseg.prompting.view_cache import ViewCache
 from splatseg.render import SparseWeights
 
 _MIN_STROKE_SHARE = 0.2
-"""Least share of a stroke's pixels that an id must have to be meant: strokes slip over borders."""
+"""Least share of the pixels of the id that a stroke shows most of, with which another one is meant
+as well: strokes slip over borders, and may go over many small things."""
 
 _MIN_SURE = 0.501
 """Confidence of what was chosen by a hair; above 0.5, so that the ids chosen are all selected."""
@@ -194,9 +195,10 @@ class LayerSource:
             if one.dense and one.inside is not None and positive:
                 continue
             ids = shown_ids(self._labels, one.positive_rows if positive else one.negative_rows)
-            values, counts = torch.unique(ids, return_counts=True)
-            enough = counts >= (_MIN_STROKE_SHARE * len(ids) if one.dense else 1)
-            found |= dict.fromkeys(id for id in values[enough].tolist() if id != UNLABELLED)
+            values, counts = torch.unique(ids[ids != UNLABELLED], return_counts=True)
+            if one.dense and len(counts):
+                values = values[counts >= _MIN_STROKE_SHARE * counts.max()]
+            found |= dict.fromkeys(values.tolist())
         return list(found)
 
     def _regions(self, prompts: Sequence[SeenPrompt]) -> list[RegionCounts]:
