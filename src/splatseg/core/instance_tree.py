@@ -312,6 +312,7 @@ def layer_kind(layer: Layer) -> str:
     return "tree" if isinstance(layer, InstanceTree) else type(layer).__name__.lower()
 
 
+@boundary
 def flat_layer(layer: Layer, level: TreeLevel | float | None, *, name: str) -> FlatLayer:
     """The layer, or of a tree the cut that is asked for; None asks for objects.
 
