@@ -33,10 +33,10 @@ from torch.nn import functional
 from splatseg.lift.point_network.config import RandlaVariant
 from splatseg.lift.point_network.layers import Affine, SharedMlp
 
-_VALUES = 1 << 20
+_VALUES = 1 << 18
 """Numbers of the largest array of a block of points, which is to stay in the processor's caches."""
 
-Encode = Callable[[slice], Tensor]
+Encode = Callable[[Tensor, slice], Tensor]
 
 
 class AttentivePooling(nn.Module):
@@ -84,32 +84,31 @@ class Pooling:
     """Whether the features are those of the point itself."""
 
     def __call__(
-        self,
-        encoding: Float[Tensor, "m k half"],
-        neighbours: Int32[Tensor, "m k"],
-        rows: slice,
+        self, encoding: Float[Tensor, "k m half"], near: Int32[Tensor, "k m"], rows: slice
     ) -> Float[Tensor, "m outputs"]:
         """Pool the neighbours of some points.
 
         Args:
             encoding: Spatial encoding of their neighbours.
-            neighbours: Rows of their neighbours.
+            near: Rows of their neighbours.
             rows: The points.
         """
-        m, k, half = encoding.shape
+        k, m, half = encoding.shape
         if self.own:
-            near = self.table[rows][:, None].expand(m, k, -1)
+            seen = self.table[rows].expand(k, m, -1)
         else:
-            near = self.table.index_select(0, neighbours.reshape(-1)).reshape(m, k, -1)
-        features, scores = near[..., :half], near[..., half:]
+            seen = self.table.index_select(0, near.reshape(-1)).reshape(k, m, -1)
+        features, scores = seen[..., :half], seen[..., half:]
         pairs = torch.addmm(
-            scores.reshape(m * k, -1), encoding.reshape(m * k, half), self.weight.T
-        ).reshape(m, k, -1)
-        shares = torch.softmax(pairs, dim=1)
+            scores.reshape(k * m, -1), encoding.reshape(k * m, half), self.weight.T
+        ).reshape(k, m, -1)
+        # The largest is taken away for the range of exponentials, and does not change the shares.
+        shares = pairs.sub_(pairs.detach().amax(dim=0)).exp_()
+        total = shares.sum(dim=0)
         pooled = torch.cat(
-            ((features * shares[..., :half]).sum(1), (encoding * shares[..., half:]).sum(1)), dim=1
+            ((features * shares[..., :half]).sum(0), (encoding * shares[..., half:]).sum(0)), dim=1
         )
-        return self.mlp(pooled)
+        return self.mlp(pooled / total)
 
 
 class ResidualBlock(nn.Module):
@@ -149,32 +148,30 @@ class ResidualBlock(nn.Module):
         """
         width = self.exit.linear.in_features
         size = max(16, _VALUES // (width * neighbours.shape[1]))
-        blocks = list(_blocks(len(positions), len(positions) if self.training else size))
+        blocks = list(_blocks(neighbours, len(positions) if self.training else size))
         squared = self.variant.distance == "squared"
-        first = _encoder(self.encode1.affine(), positions, neighbours, squared=squared)
-        second = self._second(first, positions, neighbours, squared=squared)
+        first = _encoder(self.encode1.affine(), positions, squared=squared)
+        second = self._second(first, positions, squared=squared)
 
         pool1 = self.pool1.prepare(self.entry(features))
-        pooled = torch.cat([pool1(first(rows), neighbours[rows], rows) for rows in blocks])
+        pooled = torch.cat([pool1(first(near, rows), near, rows) for near, rows in blocks])
         pool2, leave = self.pool2.prepare(pooled), self.exit.affine()
         shortcut, slope = self.shortcut.affine(), self.variant.sum_slope
         return torch.cat(
             [
                 functional.leaky_relu_(
-                    leave(pool2(second(rows), neighbours[rows], rows)) + shortcut(features[rows]),
+                    leave(pool2(second(near, rows), near, rows)) + shortcut(features[rows]),
                     slope,
                 )
-                for rows in blocks
+                for near, rows in blocks
             ]
         )
 
-    def _second(
-        self, first: Encode, positions: Tensor, neighbours: Tensor, *, squared: bool
-    ) -> Encode:
+    def _second(self, first: Encode, positions: Tensor, *, squared: bool) -> Encode:
         affine = self.encode2.affine()
         if self.variant.second_encoding == "chained":
-            return lambda rows: affine(first(rows))
-        return _encoder(affine, positions, neighbours, squared=squared)
+            return lambda near, rows: affine(first(near, rows))
+        return _encoder(affine, positions, squared=squared)
 
 
 def sample(
@@ -195,34 +192,39 @@ def sample(
     if variant.sampling == "own":
         return features[kept]
     size = max(16, _VALUES // (features.shape[1] * neighbours.shape[1]))
-    parts: list[Tensor] = []
-    for rows in _blocks(len(kept), size):
-        near = neighbours[kept[rows]]
-        seen = features.index_select(0, near.reshape(-1))
-        parts.append(seen.reshape(*near.shape, -1).amax(dim=1))
-    return torch.cat(parts)
+    return torch.cat(
+        [
+            features.index_select(0, near.reshape(-1)).reshape(*near.shape, -1).amax(dim=0)
+            for near, _ in _blocks(neighbours[kept], size)
+        ]
+    )
 
 
-def _encoder(affine: Affine, positions: Tensor, neighbours: Tensor, *, squared: bool) -> Encode:
+def _encoder(affine: Affine, positions: Tensor, *, squared: bool) -> Encode:
     """The local spatial encoding of some points, by the seven channels that the ten are made of."""
-    weight = affine.weight
-    of_distance, of_offset, of_point, of_neighbour = weight.split((1, 3, 3, 3), dim=1)
+    of_distance, of_offset, of_point, of_neighbour = affine.weight.split((1, 3, 3, 3), dim=1)
     of_pair = torch.cat((of_distance, of_offset - of_neighbour), dim=1).T
     points = torch.addmm(affine.bias, positions, (of_point + of_neighbour).T)
+    columns = positions.T.contiguous()
 
-    def encode(rows: slice) -> Tensor:
-        near = neighbours[rows]
-        seen = positions.index_select(0, near.reshape(-1)).reshape(*near.shape, 3)
-        offset = positions[rows][:, None] - seen
-        distance = (offset * offset).sum(dim=-1, keepdim=True)
+    def encode(near: Tensor, rows: slice) -> Tensor:
+        seen = columns.index_select(1, near.reshape(-1)).reshape(3, *near.shape)
+        offset = columns[:, None, rows] - seen
+        x, y, z = offset
+        distance = x * x + y * y + z * z
         if not squared:
             distance = distance.sqrt()
-        pairs = torch.cat((distance, offset), dim=-1) @ of_pair
-        return affine.finish(pairs + points[rows][:, None])
+        pairs = torch.cat((distance[None], offset)).reshape(4, -1).T @ of_pair
+        return affine.finish(pairs.reshape(*near.shape, -1) + points[rows])
 
     return encode
 
 
-def _blocks(count: int, size: int) -> Iterator[slice]:
-    for start in range(0, count, size):
-        yield slice(start, start + size)
+def _blocks(neighbours: Tensor, size: int) -> Iterator[tuple[Tensor, slice]]:
+    """Rows of a level in blocks, each with its neighbours.
+
+    They are (k, m), so that a sum over neighbours is a sum of whole arrays.
+    """
+    for start in range(0, len(neighbours), size):
+        rows = slice(start, start + size)
+        yield neighbours[rows].T.contiguous(), rows
