@@ -122,10 +122,10 @@ def point_pyramid(
     for ratio in options.ratios:
         level = points[kept[-1]]
         index = NeighbourIndex(level)
-        neighbours.append(_nearest(index, level, options.neighbours, torch.int32))
+        neighbours.append(nearest_rows(index, level, options.neighbours, torch.int32))
         chosen = torch.from_numpy(np.sort(order[: len(level) // ratio]))
         pool.append(torch.searchsorted(kept[-1], chosen))
-        nearest = _nearest(NeighbourIndex(points[chosen]), level, 1, torch.int64)
+        nearest = nearest_rows(NeighbourIndex(points[chosen]), level, 1, torch.int64)
         up.append(nearest[:, 0])
         kept.append(chosen)
     return PointPyramid(
@@ -192,7 +192,8 @@ def _check_enough(count: int, options: PyramidOptions) -> None:
     )
 
 
-def _nearest(index: NeighbourIndex, queries: Tensor, k: int, dtype: torch.dtype) -> Tensor:
+def nearest_rows(index: NeighbourIndex, queries: Tensor, k: int, dtype: torch.dtype) -> Tensor:
+    """The k nearest points of each query, (m, k), searched in blocks to bound memory."""
     found = torch.empty(len(queries), k, dtype=dtype)
     for start in range(0, len(queries), _QUERIES):
         rows = slice(start, start + _QUERIES)
