@@ -151,6 +151,8 @@ class ResidualBlock(nn.Module):
         size = len(positions) if self.training else size
         squared = self.variant.distance == "squared"
         first = _encoder(self.encode1.affine(), positions, squared=squared)
+        if self.training:  # a batch norm counts what it sees
+            first = _once(first)
         second = self._second(first, positions, squared=squared)
 
         pool1 = self.pool1.prepare(self.entry(features))
@@ -220,6 +222,18 @@ def _encoder(affine: Affine, positions: Tensor, *, squared: bool) -> Encode:
         return affine.finish(pairs.reshape(*near.shape, -1) + points[rows])
 
     return encode
+
+
+def _once(encode: Encode) -> Encode:
+    """An encoding of all points at once, which is asked for twice and made once."""
+    found: list[Tensor] = []
+
+    def encoded(near: Tensor, rows: slice) -> Tensor:
+        if not found:
+            found.append(encode(near, rows))
+        return found[0]
+
+    return encoded
 
 
 def _blocks(neighbours: Tensor, size: int) -> Iterator[tuple[Tensor, slice]]:

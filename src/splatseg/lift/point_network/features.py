@@ -18,6 +18,7 @@ from splatseg.lift.point_network.inputs import MAX_METRES, feed_points
 from splatseg.lift.point_network.pyramid import (
     PointPyramid,
     PyramidOptions,
+    check_seed,
     nearest_rows,
     point_pyramid,
 )
@@ -107,6 +108,7 @@ def spatial_features(
     """
     check_shape("positions", positions, (None, 3))
     check_finite("positions", positions)
+    check_seed(seed)
     if encoder.colour and colours is None:
         raise InputError(f"colours: {encoder.source} takes colours of points, got none.")
     points, given = positions.detach().cpu().double(), colours if encoder.colour else None
@@ -148,7 +150,7 @@ def _spacing(points: Tensor, seed: int) -> float:
         raise InputError(
             f"positions: expected at least 2 points to tell their scale by, got {len(points)}."
         )
-    asked = np.random.default_rng(abs(seed)).permutation(len(points))[:_SPACING_SAMPLE]
+    asked = np.random.default_rng(seed).permutation(len(points))[:_SPACING_SAMPLE]
     found = NeighbourIndex(points).nearest_others(1, rows=torch.from_numpy(np.sort(asked)))
     spacing = float(found.distances.median())
     if spacing == 0:

@@ -30,7 +30,7 @@ class GridPoints:
 def average_on_grid(
     positions: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"] | None, *, side: float
 ) -> GridPoints:
-    r"""Average points in cells :math:`\\lfloor p / s \\rfloor` of a grid.
+    r"""Average points in cells :math:`\lfloor p / s \rfloor` of a grid.
 
     So points are no denser in one place than in another, as in the scans that networks are
     trained on.

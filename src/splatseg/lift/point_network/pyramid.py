@@ -110,8 +110,7 @@ def point_pyramid(
     """
     check_shape("positions", positions, (None, 3))
     check_finite("positions", positions)
-    if not 0 <= seed < 1 << 63:
-        raise RangeError(f"seed: expected 0 or more, below 2^63, got {seed}.")
+    check_seed(seed)
     _check_enough(len(positions), options)
     points = positions.detach().cpu()
     order = np.random.default_rng(seed).permutation(len(points))
@@ -174,6 +173,16 @@ def join_pyramids(pyramids: Sequence[PointPyramid]) -> PointPyramid:
         pool=tuple(joined("pool", 0, level) for level in levels),
         up=tuple(joined("up", 1, level) for level in levels),
     )
+
+
+def check_seed(seed: int) -> None:
+    """Refuse seeds that no generator takes.
+
+    Raises:
+        RangeError: If it is negative, or 2^63 or more.
+    """
+    if not 0 <= seed < 1 << 63:
+        raise RangeError(f"seed: expected 0 or more, below 2^63, got {seed}.")
 
 
 def _check_enough(count: int, options: PyramidOptions) -> None:
