@@ -26,14 +26,20 @@ class MethodInputs:
     evidence: Evidence
     """Of one of the kinds that the method takes."""
 
-    guidance: FeatureEvidence | None = None
-    """Features of the same views, where the method's options name some, see `Method.guidance`."""
+    companions: Mapping[str, Evidence] = field(default_factory=dict[str, Evidence])
+    """Further evidence of the same views, by the options that name it, see `Method.companions`."""
 
     trained: Features | None = None
     """What the method made before, where its options name such a layer, see `Method.trained`."""
 
     classes: ClassTable | None = None
     """Names of the scene's classes."""
+
+    metres_per_unit: float | None = None
+    """Length of a unit of the scene; None where that is not known."""
+
+    up: tuple[float, float, float] | None = None
+    """Direction away from the ground; None where that is not known."""
 
     backend: str = "auto"
     """Name of the rendering backend."""
@@ -47,6 +53,13 @@ class MethodInputs:
     checkpoints: Checkpoints | None = None
     """Where and how often a method that declares `resumes` keeps its state, and whether it goes
     on from it; None keeps none."""
+
+    def features(self, option: str) -> FeatureEvidence | None:
+        """The features that an option names; None where it names none."""
+        found = self.companions.get(option)
+        if found is not None and not isinstance(found, FeatureEvidence):
+            raise InputError(f"{option}: expected evidence of features, got {found.kind}.")
+        return found
 
     @property
     def label_names(self) -> ClassTable | None:
@@ -107,9 +120,11 @@ class Method:
     published: Any = None
     """The options of the publication, an instance of `options`; None where the defaults are."""
 
-    guidance: str | None = None
-    """Name of the option that names evidence of features, which the method takes besides; None
-    where it takes none."""
+    companions: Mapping[str, tuple[EvidenceKind, ...]] = field(
+        default_factory=dict[str, tuple[EvidenceKind, ...]]
+    )
+    """Options that name evidence which the method takes besides, and the kinds that each may be
+    of. An option that is None names none."""
 
     trained: str | None = None
     """Name of the option that names a layer of features which the method made before, to be read
@@ -132,7 +147,8 @@ class Method:
             raise InputError(
                 f"method {self.name!r}: expected a default for every option ({error})."
             ) from error
-        for option in (self.guidance, self.trained, "readout" if self.readouts else None):
+        named = (*self.companions, self.trained, "readout" if self.readouts else None)
+        for option in named:
             if option is not None and option not in self.option_names():
                 raise InputError(f"method {self.name!r}: expected an option {option!r}.")
 

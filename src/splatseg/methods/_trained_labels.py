@@ -1,7 +1,8 @@
 """From label maps to trained features with a head: what methods trained on label maps share."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -105,15 +106,19 @@ def train_labels(
     *,
     options: LabelTrainingOptions,
     context: TrainingContext,
+    extra: Mapping[str, Any] | None = None,
 ) -> TrainingResult:
-    """Train a model of the method of this name, see `splatseg.lift.training.train`."""
+    """Train a model of the method of this name, see `splatseg.lift.training.train`.
+
+    `extra` is what else must be the same to resume, in values that JSON holds.
+    """
     return train(
         model,
         data.sampler,
         options=options.training(),
         seed=context.seed,
         checkpoints=context.checkpoints,
-        settings={"method": method} | _settings(options),
+        settings={"method": method} | _settings(options) | dict(extra or {}),
         defaults=_settings(type(options)()),
         progress=context.progress,
         cancelled=context.cancelled,
@@ -121,8 +126,11 @@ def train_labels(
 
 
 def _settings(options: LabelTrainingOptions) -> dict[str, Any]:
-    """Options without those that change nothing that is trained."""
-    values = asdict(options)
+    """Options without those that change nothing that is trained; of a file its name."""
+    values = {
+        name: value.name if isinstance(value, Path) else value
+        for name, value in asdict(options).items()
+    }
     return {name: values[name] for name in values if name not in _NOT_TRAINED}
 
 

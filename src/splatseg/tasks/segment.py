@@ -164,9 +164,11 @@ def segment(
         gaussians=scene.gaussians,
         views=_views(scene, evidence, options.views, observer),
         evidence=evidence,
-        guidance=_guidance(scene, method, chosen),
+        companions=_companions(scene, method, chosen),
         trained=trained,
         classes=scene.classes,
+        metres_per_unit=scene.metres_per_unit,
+        up=scene.up,
         backend=backend,
         seed=options.seed,
         checkpoints=(
@@ -366,18 +368,22 @@ def _trained(
     return layer
 
 
-def _guidance(scene: Scene, method: Method, options: Any) -> FeatureEvidence | None:
-    """The evidence of features that the method's options name besides, if they name some."""
-    asked = None if method.guidance is None else getattr(options, method.guidance)
-    if asked is None:
-        return None
+def _companions(scene: Scene, method: Method, options: Any) -> dict[str, Evidence]:
+    """The evidence that the method's options name besides, by option."""
     folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
-    evidence = open_evidence(find_evidence(folders, asked))
-    if not isinstance(evidence, FeatureEvidence):
-        raise InputError(
-            f"{method.guidance}: expected evidence of features, got {asked!r} of {evidence.kind}."
-        )
-    return evidence
+    found: dict[str, Evidence] = {}
+    for option, kinds in method.companions.items():
+        asked = getattr(options, option)
+        if asked is None:
+            continue
+        evidence = open_evidence(find_evidence(folders, asked))
+        if evidence.kind not in kinds:
+            raise InputError(
+                f"{option}: expected evidence of {' or '.join(kinds)}, got {asked!r} of "
+                f"{evidence.kind}."
+            )
+        found[option] = evidence
+    return found
 
 
 def _views(

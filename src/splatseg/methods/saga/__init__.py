@@ -43,7 +43,7 @@ def run(inputs: MethodInputs, options: SagaOptions) -> Features | InstanceTree:
         inputs.gaussians,
         inputs.views,
         inputs.evidence,
-        features=inputs.guidance,
+        features=inputs.features("guidance"),
         options=training,
         context=context_of(inputs),
     )
@@ -64,7 +64,7 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=SagaOptions.published(),
-    guidance="guidance",
+    companions={"guidance": ("features",)},
     trained="features",
     readouts={"tree": "tree"},
 )

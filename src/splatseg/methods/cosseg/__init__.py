@@ -1,0 +1,57 @@
+r"""CoSSegGaussians: labels decoded from features of photographs and from the shape in space.
+
+Labels of views contradict each other: a segmenter is wrong about an object from a whole range of
+views. Numbers of each Gaussian's own learn that by heart; a small network that is given what
+Gaussians look like and how they lie in space cannot, and gives alike things one label.
+
+Features of four blocks of a network are unprojected onto Gaussians (`_distilled`, eq. 2), a frozen
+RandLA-Net encodes their centres (`lift.point_network`), and a decoder fuses both from far to near
+(`_fusion`, Figs. 3 and 4). It is trained so that pixels get the labels of their label maps:
+
+.. math:: \ell_s = -\sum_p \log \mathrm{softmax}(A \sum_i w_{pi} h_i + b)_{\mathrm{id}(p)}
+
+Geometry stays as it is, so that rows of W never change (`splatseg.lift.training`). The weight
+:math:`\lambda_s` of the loss is nothing to Adam where it is the only loss.
+
+References:
+    Dou et al., CoSSegGaussians: Compact and Swift Scene Segmenting 3D Gaussians (2024), eq. 2 to 5.
+    Hu et al., RandLA-Net: Efficient Semantic Segmentation of Large-Scale Point Clouds (2020).
+"""
+
+from splatseg.core import Layer
+from splatseg.errors import InputError
+from splatseg.methods._method import Method, MethodInputs
+from splatseg.methods._trained_labels import context_of, hard_labels
+from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
+from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
+
+
+def run(inputs: MethodInputs, options: CossegOptions) -> Layer:
+    """Train the decoder, and read it as the options say."""
+    features = train_cosseg(
+        inputs.gaussians,
+        inputs.views,
+        inputs.evidence,
+        features=inputs.features("features"),
+        options=options,
+        classes=inputs.label_names,
+        metres_per_unit=inputs.metres_per_unit,
+        up=inputs.up,
+        context=context_of(inputs),
+    )
+    return features if options.readout == "rendered" else hard_labels(features, options)
+
+
+METHOD = Method(
+    name="cosseg",
+    summary="labels are decoded from features of photographs and the shape in space",
+    reference="CoSSegGaussians (Dou et al. 2024), eq. 2 to 5",
+    evidence=("labels", "tracked"),
+    options=CossegOptions,
+    run=run,
+    keeps_ids=True,
+    seeded=True,
+    resumes=True,
+    published=CossegOptions.published(),
+    companions={"features": ("features",)},
+)

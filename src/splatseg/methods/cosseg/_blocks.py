@@ -1,0 +1,205 @@
+r"""Features of several blocks of a network, brought to one width and length a block.
+
+As published, the class token of a view is joined to each of its patches, the two are reduced to 64
+principal components, and these get length 1:
+
+.. math:: f_n(p) = \frac{P_n (F_n(p) \oplus t - \mu_n)}{\| P_n (F_n(p) \oplus t - \mu_n) \|},
+          \qquad n = 1 \dots 4
+
+with :math:`P_n, \mu_n` of all patches of all views, found in one pass over them. Blocks that are no
+wider than that, as recorded components are, keep their channels; without a class token patches
+stand for themselves.
+
+References:
+    Dou et al., CoSSegGaussians (2024), sections 3.2 and 4.1, "Multi-scale Features Setup".
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from splatseg.core import FeatureMap
+from splatseg.core.models import DeepFeatures
+from splatseg.errors import InputError, ShapeError
+
+
+class BlockSource(Protocol):
+    """Features of views at several depths of a network."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have features."""
+        ...
+
+    def deep_features(self, name: str) -> DeepFeatures:
+        """Every block of a view, the shallowest first, and the class token."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Projection:
+    """The principal components that a block is reduced to."""
+
+    mean: Float[Tensor, "width"]
+    axes: Float[Tensor, "width components"]
+    """Orthonormal; the largest entry of each is positive."""
+
+
+class ReducedBlocks:
+    """All blocks of a view side by side, each reduced and of length 1.
+
+    Args:
+        source: The features.
+        views: Names of the views that the components are found of.
+        components: Channels that a wider block is reduced to, at least 1.
+
+    Raises:
+        InputError: If views differ in their blocks.
+        ShapeError: If blocks differ in width between views, or in their grid within one.
+    """
+
+    def __init__(self, source: BlockSource, views: Sequence[str], *, components: int) -> None:
+        self._source = source
+        first = source.deep_features(views[0])
+        self._names = tuple(first.depths)
+        self._token = first.class_token is not None
+        self._widths = tuple(map(self._width, first.maps))
+        self._components = components
+        self._projections = self._fitted(views)
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have features."""
+        return self._source.view_names
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the blocks, the shallowest first."""
+        return self._names
+
+    @property
+    def columns(self) -> tuple[slice, ...]:
+        """The channels of each block."""
+        ends = np.cumsum([min(self._components, width) for width in self._widths]).tolist()
+        return tuple(slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True))
+
+    @property
+    def steps(self) -> dict[str, bool]:
+        """Which of the published steps there was anything to do for."""
+        reduced = any(one is not None for one in self._projections)
+        return {"class token": self._token and reduced, "principal components": reduced}
+
+    def features(self, name: str) -> FeatureMap:
+        """The blocks of a view, one after the other along the channels."""
+        found = self._checked(name)
+        parts: list[Tensor] = []
+        for index, values in enumerate(self._joined(found)):
+            projection = self._projections[index]
+            if projection is not None:
+                values = (values - projection.mean) @ projection.axes
+            parts.append(normalize(values, dim=-1))
+        grid = found.maps[0]
+        return FeatureMap(
+            features=torch.cat(parts, dim=-1),
+            stride=grid.stride,
+            height=grid.height,
+            width=grid.width,
+        )
+
+    def _width(self, grid: FeatureMap) -> int:
+        """Channels of a block before it is reduced; a token is joined to what will be."""
+        joined = self._token and grid.channels > 0
+        return grid.channels * (2 if joined else 1)
+
+    def _joined(self, found: DeepFeatures) -> list[Tensor]:
+        """Patches of each block, with the class token where blocks are to be reduced."""
+        parts: list[Tensor] = []
+        for width, grid in zip(self._widths, found.maps, strict=True):
+            values = grid.features.float().cpu()
+            if found.class_token is not None and width > self._components:
+                token = found.class_token.float().cpu().expand(*values.shape[:2], -1)
+                values = torch.cat((values, token), dim=-1)
+            parts.append(values)
+        return parts
+
+    def _checked(self, name: str) -> DeepFeatures:
+        found = self._source.deep_features(name)
+        if tuple(found.depths) != self._names:
+            raise InputError(
+                f"evidence: expected the blocks {', '.join(self._names)} of view {name}, got "
+                f"{', '.join(found.depths)}."
+            )
+        if (found.class_token is not None) != self._token:
+            raise InputError(
+                f"evidence: expected {'a' if self._token else 'no'} class token of view {name}, "
+                "as of the others."
+            )
+        grids = {(one.features.shape[:2], one.stride, one.height, one.width) for one in found.maps}
+        if len(grids) != 1:
+            raise ShapeError(
+                f"evidence: expected blocks of view {name} on one grid, got {len(grids)} grids."
+            )
+        for depth, width, one in zip(found.depths, self._widths, found.maps, strict=True):
+            if self._width(one) != width:
+                raise ShapeError(
+                    f"evidence: expected {width // (2 if self._token else 1)} channels of "
+                    f"{depth} of view {name}, as of the others, got {one.channels}."
+                )
+        return found
+
+    def _fitted(self, views: Sequence[str]) -> tuple[Projection | None, ...]:
+        """Components of the blocks that are wider than they are to be."""
+        wide = [index for index, width in enumerate(self._widths) if width > self._components]
+        if not wide:
+            return (None,) * len(self._widths)
+        moments = {index: _Moments(self._widths[index]) for index in wide}
+        for name in views:
+            joined = self._joined(self._checked(name))
+            for index in wide:
+                moments[index].add(joined[index].flatten(0, 1).numpy())
+        return tuple(
+            moments[index].projection(self._components) if index in moments else None
+            for index in range(len(self._widths))
+        )
+
+
+class _Moments:
+    """Mean and covariance of vectors that come in pieces."""
+
+    def __init__(self, width: int) -> None:
+        self._count = 0
+        self._origin: NDArray[np.float64] | None = None
+        self._sum = np.zeros(width)
+        self._products = np.zeros((width, width))
+
+    def add(self, rows: NDArray[np.float32]) -> None:
+        """More vectors, one a row."""
+        values = rows.astype(np.float64)
+        if self._origin is None:
+            # Sums of what is left of the first piece's mean lose no digits to it.
+            self._origin = values.mean(axis=0)
+        values -= self._origin
+        self._count += len(values)
+        self._sum += values.sum(axis=0)
+        self._products += values.T @ values
+
+    def projection(self, components: int) -> Projection:
+        """The axes of largest variance."""
+        origin = np.zeros(len(self._sum)) if self._origin is None else self._origin
+        mean = self._sum / max(self._count, 1)
+        covariance = self._products / max(self._count, 1) - np.outer(mean, mean)
+        _, axes = np.linalg.eigh(covariance)
+        axes = axes[:, ::-1][:, :components]
+        largest = np.abs(axes).argmax(axis=0)
+        axes = axes * np.where(axes[largest, np.arange(axes.shape[1])] < 0, -1.0, 1.0)
+        return Projection(
+            mean=torch.from_numpy((origin + mean).astype(np.float32)),
+            axes=torch.from_numpy(np.ascontiguousarray(axes).astype(np.float32)),
+        )

@@ -1,0 +1,184 @@
+r"""The fusion decoder: distilled features and spatial encodings to one feature, from far to near.
+
+Every level l of the points has the spatial encoding :math:`e_l` of the frozen network and the
+distilled feature :math:`d_l` of one block, the shallowest at the points themselves, the deepest
+farthest up. From the last level L on, what is decoded goes to the nearest points of the level
+below and is joined to what is there:
+
+.. math:: x_L = \phi(A_L (e_L \oplus d_L) + b_L), \qquad
+          x_l = \phi(A_l (x_{l+1}[\mathrm{up}_l] \oplus e_l \oplus d_l) + b_l), \qquad
+          h = \mathrm{head}(x_0)
+
+with :math:`\phi` a leaky ReLU and a head of more such layers. A linear classifier of h gives the
+logits of ids; it is kept apart (`lift.heads.ClassifierHead`), so that what is stored of a Gaussian
+does not grow with their number. A matrix is applied to what comes from above before it is spread:
+each point above stands for four below.
+
+References:
+    Dou et al., CoSSegGaussians (2024), section 3.3, Figs. 3 and 4.
+    Hu et al., RandLA-Net (2020), Fig. 7: the skips and the head.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+from torch.nn.functional import embedding, leaky_relu
+
+from splatseg.errors import ShapeError
+
+SLOPE = 0.2
+"""Of the leaky ReLUs, as RandLA-Net has them."""
+
+_ROWS = 1 << 16
+"""Points decoded at a time where no gradient is asked for."""
+
+_CONSTANT = 1e-6
+"""Deviation below which a channel is constant."""
+
+_LARGEST = 60000.0
+"""What float16 holds."""
+
+Weights = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FusionInputs:
+    """What the decoder is given of a set of points; nothing in it is learnt."""
+
+    levels: tuple[Float[Tensor, "n_l channels"], ...]
+    """Per level, spatial encoding and distilled feature of each of its points, side by side;
+    float16 or float32. One level: nothing is decoded from above."""
+
+    up: tuple[Int64[Tensor, "n_l"], ...]
+    """For each level but the last, the row of the nearest point of the next."""
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Channels of each level."""
+        return tuple(level.shape[1] for level in self.levels)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FusionShape:
+    """Widths of the decoder's layers."""
+
+    inputs: tuple[int, ...]
+    """Channels of `FusionInputs.levels`."""
+
+    decoded: tuple[int, ...]
+    """Channels decoded at each of these levels."""
+
+    head: tuple[int, ...]
+    """Channels of the head's layers, one after the other; the last is what is classified."""
+
+    def start(self, rng: np.random.Generator) -> dict[str, Tensor]:
+        """First weights: uniform within 1 / sqrt(inputs), as torch's linear layers."""
+        found: dict[str, Tensor] = {}
+
+        def layer(name: str, parts: Mapping[str, int], outputs: int) -> None:
+            bound = 1 / math.sqrt(sum(parts.values()))
+            for part, width in parts.items():
+                found[f"{name}.{part}"] = _uniform(rng, bound, (width, outputs))
+            found[f"{name}.bias"] = _uniform(rng, bound, (outputs,))
+
+        last = len(self.inputs) - 1
+        for level in range(last, -1, -1):
+            parts = {"own": self.inputs[level]}
+            if level < last:
+                parts["above"] = self.decoded[level + 1]
+            layer(f"level{level}", parts, self.decoded[level])
+        widths = (self.decoded[0], *self.head)
+        for index, (inputs, outputs) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+            layer(f"head{index}", {"own": inputs}, outputs)
+        return found
+
+
+def decode(
+    inputs: FusionInputs, weights: Weights, rows: Int64[Tensor, "t"]
+) -> Float[Tensor, "t channels"]:
+    """What is decoded of some points, differentiable towards the weights.
+
+    Only what these points depend on is computed.
+
+    Args:
+        inputs: Of the points.
+        weights: Named as `FusionShape.start` names them.
+        rows: Rows of level 0, distinct.
+    """
+    needed, position = [rows], []
+    for up in inputs.up:
+        above, where = torch.unique(up[needed[-1]], return_inverse=True)
+        needed.append(above)
+        position.append(where)
+    last = len(inputs.levels) - 1
+    decoded = _own(inputs, weights, last, needed[last])
+    for level in range(last - 1, -1, -1):
+        # The gradient of `embedding` is a sum in the order of entries, in one pass.
+        spread = embedding(position[level], decoded @ weights[f"level{level}.above"])
+        decoded = _own(inputs, weights, level, needed[level], spread)
+    return _headed(weights, decoded)
+
+
+def decode_all(inputs: FusionInputs, weights: Weights) -> Float[Tensor, "n channels"]:
+    """`decode` of all points: level by level, some at a time, without gradients."""
+    with torch.no_grad():
+        decoded: Tensor | None = None
+        for level in range(len(inputs.levels) - 1, -1, -1):
+            above = None if decoded is None else decoded @ weights[f"level{level}.above"]
+            count = len(inputs.levels[level])
+            decoded = torch.empty(count, len(weights[f"level{level}.bias"]))
+            for start in range(0, count, _ROWS):
+                rows = torch.arange(start, min(start + _ROWS, count))
+                spread = None if above is None else above[inputs.up[level][rows]]
+                own = _own(inputs, weights, level, rows, spread)
+                decoded[rows] = own if level else _headed(weights, own)
+    if decoded is None:
+        raise ShapeError("levels: expected at least one, got none.")
+    return decoded
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scaling:
+    """What brings channels to mean 0 and variance 1."""
+
+    mean: Float[Tensor, "channels"]
+    scale: Float[Tensor, "channels"]
+
+    @classmethod
+    def of(cls, values: Float[Tensor, "n channels"]) -> "Scaling":
+        """That of some rows; a constant channel becomes 0."""
+        # NumPy's sums are the same on any number of threads.
+        numbers = values.float().numpy()
+        mean = numbers.mean(axis=0, dtype=np.float64)
+        deviation = numbers.std(axis=0, dtype=np.float64)
+        scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > _CONSTANT)
+        return cls(mean=torch.from_numpy(mean).float(), scale=torch.from_numpy(scale).float())
+
+    def __call__(self, values: Float[Tensor, "n channels"]) -> Float[Tensor, "n channels"]:
+        """The values scaled, in float16."""
+        return ((values.float() - self.mean) * self.scale).clamp_(-_LARGEST, _LARGEST).half()
+
+
+def _own(
+    inputs: FusionInputs, weights: Weights, level: int, rows: Tensor, above: Tensor | None = None
+) -> Tensor:
+    own = inputs.levels[level].index_select(0, rows).float()
+    decoded = torch.addmm(weights[f"level{level}.bias"], own, weights[f"level{level}.own"])
+    return leaky_relu(decoded if above is None else decoded + above, SLOPE)
+
+
+def _headed(weights: Weights, decoded: Tensor) -> Tensor:
+    layers = sum(name.startswith("head") and name.endswith(".bias") for name in weights)
+    for index in range(layers):
+        own, bias = weights[f"head{index}.own"], weights[f"head{index}.bias"]
+        decoded = leaky_relu(torch.addmm(bias, decoded, own), SLOPE)
+    return decoded
+
+
+def _uniform(rng: np.random.Generator, bound: float, shape: tuple[int, ...]) -> Tensor:
+    return torch.from_numpy(rng.uniform(-bound, bound, shape).astype(np.float32))

@@ -1,0 +1,148 @@
+"""How a fusion decoder is trained."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from splatseg._check import check_choice, check_range
+from splatseg.errors import RangeError
+from splatseg.lift.heads import Blend
+from splatseg.lift.training import SamplingOptions
+from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
+from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
+from splatseg.methods.cosseg._distilled import Division
+
+Scales = Literal["all", "first", "none"]
+Points = Literal["visible", "all", "blocks"]
+Weighting = Literal["none", "agreement"]
+Transitions = Literal["none", "views"]
+
+# Dou et al. 2024, sections 3.3, 3.4 and 4.1: what `published` is made of.
+PUBLISHED_COMPONENTS = 64
+PUBLISHED_RATE = 1e-3
+PUBLISHED_STEPS = 10_000
+"""Each with one whole picture."""
+PUBLISHED_DECODED = (32, 32, 128, 256, 512, 1024)
+"""RandLA-Net's own decoder for S3DIS, which the paper extends."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CossegOptions(LabelTrainingOptions):
+    """How labels are decoded from features and space."""
+
+    features: str | None = None
+    """Name of evidence of features, such as features_dino: several blocks of a network. None
+    decodes space alone."""
+
+    semantic: Scales = "all"
+    """Which blocks are used. all: each at a scale of its own. first: the shallowest alone, at the
+    Gaussians themselves. none: space alone."""
+
+    spatial: Scales = "all"
+    """Which levels of the point network are used. all: each is joined to what is decoded there.
+    first: the last one alone, of the widest neighbourhood. none: each Gaussian is decoded from its
+    own features."""
+
+    division: Division = "mean"
+    """What features summed over pixels are divided by. mean: their weights. pixels: the number of
+    pixels. sum: nothing, as equation 2 is printed."""
+
+    components: int = PUBLISHED_COMPONENTS
+    """Principal components that wider blocks are reduced to."""
+
+    min_pixels: int = 0
+    """Pixels, of all views, in which a Gaussian must take part to be decoded; others take the
+    labels of their neighbours."""
+
+    points: Points = "all"
+    """What the point network is given. visible: what each view shows, as published. all: all
+    Gaussians at once. blocks: all, in boxes that do not see each other, for less memory."""
+
+    block_points: int = 40_960
+    """Gaussians of a box at most."""
+
+    encoder: Path | None = None
+    """Checkpoint of a point network; None is the one that comes along."""
+
+    decoded: tuple[int, ...] = (32, 64, 64, 64, 64, 64)
+    """Channels that are decoded at each level, the Gaussians' own first."""
+
+    head: tuple[int, ...] = (64, 32)
+    """Channels of the layers between them and the classifier."""
+
+    blend: Blend = "probabilities"
+    """features: what is decoded is rendered and then classified, as published. probabilities:
+    Gaussians are classified and their probabilities rendered."""
+
+    label_loss: LabelLoss = "cross_entropy"
+    """What a pixel's label costs. generalised and symmetric: bounded, so that labels which fit
+    nothing count little. bootstrap: the answer itself is a part of the label."""
+
+    weighting: Weighting = "none"
+    """How much a pixel counts. none: all alike. agreement: as much as all views together vote for
+    its label on the Gaussians that it shows."""
+
+    transitions: Transitions = "none"
+    """views: each view has a matrix by which its labels differ from the true ones, learnt along."""
+
+    transition_rate: float = 0.01
+    """Adam's rate for these matrices."""
+
+    rate: float = 3e-3
+    """Adam's rate for the decoder."""
+
+    def __post_init__(self) -> None:
+        LabelTrainingOptions.__post_init__(self)
+        check_choice("semantic", self.semantic, get_args(Scales))
+        check_choice("spatial", self.spatial, get_args(Scales))
+        check_choice("division", self.division, get_args(Division))
+        check_choice("points", self.points, get_args(Points))
+        check_choice("label_loss", self.label_loss, LABEL_LOSSES)
+        check_choice("weighting", self.weighting, get_args(Weighting))
+        check_choice("transitions", self.transitions, get_args(Transitions))
+        for name, least in (("components", 1), ("min_pixels", 0), ("block_points", 1)):
+            if getattr(self, name) < least:
+                raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
+        for name in ("decoded", "head"):
+            if not getattr(self, name) or min(getattr(self, name)) < 1:
+                raise RangeError(f"{name}: expected numbers from 1, got {getattr(self, name)}.")
+        check_rate("rate", self.rate)
+        check_rate("transition_rate", self.transition_rate)
+        check_range("min_share", self.min_share, 0.0, 1.0)
+        if self.spatial == "none" and self.semantic == "none":
+            raise RangeError("semantic, spatial: expected one of the two, got neither.")
+
+    def drawing(self) -> SamplingOptions:
+        """Which pixels are drawn: of one view at a time where points are those that it shows."""
+        drawn = LabelTrainingOptions.drawing(self)
+        return SamplingOptions(
+            pixels=drawn.pixels,
+            sampling=drawn.sampling,
+            min_weight=drawn.min_weight,
+            memory=drawn.memory,
+            views_per_batch=1 if self.points == "visible" and self.spatial != "none" else None,
+        )
+
+    @classmethod
+    def published(cls, *, steps: int = 2000) -> "CossegOptions":
+        """The published setting: its features, points, loss and rate.
+
+        Steps are of sampled pixels of one view, and fewer than `PUBLISHED_STEPS`. The paper prunes
+        Gaussians by their pixels and does not say below how many.
+        """
+        return cls(
+            features="features_dino",
+            readout="rendered",
+            steps=steps,
+            batch=4096,
+            division="sum",
+            min_pixels=10,
+            points="visible",
+            decoded=PUBLISHED_DECODED,
+            blend="features",
+            rate=PUBLISHED_RATE,
+            schedule="constant",
+            min_weight=0.0,
+            held_out=0.0,
+            patience=0,
+        )
