@@ -14,7 +14,8 @@ from splatseg.methods._method import Method
 ENTRY_POINT_GROUP = "splatseg.methods"
 
 _OWN = (
-    "uplift", "features", "vote", "associate", "identity", "saga", "logits", "probabilities",
+    "uplift", "features", "vote", "associate", "identity", "saga", "cosseg", "logits",
+    "probabilities",
 )  # fmt: skip
 _REGISTERED: dict[str, Method] = {}
 

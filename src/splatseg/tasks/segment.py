@@ -25,7 +25,6 @@ from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
     Evidence,
-    FeatureEvidence,
     TrackedEvidence,
     check_map_sizes,
     find_evidence,

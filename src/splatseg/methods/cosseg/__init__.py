@@ -18,16 +18,23 @@ References:
     Hu et al., RandLA-Net: Efficient Semantic Segmentation of Large-Scale Point Clouds (2020).
 """
 
+from collections.abc import Mapping
+
 from splatseg.core import Layer
 from splatseg.errors import InputError
+from splatseg.io.evidence import Evidence, TrackedEvidence
+from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods._trained_labels import context_of, hard_labels
+from splatseg.methods.cosseg._objects import CategoryMaps, label_objects
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
 
 
 def run(inputs: MethodInputs, options: CossegOptions) -> Layer:
-    """Train the decoder, and read it as the options say."""
+    """Find labels of objects, or train the decoder and read it, as the options say."""
+    if options.decide == "objects":
+        return _objects(inputs, options)
     features = train_cosseg(
         inputs.gaussians,
         inputs.views,
@@ -42,6 +49,36 @@ def run(inputs: MethodInputs, options: CossegOptions) -> Layer:
     return features if options.readout == "rendered" else hard_labels(features, options)
 
 
+def _objects(inputs: MethodInputs, options: CossegOptions) -> Layer:
+    """Of label maps the classes of Gaussians, of tracks the objects with a class each."""
+    masks = inputs.companions.get("masks")
+    if masks is None:
+        raise InputError(
+            "masks: expected evidence of masks, such as masks_sam, to find objects by, got none; "
+            "`decide` by decoder wants none."
+        )
+    evidence = inputs.evidence
+    tracked = isinstance(evidence, TrackedEvidence)
+    found = label_objects(
+        inputs.gaussians,
+        inputs.views,
+        CategoryMaps(evidence, _categories(evidence)) if tracked else evidence,
+        features=inputs.features("features"),
+        masks=EvidenceSegments(evidence=masks),
+        options=options,
+        object_options=options.classification,
+        classes=inputs.categories if tracked else inputs.label_names,
+        context=context_of(inputs),
+        told=inputs.progress,
+    )
+    return found.objects if tracked else found.classes
+
+
+def _categories(evidence: Evidence) -> Mapping[int, int]:
+    """The category of each track."""
+    return EvidenceSegments(evidence=evidence).categories_of("")
+
+
 METHOD = Method(
     name="cosseg",
     summary="labels are decoded from features of photographs and the shape in space",
@@ -53,5 +90,5 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=CossegOptions.published(),
-    companions={"features": ("features",)},
+    companions={"features": ("features",), "masks": ("masks",)},
 )

@@ -1,18 +1,21 @@
 """How a fusion decoder is trained."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
 from splatseg._check import check_choice, check_range
 from splatseg.errors import RangeError
 from splatseg.lift.heads import Blend
+from splatseg.lift.object_classes import ObjectClassOptions
 from splatseg.lift.training import SamplingOptions
 from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
 from splatseg.methods.cosseg._distilled import Division
 
-Scales = Literal["all", "first", "none"]
+Semantic = Literal["all", "first", "deepest", "none"]
+Spatial = Literal["all", "first", "none"]
+Decide = Literal["objects", "decoder"]
 Points = Literal["visible", "all", "blocks"]
 Weighting = Literal["none", "agreement"]
 Transitions = Literal["none", "views"]
@@ -34,11 +37,26 @@ class CossegOptions(LabelTrainingOptions):
     """Name of evidence of features, such as features_dino: several blocks of a network. None
     decodes space alone."""
 
-    semantic: Scales = "all"
-    """Which blocks are used. all: each at a scale of its own. first: the shallowest alone, at the
-    Gaussians themselves. none: space alone."""
+    masks: str | None = None
+    """Name of evidence of masks, such as masks_sam, that decide by `objects` wants."""
 
-    spatial: Scales = "all"
+    decide: Decide = "objects"
+    """How labels are found. objects: in closed form; masks are associated into objects, and each
+    gets the class that its own votes and those of objects that look like it speak for. decoder:
+    a network that is given features and space is trained, as published."""
+
+    semantic: Semantic = "all"
+    """Which blocks are used. all: each, by the decoder at a scale of its own. first: the
+    shallowest alone, at the Gaussians themselves. deepest: the last. none: space alone."""
+
+    lifted_side: int = 256
+    """Longest side, in pixels, of the views through which features are lifted; they come in
+    patches of many pixels."""
+
+    classification: ObjectClassOptions = field(default_factory=ObjectClassOptions)
+    """How votes and features of objects are weighed."""
+
+    spatial: Spatial = "all"
     """Which levels of the point network are used. all: each is joined to what is decoded there.
     first: the last one alone, of the widest neighbourhood. none: each Gaussian is decoded from its
     own features."""
@@ -93,14 +111,20 @@ class CossegOptions(LabelTrainingOptions):
 
     def __post_init__(self) -> None:
         LabelTrainingOptions.__post_init__(self)
-        check_choice("semantic", self.semantic, get_args(Scales))
-        check_choice("spatial", self.spatial, get_args(Scales))
+        check_choice("decide", self.decide, get_args(Decide))
+        check_choice("semantic", self.semantic, get_args(Semantic))
+        check_choice("spatial", self.spatial, get_args(Spatial))
         check_choice("division", self.division, get_args(Division))
         check_choice("points", self.points, get_args(Points))
         check_choice("label_loss", self.label_loss, LABEL_LOSSES)
         check_choice("weighting", self.weighting, get_args(Weighting))
         check_choice("transitions", self.transitions, get_args(Transitions))
-        for name, least in (("components", 1), ("min_pixels", 0), ("block_points", 1)):
+        for name, least in (
+            ("components", 1),
+            ("min_pixels", 0),
+            ("block_points", 1),
+            ("lifted_side", 1),
+        ):
             if getattr(self, name) < least:
                 raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
         for name in ("decoded", "head"):
@@ -132,6 +156,7 @@ class CossegOptions(LabelTrainingOptions):
         """
         return cls(
             features="features_dino",
+            decide="decoder",
             readout="rendered",
             steps=steps,
             batch=4096,

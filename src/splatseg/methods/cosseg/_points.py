@@ -17,7 +17,7 @@ from splatseg.lift.point_network import (
     spatial_features,
 )
 from splatseg.methods.cosseg._fusion import FusionInputs, Scaling
-from splatseg.methods.cosseg._options import Scales
+from splatseg.methods.cosseg._options import Spatial
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class PointSource:
     encoder: PointEncoder | None
     """None where each Gaussian is decoded from its own features."""
 
-    spatial: Scales
+    spatial: Spatial
     metres_per_unit: float | None
     up: tuple[float, float, float] | None
     seed: int
@@ -153,7 +153,9 @@ def joined_blocks(raw: Sequence[RawPoints]) -> RawPoints:
     """Points of boxes that do not see each other, as one."""
     first = raw[0]
     levels = range(len(first.parts))
-    starts = np.cumsum([[0] * len(first.parts), *([len(p[0]) for p in one.parts] for one in raw)], 0)
+    starts = np.cumsum(
+        [[0] * len(first.parts), *([len(p[0]) for p in one.parts] for one in raw)], 0
+    )
     return RawPoints(
         parts=tuple(
             tuple(
@@ -198,5 +200,3 @@ def check_decoded(kept: Bool[Tensor, "n"], min_pixels: int) -> Int64[Tensor, "m"
             f"{len(kept)}."
         )
     return chosen
-
-

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 from torch import Tensor
 
 from splatseg.core import ClassTable, Features, Gaussians, LabelSource, LayerInfo, View
@@ -185,10 +185,13 @@ def _given(
             components=options.components,
             division=options.division,
             pixels=counts,
+            longest_side=options.lifted_side,
             **drawn_by,
         )
     encoder = None if options.spatial == "none" else load_point_encoder(options.encoder)
-    scales = () if distilled is None else distilled.scales
+    scales: Sequence[Tensor] = () if distilled is None else distilled.scales
+    if options.semantic in ("first", "deepest"):
+        scales = scales[:1] if options.semantic == "first" else scales[-1:]
     return _Given(
         gaussians=gaussians,
         chosen=chosen,
@@ -196,7 +199,7 @@ def _given(
         encoder=encoder,
         source=PointSource(
             gaussians=gaussians,
-            scales=scales[:1] if options.semantic == "first" else scales,
+            scales=scales,
             encoder=encoder,
             spatial=options.spatial,
             metres_per_unit=frame[0],

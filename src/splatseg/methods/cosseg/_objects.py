@@ -1,0 +1,248 @@
+r"""Labels of objects in closed form: votes of all pixels of an object, and of objects alike.
+
+Masks are associated into objects (`methods.associate`), which need no names; labels vote for
+classes on the Gaussians, and features are lifted onto them, as for the decoder. Then each object
+gets the class that its own votes and those of objects that look like it speak for
+(`lift.object_classes`), and a Gaussian that is in several objects in part gets
+
+.. math:: P_{ic} = \sum_k s_{ik} r_{kc} + \Bigl(1 - \sum_k s_{ik}\Bigr) v_{ic} / \sum_{c'} v_{ic'}
+
+with :math:`s_{ik}` its share in object k and :math:`v_{ic}` its own votes. Nothing is trained.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import (
+    UNLABELLED,
+    ClassTable,
+    Gaussians,
+    InstanceTree,
+    LabelMap,
+    Labels,
+    LabelSource,
+    LayerInfo,
+    View,
+)
+from splatseg.lift.mass.uplift import UpliftOptions, uplift
+from splatseg.lift.object_classes import (
+    ObjectClassOptions,
+    PooledObjects,
+    classify_objects,
+    pool_objects,
+)
+from splatseg.lift.segments.table import SegmentSource
+from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods.associate import associate_masks
+from splatseg.methods.cosseg._blocks import BlockSource
+from splatseg.methods.cosseg._distilled import distilled_features
+from splatseg.methods.cosseg._options import CossegOptions
+
+_CANDIDATES = 16
+"""Ids of a Gaussian whose votes are counted, and kept of the result."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObjectLabels:
+    """What objects are."""
+
+    classes: Labels
+    """The class of each Gaussian, soft."""
+
+    objects: Labels
+    """Which object it is of, with the class of each."""
+
+
+@dataclass(frozen=True, slots=True)
+class CategoryMaps:
+    """Label maps of classes, from maps of tracks and the category of each track."""
+
+    maps: LabelSource
+    categories: Mapping[int, int]
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have maps."""
+        return self.maps.view_names
+
+    def label_map(self, name: str) -> LabelMap:
+        """The map of a view; pixels of tracks without a category have no label."""
+        found = self.maps.label_map(name)
+        most = max(self.categories, default=0)
+        table = torch.full((most + 2,), UNLABELLED, dtype=torch.int32)
+        for track, category in self.categories.items():
+            table[track] = category
+        ids = found.ids.long()
+        known = torch.where((ids >= 0) & (ids <= most), ids, most + 1)
+        return replace(found, ids=table[known])
+
+
+def label_objects(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    evidence: LabelSource,
+    *,
+    features: BlockSource | None,
+    masks: SegmentSource,
+    options: CossegOptions,
+    object_options: ObjectClassOptions,
+    classes: ClassTable | None,
+    context: TrainingContext,
+    told: Callable[[int, int], None] | None = None,
+) -> ObjectLabels:
+    """Associate masks, and find the class of each object.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: Those whose labels, features and masks count.
+        evidence: Label maps of classes.
+        features: Several blocks of a network; None takes votes of each object alone.
+        masks: Masks of objects, parts and groups.
+        options: How features are reduced and lifted.
+        object_options: How votes and features are weighed.
+        classes: Names of the classes.
+        context: Render options and backend.
+        told: Called with the stages done and all there are.
+
+    Raises:
+        InputError: If there are no views, one has no label map, features or masks, or no pixel has
+            a label.
+        ShapeError: If maps, masks or features do not have their photograph's proportions.
+    """
+    drawn_by = {"render_options": context.render_options, "backend": context.backend}
+
+    def tell(stage: int) -> None:
+        if told is not None:
+            told(stage, 4)
+
+    found = uplift(
+        gaussians,
+        views,
+        evidence,
+        options=UpliftOptions(candidates=_CANDIDATES),
+        classes=classes,
+        **drawn_by,
+    )
+    tell(1)
+    tree = associate_masks(gaussians, views, masks, **drawn_by).tree
+    tell(2)
+    scales: tuple[Tensor, ...] = (torch.zeros(len(gaussians), 1),)
+    weights = torch.zeros(len(gaussians))
+    if features is not None:
+        distilled = distilled_features(
+            gaussians,
+            views,
+            features,
+            components=options.components,
+            division="mean",
+            longest_side=options.lifted_side,
+            **drawn_by,
+        )
+        deepest = distilled.scales[-1:] if options.semantic == "deepest" else distilled.scales
+        scales = distilled.scales[:1] if options.semantic == "first" else deepest
+        weights = distilled.weights
+    tell(3)
+    return _labelled(tree, found, scales, weights, object_options, told=tell)
+
+
+def _labelled(
+    tree: InstanceTree,
+    votes: Labels,
+    scales: Sequence[Tensor],
+    weights: Float[Tensor, "n"],
+    options: ObjectClassOptions,
+    *,
+    told: Callable[[int], None],
+) -> ObjectLabels:
+    objects = tree.cut("object")
+    pooled = pool_objects(objects, votes, scales, weights)
+    probabilities = classify_objects(pooled, options=options)
+    told(4)
+    return ObjectLabels(
+        classes=_spread(objects, votes, pooled, probabilities),
+        objects=_with_classes(objects, pooled, probabilities, votes.info),
+    )
+
+
+def _spread(objects: Labels, votes: Labels, pooled: PooledObjects, probabilities: Tensor) -> Labels:
+    """Classes of objects on the Gaussians, by their shares; what is left are own votes."""
+    if votes.candidates is None or votes.shares is None:
+        return votes
+    count, width = len(objects), len(pooled.classes)
+    total = torch.zeros(count, width + 1)
+    decided = probabilities.sum(dim=1) > 0
+    own = torch.ones(count)
+    if objects.candidates is not None and objects.shares is not None:
+        members, shares = objects.candidates.cpu().long(), objects.shares.cpu().float()
+        # Shares that were solved for each by itself may add up to more than 1.
+        shares = shares / shares.sum(dim=1, keepdim=True).clamp_min(1.0)
+    else:
+        members, shares = objects.ids.cpu().long()[:, None], torch.ones(count, 1)
+    for rank in range(members.shape[1]):
+        row = torch.searchsorted(pooled.ids, members[:, rank]).clamp_max(len(pooled.ids) - 1)
+        there = (members[:, rank] != UNLABELLED) & (pooled.ids[row] == members[:, rank])
+        there &= decided[row]
+        share = torch.where(there, shares[:, rank], 0.0)
+        total[:, :width] += probabilities[row].float() * share[:, None]
+        own -= share
+    for rank in range(votes.candidates.shape[1]):
+        ids = votes.candidates[:, rank].cpu().long()
+        column = torch.searchsorted(pooled.classes, ids).clamp_max(width - 1)
+        column = torch.where(ids == UNLABELLED, width, column)
+        share = votes.shares[:, rank].cpu().float() * own.clamp_min(0)
+        total.scatter_add_(1, column[:, None], share[:, None])
+    return _soft(total[:, :width], pooled, votes)
+
+
+def _soft(shares: Float[Tensor, "n classes"], pooled: PooledObjects, votes: Labels) -> Labels:
+    kept = min(_CANDIDATES, shares.shape[1])
+    # Stable: of equals the one with the smaller id.
+    order = torch.sort(shares, dim=1, descending=True, stable=True)
+    best, column = order.values[:, :kept], order.indices[:, :kept]
+    ids = torch.where(best > 0, pooled.classes[column], UNLABELLED).int()
+    return replace(
+        votes,
+        ids=ids[:, 0],
+        confidence=best[:, 0].clamp(0, 1),
+        candidates=ids,
+        shares=best,
+    )
+
+
+def _with_classes(
+    objects: Labels, pooled: PooledObjects, probabilities: Tensor, info: LayerInfo
+) -> Labels:
+    """Objects with what each is, and how surely."""
+    decided = (probabilities.sum(dim=1) > 0).numpy()
+    best = probabilities.argmax(dim=1)
+    kinds = {
+        int(id): int(pooled.classes[column])
+        for id, column, known in zip(pooled.ids, best, decided, strict=True)
+        if known
+    }
+    surely = probabilities.amax(dim=1).numpy()
+    names = {
+        id: f"{info.names[kind]} {id}" if kind in info.names else str(id)
+        for id, kind in kinds.items()
+    }
+    sure = {
+        str(int(id)): round(float(value), 4)
+        for id, value, known in zip(pooled.ids, surely, decided, strict=True)
+        if known
+    }
+    details = {**objects.info.details, "class_probability": sure}
+    mean = float(np.mean(list(sure.values()))) if sure else 0.0
+    return replace(
+        objects,
+        info=replace(
+            objects.info,
+            class_of=kinds,
+            names=names,
+            details={**details, "mean_class_probability": round(mean, 4)},
+        ),
+    )
