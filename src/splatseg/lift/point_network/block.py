@@ -101,15 +101,16 @@ class Pooling:
             seen = self.table[rows].expand(k, m, -1)
         else:
             seen = self.table.index_select(0, near.reshape(-1)).reshape(k, m, -1)
-        features, scores = seen[..., :half], seen[..., half:]
+        features, scores = seen.split((half, 2 * half), dim=-1)
         pairs = torch.addmm(
             scores.reshape(k * m, -1), encoding.reshape(k * m, half), self.weight.T
         ).reshape(k, m, -1)
         # The largest is taken away for the range of exponentials, and does not change the shares.
         shares = pairs.sub_(pairs.detach().amax(dim=0)).exp_()
         total = shares.sum(dim=0)
+        of_features, of_encoding = shares.split(half, dim=-1)
         pooled = torch.cat(
-            ((features * shares[..., :half]).sum(0), (encoding * shares[..., half:]).sum(0)), dim=1
+            ((features * of_features).sum(dim=0), (encoding * of_encoding).sum(dim=0)), dim=1
         )
         return self.mlp(pooled / total)
 

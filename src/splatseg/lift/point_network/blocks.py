@@ -5,7 +5,7 @@ own threads would share out each of some twenty small operations and wait for ea
 each. So results do not depend on the number of threads either.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -14,6 +14,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from splatseg import _native
+from splatseg.errors import InputError
 
 Make = Callable[[Int32[Tensor, "k m"], slice], Float[Tensor, "m channels"]]
 """Makes something of some points: it gets their neighbours, and their rows."""
@@ -49,9 +50,20 @@ def in_blocks(
     threads = min(_native.threads() if on_cpu else 1, len(rows))
     call = partial(_made, make, neighbours)
     if threads == 1:
-        return torch.cat(list(map(call, rows)))
+        return _filled(len(neighbours), rows, map(call, rows))
     with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        return torch.cat(list(pool.map(call, rows)))
+        return _filled(len(neighbours), rows, pool.map(call, rows))
+
+
+def _filled(count: int, rows: Sequence[slice], parts: Iterable[Tensor]) -> Tensor:
+    """Parts as one array: no two copies of all at once."""
+    found: Tensor | None = None
+    for chosen, part in zip(rows, parts, strict=True):
+        found = part.new_empty(count, part.shape[1]) if found is None else found
+        found[chosen] = part
+    if found is None:
+        raise InputError("neighbours: expected at least one point, got none.")
+    return found
 
 
 def _made(make: Make, neighbours: Tensor, rows: slice) -> Tensor:
