@@ -3,6 +3,7 @@
 import argparse
 import pickle
 import tempfile
+import zipfile
 from collections import OrderedDict
 from pathlib import Path
 
@@ -52,3 +53,8 @@ def test_other_files(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("made*"))
     with pytest.raises(FileFormatError, match=r"expected a checkpoint of PyTorch 1\.6 or later"):
         read_torch_file(tmp_path)
+    with zipfile.ZipFile(tmp_path / "c.pth", "w") as file:
+        file.writestr("c/data.pkl", b"o no pickle")
+        file.writestr("c/version", b"3")
+    with pytest.raises(FileFormatError, match=r"c\.pth: expected a checkpoint"):
+        read_torch_file(tmp_path / "c.pth")

@@ -52,8 +52,8 @@ def read_torch_file(path: Path) -> object:
     with reading(path, _EXPECTED):
         if path.stat().st_size and not zipfile.is_zipfile(path):
             raise FileFormatError(f"{path}: expected {_EXPECTED}, got another kind of file.")
-        named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
         try:
+            named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
             with torch.serialization.safe_globals([(_stand_in(name), name) for name in named]):
                 # Mapped and not read: optimizers' states, which are as large as the weights,
                 # are never touched.
