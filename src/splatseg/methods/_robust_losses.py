@@ -10,7 +10,8 @@ With p the probability of the pixel's label and q those of all ids:
 
 References:
     Zhang and Sabuncu, Generalized Cross Entropy Loss for Training Deep Neural Networks with Noisy
-    Labels (2018). Wang et al., Symmetric Cross Entropy for Robust Learning with Noisy Labels (2019).
+    Labels (2018).
+    Wang et al., Symmetric Cross Entropy for Robust Learning with Noisy Labels (2019).
     Reed et al., Training Deep Neural Networks on Noisy Labels with Bootstrapping (2015), soft.
 """
 

@@ -6,18 +6,18 @@ right. So classes are found of which both are likely:
 
 .. math:: r_{kc} \propto (s_{kc} + \epsilon)^{\kappa} \; p(f_k \mid c, r_{-k})^{\tau}
 
-with :math:`s_{kc}` the share of the object's votes for class c and :math:`f_k` its feature. Features
-of a class are Gaussian about a mean that is Gaussian itself (probabilistic linear discriminant
-analysis; the two covariances B between and W within classes are common to all):
+with :math:`s_{kc}` the share of the object's votes for class c and :math:`f_k` its feature.
+Features of a class are Gaussian about a mean that is Gaussian itself (probabilistic linear
+discriminant analysis; the two covariances B between and W within classes are common to all):
 
 .. math:: f \mid c \sim \mathcal{N}(\mu_c, W), \quad \mu_c \sim \mathcal{N}(0, B), \qquad
           p(f_k \mid c) = \mathcal{N}\Bigl(f_k;\; V_c W^{-1} \sum_{j \ne k} r_{jc} f_j,\;
           W + V_c\Bigr), \quad V_c = \Bigl(B^{-1} + \sum_{j \ne k} r_{jc} W^{-1}\Bigr)^{-1}
 
-What an object itself says of a class is left out of what the class says of it. A class that no other
-object is of is as likely as B and W allow: an object that is unlike all of the class it is voted
-for may be the only one of another. W, B and r are found in turns. The exponents are below what
-independent votes and channels would have, since neither are independent.
+What an object itself says of a class is left out of what the class says of it. A class that no
+other object is of is as likely as B and W allow: an object that is unlike all of the class it is
+voted for may be the only one of another. W, B and r are found in turns. The exponents are below
+what independent votes and channels would have, since neither are independent.
 
 References:
     Ioffe, Probabilistic Linear Discriminant Analysis (2006). Prince and Elder, Probabilistic Linear

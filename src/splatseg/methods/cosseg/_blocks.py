@@ -182,10 +182,10 @@ class _Moments:
     def add(self, rows: NDArray[np.float32]) -> None:
         """More vectors, one a row."""
         values = rows.astype(np.float64)
-        if self._origin is None:
-            # Sums of what is left of the first piece's mean lose no digits to it.
-            self._origin = values.mean(axis=0)
-        values -= self._origin
+        # Sums of what is left of the first piece's mean lose no digits to it.
+        origin = values.mean(axis=0) if self._origin is None else self._origin
+        self._origin = origin
+        values -= origin
         self._count += len(values)
         self._sum += values.sum(axis=0)
         self._products += values.T @ values

@@ -22,6 +22,7 @@ References:
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -93,7 +94,7 @@ class FusionShape:
                 parts["above"] = self.decoded[level + 1]
             layer(f"level{level}", parts, self.decoded[level])
         widths = (self.decoded[0], *self.head)
-        for index, (inputs, outputs) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+        for index, (inputs, outputs) in enumerate(pairwise(widths)):
             layer(f"head{index}", {"own": inputs}, outputs)
         return found
 

@@ -114,7 +114,6 @@ def label_objects(
             a label.
         ShapeError: If maps, masks or features do not have their photograph's proportions.
     """
-    drawn_by = {"render_options": context.render_options, "backend": context.backend}
 
     def tell(stage: int) -> None:
         if told is not None:
@@ -126,10 +125,17 @@ def label_objects(
         evidence,
         options=UpliftOptions(candidates=_CANDIDATES),
         classes=classes,
-        **drawn_by,
+        render_options=context.render_options,
+        backend=context.backend,
     )
     tell(1)
-    tree = associate_masks(gaussians, views, masks, **drawn_by).tree
+    tree = associate_masks(
+        gaussians,
+        views,
+        masks,
+        render_options=context.render_options,
+        backend=context.backend,
+    ).tree
     tell(2)
     scales: tuple[Tensor, ...] = (torch.zeros(len(gaussians), 1),)
     weights = torch.zeros(len(gaussians))
@@ -141,7 +147,8 @@ def label_objects(
             components=options.components,
             division="mean",
             longest_side=options.lifted_side,
-            **drawn_by,
+            render_options=context.render_options,
+            backend=context.backend,
         )
         deepest = distilled.scales[-1:] if options.semantic == "deepest" else distilled.scales
         scales = distilled.scales[:1] if options.semantic == "first" else deepest
@@ -178,20 +185,20 @@ def _spread(objects: Labels, votes: Labels, pooled: PooledObjects, probabilities
     decided = probabilities.sum(dim=1) > 0
     own = torch.ones(count)
     if objects.candidates is not None and objects.shares is not None:
-        members, shares = objects.candidates.cpu().long(), objects.shares.cpu().float()
+        members, shares = objects.candidates.cpu().long().T, objects.shares.cpu().float().T
         # Shares that were solved for each by itself may add up to more than 1.
-        shares = shares / shares.sum(dim=1, keepdim=True).clamp_min(1.0)
+        shares = (shares / shares.sum(dim=0).clamp_min(1.0)).contiguous()
+        members = members.contiguous()
     else:
-        members, shares = objects.ids.cpu().long()[:, None], torch.ones(count, 1)
-    for rank in range(members.shape[1]):
-        row = torch.searchsorted(pooled.ids, members[:, rank]).clamp_max(len(pooled.ids) - 1)
-        there = (members[:, rank] != UNLABELLED) & (pooled.ids[row] == members[:, rank])
-        there &= decided[row]
-        share = torch.where(there, shares[:, rank], 0.0)
+        members, shares = objects.ids.cpu().long()[None], torch.ones(1, count)
+    for member, given in zip(members, shares, strict=True):
+        row = torch.searchsorted(pooled.ids, member).clamp_max(len(pooled.ids) - 1)
+        there = (member != UNLABELLED) & (pooled.ids[row] == member) & decided[row]
+        share = torch.where(there, given, 0.0)
         total[:, :width] += probabilities[row].float() * share[:, None]
         own -= share
     for rank in range(votes.candidates.shape[1]):
-        ids = votes.candidates[:, rank].cpu().long()
+        ids = votes.candidates[:, rank].cpu().long().contiguous()
         column = torch.searchsorted(pooled.classes, ids).clamp_max(width - 1)
         column = torch.where(ids == UNLABELLED, width, column)
         share = votes.shares[:, rank].cpu().float() * own.clamp_min(0)

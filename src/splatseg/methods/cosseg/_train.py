@@ -1,7 +1,7 @@
 """From label maps and features to a decoder of both, and what it says of every Gaussian."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -35,7 +35,7 @@ from splatseg.methods.cosseg._distilled import (
     pixel_counts,
     view_pixel_counts,
 )
-from splatseg.methods.cosseg._fusion import FusionShape, decode_all
+from splatseg.methods.cosseg._fusion import FusionShape, Scaling, decode_all
 from splatseg.methods.cosseg._model import FusionModel, PointsOf
 from splatseg.methods.cosseg._options import CossegOptions
 from splatseg.methods.cosseg._points import (
@@ -99,13 +99,18 @@ def train_cosseg(
     """
     options, context = options or CossegOptions(), context or TrainingContext()
     data = label_data(gaussians, views, evidence, options=options, context=context)
-    given = _given(gaussians, data, features, options, context, (metres_per_unit, up))
+    given = _given(
+        gaussians, data, features, options=options, context=context, frame=(metres_per_unit, up)
+    )
     with one_torch_thread():
         whole = given.points_of(given.chosen)
         scalings = whole.scalings()
         everything = whole.scaled(scalings, len(gaussians))
     agreement = _agreement(gaussians, data, evidence, options, context)
-    with _points(given, data, options, scalings, everything, context) as (points, scored):
+    with _points(given, data.views, scalings=scalings, everything=everything, context=context) as (
+        points,
+        scored,
+    ):
         model = FusionModel(
             FusionShape(
                 inputs=everything.inputs.widths,
@@ -126,7 +131,7 @@ def train_cosseg(
         result = train_labels(
             "cosseg", data, model, options=options, context=context, extra=given.settings
         )
-    return _layer(given, everything, data, result, options, classes, context.seed)
+    return _layer(given, everything, data, result, classes=classes, seed=context.seed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,6 +169,7 @@ def _given(
     gaussians: Gaussians,
     data: LabelData,
     features: BlockSource | None,
+    *,
     options: CossegOptions,
     context: TrainingContext,
     frame: tuple[float | None, tuple[float, float, float] | None],
@@ -171,10 +177,14 @@ def _given(
     """Lift features, count pixels and load the point network, as far as they are asked for."""
     if features is None and options.semantic != "none" and options.spatial == "none":
         raise InputError("features: expected evidence of features to decode, got none.")
-    drawn_by = {"render_options": context.render_options, "backend": context.backend}
     chosen, counts = torch.arange(len(gaussians)), None
     if options.min_pixels > 0 or (options.division == "pixels" and features is not None):
-        counts = pixel_counts(gaussians, data.views, **drawn_by)
+        counts = pixel_counts(
+            gaussians,
+            data.views,
+            render_options=context.render_options,
+            backend=context.backend,
+        )
         chosen = check_decoded(counts >= options.min_pixels, options.min_pixels)
     distilled = None
     if features is not None and options.semantic != "none":
@@ -186,7 +196,8 @@ def _given(
             division=options.division,
             pixels=counts,
             longest_side=options.lifted_side,
-            **drawn_by,
+            render_options=context.render_options,
+            backend=context.backend,
         )
     encoder = None if options.spatial == "none" else load_point_encoder(options.encoder)
     scales: Sequence[Tensor] = () if distilled is None else distilled.scales
@@ -239,13 +250,14 @@ def _agreement(
 @contextmanager
 def _points(
     given: _Given,
-    data: LabelData,
-    options: CossegOptions,
-    scalings: Any,
+    views: Sequence[View],
+    *,
+    scalings: Sequence[Sequence[Scaling]],
     everything: PointSet,
     context: TrainingContext,
-) -> Iterator[tuple[PointsOf, PointsOf]]:
+) -> Generator[tuple[PointsOf, PointsOf]]:
     """The points of views that are learnt from, and of those that are held out."""
+    options = given.options
     if options.points != "visible" or given.encoder is None:
         yield (lambda _: everything), (lambda _: everything)
         return
@@ -260,7 +272,7 @@ def _points(
         with one_torch_thread():
             return given.points_of(shown).scaled(scalings, len(gaussians))
 
-    kept, held_out = held_out_views(data.views, options.held_out)
+    kept, held_out = held_out_views(views, options.held_out)
     with (
         VisiblePoints(partial(make, kept), memory=options.memory) as points,
         VisiblePoints(partial(make, held_out), memory=options.memory) as scored,
@@ -273,11 +285,12 @@ def _layer(
     everything: PointSet,
     data: LabelData,
     result: TrainingResult,
-    options: CossegOptions,
+    *,
     classes: ClassTable | None,
     seed: int,
 ) -> Features:
     """What is decoded of every Gaussian, with the classifier that reads it."""
+    options = given.options
     with one_torch_thread():
         decoded = decode_all(everything.inputs, result.shared)
     values = torch.zeros(len(everything.rows), decoded.shape[1])
