@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -126,12 +126,20 @@ def train_labels(
 
 
 def _settings(options: LabelTrainingOptions) -> dict[str, Any]:
-    """Options without those that change nothing that is trained; of a file its name."""
-    values = {
-        name: value.name if isinstance(value, Path) else value
-        for name, value in asdict(options).items()
-    }
+    """Options without those that change nothing that is trained, in values that JSON holds."""
+    values = recorded_options(options)
     return {name: values[name] for name in values if name not in _NOT_TRAINED}
+
+
+def recorded_options(options: LabelTrainingOptions) -> dict[str, Any]:
+    """All options, in values that JSON holds: of a file its name, for folders are of one machine."""
+    found: dict[str, Any] = asdict(options)
+    for name, value in found.items():
+        if isinstance(value, Path):
+            found[name] = value.name
+        elif isinstance(value, tuple):
+            found[name] = list(cast("tuple[object, ...]", value))
+    return found
 
 
 def layer_info(

@@ -70,7 +70,7 @@ class ReducedBlocks:
         first = source.deep_features(views[0])
         self._names = tuple(first.depths)
         self._token = first.class_token is not None
-        self._widths = tuple(map(self._width, first.maps))
+        self._channels = tuple(grid.channels for grid in first.maps)
         self._components = components
         self._projections = self._fitted(views)
 
@@ -87,7 +87,7 @@ class ReducedBlocks:
     @property
     def columns(self) -> tuple[slice, ...]:
         """The channels of each block."""
-        ends = np.cumsum([min(self._components, width) for width in self._widths]).tolist()
+        ends = np.cumsum([min(self._components, channels) for channels in self._channels]).tolist()
         return tuple(slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True))
 
     @property
@@ -113,17 +113,12 @@ class ReducedBlocks:
             width=grid.width,
         )
 
-    def _width(self, grid: FeatureMap) -> int:
-        """Channels of a block before it is reduced; a token is joined to what will be."""
-        joined = self._token and grid.channels > 0
-        return grid.channels * (2 if joined else 1)
-
     def _joined(self, found: DeepFeatures) -> list[Tensor]:
         """Patches of each block, with the class token where blocks are to be reduced."""
         parts: list[Tensor] = []
-        for width, grid in zip(self._widths, found.maps, strict=True):
+        for grid in found.maps:
             values = grid.features.float().cpu()
-            if found.class_token is not None and width > self._components:
+            if found.class_token is not None and grid.channels > self._components:
                 token = found.class_token.float().cpu().expand(*values.shape[:2], -1)
                 values = torch.cat((values, token), dim=-1)
             parts.append(values)
@@ -146,53 +141,56 @@ class ReducedBlocks:
             raise ShapeError(
                 f"evidence: expected blocks of view {name} on one grid, got {len(grids)} grids."
             )
-        for depth, width, one in zip(found.depths, self._widths, found.maps, strict=True):
-            if self._width(one) != width:
+        for depth, channels, one in zip(found.depths, self._channels, found.maps, strict=True):
+            if one.channels != channels:
                 raise ShapeError(
-                    f"evidence: expected {width // (2 if self._token else 1)} channels of "
-                    f"{depth} of view {name}, as of the others, got {one.channels}."
+                    f"evidence: expected {channels} channels of {depth} of view {name}, as of "
+                    f"the others, got {one.channels}."
                 )
         return found
 
     def _fitted(self, views: Sequence[str]) -> tuple[Projection | None, ...]:
         """Components of the blocks that are wider than they are to be."""
-        wide = [index for index, width in enumerate(self._widths) if width > self._components]
-        if not wide:
-            return (None,) * len(self._widths)
-        moments = {index: _Moments(self._widths[index]) for index in wide}
+        wide = [
+            index for index, channels in enumerate(self._channels) if channels > self._components
+        ]
+        moments = {index: _Moments() for index in wide}
         for name in views:
+            if not wide:
+                break
             joined = self._joined(self._checked(name))
             for index in wide:
                 moments[index].add(joined[index].flatten(0, 1).numpy())
         return tuple(
             moments[index].projection(self._components) if index in moments else None
-            for index in range(len(self._widths))
+            for index in range(len(self._channels))
         )
 
 
 class _Moments:
     """Mean and covariance of vectors that come in pieces."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self) -> None:
         self._count = 0
-        self._origin: NDArray[np.float64] | None = None
-        self._sum = np.zeros(width)
-        self._products = np.zeros((width, width))
+        self._origin: NDArray[np.float64] = np.zeros(0)
+        self._sum: NDArray[np.float64] = np.zeros(0)
+        self._products: NDArray[np.float64] = np.zeros((0, 0))
 
     def add(self, rows: NDArray[np.float32]) -> None:
         """More vectors, one a row."""
         values = rows.astype(np.float64)
-        # Sums of what is left of the first piece's mean lose no digits to it.
-        origin = values.mean(axis=0) if self._origin is None else self._origin
-        self._origin = origin
-        values -= origin
+        if not self._count:
+            # Sums of what is left of the first piece's mean lose no digits to it.
+            self._origin = values.mean(axis=0)
+            self._sum = np.zeros(values.shape[1])
+            self._products = np.zeros((values.shape[1], values.shape[1]))
+        values -= self._origin
         self._count += len(values)
         self._sum += values.sum(axis=0)
         self._products += values.T @ values
 
     def projection(self, components: int) -> Projection:
         """The axes of largest variance."""
-        origin = np.zeros(len(self._sum)) if self._origin is None else self._origin
         mean = self._sum / max(self._count, 1)
         covariance = self._products / max(self._count, 1) - np.outer(mean, mean)
         _, axes = np.linalg.eigh(covariance)
@@ -200,6 +198,6 @@ class _Moments:
         largest = np.abs(axes).argmax(axis=0)
         axes = axes * np.where(axes[largest, np.arange(axes.shape[1])] < 0, -1.0, 1.0)
         return Projection(
-            mean=torch.from_numpy((origin + mean).astype(np.float32)),
+            mean=torch.from_numpy((self._origin + mean).astype(np.float32)),
             axes=torch.from_numpy(np.ascontiguousarray(axes).astype(np.float32)),
         )

@@ -131,13 +131,12 @@ def decode_all(inputs: FusionInputs, weights: Weights) -> Float[Tensor, "n chann
         decoded: Tensor | None = None
         for level in range(len(inputs.levels) - 1, -1, -1):
             above = None if decoded is None else decoded @ weights[f"level{level}.above"]
-            count = len(inputs.levels[level])
-            decoded = torch.empty(count, len(weights[f"level{level}.bias"]))
-            for start in range(0, count, _ROWS):
-                rows = torch.arange(start, min(start + _ROWS, count))
+            parts: list[Tensor] = []
+            for rows in torch.arange(len(inputs.levels[level])).split(_ROWS):
                 spread = None if above is None else above[inputs.up[level][rows]]
                 own = _own(inputs, weights, level, rows, spread)
-                decoded[rows] = own if level else _headed(weights, own)
+                parts.append(own if level else _headed(weights, own))
+            decoded = torch.cat(parts)
     if decoded is None:
         raise ShapeError("levels: expected at least one, got none.")
     return decoded

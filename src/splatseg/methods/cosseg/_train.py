@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,7 @@ from splatseg.methods._trained_labels import (
     TrainingContext,
     label_data,
     layer_info,
+    recorded_options,
     train_labels,
 )
 from splatseg.methods.cosseg._agreement import VoteAgreement
@@ -294,12 +295,13 @@ def _layer(
     with one_torch_thread():
         decoded = decode_all(everything.inputs, result.shared)
     values = torch.zeros(len(everything.rows), decoded.shape[1])
-    values[given.chosen] = decoded
+    there = everything.rows >= 0
+    values[there] = decoded[everything.rows[there]]
     # Features say what a Gaussian is though no drawn pixel shows it.
     weights = result.visibility.clone()
     if given.distilled is not None:
         weights = torch.maximum(weights, given.distilled.weights)
-    weights[everything.rows < 0] = 0
+    weights[~there] = 0
     head = ClassifierHead(
         ids=data.ids,
         weight=result.shared["classifier.weight"],
@@ -307,16 +309,9 @@ def _layer(
         blend=options.blend,
     )
     info = layer_info(
-        "cosseg", recorded(options), data, result, head=head, classes=classes, seed=seed
+        "cosseg", recorded_options(options), data, result, head=head, classes=classes, seed=seed
     )
     return Features(values=values, weights=weights, info=_with_facts(info, given, everything))
-
-
-def recorded(options: CossegOptions) -> dict[str, Any]:
-    """Options as a layer records them: of a file its name, for folders are of one machine."""
-    found = asdict(options)
-    found["encoder"] = None if options.encoder is None else options.encoder.name
-    return found
 
 
 def _with_facts(info: LayerInfo, given: _Given, everything: PointSet) -> LayerInfo:

@@ -1,0 +1,280 @@
+"""The method: what is found, what options do, and that bits repeat."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splatseg.core import Features, LabelMap
+from splatseg.core.checkpoints import Checkpoints
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.lift.heads import ClassifierHead
+from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods.cosseg import CossegOptions, train_cosseg
+
+from .conftest import Blocks, Maps
+
+DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
+QUICK = {
+    "decide": "decoder", "steps": 30, "batch": 200, "pixels": 200, "held_out": 0.0, "rate": 0.01,
+    "decoded": (6, 5), "head": (8, 4),
+}  # fmt: skip
+
+
+def context(**changes) -> TrainingContext:
+    return TrainingContext(backend=DRAWN_BY, **{"seed": 3} | changes)
+
+
+def trained(halves, encoder_file, *, given=context(), features=True, **changes) -> Features:
+    options = CossegOptions(**QUICK | {"encoder": encoder_file} | changes)
+    return train_cosseg(
+        halves.gaussians, halves.views, halves.evidence,
+        features=halves.blocks if features else None, options=options, metres_per_unit=1.0,
+        context=given,
+    )  # fmt: skip
+
+
+def right(halves, features: Features) -> float:
+    """Share of Gaussians away from the middle that have their half's id."""
+    labels = ClassifierHead.of(features).labels(features)
+    away = halves.means[:, 0].abs() > 0.1
+    return float((labels.ids == halves.side)[away].float().mean())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"spatial": "none"},
+        {"semantic": "none", "steps": 150},
+        {"spatial": "first", "semantic": "first"},
+        {"semantic": "deepest"},
+        {"points": "blocks", "block_points": 200},
+        {"points": "visible"},
+        {"blend": "features"},
+        {"label_loss": "generalised"},
+        {"weighting": "agreement"},
+        {"transitions": "views"},
+        {"division": "sum"},
+    ],
+)
+def test_halves_are_told_apart(halves, encoder_file, change) -> None:
+    features = trained(halves, encoder_file, **{"steps": 80} | change)
+    assert features.values.shape == (384, 4)
+    wanted = 0.8 if change.get("semantic") == "none" else 0.97
+    assert right(halves, features) > wanted
+    assert features.info.method == "cosseg"
+    assert features.info.details["decoded"] == 384
+
+
+def test_one_view_that_errs_is_overruled_by_what_is_alike(halves, encoder_file) -> None:
+    maps = dict(halves.evidence.maps)
+    ids = maps["v1"].ids.clone()
+    ids[:, :8] = 8  # a strip of the left half
+    maps["v1"] = LabelMap(ids=ids)
+    wrong = replace_evidence(halves, Maps(maps))
+    assert right(halves, trained(wrong, encoder_file, steps=80)) > 0.97
+
+
+def replace_evidence(halves, evidence):
+    class Changed:
+        def __getattr__(self, name):
+            return evidence if name == "evidence" else getattr(halves, name)
+
+    return Changed()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"semantic": "first"},
+        {"semantic": "deepest"},
+        {"semantic": "none"},
+        {"spatial": "first"},
+        {"spatial": "none"},
+        {"division": "sum"},
+        {"division": "pixels"},
+        {"components": 2},
+        {"lifted_side": 16},
+        {"min_pixels": 110},
+        {"points": "visible"},
+        {"points": "blocks", "block_points": 200},
+        {"decoded": (6, 7)},
+        {"head": (4,)},
+        {"blend": "features"},
+        {"label_loss": "generalised"},
+        {"label_loss": "symmetric"},
+        {"label_loss": "bootstrap"},
+        {"weighting": "agreement"},
+        {"transitions": "views"},
+        {"rate": 0.02},
+        {"steps": 20},
+        {"batch": 100},
+        {"pixels": 150},
+        {"sampling": "groups"},
+        {"passes": 1},
+        {"min_weight": 0.3},
+        {"schedule": "constant"},
+        {"final_rate": 0.5},
+        {"held_out": 0.3},
+    ],
+)
+def test_each_option_makes_a_difference(halves, encoder_file, change) -> None:
+    usual, changed = trained(halves, encoder_file), trained(halves, encoder_file, **change)
+    same_shape = usual.values.shape == changed.values.shape
+    assert not (same_shape and torch.equal(usual.values, changed.values))
+
+
+def test_block_points_and_transition_rate_make_a_difference(halves, encoder_file) -> None:
+    blocks = {"points": "blocks", "block_points": 200}
+    first = trained(halves, encoder_file, **blocks)
+    second = trained(halves, encoder_file, **blocks | {"block_points": 384})
+    assert not torch.equal(first.values, second.values)
+    first = trained(halves, encoder_file, transitions="views")
+    second = trained(halves, encoder_file, transitions="views", transition_rate=0.1)
+    assert not torch.equal(first.values, second.values)
+
+
+def test_gaussians_in_few_pixels_are_left_to_their_neighbours(halves, encoder_file) -> None:
+    from splatseg.methods.cosseg._distilled import pixel_counts
+
+    counts = pixel_counts(halves.gaussians, halves.views, backend=DRAWN_BY)
+    least = int(counts.median())
+    features = trained(halves, encoder_file, min_pixels=least)
+    few = counts < least
+    assert features.weights is not None
+    assert bool((features.weights[few] == 0).all())
+    assert not features.values[few].any()
+    assert features.info.details["decoded"] == int((~few).sum())
+    labels = ClassifierHead.of(features).labels(features)
+    assert bool((labels.ids[few] == -1).all())
+    assert bool((labels.ids[~few] != -1).all())
+
+
+def test_what_was_skipped_and_assumed_is_recorded(halves, encoder_file) -> None:
+    features = trained(halves, encoder_file)
+    details = features.info.details
+    assert details["blocks"] == ["block3", "block12"]
+    assert details["skipped"] == ["class token", "principal components"]
+    assert details["point_network"] == encoder_file.name
+    assert (details["metres_per_unit"], details["scale_assumed"]) == (1.0, False)
+    assert features.info.options["encoder"] == encoder_file.name
+    unknown = train_cosseg(
+        halves.gaussians, halves.views, halves.evidence, features=halves.blocks,
+        options=CossegOptions(**QUICK | {"encoder": encoder_file}), context=context(),
+    )  # fmt: skip
+    assert unknown.info.details["scale_assumed"] is True
+
+
+@pytest.mark.parametrize("points", ["all", "visible"])
+def test_bits_do_not_depend_on_threads_or_on_the_order_of_views(
+    halves, encoder_file, points
+) -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        first = trained(halves, encoder_file, points=points)
+        torch.set_num_threads(2)
+        second = trained(halves, encoder_file, points=points)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(first.values, second.values)
+    turned = replace_views(halves)
+    assert torch.equal(trained(turned, encoder_file, points=points).values, first.values)
+    other = trained(halves, encoder_file, points=points, given=context(seed=4))
+    assert not torch.equal(other.values, first.values)
+
+
+def replace_views(halves):
+    class Changed:
+        def __getattr__(self, name):
+            return halves.views[::-1] if name == "views" else getattr(halves, name)
+
+    return Changed()
+
+
+def test_what_was_interrupted_goes_on_to_the_same_bits(halves, encoder_file, tmp_path) -> None:
+    whole = trained(halves, encoder_file)
+    path = tmp_path / "training.npz"
+
+    def stop(state) -> None:
+        if state.step == 11:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(
+            halves, encoder_file, given=context(checkpoints=Checkpoints(path=path), progress=stop)
+        )
+    resumed = context(checkpoints=Checkpoints(path=path, resume=True))
+    assert torch.equal(trained(halves, encoder_file, given=resumed).values, whole.values)
+    with pytest.raises(InputError, match="distilled"):
+        trained(halves, encoder_file, given=resumed, components=2)
+
+
+def test_points_of_views_lie_in_files_beyond_the_budget(halves, encoder_file) -> None:
+    whole = trained(halves, encoder_file, points="visible")
+    spilled = trained(halves, encoder_file, points="visible", memory=0)
+    assert torch.equal(whole.values, spilled.values)
+
+
+def test_the_published_setting(halves, encoder_file) -> None:
+    """As it is, with rates raised, for steps are few."""
+    published = CossegOptions.published(steps=60)
+    assert (published.points, published.division, published.blend) == ("visible", "sum", "features")
+    assert published.rate == 1e-3
+    assert published.drawing().views_per_batch == 1
+    options = replace(
+        published, encoder=encoder_file, rate=0.01, batch=200, pixels=200, decoded=(6, 5)
+    )
+    features = train_cosseg(
+        halves.gaussians, halves.views, halves.evidence, features=halves.blocks, options=options,
+        metres_per_unit=1.0, context=context(),
+    )  # fmt: skip
+    assert right(halves, features) > 0.97
+
+
+def test_bad_input_is_one_clear_sentence(halves, encoder_file) -> None:
+    some = Blocks({name: one for name, one in halves.blocks.found.items() if name != "v2"})
+    with pytest.raises(InputError, match="1 of 4 have none, the first is v2"):
+        train_cosseg(
+            halves.gaussians, halves.views, halves.evidence, features=some,
+            options=CossegOptions(**QUICK | {"encoder": encoder_file}), context=context(),
+        )  # fmt: skip
+    narrow = Blocks(dict(halves.blocks.found))
+    one = narrow.found["v3"]
+    first = replace(one.maps[0], features=one.maps[0].features[..., :2])
+    narrow.found["v3"] = replace(one, maps=(first, *one.maps[1:]))
+    with pytest.raises(ShapeError, match="expected 3 channels of block3 of view v3"):
+        train_cosseg(
+            halves.gaussians, halves.views, halves.evidence, features=narrow,
+            options=CossegOptions(**QUICK | {"encoder": encoder_file}), context=context(),
+        )  # fmt: skip
+    with pytest.raises(InputError, match="expected at least 36 points"):
+        few = halves.gaussians[torch.arange(20)]
+        train_cosseg(
+            few, halves.views, halves.evidence, features=halves.blocks,
+            options=CossegOptions(**QUICK | {"encoder": encoder_file}), context=context(),
+        )  # fmt: skip
+    with pytest.raises(InputError, match="features: expected evidence of features to decode"):
+        trained(halves, encoder_file, features=False, spatial="none")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"semantic": "none", "spatial": "none"}, "expected one of the two"),
+        ({"components": 0}, "components: expected at least 1"),
+        ({"min_pixels": -1}, "min_pixels: expected at least 0"),
+        ({"block_points": 0}, "block_points: expected at least 1"),
+        ({"lifted_side": 0}, "lifted_side: expected at least 1"),
+        ({"decoded": ()}, "decoded: expected numbers from 1"),
+        ({"head": (4, 0)}, "head: expected numbers from 1"),
+        ({"rate": -1.0}, "rate: expected 0 or more"),
+        ({"transition_rate": float("nan")}, "transition_rate: expected 0 or more"),
+    ],
+)
+def test_options_out_of_range_are_refused(change, message) -> None:
+    with pytest.raises(RangeError, match=message):
+        CossegOptions(**change)
+
+

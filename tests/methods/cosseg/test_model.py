@@ -1,0 +1,58 @@
+"""Parts of the loss by hand."""
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import Labels
+from splatseg.errors import InputError
+from splatseg.lift.mass.uplift import UpliftOptions, uplift
+from splatseg.lift.training import LabelTargets, RowSampler, SamplingOptions
+from splatseg.methods.cosseg._agreement import VoteAgreement
+from splatseg.methods.cosseg._model import transferred
+
+
+def test_labels_of_a_view_are_reached_by_its_matrix() -> None:
+    probabilities = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.1, 0.8]])
+    transitions = torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0))
+    views, label = torch.tensor([1, 0]), torch.tensor([2, 0])
+    found = transferred(probabilities, transitions, views, label)
+    for row in range(2):
+        matrix = torch.softmax(transitions[views[row]], dim=1)
+        wanted = (matrix.T @ probabilities[row])[label[row]]
+        assert float(found[row, label[row]]) == pytest.approx(float(wanted), rel=1e-5)
+    torch.testing.assert_close(found.sum(dim=1), torch.ones(2))
+
+
+def test_agreement_is_what_all_views_say_of_a_label(halves) -> None:
+    names = [view.name for view in halves.views]
+    targets = LabelTargets(halves.evidence, names)
+    sampler = RowSampler(
+        halves.gaussians, halves.views, targets, options=SamplingOptions(pixels=60), backend="auto"
+    )
+    votes = uplift(
+        halves.gaussians, halves.views, halves.evidence, options=UpliftOptions(candidates=2),
+        backend="auto",
+    )  # fmt: skip
+    with sampler.draw(np.random.default_rng(0), batch=200) as drawn:
+        batch = drawn.batch(0)
+        found = VoteAgreement(votes, targets.ids)(batch)
+        assert votes.candidates is not None
+        assert votes.shares is not None
+        share = torch.zeros(len(halves.gaussians), 2)
+        for rank in range(2):
+            for row in range(len(share)):
+                id = int(votes.candidates[row, rank])
+                if id in (3, 8):
+                    share[row, (3, 8).index(id)] = votes.shares[row, rank]
+        dense = batch.weights.product(share[batch.weights.touched])
+        own = dense.gather(1, batch.target("label")[:, None])[:, 0]
+        expected = own / batch.weights.rows.row_sums()
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    assert 0.5 < float(found.min()) <= float(found.max()) <= 1.001
+
+
+def test_agreement_wants_shares() -> None:
+    hard = Labels(ids=torch.tensor([1]), confidence=torch.ones(1))
+    with pytest.raises(InputError, match="shares of several ids"):
+        VoteAgreement(hard, torch.tensor([1]))
