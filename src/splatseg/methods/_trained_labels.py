@@ -9,6 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import (
+    LEARNED_BYTES,
     ClassTable,
     Features,
     Gaussians,
@@ -152,6 +153,7 @@ def layer_info(
             "best_step": result.best_step,
             "stopped": result.stopped,
             "scores": [[step, score] for step, score in result.scores],
+            LEARNED_BYTES: result.learned_bytes,
         },
     )
 

@@ -11,7 +11,7 @@ from splatseg.methods import Method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
-from splatseg.tasks.benchmark.sight import Seen, seen_for
+from splatseg.tasks.benchmark.sight import Seen, kinds_wanted, seen_for
 from splatseg.tasks.segment import SegmentOptions, segment
 
 
@@ -41,6 +41,7 @@ class Job:
             self.scene,
             self.bench,
             words=words,
+            kinds=kinds_wanted(self.protocol, self.method),
             options=self.options,
             backend=self.backend,
             observer=self.observer,
