@@ -13,7 +13,7 @@ AMOUNTS = {
     "psnr": (0.0, _MAX_DECIBELS),
     "fps": (0.0, 1e6),
     "learned_mb": (0.0, 1e9),
-    "learned_mb_scene": (0.0, 1e9),
+    "scene_mb": (0.0, 1e9),
 }
 """Measures that are no shares, with what they can be."""
 

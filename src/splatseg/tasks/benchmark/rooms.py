@@ -75,9 +75,9 @@ def room_scores(job: Job) -> Scores:
     """Figures of a method in a room.
 
     Returns:
-        ``miou`` and what goes with it; of panoptic segments ``pq_scene``, ``ap50`` and ``pq`` as
-        well; ``fps``, the rate of label maps; ``learned_mb`` and ``learned_mb_scene``, without and
-        with the Gaussians. A row a view, or of panoptic segments a row a class.
+        ``miou``, of panoptic segments with ``ap50`` and ``pq_scene``; ``fps``, the rate of label
+        maps; ``learned_mb``, what the method learned, and ``scene_mb``, that with the Gaussians.
+        A row a view, or of panoptic segments a row a class.
 
     Raises:
         InputError: If the method gives no classes, or the classes of its instances are not known.
@@ -101,7 +101,7 @@ def room_scores(job: Job) -> Scores:
     costs = {
         "fps": frames_per_second(seconds),
         "learned_mb": size.layer / _MEGABYTE,
-        "learned_mb_scene": size.total / _MEGABYTE,
+        "scene_mb": size.total / _MEGABYTE,
     }
     return scores | costs, rows, [*notes, *lacking, _rate_note(job, views)]
 
@@ -126,7 +126,8 @@ class _Room:
             keep_map(self.job, "classes", one.view, classes)
             confusions.append(Confusion.of(classes, one.true.ids))
             seconds.append(one.seconds)
-        return *class_scores(self.views, confusions), seconds
+        scores, rows = class_scores(self.views, confusions)
+        return {name: scores[name] for name in ("miou", "accuracy")}, rows, seconds
 
     def panoptic(self) -> tuple[dict[str, float], list[dict[str, Any]], list[float]]:
         """Scores, a row a class, and seconds of each view."""
@@ -137,11 +138,9 @@ class _Room:
             seconds.append(one.seconds)
         report = self._report()
         scores = {
-            "pq_scene": report.score.pq,
-            "ap50": report.precision.mean,
             "miou": report.semantic.miou,
-            "pq": report.image_score.pq,
-            "accuracy": report.semantic.accuracy,
+            "ap50": report.precision.mean,
+            "pq_scene": report.score.pq,
         }
         rows: list[dict[str, Any]] = [
             {

@@ -108,6 +108,11 @@ def bench(
     chosen = find_protocol(protocol)
     chosen = chosen.with_switches(dict(switch_value(chosen, one) for one in options.switches))
     methods = [find_method(name) for name in options.methods]
+    if options.guidance is not None and not any(method.guidance for method in methods):
+        raise InputError(
+            "guidance: expected a method that takes features besides its evidence, got "
+            f"{', '.join(options.methods)}."
+        )
     scenes = asked_scenes(chosen, data, options)
     with named_write_failures(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -218,6 +223,9 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
     """All that a result depends on, in values that JSON holds."""
     method = job.method
     chosen = method.published_options if job.options.published else method.options()
+    # Left out where there is none: results of versions that did not know it stay what they are.
+    given = method.guidance is not None and job.options.guidance is not None
+    guidance = {"guidance": job.options.guidance} if given else {}
     return plain_object(
         "made",
         {
@@ -229,6 +237,7 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
             "published": job.options.published,
             "seed": job.options.seed,
             "models": list(job.options.models),
+            **guidance,
             "prompter": _recorded_model(job.prompter),
             "grounder": _recorded_model(job.grounder),
             "gaussians": digest,

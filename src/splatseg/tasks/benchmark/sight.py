@@ -73,6 +73,45 @@ def seen_for(
         InputError: If no model gives it.
     """
     choice = chosen_model(method, bench, words=words, kinds=kinds, options=options)
+    return _seen(choice, scene, options=options, backend=backend, observer=observer)
+
+
+def guidance_for(
+    scene: Scene,
+    bench: BenchmarkScene,
+    *,
+    options: BenchOptions,
+    backend: BackendName,
+    observer: Observer,
+) -> Seen:
+    """Features that methods take besides their evidence, of the model that `guidance` names.
+
+    Args:
+        scene: The fitted scene.
+        bench: The benchmark's scene.
+        options: Who sees.
+        backend: Who draws views without photographs.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If it gives no features.
+    """
+    named = options.guidance or ""
+    choice = _choice(named, bench, ("features",), words=False)
+    if choice is None:
+        raise InputError(f"guidance: expected a model that gives features, got {named or 'none'}.")
+    return _seen(choice, scene, options=options, backend=backend, observer=observer)
+
+
+def _seen(
+    choice: "Choice",
+    scene: Scene,
+    *,
+    options: BenchOptions,
+    backend: BackendName,
+    observer: Observer,
+) -> Seen:
+    """What a model sees of a scene, written down."""
     model = None if choice.folder is not None else bench_model(choice.named, options, observer)
     recorded = choice.folder is not None
     seen = see(
@@ -124,21 +163,29 @@ def chosen_model(
             f"takes {' or '.join(method.evidence)}."
         )
     for named in options.models:
-        path = Path(named.replace("{scene}", bench.name))
-        recorded = name_of(named) not in model_names()
-        found = (
-            _of_folder(path, taken, words=words)
-            if recorded
-            else _of_model(named, taken, words=words)
-        )
-        if found is not None:
-            kind, what = found
-            return Choice(named=named, folder=path if recorded else None, kind=kind, what=what)
+        choice = _choice(named, bench, taken, words=words)
+        if choice is not None:
+            return choice
     wanted = "features of words" if words else " or ".join(taken)
     raise InputError(
         f"method {method.name}: expected a model that gives {wanted}, got "
         f"{', '.join(options.models) or 'no model'}; name one with `models`."
     )
+
+
+def _choice(
+    named: str, bench: BenchmarkScene, taken: tuple[EvidenceKind, ...], *, words: bool
+) -> Choice | None:
+    """A model, or recorded evidence, if it gives one of some kinds."""
+    path = Path(named.replace("{scene}", bench.name))
+    recorded = name_of(named) not in model_names()
+    found = (
+        _of_folder(path, taken, words=words) if recorded else _of_model(named, taken, words=words)
+    )
+    if found is None:
+        return None
+    kind, what = found
+    return Choice(named=named, folder=path if recorded else None, kind=kind, what=what)
 
 
 def evidence_wanted(

@@ -9,7 +9,7 @@ from splatseg.evaluate.protocols.published._rows import Table
 DataSet = Literal["replica", "scannet"]
 Task = Literal["semantic", "panoptic"]
 
-_COSTS = ("fps", "learned_mb_scene")
+_COSTS = ("fps", "scene_mb")
 _LABELS = "Seven scenes; every method is fitted to labels of MaskDINO, which was trained on ADE20K."
 _TRAINED = {
     "semantic": f"Trained on classes. {_LABELS}",
