@@ -28,6 +28,8 @@ from support.benchmark_layouts.source import Source
 WIDTH, HEIGHT = 80, 60
 TRAIN, TEST = 15, 3
 EVIDENCE = ("labels_semantic", "labels_panoptic", "labels_tracked")
+SCENES = {"replica": "room_0", "scannet": "scene0010_00"}
+"""Named as scenes of the benchmark are."""
 
 
 def walk_views(scene: SyntheticScene) -> tuple[View, ...]:
@@ -64,7 +66,6 @@ def write_walk(folder: Path) -> None:
         (found,) = read_benchmark(layout, data)
         for name in EVIDENCE:
             write_evidence(read_source(source), found.capture, name, data / "evidence" / found.name)
-    # Named as scenes of the benchmark are.
     shutil.move(folder / "replica/source", folder / "replica/room_0")
     shutil.move(folder / "replica/evidence/source", folder / "replica/evidence/room_0")
     described = folder / "replica/semantic_info"
@@ -104,3 +105,18 @@ def write_fits(
         target = fits / layout / found.name
         target.parent.mkdir(parents=True)
         save_scene(scene, target)
+
+
+def models(walk: Path, layout: str) -> tuple[str, ...]:
+    """Evidence of a layout as `splatseg bench` is told of it."""
+    return tuple(str(walk / layout / "evidence" / "{scene}" / name) for name in EVIDENCE)
+
+
+def fits(folder: Path, layout: str) -> str:
+    """Fits of a layout as `splatseg bench` is told of them."""
+    return str(folder / "fits" / layout / "{scene}")
+
+
+def copied(walk: Path, layout: str, target: Path) -> Path:
+    """A layout that may be changed."""
+    return Path(shutil.copytree(walk / layout, target / layout))
