@@ -57,6 +57,7 @@ def learned_bytes(layer: Layer, gaussians: Gaussians) -> LearnedBytes:
 
     Example:
         >>> import torch
+        >>> from splatseg.core import Labels
         >>> gaussians = Gaussians(means=torch.zeros(5, 3), rotations=torch.eye(4)[:1].repeat(5, 1),
         ...                       scales=torch.ones(5, 3), opacities=torch.ones(5),
         ...                       sh=torch.zeros(5, 1, 3))
