@@ -60,7 +60,7 @@ def test_what_is_fitted_and_scored_follows_the_switches(run_room, walk, tmp_path
         run_room("cosseg-replica-semantic", "train_every=4")
     fit = {"fitted": None, "steps": 3, "max_gaussians": 200}
     run_room("cosseg-scannet-semantic", "train_every=3", **fit)
-    made = load_scene(tmp_path / "out/scenes/scannet/scene0010_00")
+    made = load_scene(tmp_path / "out/scenes/scannet-every-3/scene0010_00")
     assert sorted(int(view.name) for view in made.train_views) == list(range(0, 360, 60))
     with pytest.raises(InputError, match="learned from 6 views|got one of another split"):
         run_room("cosseg-scannet-semantic", "train_every=3", "scored_in_training=yes", **fit)

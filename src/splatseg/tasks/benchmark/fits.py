@@ -16,7 +16,9 @@ from splatseg.evaluate.protocols import (
     RoomSwitches,
     TargetSwitches,
 )
+from splatseg.io.benchmarks.replica import LAYOUT as REPLICA
 from splatseg.io.benchmarks.replica import SEQUENCES
+from splatseg.io.captures.replica import TRAIN_EVERY
 from splatseg.io.paths import path_inside
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
@@ -144,11 +146,16 @@ def _capture(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> Captu
 
 
 def _kind(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> str:
-    """The folder of fits of a layout; another walk through the same scenes has one of its own."""
+    """The folder of fits of a layout; other walks and other splits of them have their own."""
+    kind = f"{bench.layout}-fixed" if fixed else bench.layout
     switches = protocol.switches
-    walk = switches.sequence if isinstance(switches, RoomSwitches) else None
-    first = walk is None or walk == SEQUENCES[0]
-    return bench.layout + ("-fixed" if fixed else "") + ("" if first else f"-{walk}")
+    if not isinstance(switches, RoomSwitches):
+        return kind
+    if switches.sequence not in (None, SEQUENCES[0]):
+        kind = f"{kind}-{switches.sequence}"
+    # The data set's own split, which other protocols fit to as well, needs no name.
+    own = bench.layout == REPLICA and switches.train_every == TRAIN_EVERY
+    return kind if own else f"{kind}-every-{switches.train_every}"
 
 
 def _check_views(scene: Scene, bench: BenchmarkScene, protocol: Protocol) -> None:
