@@ -27,7 +27,7 @@ from support.benchmark_layouts.source import Source
 
 WIDTH, HEIGHT = 80, 60
 TRAIN, TEST = 15, 3
-EVIDENCE = ("labels_semantic", "labels_panoptic", "labels_tracked")
+EVIDENCE = ("labels_semantic", "labels_panoptic", "labels_tracked", "features_text")
 SCENES = {"replica": "room_0", "scannet": "scene0010_00"}
 """Named as scenes of the benchmark are."""
 
@@ -61,6 +61,7 @@ def write_walk(folder: Path) -> None:
         seen[name] = recorded.Seen(semantic=semantic, instance=instance, part=instance)
     recorded.write_panoptic(source / "labels_panoptic", scene, seen)
     recorded.write_tracked(source / "labels_tracked", scene, seen)
+    recorded.write_text(source, scene, seen)
     for layout in ("replica", "scannet"):
         data = write_layout(layout, source, folder / layout)
         (found,) = read_benchmark(layout, data)

@@ -211,12 +211,20 @@ def test_any_registered_method_that_takes_labels(run_room) -> None:
             _registry._REGISTERED.pop(name, None)
 
 
+def test_classes_by_words(run_room, walk) -> None:
+    """Features of words are read by the names of the truth's classes."""
+    found = run_room("cosseg-replica-semantic", methods=("features",))
+    assert only(found)["miou"] > 0.2
+    count = len(load_scene(walk / "fits/replica/room_0").gaussians)
+    assert only(found)["learned_mb"] == pytest.approx(4 * 16 * count / 1e6), "16 channels"
+
+
 def test_methods_and_evidence_that_tell_no_classes(run_room, walk) -> None:
     with pytest.raises(InputError, match="method saga: expected one that takes panoptic or tr"):
         run_room("cosseg-replica-semantic", methods=("saga",))
     with pytest.raises(InputError, match="method features: expected one that takes panoptic"):
         run_room("cosseg-replica-panoptic", methods=("features",))
-    tracked = models(walk, "replica")[2:]
+    tracked = models(walk, "replica")[2:3]
     with pytest.raises(InputError, match="method uplift: expected a model that gives labels, got"):
         run_room("cosseg-replica-semantic", models=tracked)
 

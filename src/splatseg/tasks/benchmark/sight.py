@@ -1,14 +1,15 @@
 """Evidence for the methods of a run, from the models that were named."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 from splatseg.core import Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.errors import InputError
 from splatseg.evaluate.protocols import Protocol, RoomSwitches, TargetSwitches
-from splatseg.io.evidence import TEXT_FILE, EvidenceKind, open_evidence
+from splatseg.io.evidence import TEXT_FILE, EvidenceKind, evidence_header, open_evidence
 from splatseg.methods import Method
 from splatseg.models import What, find_family, model_names
 from splatseg.render import BackendName
@@ -117,7 +118,7 @@ def _seen(
     seen = see(
         scene,
         str(choice.folder) if model is None else model,
-        _slug(choice.folder.name if choice.folder is not None else name_of(choice.named)),
+        _evidence_name(choice, scene),
         options=SeeOptions(
             what=() if recorded else (cast(What, choice.what),), allow_missing=recorded
         ),
@@ -236,6 +237,18 @@ def _of_model(
         if kind in taken and (not words or what == "text"):
             return kind, what
     return None
+
+
+def _evidence_name(choice: Choice, scene: Scene) -> str:
+    """What the evidence is called: as its model, and what else was asked of it behind a point."""
+    name = _slug(choice.folder.name if choice.folder is not None else name_of(choice.named))
+    if choice.folder is not None or scene.root is None:
+        return name
+    there = scene.root / "evidence" / name
+    header = evidence_header(there) if there.is_dir() else None
+    known = None if header is None else header.get("metadata")
+    asked = cast("Mapping[str, Any]", known).get("what") if isinstance(known, Mapping) else None
+    return name if asked in (None, choice.what) else f"{name}.{choice.what}"
 
 
 def _slug(name: str) -> str:
