@@ -15,10 +15,14 @@ from splatseg.evaluate.protocols._switches import RoomSwitches
 _REFERENCE = "CoSSegGaussians (Dou et al. 2024), Table {}; PQ of Siddiqui et al. 2023"
 _STUFF = ("wall", "floor", "ceiling")
 _OPEN = (
-    "the paper does not say how ADE20K's classes became those of the truth (aliases), which "
-    "classes are stuff, whether mAP50 is over classes, or what a megabyte is (here 1 000 000 bytes)"
+    "fps are label maps drawn per second on the machine that measured; the paper does not say how "
+    "ADE20K's classes became those of the truth (aliases), which classes are stuff, whether mAP50 "
+    "is over classes, or what a megabyte is (here 1 000 000 bytes)"
 )
-_REPLICA_OPEN = "that the walk is Sequence_1, and that the test poses are Semantic-NeRF's"
+_REPLICA_OPEN = (
+    "of public code, not of the paper: the seven scenes are DM-NeRF's, the walk is Sequence_1, and "
+    "the test poses are Semantic-NeRF's"
+)
 _SCANNET_OPEN = (
     "the paper has seven scenes without their names and DM-NeRF names eight, all of which are run; "
     "the split is Semantic-NeRF's, whose code trains on every 100th frame: every fifth of those "
@@ -36,7 +40,7 @@ def _replica(task: Literal["semantic", "panoptic"]) -> Protocol:
         switches=RoomSwitches(task=task, scene_list="dm-nerf", sequence="Sequence_1", stuff=_STUFF),
         measure=_measure(task),
         scene_lists=SCENE_LISTS["replica"],
-        note=f"{_OPEN}; taken from public code: {_REPLICA_OPEN}",
+        note=f"{_REPLICA_OPEN}; {_OPEN}",
     )
 
 
