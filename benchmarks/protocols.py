@@ -44,9 +44,10 @@ class Run:
     switches: tuple[str, ...] = ()
 
 
-_TEXT, _CLASSES, _PANOPTIC, _MASKS = (
-    "features_text", "labels_semantic", "labels_panoptic", "masks_sam",
+_TEXT, _CLASSES, _PANOPTIC, _TRACKED, _MASKS = (
+    "features_text", "labels_semantic", "labels_panoptic", "labels_tracked", "masks_sam",
 )  # fmt: skip
+_ANY = ("scene_list=all",)
 RUNS = (
     Run(protocol="nvos", layout="nvos", scene="frontal",
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
@@ -76,6 +77,14 @@ RUNS = (
         evidence=(_PANOPTIC,)),
     Run(protocol="scannet-10", layout="scannet", scene="office", methods=("uplift", "features"),
         evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
+    Run(protocol="cosseg-replica-semantic", layout="replica", scene="office",
+        methods=("uplift", "associate"), evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
+    Run(protocol="cosseg-replica-panoptic", layout="replica", scene="office",
+        methods=("uplift", "associate"), evidence=(_TRACKED, _PANOPTIC), switches=_ANY),
+    Run(protocol="cosseg-scannet-semantic", layout="scannet", scene="office",
+        methods=("uplift", "associate"), evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
+    Run(protocol="cosseg-scannet-panoptic", layout="scannet", scene="office",
+        methods=("uplift", "associate"), evidence=(_TRACKED, _PANOPTIC), switches=_ANY),
 )  # fmt: skip
 
 
@@ -158,7 +167,7 @@ def _checked(
         ("instances", scene.instances, "instances", "pooled_instance_miou", "mIoU"),
     ):
         folder = predicted / kind
-        if maps is not None and folder.is_dir():
+        if maps is not None and folder.is_dir() and ours in result.scores:
             views = [path.stem for path in folder.glob("*.png")]
             ids = {v: maps.read[v]().ids.clamp_min(0).numpy().astype(np.uint16) for v in views}
             theirs = _score(scorer, command, folder, _saved(ids, truth / kind))

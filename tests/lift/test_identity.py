@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from splatseg.core import (
+    LEARNED_BYTES,
     ClassInfo,
     ClassTable,
     LabelMap,
@@ -191,6 +192,9 @@ def test_training_finds_what_is_where(blend) -> None:
     assert info.details["loss"] < 0.3
     assert info.options["blend"] == blend
     assert (info.details["steps"], info.details["stopped"]) == (120, "steps")
+    # The features and the classifier of two ids are not in the labels, but were learned.
+    channels = options.channels
+    assert info.details[LEARNED_BYTES] == 4 * (19 * channels + 2 * channels + 2)
     least = float(labels.confidence[:18].median())
     sure = IdentityOptions(**FAST, blend=blend, min_share=least)
     some = identity(gaussians, views, maps, options=sure, backend=BACKEND, seed=5)

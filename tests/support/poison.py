@@ -277,6 +277,8 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "tasks.select.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
         "tasks.draw_selection.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
         "core.apply_rows.layer": world.labels,
+        "evaluate.learned_bytes.layer": world.labels,
+        "evaluate.LearnedBytes.layer": 4,
         "core.map_ids.ids": ids,
         "core.map_ids.values": {1: 2},
         "core.map_ids.default": None,

@@ -54,6 +54,10 @@ class Command:
     evidence in which {scene} stands for the scene's name. A method takes the first that gives what
     it needs."""
 
+    guidance: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    """Who sees features for the methods that take them besides their evidence, named in the same
+    way; without it they get none."""
+
     prompter: Annotated[str, tyro.conf.arg(metavar="MODEL")] = _DEFAULT.prompter
     """Who turns strokes into a mask: a model that answers points, named in the same way."""
 
@@ -117,6 +121,7 @@ def run(command: Command) -> None:
         options=BenchOptions(
             methods=listed("--method", command.method),
             models=command.model,
+            guidance=command.guidance,
             prompter=command.prompter,
             grounder=command.grounder,
             scenes=listed("--scenes", command.scenes) if command.scenes else (),
@@ -160,6 +165,7 @@ def _print_table(done: BenchRun) -> None:
     table = Table(*columns, title=f"{done.protocol.name}: {done.protocol.summary}")
     for column in table.columns[1:-1]:
         column.justify = "right"
+        column.no_wrap = True  # a figure that is cut off is another figure
     for row in rows:
         table.add_row(*(f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row))
     Console(highlight=False).print(table)

@@ -13,6 +13,9 @@ _MAX_DEPTH = MAX_DEPTH - 10
 
 _Value = TypeVar("_Value")
 
+LEARNED_BYTES = "learned_bytes"
+"""Among the details of a layer: bytes of all that its method trained, kept in it or not."""
+
 LayerEditName = Literal[
     "correct_confusion", "complete", "merge_panoptic", "sharpen", "attach", "merge", "decompose"
 ]

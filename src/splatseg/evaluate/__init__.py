@@ -7,6 +7,7 @@ from splatseg.evaluate.boundary import BoundaryCounts as BoundaryCounts
 from splatseg.evaluate.boundary import BoundaryScore as BoundaryScore
 from splatseg.evaluate.boundary import boundary_overlap as boundary_overlap
 from splatseg.evaluate.boundary import boundary_score as boundary_score
+from splatseg.evaluate.frame_rate import frames_per_second as frames_per_second
 from splatseg.evaluate.held_out import BinaryReport as BinaryReport
 from splatseg.evaluate.held_out import SemanticReport as SemanticReport
 from splatseg.evaluate.held_out import evaluate_binary as evaluate_binary
@@ -17,6 +18,8 @@ from splatseg.evaluate.held_out_segments import PointReport as PointReport
 from splatseg.evaluate.held_out_segments import evaluate_instances as evaluate_instances
 from splatseg.evaluate.held_out_segments import evaluate_panoptic as evaluate_panoptic
 from splatseg.evaluate.held_out_segments import evaluate_points as evaluate_points
+from splatseg.evaluate.learned import LearnedBytes as LearnedBytes
+from splatseg.evaluate.learned import learned_bytes as learned_bytes
 from splatseg.evaluate.matched_instances import matched_instance_score as matched_instance_score
 from splatseg.evaluate.metrics import BinaryScore as BinaryScore
 from splatseg.evaluate.metrics import Confusion as Confusion

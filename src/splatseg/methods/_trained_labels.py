@@ -10,6 +10,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg.core import (
+    LEARNED_BYTES,
     ClassTable,
     Features,
     Gaussians,
@@ -168,6 +169,7 @@ def layer_info(
             "best_step": result.best_step,
             "stopped": result.stopped,
             "scores": [[step, score] for step, score in result.scores],
+            LEARNED_BYTES: result.learned_bytes,
         },
     )
 

@@ -7,8 +7,10 @@ import pytest
 from splatseg.errors import InputError, RangeError
 from splatseg.evaluate.protocols import (
     PROTOCOLS,
+    SCENE_LISTS,
     MapSwitches,
     PointSwitches,
+    RoomSwitches,
     TargetSwitches,
     differences,
     find_protocol,
@@ -98,3 +100,71 @@ def test_values_are_checked() -> None:
         PointSwitches(frame_step=0)
     with pytest.raises(InputError, match=r"did you mean .*lerf-ovs-2d"):
         find_protocol("lerf-ovs")
+
+
+ROOMS = [f"cosseg-{data}-{task}" for data in SCENE_LISTS for task in ("semantic", "panoptic")]
+
+
+def test_rooms_are_one_experiment_but_for_the_task_and_the_data_set() -> None:
+    switches = {name: find_protocol(name).switches for name in ROOMS}
+    for data in SCENE_LISTS:
+        pair = (switches[f"cosseg-{data}-{task}"] for task in ("semantic", "panoptic"))
+        assert differences(*pair) == ["task 'semantic' and 'panoptic'"]
+    replica, scannet = (switches[f"cosseg-{data}-semantic"] for data in ("replica", "scannet"))
+    assert differences(replica, scannet) == ["sequence 'Sequence_1' and None"]
+    assert isinstance(replica, RoomSwitches)
+    assert (replica.train_every, replica.stuff) == (5, ("wall", "floor", "ceiling"))
+    assert (replica.scored_in_training, replica.aliases) == (False, ())
+    measures = {name: find_protocol(name).measure for name in ROOMS}
+    assert set(measures.values()) == {"miou", "pq_scene"}
+
+
+def test_lists_of_scenes_are_those_that_are_published() -> None:
+    """Read off the README of vLAR-group/DM-NeRF by eye; Gaga's seven are all but one of them."""
+    replica, scannet = (find_protocol(f"cosseg-{data}-panoptic") for data in SCENE_LISTS)
+    assert replica.scenes == (
+        "office_0", "office_2", "office_3", "office_4", "room_0", "room_1", "room_2",
+    )  # fmt: skip
+    assert scannet.scenes == tuple(
+        f"scene{number}_00"
+        for number in ("0010", "0012", "0024", "0033", "0038", "0088", "0113", "0192")
+    )
+    gaga = scannet.with_switches({"scene_list": "gaga"})
+    assert set(scannet.scenes) - set(gaga.scenes) == {"scene0024_00"}
+    assert gaga.scenes == find_protocol("scannet-gaga").scenes
+    assert scannet.with_switches({"scene_list": "all"}).scenes == ()
+    with pytest.raises(InputError, match="protocol cosseg-replica-panoptic has dm-nerf, all; got"):
+        replica.with_switches({"scene_list": "gaga"})
+    assert "eight" in scannet.note, "the paper has seven, and does not name them"
+    assert all(one.source for lists in SCENE_LISTS.values() for one in lists.values())
+
+
+def test_switches_of_rooms_are_typed() -> None:
+    rooms = find_protocol("cosseg-replica-semantic")
+    typed = dict(
+        switch_value(rooms, text)
+        for text in ("train_every=4", "sequence=none", "stuff=wall", "aliases=windowpane:window")
+    )
+    other = rooms.with_switches(typed).switches
+    assert isinstance(other, RoomSwitches)
+    assert (other.train_every, other.sequence, other.stuff) == (4, None, ("wall",))
+    assert other.named_alike == {"windowpane": "window"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"train_every": 1}, RangeError, "train_every: expected 2 or more, got 1"),
+        ({"task": "parts"}, InputError, "task: expected one of"),
+        ({"sequence": "Sequence_3"}, InputError, "sequence: expected one of"),
+        ({"scene_list": "mine"}, InputError, "scene_list: expected one of"),
+        ({"aliases": ("a:b:c",)}, InputError, "aliases: expected pairs THERE:HERE of names"),
+        ({"aliases": ("a:",)}, InputError, "aliases: expected pairs THERE:HERE of names"),
+        # Choices that would change nothing are none.
+        ({"averaging": "pooled"}, InputError, "averaging: rooms are averaged over scenes"),
+        ({"missing": "skipped"}, InputError, "missing: a pixel without a label is wrong"),
+    ],
+)
+def test_switches_of_rooms_that_cannot_be(changes, error, message) -> None:
+    with pytest.raises(error, match=message):
+        find_protocol("cosseg-replica-semantic").with_switches(changes)

@@ -10,6 +10,7 @@ from PIL import Image
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.benchmarks import read_benchmark
+from splatseg.io.benchmarks.replica_classes import REPLICA_CLASSES
 from splatseg.io.benchmarks.scannet import (
     CLASS_SUBSETS,
     NYU40,
@@ -57,6 +58,43 @@ def test_zero_is_none_in_maps(tmp_path, write_replica) -> None:
     assert (scene.name, scene.instances, scene.semantic.table) == ("room_0", None, None)
     assert scene.semantic.read["rgb_0"]().ids.unique().tolist() == [-1]
     assert scene.semantic.read["rgb_2"]().ids.unique().tolist() == [2]
+
+
+def test_which_walk_of_a_scene_is_read(tmp_path, write_replica) -> None:
+    first = write_replica(tmp_path / "room_0")
+    second = first.with_name("Sequence_2")
+    shutil.copytree(first, second)
+    shutil.copytree(first, tmp_path / "room_1/Sequence_1")
+    for asked, folder, names in (
+        (None, tmp_path, ["room_0", "room_1"]),
+        ("Sequence_1", tmp_path, ["room_0", "room_1"]),
+        ("Sequence_2", tmp_path, ["room_0"]),
+        ("Sequence_2", tmp_path / "room_0", ["room_0"]),
+        ("Sequence_2", second, ["room_0"]),
+        (None, second, ["room_0"]),
+    ):
+        scenes = read_benchmark("replica", folder, sequence=asked)
+        assert [scene.name for scene in scenes] == names
+        expected = second if asked == "Sequence_2" or folder == second else first
+        assert scenes[0].capture.path == expected
+    # The folder of another walk than the one that is asked for is not taken for it.
+    with pytest.raises(MissingFileError, match="there or in Sequence_1, got none"):
+        read_benchmark("replica", second, sequence="Sequence_1")
+    with pytest.raises(MissingFileError, match="there or in Sequence_2, got none"):
+        read_benchmark("replica", tmp_path / "room_1", sequence="Sequence_2")
+    with pytest.raises(InputError, match="sequence: expected one of"):
+        read_benchmark("replica", tmp_path, sequence="Sequence_3")
+    with pytest.raises(InputError, match="sequence: scenes of layout scannet have one, got 'Seq"):
+        read_benchmark("scannet", tmp_path, sequence="Sequence_1")
+
+
+def test_the_classes_of_replica() -> None:
+    names = {row.id: row.name for row in REPLICA_CLASSES.rows}
+    assert list(names) == list(range(1, 102))
+    assert len(set(names.values())) == 101
+    # Numbers that other readers of Replica's maps have.
+    known = {2: "base-cabinet", 7: "bed", 40: "floor", 93: "wall", 94: "wall-cabinet", 98: "rug"}
+    assert {id: names[id] for id in known} == known
 
 
 def test_replica_with_faults(tmp_path, write_replica) -> None:

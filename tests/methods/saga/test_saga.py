@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from splatseg import _native
-from splatseg.core import Features, MaskSet
+from splatseg.core import LEARNED_BYTES, Features, MaskSet, with_info
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.evaluate import learned_bytes
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.heads import ClassifierHead
@@ -68,6 +69,9 @@ def test_one_training_serves_windows_and_walls(walls) -> None:
     assert between[1] - between[0] > 0.1
     info = features.info
     assert (info.method, info.seed, info.details["steps"]) == ("saga", 3, 300)
+    # All that was trained is in the layer: rows, and the gate of the head.
+    kept = with_info(features, replace(info, details={}))
+    assert info.details[LEARNED_BYTES] == learned_bytes(kept, walls.gaussians).layer
     assert features.weights is not None
     assert bool((features.weights > 0).any())
 

@@ -1,7 +1,9 @@
 """A generated room in the layouts of benchmarks, with its evidence, and fits of a few steps."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +15,13 @@ from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.images import save_png
 from splatseg.io.scene import save_scene
 from splatseg.render import render
+from splatseg.tasks.benchmark import BenchOptions, bench
+from splatseg.tasks.benchmark.walks import walk_splits
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence
 from support.benchmark_layouts.sparse import write_sparse
 from support.red_square import NAMES, camera, wall
+from support.walks import SCENES, fits, models, write_fits, write_walk
 
 EVIDENCE = ("masks_sam", "labels_semantic", "labels_panoptic", "features_text", "features_dino")
 STEPS = ("--steps", "80", "--max-gaussians", "4000", "--quiet")
@@ -65,3 +70,33 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     scenes.mkdir()
     save_scene(Scene(gaussians=gaussians, views=tuple(views), source=folder), scenes / "wall")
     return data, scenes
+
+
+@pytest.fixture(scope="session")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``replica`` and ``scannet`` with evidence, and ``fits`` of both; not to be changed."""
+    folder = tmp_path_factory.mktemp("walk")
+    write_walk(folder)
+    write_fits(folder, lambda capture: walk_splits(capture, 5), fits=folder / "fits")
+    return folder
+
+
+@pytest.fixture
+def run_room(walk: Path, tmp_path: Path) -> Callable[..., Any]:
+    """Runs uplift with other options than the protocol's; what it found."""
+
+    def go(protocol: str, *switches: str, data: Path | None = None, **options: Any) -> Any:
+        layout = protocol.split("-")[1]
+        shutil.rmtree(tmp_path / "fits", ignore_errors=True)
+        shutil.copytree(walk / "fits", tmp_path / "fits")
+        given = {
+            "models": models(walk, layout),
+            "fitted": fits(tmp_path, layout),
+            "scenes": (SCENES[layout],),
+            "switches": switches,
+            **options,
+        }
+        where = tmp_path / "out"
+        return bench(protocol, data or walk / layout, where, options=BenchOptions(**given))
+
+    return go

@@ -21,12 +21,12 @@ from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.evaluate.protocols import find_protocol
 from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.scene import load_scene, save_scene
-from splatseg.methods import Method, MethodInputs, _registry, register_method
+from splatseg.methods import Method, MethodInputs, _registry, find_method, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import SILENT, Observer
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import held_out_views
-from splatseg.tasks.benchmark.sight import bench_model
+from splatseg.tasks.benchmark.sight import bench_model, guidance_for, seen_for
 from support.red_square import save_strokes
 
 
@@ -222,6 +222,20 @@ def test_options_of_models() -> None:
     other = bench_model("classical,cuts=0.2,0.4", BenchOptions(), SILENT)
     assert plain.settings != other.settings
     assert "0.2, 0.4" in str(other.settings)
+
+
+def test_one_model_that_is_asked_for_two_things(tiny, tmp_path) -> None:
+    """What it is asked for second has a name of its own, and both are there the next time."""
+    shutil.copytree(tiny[1] / "wall", tmp_path / "wall")
+    scene = load_scene(tmp_path / "wall")
+    (found,) = read_benchmark("spin-nerf", tiny[0])
+    options = BenchOptions(models=("classical",), guidance="classical")
+    told = {"options": options, "backend": "auto", "observer": SILENT}
+    for _ in range(2):
+        masks = seen_for(find_method("associate"), scene, found, **told)
+        features = guidance_for(scene, found, **told)
+        assert (masks.name, masks.kind) == ("classical", "masks")
+        assert (features.name, features.kind) == ("classical.features", "features")
 
 
 class Redness:

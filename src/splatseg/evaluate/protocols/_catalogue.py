@@ -7,6 +7,8 @@ import difflib
 
 from splatseg.errors import InputError
 from splatseg.evaluate.protocols._protocol import Protocol
+from splatseg.evaluate.protocols._rooms import ROOMS
+from splatseg.evaluate.protocols._scene_lists import SCENE_LISTS
 from splatseg.evaluate.protocols._switches import MapSwitches, PointSwitches, TargetSwitches
 
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
@@ -18,10 +20,6 @@ _SPIN_SCENES = (
 _OPEN_GAUSSIAN_SCENES = (
     "scene0000_00", "scene0062_00", "scene0070_00", "scene0097_00", "scene0140_00",
     "scene0200_00", "scene0347_00", "scene0400_00", "scene0590_00", "scene0645_00",
-)  # fmt: skip
-_GAGA_SCENES = (
-    "scene0010_00", "scene0012_00", "scene0033_00", "scene0038_00", "scene0088_00",
-    "scene0113_00", "scene0192_00",
 )  # fmt: skip
 _LERF_OVS_SCENES = ("figurines", "ramen", "teatime", "waldo_kitchen")
 
@@ -184,12 +182,13 @@ PROTOCOLS: tuple[Protocol, ...] = (
         "scannet-views", "classes and instances of held-out views of ScanNet's rooms", ("scannet",),
         "CoSSegGaussians; PQ of Siddiqui et al. 2023",
     ),
-    _gaga("scannet-gaga", ("scannet",), _GAGA_SCENES),
+    _gaga("scannet-gaga", ("scannet",), SCENE_LISTS["scannet"]["gaga"].scenes),
     _views(
         "scannetpp", "classes of views, their truth rendered from the labelled mesh",
         ("scannetpp",),
         "the open-vocabulary voxel paper: mIoU and frequency-weighted IoU",
     ),
+    *ROOMS,
 )  # fmt: skip
 """All of them, in the order of the documentation."""
 

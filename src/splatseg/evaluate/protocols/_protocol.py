@@ -1,12 +1,14 @@
 """A protocol: which layout, what is asked of a method, and every choice of how it is scored."""
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from splatseg.core.boundary import convert_fields
 from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
-from splatseg.evaluate.protocols._switches import Switches
+from splatseg.evaluate.protocols._scene_lists import SceneList
+from splatseg.evaluate.protocols._switches import RoomSwitches, Switches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,11 +36,16 @@ class Protocol:
     scenes: tuple[str, ...] = ()
     """Its scenes; none where all of the data set are meant."""
 
+    scene_lists: Mapping[str, SceneList] = field(default_factory=dict[str, SceneList])
+    """Lists of which the switch ``scene_list`` takes one to be the scenes."""
+
     note: str = ""
     """What else should be known, such as what of the original is not settled."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
+        if isinstance(self.switches, RoomSwitches):
+            object.__setattr__(self, "scenes", self._listed(self.switches.scene_list))
 
     def with_switches(self, changes: dict[str, Any]) -> "Protocol":
         """The same protocol with other choices; results record them.
@@ -46,13 +53,24 @@ class Protocol:
         Raises:
             InputError: If it has no such switch.
         """
-        known = {field.name for field in fields(self.switches)}
+        known = {each.name for each in fields(self.switches)}
         for name in changes:
             if name not in known:
                 raise InputError(
                     f"switch: protocol {self.name} has {', '.join(sorted(known))}; got {name!r}."
                 )
         return replace(self, switches=replace(self.switches, **changes))
+
+    def _listed(self, name: str) -> tuple[str, ...]:
+        """Scenes of a list by its name; none where all are meant."""
+        if name == "all":
+            return ()
+        if name not in self.scene_lists:
+            raise InputError(
+                f"scene_list: protocol {self.name} has {', '.join((*self.scene_lists, 'all'))}; "
+                f"got {name!r}."
+            )
+        return self.scene_lists[name].scenes
 
 
 def switch_value(protocol: Protocol, text: str) -> tuple[str, Any]:

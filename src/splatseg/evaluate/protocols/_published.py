@@ -9,6 +9,14 @@ from splatseg.errors import InputError, RangeError
 
 _MAX_DECIBELS = 100.0  # of one level in 8 bits it is 48
 
+AMOUNTS = {
+    "psnr": (0.0, _MAX_DECIBELS),
+    "fps": (0.0, 1e6),
+    "learned_mb": (0.0, 1e9),
+    "scene_mb": (0.0, 1e9),
+}
+"""Measures that are no shares, with what they can be."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishedFigure:
@@ -22,7 +30,7 @@ class PublishedFigure:
 
     scores: Mapping[str, float]
     """By measure, as results name them (``iou``, ``accuracy``, ``pq_scene``); shares in [0, 1],
-    PSNR in decibels."""
+    PSNR in decibels, frames per second, megabytes."""
 
     scene: str | None = None
     """The scene; None is the mean over all of them."""
@@ -45,7 +53,7 @@ class PublishedFigure:
         if not self.scores:
             raise InputError("scores: expected at least one measure, got none.")
         for name, value in self.scores.items():
-            if name == "psnr":
-                check_range(name, value, 0.0, _MAX_DECIBELS)
+            if name in AMOUNTS:
+                check_range(name, value, *AMOUNTS[name])
             elif not 0 <= value <= 1:
                 raise RangeError(f"{name}: expected a share in [0, 1], got {value}.")

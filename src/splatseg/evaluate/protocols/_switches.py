@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from splatseg._check import check_choice, check_range
 from splatseg.core.boundary import convert_fields
-from splatseg.errors import RangeError
+from splatseg.errors import InputError, RangeError
 
 Averaging = Literal["tasks", "scenes", "pairs", "pooled"]
 """tasks: mean over the views of a task, then over all tasks of all scenes. scenes: over views, then
@@ -142,6 +142,55 @@ class MapSwitches(Switches):
         if self.hold_out_every < 2:
             raise RangeError(f"hold_out_every: expected 2 or more, got {self.hold_out_every}.")
         check_choice("void_rule", self.void_rule, ("coco", "strict"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoomSwitches(Switches):
+    """Choices of CoSSegGaussians' experiments: rooms whose frames are a walk, in two tasks."""
+
+    task: Literal["semantic", "panoptic"] = "semantic"
+    """semantic: a class of every pixel. panoptic: classes, and which thing each pixel is of."""
+
+    scene_list: Literal["dm-nerf", "gaga", "all"] = "all"
+    """The scenes: a published list of the data set, see `SCENE_LISTS`, or all that are there."""
+
+    sequence: Literal["Sequence_1", "Sequence_2"] | None = None
+    """The walk through a scene, where the data set has several; None where it has one."""
+
+    train_every: int = 5
+    """Of the frames in their order every so many are fitted, and the one in the middle between two
+    of these is held out and scored; all others are left out."""
+
+    stuff: tuple[str, ...] = ()
+    """Names of the classes whose instances are not told apart; all others are things."""
+
+    aliases: tuple[str, ...] = ()
+    """What classes of the evidence are called in the truth, each ``THERE:HERE``, where they have
+    other names there. A class whose name the truth does not know is wrong wherever it is found."""
+
+    def __post_init__(self) -> None:
+        Switches.__post_init__(self)
+        check_choice("task", self.task, ("semantic", "panoptic"))
+        check_choice("scene_list", self.scene_list, ("dm-nerf", "gaga", "all"))
+        if self.sequence is not None:
+            check_choice("sequence", self.sequence, ("Sequence_1", "Sequence_2"))
+        if self.train_every < 2:
+            raise RangeError(f"train_every: expected 2 or more, got {self.train_every}.")
+        for pair in self.aliases:
+            words = [word.strip() for word in pair.split(":")]
+            if len(words) != 2 or not all(words):
+                raise InputError(f"aliases: expected pairs THERE:HERE of names, got {pair!r}.")
+        # What would change nothing is no choice.
+        if self.averaging != "scenes":
+            raise InputError(f"averaging: rooms are averaged over scenes, got {self.averaging!r}.")
+        if self.missing != "wrong":
+            raise InputError(f"missing: a pixel without a label is wrong, got {self.missing!r}.")
+
+    @property
+    def named_alike(self) -> dict[str, str]:
+        """Name in the truth by name in the evidence, in lower case."""
+        pairs = (pair.lower().split(":") for pair in self.aliases)
+        return {there.strip(): here.strip() for there, here in pairs}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

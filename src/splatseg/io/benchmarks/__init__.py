@@ -16,7 +16,9 @@ from splatseg.io.benchmarks.lerf_mask import find_lerf_mask, read_lerf_mask
 from splatseg.io.benchmarks.lerf_ovs import find_lerf_ovs, read_lerf_ovs
 from splatseg.io.benchmarks.nvos import find_nvos, read_nvos
 from splatseg.io.benchmarks.ovs3d import find_ovs3d, read_ovs3d
+from splatseg.io.benchmarks.replica import LAYOUT as REPLICA
 from splatseg.io.benchmarks.replica import (
+    SEQUENCES,
     find_grouping_replica,
     find_replica_scenes,
     read_grouping_replica,
@@ -55,7 +57,9 @@ LAYOUTS = tuple(_LAYOUTS)
 
 
 @boundary
-def read_benchmark(layout: str, folder: Path) -> tuple[BenchmarkScene, ...]:
+def read_benchmark(
+    layout: str, folder: Path, *, sequence: str | None = None
+) -> tuple[BenchmarkScene, ...]:
     """Read scenes of a benchmark: cameras, tasks and truth, sorted by name.
 
     Masks and maps are read when they are asked for, by the `read` of their values; that is when a
@@ -64,15 +68,23 @@ def read_benchmark(layout: str, folder: Path) -> tuple[BenchmarkScene, ...]:
     Args:
         layout: One of `LAYOUTS`.
         folder: A scene, or the data set's folder with several.
+        sequence: Which walk through a scene is read, of a layout with several (``replica``); None
+            reads the first.
 
     Raises:
         MissingFileError: If there is no such folder, or files of the layout are missing.
         InputError: If a file is damaged, or of a view that the scene does not have; one sentence
-            that names it.
+            that names it. Also if scenes of the layout have one walk, and another is asked for.
     """
     check_choice("layout", layout, LAYOUTS)
+    if sequence is not None:
+        if layout != REPLICA:
+            raise InputError(f"sequence: scenes of layout {layout} have one, got {sequence!r}.")
+        check_choice("sequence", sequence, SEQUENCES)
     if not folder.is_dir():
         raise MissingFileError(f"{folder}: there is no such folder of a benchmark.")
+    if sequence is not None:
+        return read_replica_scenes(folder, sequence=sequence)
     return _LAYOUTS[layout].read(folder)
 
 

@@ -20,6 +20,9 @@ from splatseg.io.images import find_images
 from splatseg.io.json_files import read_json
 
 LAYOUT = "replica"
+SEQUENCES = ("Sequence_1", "Sequence_2")
+"""Walks through a scene, 900 frames each."""
+
 GROUPING_LAYOUT = "replica-gg"
 
 _NAMES = "info_semantic.json"
@@ -28,9 +31,9 @@ _TRAIN = "images_train"
 _MAX_ID = 2**31 - 1
 
 
-def find_replica_scenes(folder: Path) -> tuple[Path, ...]:
-    """Folders of scenes, or of one sequence, as Semantic-NeRF rendered them."""
-    return scene_folders(folder, lambda path: find_replica(path) is not None)
+def find_replica_scenes(folder: Path, sequence: str | None = None) -> tuple[Path, ...]:
+    """Folders of scenes with a sequence, or of that sequence, as Semantic-NeRF rendered them."""
+    return scene_folders(folder, lambda path: _sequence_of(path, sequence) is not None)
 
 
 def find_grouping_replica(folder: Path) -> tuple[Path, ...]:
@@ -40,28 +43,30 @@ def find_grouping_replica(folder: Path) -> tuple[Path, ...]:
     )
 
 
-def read_replica_scenes(folder: Path) -> tuple[BenchmarkScene, ...]:
+def read_replica_scenes(folder: Path, *, sequence: str | None = None) -> tuple[BenchmarkScene, ...]:
     """Read scenes with classes and instances of every pixel.
 
-    A scene is a sequence (see `io.captures.replica`), or has it in ``Sequence_1``, with
+    A scene is a sequence (see `io.captures.replica`), or has it in its folder, with
     ``semantic_class/semantic_class_N.png`` and ``semantic_instance/semantic_instance_N.png``;
     0 is none. Names come from Replica's ``info_semantic.json`` in the scene or in
     ``semantic_info/SCENE`` beside it, where it is there.
 
     Args:
         folder: A sequence, a scene, or the folder of several.
+        sequence: Which of a scene's sequences is read; scenes without it are passed over. None
+            reads the first, or the folder itself, where it is one.
 
     Raises:
         MissingFileError: If there is no scene, or it has no maps.
         InputError: If a map is of a frame that is not there.
     """
-    scenes = find_replica_scenes(folder)
+    scenes = find_replica_scenes(folder, sequence)
     if not scenes:
         raise MissingFileError(
-            f"{folder}: expected scenes of Replica with traj_w_c.txt, there or in {SEQUENCE}, got "
-            "none."
+            f"{folder}: expected scenes of Replica with traj_w_c.txt, there or in "
+            f"{sequence or SEQUENCE}, got none."
         )
-    return tuple(_scene(path) for path in scenes)
+    return tuple(_scene(path, sequence) for path in scenes)
 
 
 def read_grouping_replica(folder: Path) -> tuple[BenchmarkScene, ...]:
@@ -83,9 +88,23 @@ def read_grouping_replica(folder: Path) -> tuple[BenchmarkScene, ...]:
     return tuple(_grouping_scene(path) for path in scenes)
 
 
-def _scene(path: Path) -> BenchmarkScene:
-    sequence = find_replica(path) or path
-    scene = sequence.parent if sequence.resolve().name.startswith("Sequence") else sequence
+def _sequence_of(path: Path, name: str | None) -> Path | None:
+    """The sequence that a folder is, or has: any, or the one of a name."""
+    found = find_replica(path, name or SEQUENCE)
+    own = path.resolve().name
+    if name is not None and found == path and own.startswith("Sequence") and own != name:
+        return None  # another walk
+    return found
+
+
+def _scene_of(sequence: Path) -> Path:
+    """The folder of the scene of a sequence, which may be the sequence itself."""
+    return sequence.parent if sequence.resolve().name.startswith("Sequence") else sequence
+
+
+def _scene(path: Path, name: str | None) -> BenchmarkScene:
+    sequence = _sequence_of(path, name) or path
+    scene = _scene_of(sequence)
     capture = read_views(sequence, format="replica")
     classes, objects = _tables(scene)
     views = ViewsByFile(capture)

@@ -25,9 +25,14 @@ _MILLIMETRE = 0.001
 _CAMERA_FILE = "cam_params.json"
 
 
-def find_replica(folder: Path) -> Path | None:
-    """The folder of the poses of a sequence, or of the first of a scene; None where none is."""
-    for sequence in (folder, folder / SEQUENCE):
+def find_replica(folder: Path, sequence_name: str = SEQUENCE) -> Path | None:
+    """The folder of the poses of a sequence, or of one of a scene; None where none is.
+
+    Args:
+        folder: A sequence, or a scene.
+        sequence_name: Which of a scene's sequences is meant.
+    """
+    for sequence in (folder, folder / sequence_name):
         if (sequence / FILE).is_file() and (sequence / "rgb").is_dir():
             return sequence
     return None

@@ -77,6 +77,12 @@ class TrainingResult:
     stopped: Literal["steps", "patience"]
     """Whether all steps were done, or scores had got no better for the stated patience."""
 
+    @property
+    def learned_bytes(self) -> int:
+        """Of all arrays."""
+        arrays = (*self.rows.values(), *self.shared.values())
+        return sum(one.numel() * one.element_size() for one in arrays)
+
 
 @boundary
 def train(

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.core import Features, FeatureSource, Gaussians, LayerInfo, View
+from splatseg.core import LEARNED_BYTES, Features, FeatureSource, Gaussians, LayerInfo, View
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.lift.affinity import AffinityHead
@@ -191,5 +191,6 @@ def _info(
             "best_step": result.best_step,
             "stopped": result.stopped,
             "scores": [[step, score] for step, score in result.scores],
+            LEARNED_BYTES: result.learned_bytes,
         },
     )

@@ -9,13 +9,23 @@ from splatseg.core import Capture, PointCloud, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError
-from splatseg.evaluate.protocols import MapSwitches, PointSwitches, Protocol, TargetSwitches
+from splatseg.evaluate.protocols import (
+    MapSwitches,
+    PointSwitches,
+    Protocol,
+    RoomSwitches,
+    TargetSwitches,
+)
+from splatseg.io.benchmarks.replica import LAYOUT as REPLICA
+from splatseg.io.benchmarks.replica import SEQUENCES
+from splatseg.io.captures.replica import TRAIN_EVERY
 from splatseg.io.paths import path_inside
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
+from splatseg.tasks.benchmark.walks import walk_splits
 from splatseg.tasks.make_scene import MakeSceneOptions, fit_capture
 
 SCENES_FOLDER = "scenes"
@@ -44,8 +54,7 @@ def fitted_scene(
         _check_views(scene, bench, protocol)
         return scene
     fit_options = options.fit_options(fixed=fixed)
-    kind = f"{bench.layout}-fixed" if fixed else bench.layout
-    folder = path_inside(root, SCENES_FOLDER, kind, bench.name)
+    folder = path_inside(root, SCENES_FOLDER, _kind(bench, protocol, fixed=fixed), bench.name)
     capture = _capture(bench, protocol, fixed=fixed)
     if not is_scene(folder) or (folder / CHECKPOINT_FILE).is_file():
         made = fit_capture(
@@ -71,10 +80,13 @@ def held_out_views(bench: BenchmarkScene, protocol: Protocol) -> frozenset[str]:
     """Names of the views that a fit must not learn from.
 
     Of things that are asked for they are the scored ones, else those of the data set's split, or
-    every so many where it has none.
+    every so many where it has none. Of rooms they are the frames between those that are fitted.
     """
     if protocol.switches.scored_in_training:
         return frozenset()
+    if isinstance(protocol.switches, RoomSwitches):
+        splits = walk_splits(bench.capture, protocol.switches.train_every)
+        return frozenset(name for name, split in splits.items() if split == "test")
     if isinstance(protocol.switches, MapSwitches):
         own = frozenset(view.name for view in bench.capture.test_views)
         names = sorted(view.name for view in bench.capture.views)
@@ -102,6 +114,12 @@ def _capture(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> Captu
     if isinstance(protocol.switches, PointSwitches) and protocol.switches.frame_step > 1:
         views = capture.views[:: protocol.switches.frame_step]
         capture = replace(capture, views=views)
+    if isinstance(protocol.switches, RoomSwitches):
+        splits = walk_splits(capture, protocol.switches.train_every)
+        if protocol.switches.scored_in_training:
+            splits = {name: "train" if split == "test" else split for name, split in splits.items()}
+        views = tuple(replace(view, split=splits[view.name]) for view in capture.views)
+        return replace(capture, views=views)
     out = held_out_views(bench, protocol)
     # Views that are neither, as Replica's between two that count, stay so.
     own = not (
@@ -125,6 +143,19 @@ def _capture(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> Captu
     return replace(
         capture, points=PointCloud(points=bench.points.points, colours=colours if same else None)
     )
+
+
+def _kind(bench: BenchmarkScene, protocol: Protocol, *, fixed: bool) -> str:
+    """The folder of fits of a layout; other walks and other splits of them have their own."""
+    kind = f"{bench.layout}-fixed" if fixed else bench.layout
+    switches = protocol.switches
+    if not isinstance(switches, RoomSwitches):
+        return kind
+    if switches.sequence not in (None, SEQUENCES[0]):
+        kind = f"{kind}-{switches.sequence}"
+    # The data set's own split, which other protocols fit to as well, needs no name.
+    own = bench.layout == REPLICA and switches.train_every == TRAIN_EVERY
+    return kind if own else f"{kind}-every-{switches.train_every}"
 
 
 def _check_views(scene: Scene, bench: BenchmarkScene, protocol: Protocol) -> None:

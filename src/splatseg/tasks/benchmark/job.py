@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from splatseg.core import Layer, Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
@@ -11,7 +12,7 @@ from splatseg.methods import Method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
-from splatseg.tasks.benchmark.sight import Seen, seen_for
+from splatseg.tasks.benchmark.sight import Seen, guidance_for, kinds_wanted, seen_for
 from splatseg.tasks.segment import SegmentOptions, segment
 
 
@@ -41,6 +42,7 @@ class Job:
             self.scene,
             self.bench,
             words=words,
+            kinds=kinds_wanted(self.protocol, self.method),
             options=self.options,
             backend=self.backend,
             observer=self.observer,
@@ -60,6 +62,7 @@ class Job:
         made = segment(
             scene,
             self.method,
+            method_options=self._guided_options(),
             options=SegmentOptions(
                 evidence=evidence,
                 views=views,
@@ -70,3 +73,18 @@ class Job:
             observer=self.observer,
         )
         return made.layer
+
+    def _guided_options(self) -> Any:
+        """Options of a method that takes features besides, if some are given; else None."""
+        method = self.method
+        if method.guidance is None or self.options.guidance is None:
+            return None
+        seen = guidance_for(
+            self.scene,
+            self.bench,
+            options=self.options,
+            backend=self.backend,
+            observer=self.observer,
+        )
+        chosen = method.published_options if self.options.published else method.options()
+        return replace(chosen, **{method.guidance: seen.name})

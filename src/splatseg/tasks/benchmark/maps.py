@@ -50,16 +50,18 @@ Scores = tuple[dict[str, float], list[dict[str, Any]], list[str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Maps:
+class TrueMapSource:
     """True maps as a source of label maps."""
 
     maps: TrueMaps
 
     @property
     def view_names(self) -> tuple[str, ...]:
+        """Views that have a map."""
         return tuple(self.maps.read)
 
     def label_map(self, name: str) -> LabelMap:
+        """The map of a view."""
         return self.maps.read[name]()
 
 
@@ -93,15 +95,22 @@ def _classes(job: Job, seen: Seen, layer: Layer, *, by_words: bool) -> Scores:
     views = _scored(job, truth)
     confusions: list[Confusion] = []
     with job.observer.stage("score") as step:
-        maps = drawn_and_true(field, views, _LAYER, _Maps(maps=truth), progress=step)
+        maps = drawn_and_true(field, views, _LAYER, TrueMapSource(maps=truth), progress=step)
         for view, (drawn, true) in zip(views, maps, strict=True):
             ids = drawn.ids
             if mapping is not None:
                 ids = map_ids(ids, mapping, default=UNLABELLED)
-            _keep(job, "classes", view, ids)
+            keep_map(job, "classes", view, ids)
             confusions.append(Confusion.of(ids, true.ids))
+    return *class_scores(views, confusions), notes
+
+
+def class_scores(
+    views: Sequence[View], confusions: Sequence[Confusion]
+) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """Scores of classes over views, and a row for each view that has a true class."""
     pooled = semantic_score(sum(confusions, start=Confusion.none()))
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"view": view.name, "miou": semantic_score(one).miou}
         for view, one in zip(views, confusions, strict=True)
         if one.pixels
@@ -113,7 +122,7 @@ def _classes(job: Job, seen: Seen, layer: Layer, *, by_words: bool) -> Scores:
         "mean_accuracy": pooled.mean_accuracy,
         "per_image_miou": per_image_miou(confusions),
     }
-    return scores, rows, notes
+    return scores, rows
 
 
 def _instances(job: Job, seen: Seen, layer: Layer) -> Scores:
@@ -126,7 +135,7 @@ def _instances(job: Job, seen: Seen, layer: Layer) -> Scores:
         raise InputError(f"method {job.method.name}: expected instances, got a selection.")
     layer, notes = _in_true_classes(job, seen, layer)
     field = GaussianField(job.scene.gaussians, {_LAYER: layer}, backend=job.backend)
-    views, source = _scored(job, truth), _Maps(maps=truth)
+    views, source = _scored(job, truth), TrueMapSource(maps=truth)
     pooled = evaluate_instances(field, views, _LAYER, source).score
     with job.observer.stage("score") as step:
         drawn = drawn_and_true(field, views, _LAYER, source, progress=step)
@@ -152,11 +161,11 @@ def _kept_maps(
 ) -> Iterator[tuple[str, Int[Tensor, "height width"], Int[Tensor, "height width"]]]:
     """Name, predicted and true ids of each view, which are written on the way."""
     for view, (found, true) in zip(views, maps, strict=True):
-        _keep(job, "instances", view, found.ids)
+        keep_map(job, "instances", view, found.ids)
         yield view.name, found.ids, true.ids
 
 
-def _keep(job: Job, kind: str, view: View, ids: Int[Tensor, "height width"]) -> None:
+def keep_map(job: Job, kind: str, view: View, ids: Int[Tensor, "height width"]) -> None:
     """Write a predicted map: 16 bit, 0 for none."""
     folder = path_inside(
         job.root, "predictions", job.protocol.name, job.method.name, job.bench.name, kind
@@ -178,8 +187,8 @@ def _panoptic(
         views,
         classes=None,
         instances=_LAYER,
-        true_classes=_Maps(maps=semantic),
-        true_instances=_Maps(maps=instances),
+        true_classes=TrueMapSource(maps=semantic),
+        true_instances=TrueMapSource(maps=instances),
         table=semantic.table,
         void_rule=cast(MapSwitches, job.protocol.switches).void_rule,
     )

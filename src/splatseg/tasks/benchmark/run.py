@@ -2,13 +2,12 @@
 
 import importlib.metadata
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from splatseg.core import Model
-from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.json_values import plain_object
 from splatseg.core.models import GroundedMasks
@@ -16,12 +15,12 @@ from splatseg.errors import InputError
 from splatseg.evaluate.protocols import (
     PointSwitches,
     Protocol,
+    RoomSwitches,
     TargetSwitches,
     find_protocol,
     mask_scores,
     switch_value,
 )
-from splatseg.io.benchmarks import find_layout, read_benchmark
 from splatseg.io.paths import path_inside
 from splatseg.io.write_errors import named_write_failures
 from splatseg.methods import find_method
@@ -46,7 +45,14 @@ from splatseg.tasks.benchmark.results import (
     save_result,
     switches_of,
 )
-from splatseg.tasks.benchmark.sight import bench_model, chosen_model, evidence_wanted
+from splatseg.tasks.benchmark.rooms import check_room, room_scores
+from splatseg.tasks.benchmark.scenes import asked_scenes, scene_notes
+from splatseg.tasks.benchmark.sight import (
+    bench_model,
+    chosen_model,
+    evidence_wanted,
+    kinds_wanted,
+)
 from splatseg.tasks.benchmark.targets import TargetRun
 
 
@@ -102,17 +108,25 @@ def bench(
     chosen = find_protocol(protocol)
     chosen = chosen.with_switches(dict(switch_value(chosen, one) for one in options.switches))
     methods = [find_method(name) for name in options.methods]
-    scenes = _asked_scenes(_read(chosen, data), options, data)
+    if options.guidance is not None and not any(method.guidance for method in methods):
+        raise InputError(
+            "guidance: expected a method that takes features besides its evidence, got "
+            f"{', '.join(options.methods)}."
+        )
+    scenes = asked_scenes(chosen, data, options)
     with named_write_failures(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    notes = _notes(chosen, scenes)
+    notes = scene_notes(chosen, scenes)
     for note in notes:
         observer.note(note.rstrip("."))
     for one in scenes:
+        if isinstance(chosen.switches, RoomSwitches):
+            check_room(chosen, one)
         for method in methods:
             wanted = evidence_wanted(chosen, method, options)
             if wanted != "prompts":
-                chosen_model(method, one, words=wanted == "words", options=options)
+                kinds = kinds_wanted(chosen, method)
+                chosen_model(method, one, words=wanted == "words", kinds=kinds, options=options)
     prompter, grounder = _models(chosen, options, observer)
     found: dict[str, list[SceneResult]] = {method.name: [] for method in methods}
     kept = 0
@@ -199,7 +213,9 @@ def _scored(job: Job) -> tuple[dict[str, float], list[Mapping[str, Any]], list[s
     if isinstance(switches, PointSwitches):
         scores, classes, notes = point_scores(job)
         return scores, [*classes], notes
-    scores, maps, notes = map_scores(job)
+    scores, maps, notes = (
+        room_scores(job) if isinstance(switches, RoomSwitches) else map_scores(job)
+    )
     return scores, [*maps], notes
 
 
@@ -207,6 +223,9 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
     """All that a result depends on, in values that JSON holds."""
     method = job.method
     chosen = method.published_options if job.options.published else method.options()
+    # Left out where there is none: results of versions that did not know it stay what they are.
+    given = method.guidance is not None and job.options.guidance is not None
+    guidance = {"guidance": job.options.guidance} if given else {}
     return plain_object(
         "made",
         {
@@ -218,6 +237,7 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
             "published": job.options.published,
             "seed": job.options.seed,
             "models": list(job.options.models),
+            **guidance,
             "prompter": _recorded_model(job.prompter),
             "grounder": _recorded_model(job.grounder),
             "gaussians": digest,
@@ -229,42 +249,6 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
 
 def _recorded_model(model: Model | None) -> dict[str, Any] | None:
     return None if model is None else {"name": model.name, "settings": dict(model.settings)}
-
-
-def _read(protocol: Protocol, data: Path) -> tuple[BenchmarkScene, ...]:
-    """The data set, in the one of the protocol's layouts that it has."""
-    if len(protocol.layouts) == 1:
-        return read_benchmark(protocol.layouts[0], data)
-    found = find_layout(data)
-    if found not in protocol.layouts:
-        raise InputError(
-            f"{data}: expected the layout {' or '.join(protocol.layouts)}, got {found}."
-        )
-    return read_benchmark(found, data)
-
-
-def _asked_scenes(
-    scenes: Sequence[BenchmarkScene], options: BenchOptions, data: Path
-) -> list[BenchmarkScene]:
-    known = [one.name for one in scenes]
-    for name in options.scenes:
-        if name not in known:
-            raise InputError(f"{data}: expected scenes {', '.join(known)}, got {name!r}.")
-    return [one for one in scenes if not options.scenes or one.name in options.scenes]
-
-
-def _notes(protocol: Protocol, scenes: Sequence[BenchmarkScene]) -> list[str]:
-    """How the scenes at hand differ from those of the protocol."""
-    if not protocol.scenes:
-        return []
-    names = {one.name for one in scenes}
-    there, others = [n for n in protocol.scenes if n in names], names - set(protocol.scenes)
-    notes: list[str] = []
-    if len(there) < len(protocol.scenes):
-        notes.append(f"{len(there)} of the {len(protocol.scenes)} scenes of the protocol are run.")
-    if others:
-        notes.append(f"{', '.join(sorted(others))}: of no published figure.")
-    return notes
 
 
 def _models(

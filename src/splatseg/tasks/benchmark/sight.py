@@ -1,14 +1,15 @@
 """Evidence for the methods of a run, from the models that were named."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 from splatseg.core import Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.errors import InputError
-from splatseg.evaluate.protocols import Protocol, TargetSwitches
-from splatseg.io.evidence import TEXT_FILE, EvidenceKind, open_evidence
+from splatseg.evaluate.protocols import Protocol, RoomSwitches, TargetSwitches
+from splatseg.io.evidence import TEXT_FILE, EvidenceKind, evidence_header, open_evidence
 from splatseg.methods import Method
 from splatseg.models import What, find_family, model_names
 from splatseg.render import BackendName
@@ -52,6 +53,7 @@ def seen_for(
     bench: BenchmarkScene,
     *,
     words: bool = False,
+    kinds: tuple[EvidenceKind, ...] | None = None,
     options: BenchOptions,
     backend: BackendName,
     observer: Observer,
@@ -63,6 +65,7 @@ def seen_for(
         scene: The fitted scene.
         bench: The benchmark's scene.
         words: Whether features must lie in a space of words.
+        kinds: The kinds that will do, of those that the method takes; None takes any.
         options: Models.
         backend: Who draws views without photographs.
         observer: Is told of the progress.
@@ -70,13 +73,52 @@ def seen_for(
     Raises:
         InputError: If no model gives it.
     """
-    choice = chosen_model(method, bench, words=words, options=options)
+    choice = chosen_model(method, bench, words=words, kinds=kinds, options=options)
+    return _seen(choice, scene, options=options, backend=backend, observer=observer)
+
+
+def guidance_for(
+    scene: Scene,
+    bench: BenchmarkScene,
+    *,
+    options: BenchOptions,
+    backend: BackendName,
+    observer: Observer,
+) -> Seen:
+    """Features that methods take besides their evidence, of the model that `guidance` names.
+
+    Args:
+        scene: The fitted scene.
+        bench: The benchmark's scene.
+        options: Who sees.
+        backend: Who draws views without photographs.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If it gives no features.
+    """
+    named = options.guidance or ""
+    choice = _choice(named, bench, ("features",), words=False)
+    if choice is None:
+        raise InputError(f"guidance: expected a model that gives features, got {named or 'none'}.")
+    return _seen(choice, scene, options=options, backend=backend, observer=observer)
+
+
+def _seen(
+    choice: "Choice",
+    scene: Scene,
+    *,
+    options: BenchOptions,
+    backend: BackendName,
+    observer: Observer,
+) -> Seen:
+    """What a model sees of a scene, written down."""
     model = None if choice.folder is not None else bench_model(choice.named, options, observer)
     recorded = choice.folder is not None
     seen = see(
         scene,
         str(choice.folder) if model is None else model,
-        _slug(choice.folder.name if choice.folder is not None else name_of(choice.named)),
+        _evidence_name(choice, scene),
         options=SeeOptions(
             what=() if recorded else (cast(What, choice.what),), allow_missing=recorded
         ),
@@ -101,30 +143,50 @@ class Choice:
 
 
 def chosen_model(
-    method: Method, bench: BenchmarkScene, *, words: bool, options: BenchOptions
+    method: Method,
+    bench: BenchmarkScene,
+    *,
+    words: bool,
+    kinds: tuple[EvidenceKind, ...] | None = None,
+    options: BenchOptions,
 ) -> Choice:
-    """The first model that gives what a method takes; nothing is loaded.
+    """The first model that gives what a method takes, and of a kind that will do; none is loaded.
 
     Raises:
         InputError: If none does.
         MissingFileError: If recorded evidence is not there.
     """
-    for named in options.models:
-        path = Path(named.replace("{scene}", bench.name))
-        recorded = name_of(named) not in model_names()
-        found = (
-            _of_folder(path, method, words=words)
-            if recorded
-            else _of_model(named, method, words=words)
+    own = method.evidence
+    taken: tuple[EvidenceKind, ...] = tuple(k for k in own if kinds is None or k in kinds)
+    if kinds is not None and not taken:
+        raise InputError(
+            f"method {method.name}: expected one that takes {' or '.join(kinds)}, got one that "
+            f"takes {' or '.join(method.evidence)}."
         )
-        if found is not None:
-            kind, what = found
-            return Choice(named=named, folder=path if recorded else None, kind=kind, what=what)
-    wanted = "features of words" if words else " or ".join(method.evidence)
+    for named in options.models:
+        choice = _choice(named, bench, taken, words=words)
+        if choice is not None:
+            return choice
+    wanted = "features of words" if words else " or ".join(taken)
     raise InputError(
         f"method {method.name}: expected a model that gives {wanted}, got "
         f"{', '.join(options.models) or 'no model'}; name one with `models`."
     )
+
+
+def _choice(
+    named: str, bench: BenchmarkScene, taken: tuple[EvidenceKind, ...], *, words: bool
+) -> Choice | None:
+    """A model, or recorded evidence, if it gives one of some kinds."""
+    path = Path(named.replace("{scene}", bench.name))
+    recorded = name_of(named) not in model_names()
+    found = (
+        _of_folder(path, taken, words=words) if recorded else _of_model(named, taken, words=words)
+    )
+    if found is None:
+        return None
+    kind, what = found
+    return Choice(named=named, folder=path if recorded else None, kind=kind, what=what)
 
 
 def evidence_wanted(
@@ -139,22 +201,54 @@ def evidence_wanted(
     return "prompts" if "labels" in method.evidence else "any"
 
 
-def _of_folder(path: Path, method: Method, *, words: bool) -> tuple[EvidenceKind, str] | None:
+def kinds_wanted(protocol: Protocol, method: Method) -> tuple[EvidenceKind, ...] | None:
+    """Kinds of evidence that will do; None where any will that the method takes.
+
+    In rooms every pixel needs a class: label maps of classes, or segments whose class is known,
+    which tell things apart as well.
+    """
+    switches = protocol.switches
+    if not isinstance(switches, RoomSwitches):
+        return None
+    if switches.task == "panoptic":
+        return ("panoptic", "tracked")
+    if "labels" in method.evidence:
+        return ("labels",)
+    return ("features",) if method.evidence == ("features",) else ("panoptic", "tracked")
+
+
+def _of_folder(
+    path: Path, taken: tuple[EvidenceKind, ...], *, words: bool
+) -> tuple[EvidenceKind, str] | None:
     kind = open_evidence(path).kind
     beside = path.absolute().parent / TEXT_FILE
     if words and not ((path / TEXT_FILE).is_file() or beside.is_file()):
         return None
-    return (kind, kind) if kind in method.evidence else None
+    return (kind, kind) if kind in taken else None
 
 
-def _of_model(named: str, method: Method, *, words: bool) -> tuple[EvidenceKind, str] | None:
+def _of_model(
+    named: str, taken: tuple[EvidenceKind, ...], *, words: bool
+) -> tuple[EvidenceKind, str] | None:
     family = find_family(name_of(named))
     gives: tuple[What, ...] = () if family is None else family.gives
     for what in gives:
         kind = _KIND_OF.get(what)
-        if kind in method.evidence and (not words or what == "text"):
+        if kind in taken and (not words or what == "text"):
             return kind, what
     return None
+
+
+def _evidence_name(choice: Choice, scene: Scene) -> str:
+    """What the evidence is called: as its model, and what else was asked of it behind a point."""
+    name = _slug(choice.folder.name if choice.folder is not None else name_of(choice.named))
+    if choice.folder is not None or scene.root is None:
+        return name
+    there = scene.root / "evidence" / name
+    header = evidence_header(there) if there.is_dir() else None
+    known = None if header is None else header.get("metadata")
+    asked = cast("Mapping[str, Any]", known).get("what") if isinstance(known, Mapping) else None
+    return name if asked in (None, choice.what) else f"{name}.{choice.what}"
 
 
 def _slug(name: str) -> str:

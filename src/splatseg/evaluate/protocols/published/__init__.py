@@ -9,6 +9,7 @@ from types import MappingProxyType
 from splatseg.errors import InputError, quoted
 from splatseg.evaluate.protocols._published import PublishedFigure
 from splatseg.evaluate.protocols.published import (
+    _cosseg,
     _lerf_mask,
     _lerf_ovs,
     _nvos,
@@ -36,6 +37,10 @@ _FIGURES = MappingProxyType(
         "scannet-views": _views.SCANNET,
         "scannet-gaga": (),
         "scannetpp": _views.SCANNETPP,
+        "cosseg-replica-semantic": _cosseg.REPLICA_SEMANTIC,
+        "cosseg-replica-panoptic": _cosseg.REPLICA_PANOPTIC,
+        "cosseg-scannet-semantic": _cosseg.SCANNET_SEMANTIC,
+        "cosseg-scannet-panoptic": _cosseg.SCANNET_PANOPTIC,
     }
 )
 

@@ -1,10 +1,10 @@
-"""Rows of figures as tables print them: in percent, under a heading of measures."""
+"""Rows of figures as tables print them: shares in percent, under a heading of measures."""
 
 from dataclasses import dataclass
 
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import ShapeError
-from splatseg.evaluate.protocols._published import PublishedFigure
+from splatseg.evaluate.protocols._published import AMOUNTS, PublishedFigure
 
 SECOND_HAND = "second-hand"
 """Source of figures that were read in somebody else's table or text."""
@@ -47,8 +47,8 @@ class Table:
 
         Args:
             method: As the table calls it.
-            cells: By column: percent, PSNR in decibels, None where a cell is empty. Those at the
-                end may be left out.
+            cells: By column: percent, amounts (decibels, frames, megabytes) as they are, None
+                where a cell is empty. Those at the end may be left out.
             scene: None for the mean over scenes.
             source: Where this row stands, if not where the others do.
             note: In what it differs from the protocol, and what contradicts it.
@@ -61,7 +61,7 @@ class Table:
                 f"{method}: expected at most {len(self.measures)} cells, got {len(cells)}."
             )
         scores = {
-            measure: cell if measure == "psnr" else round(cell / 100, 6)
+            measure: float(cell) if measure in AMOUNTS else round(cell / 100, 6)
             for measure, cell in zip(self.measures, cells, strict=False)
             if cell is not None
         }

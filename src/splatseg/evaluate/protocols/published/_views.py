@@ -1,29 +1,16 @@
 """Held-out views of rooms: classes and instances in Replica, ScanNet and ScanNet++."""
 
+from dataclasses import replace
+
 from splatseg.evaluate.protocols._published import PublishedFigure
+from splatseg.evaluate.protocols.published import _cosseg
 from splatseg.evaluate.protocols.published._rows import SECOND_HAND, Table
 
-_LABELS = "Seven scenes; every method is fitted to labels of MaskDINO, which was trained on ADE20K."
 _GROUPING = (
     "Gaussian Grouping on Replica: 66.84 (classes) and 71.15 (panoptic) in CoSSegGaussians, Tables "
     "1 and 2; second-hand 83.36 (panoptic IoU), 54.12 (mIoU in 3D) and 29.6 (extraction in 3D). "
     "These are different evaluations."
 )
-
-
-def _classes(protocol: str) -> Table:
-    return Table(
-        protocol=protocol, measures=("miou",), source="CoSSegGaussians, Table 1", verified=True
-    )
-
-
-def _panoptic(protocol: str) -> Table:
-    return Table(
-        protocol=protocol,
-        measures=("miou", "ap50", "pq_scene"),
-        source="CoSSegGaussians, Table 2",
-        verified=True,
-    )
 
 
 def _second(evaluation: str, *measures: str) -> Table:
@@ -34,8 +21,6 @@ _EXTRACTION = _second("extraction in 3D", "iou", "psnr")
 _OBJECTS = _second("objects in novel views", "iou")
 _PANOPTIC_IOU = _second("panoptic IoU", "miou")
 _IOU_3D = _second("mIoU in 3D", "miou")
-_CLASS_NOTE = "Trained on classes. " + _LABELS
-_PANOPTIC_NOTE = "Trained on panoptic labels. " + _LABELS
 _EXTRACTED = "Objects rendered alone by Trace3D's protocol; PSNR inside their boxes."
 _NOVEL = "Objects in novel views by Trace3D's protocol."
 
@@ -60,25 +45,14 @@ def _second_hand() -> tuple[PublishedFigure, ...]:
 
 
 REPLICA = (
-    _classes("replica").row("Semantic-NeRF", 69.81, note=_CLASS_NOTE),
-    _classes("replica").row("Gaussian Grouping", 66.84, note=f"{_CLASS_NOTE} {_GROUPING}"),
-    _classes("replica").row("CoSSegGaussians", 79.34, note=_CLASS_NOTE),
-    _panoptic("replica").row("Panoptic Lifting", 66.22, 72.25, 64.34, note=_PANOPTIC_NOTE),
-    _panoptic("replica").row(
-        "Gaussian Grouping", 71.15, 69.98, 66.52, note=f"{_PANOPTIC_NOTE} {_GROUPING}"
+    *(
+        replace(one, note=f"{one.note} {_GROUPING}") if one.method == "Gaussian Grouping" else one
+        for one in _cosseg.qualities("replica", "replica")
     ),
-    _panoptic("replica").row("CoSSegGaussians", 79.49, 80.97, 75.60, note=_PANOPTIC_NOTE),
     *_second_hand(),
 )
 
-SCANNET = (
-    _classes("scannet-views").row("Semantic-NeRF", 69.67, note=_CLASS_NOTE),
-    _classes("scannet-views").row("Gaussian Grouping", 67.99, note=_CLASS_NOTE),
-    _classes("scannet-views").row("CoSSegGaussians", 75.40, note=_CLASS_NOTE),
-    _panoptic("scannet-views").row("Panoptic Lifting", 67.01, 66.95, 60.74, note=_PANOPTIC_NOTE),
-    _panoptic("scannet-views").row("Gaussian Grouping", 68.70, 67.03, 61.83, note=_PANOPTIC_NOTE),
-    _panoptic("scannet-views").row("CoSSegGaussians", 74.37, 76.14, 68.68, note=_PANOPTIC_NOTE),
-)
+SCANNET = _cosseg.qualities("scannet", "scannet-views")
 
 SCANNETPP = (
     Table(
