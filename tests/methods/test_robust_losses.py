@@ -25,9 +25,7 @@ LABEL = torch.tensor([0, 1])
 )
 def test_by_hand(kind, expected) -> None:
     found = label_loss(PROBABILITIES, LABEL, kind)
-    wanted = [
-        expected(float(q[c]), q.tolist()) for q, c in zip(PROBABILITIES, LABEL, strict=True)
-    ]
+    wanted = [expected(float(q[c]), q.tolist()) for q, c in zip(PROBABILITIES, LABEL, strict=True)]
     torch.testing.assert_close(found, torch.tensor(wanted))
 
 

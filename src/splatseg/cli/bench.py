@@ -54,9 +54,9 @@ class Command:
     evidence in which {scene} stands for the scene's name. A method takes the first that gives what
     it needs."""
 
-    guidance: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
-    """Who sees features for the methods that take them besides their evidence, named in the same
-    way; without it they get none."""
+    companion: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL ..")] = ()
+    """Who sees what methods take besides their evidence, such as features and masks, named in the
+    same way. Each option of a method takes the first that gives what it may name."""
 
     prompter: Annotated[str, tyro.conf.arg(metavar="MODEL")] = _DEFAULT.prompter
     """Who turns strokes into a mask: a model that answers points, named in the same way."""
@@ -121,7 +121,7 @@ def run(command: Command) -> None:
         options=BenchOptions(
             methods=listed("--method", command.method),
             models=command.model,
-            guidance=command.guidance,
+            companions=command.companion,
             prompter=command.prompter,
             grounder=command.grounder,
             scenes=listed("--scenes", command.scenes) if command.scenes else (),

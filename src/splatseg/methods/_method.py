@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from splatseg.core import ClassTable, Features, Gaussians, Layer, View
 from splatseg.core.boundary import convert_fields
@@ -55,11 +55,8 @@ class MethodInputs:
     on from it; None keeps none."""
 
     def features(self, option: str) -> FeatureEvidence | None:
-        """The features that an option names; None where it names none."""
-        found = self.companions.get(option)
-        if found is not None and not isinstance(found, FeatureEvidence):
-            raise InputError(f"{option}: expected evidence of features, got {found.kind}.")
-        return found
+        """The features that an option names, of the kinds it may be of; None where it names none."""
+        return cast("FeatureEvidence | None", self.companions.get(option))
 
     @property
     def label_names(self) -> ClassTable | None:

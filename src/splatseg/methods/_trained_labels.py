@@ -133,7 +133,7 @@ def _settings(options: LabelTrainingOptions) -> dict[str, Any]:
 
 
 def recorded_options(options: LabelTrainingOptions) -> dict[str, Any]:
-    """All options, in values that JSON holds: of a file its name, for folders are of one machine."""
+    """All options, in values that JSON holds: of a file its name, as folders are of one machine."""
     found: dict[str, Any] = asdict(options)
     for name, value in found.items():
         if isinstance(value, Path):

@@ -77,7 +77,8 @@ def test_most_views_may_be_wrong_about_an_object_that_looks_like_others() -> Non
     assert int(votes[5].argmax()) == 1
     found = classify_objects(pooled(votes, features))
     assert found.argmax(dim=1).tolist() == [0] * 12 + [1] * 12
-    alone = classify_objects(pooled(votes, features), options=ObjectClassOptions(feature_exponent=0))
+    by_votes = ObjectClassOptions(feature_exponent=0)
+    alone = classify_objects(pooled(votes, features), options=by_votes)
     assert int(alone[5].argmax()) == 1
 
 

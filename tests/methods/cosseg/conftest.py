@@ -96,7 +96,8 @@ class Halves:
         shallow = torch.stack((share, 1 - share, rows), dim=-1)
         deep = torch.stack((share - 0.5, 0.1 * torch.ones_like(share)), dim=-1)
         maps = tuple(
-            FeatureMap(features=one, stride=4, height=HEIGHT, width=WIDTH) for one in (shallow, deep)
+            FeatureMap(features=one, stride=4, height=HEIGHT, width=WIDTH)
+            for one in (shallow, deep)
         )
         return DeepFeatures(maps=maps, depths=("block3", "block12"))
 

@@ -25,12 +25,12 @@ def context(**changes) -> TrainingContext:
     return TrainingContext(backend=DRAWN_BY, **{"seed": 3} | changes)
 
 
-def trained(halves, encoder_file, *, given=context(), features=True, **changes) -> Features:
+def trained(halves, encoder_file, *, given=None, features=True, **changes) -> Features:
     options = CossegOptions(**QUICK | {"encoder": encoder_file} | changes)
     return train_cosseg(
         halves.gaussians, halves.views, halves.evidence,
         features=halves.blocks if features else None, options=options, metres_per_unit=1.0,
-        context=given,
+        context=given or context(),
     )  # fmt: skip
 
 
@@ -249,8 +249,8 @@ def test_bad_input_is_one_clear_sentence(halves, encoder_file) -> None:
             halves.gaussians, halves.views, halves.evidence, features=narrow,
             options=CossegOptions(**QUICK | {"encoder": encoder_file}), context=context(),
         )  # fmt: skip
+    few = halves.gaussians[torch.arange(20)]
     with pytest.raises(InputError, match="expected at least 36 points"):
-        few = halves.gaussians[torch.arange(20)]
         train_cosseg(
             few, halves.views, halves.evidence, features=halves.blocks,
             options=CossegOptions(**QUICK | {"encoder": encoder_file}), context=context(),
@@ -276,5 +276,3 @@ def test_bad_input_is_one_clear_sentence(halves, encoder_file) -> None:
 def test_options_out_of_range_are_refused(change, message) -> None:
     with pytest.raises(RangeError, match=message):
         CossegOptions(**change)
-
-

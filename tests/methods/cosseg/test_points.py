@@ -40,7 +40,8 @@ def test_boxes_hold_all_points_once_and_lie_apart() -> None:
     assert sorted(torch.cat(found).tolist()) == chosen.tolist()
     assert max(map(len, found)) <= 7
     first = torch.cat(found[: len(found) // 2])
-    assert float(means[first, 1].max()) <= float(means[torch.cat(found[len(found) // 2 :]), 1].min())
+    second = torch.cat(found[len(found) // 2 :])
+    assert float(means[first, 1].max()) <= float(means[second, 1].min())
     assert boxes(means, chosen, 25)[0] is chosen
 
 

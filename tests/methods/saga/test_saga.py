@@ -236,15 +236,15 @@ def test_the_layer_and_its_head_go_through_a_file(plain, tmp_path) -> None:
 
 def test_the_method_is_declared(walls) -> None:
     method = find_method("saga")
-    assert (method.evidence, method.returns, method.guidance) == (
+    assert (method.evidence, method.returns, method.companions) == (
         ("masks",),
         "features",
-        "guidance",
+        {"guidance": ("features",)},
     )
     assert method.published_options == SagaOptions.published()
     inputs = MethodInputs(
         gaussians=walls.gaussians, views=tuple(walls.views), evidence=walls.evidence,
-        guidance=walls.grids, backend=DRAWN_BY, seed=3,
+        companions={"guidance": walls.grids}, backend=DRAWN_BY, seed=3,
     )  # fmt: skip
     options = SagaOptions(**QUICK, guidance="grids", guidance_weight=1.0)
     layer = method.run(inputs, options)

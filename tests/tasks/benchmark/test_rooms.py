@@ -235,11 +235,11 @@ class GuidedOptions:
 
 
 def test_features_besides_the_evidence(run_room, walk, tmp_path) -> None:
-    """A method that declares guidance is given it, and the result tells."""
+    """A method that takes more is given it, and the result tells."""
     given: list[Any] = []
 
     def keep(inputs, options):
-        given.append((inputs.guidance, options))
+        given.append((inputs.companions.get("guidance"), options))
         return uplift.run(inputs, UpliftMethodOptions())
 
     seen = {}
@@ -251,23 +251,27 @@ def test_features_besides_the_evidence(run_room, walk, tmp_path) -> None:
     register_method(
         Method(
             name="guided", summary="s", reference="r", evidence=("labels",), options=GuidedOptions,
-            run=keep, guidance="guidance", keeps_ids=True,
+            run=keep, companions={"guidance": ("features",)}, keeps_ids=True,
         )
     )  # fmt: skip
     try:
         protocol = "cosseg-replica-semantic"
         without = run_room(protocol, methods=("guided",))
         assert given[-1][0] is None
-        found = run_room(protocol, methods=("guided",), guidance=str(folder))
+        found = run_room(protocol, methods=("guided",), companions=(str(folder),))
         assert isinstance(given[-1][0], FeatureEvidence)
         assert given[-1][1].guidance == "features_dino"
         assert found.kept == 0, "another experiment"
         made = [one.methods[0].scenes[0].made for one in (without, found)]
-        assert [one.get("guidance") for one in made] == [None, str(folder)]
-        with pytest.raises(InputError, match="guidance: expected a model that gives features, got"):
-            run_room(protocol, methods=("guided",), guidance=models(walk, "replica")[0])
-        with pytest.raises(InputError, match="guidance: expected a method that takes features be"):
-            run_room(protocol, guidance=str(folder))
+        assert [one.get("companions") for one in made] == [None, [str(folder)]]
+        with pytest.raises(
+            InputError, match="companions: expected a model that gives features, got"
+        ):
+            run_room(protocol, methods=("guided",), companions=models(walk, "replica")[:1])
+        with pytest.raises(
+            InputError, match="companions: expected a method that takes more than its"
+        ):
+            run_room(protocol, companions=(str(folder),))
     finally:
         del _registry._REGISTERED["guided"]
 

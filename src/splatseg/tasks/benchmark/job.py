@@ -7,12 +7,13 @@ from typing import Any
 from splatseg.core import Layer, Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.models import GroundedMasks
+from splatseg.errors import InputError
 from splatseg.evaluate.protocols import Protocol
 from splatseg.methods import Method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.benchmark.options import BenchOptions
-from splatseg.tasks.benchmark.sight import Seen, guidance_for, kinds_wanted, seen_for
+from splatseg.tasks.benchmark.sight import Seen, companion_for, kinds_wanted, seen_for
 from splatseg.tasks.segment import SegmentOptions, segment
 
 
@@ -62,7 +63,7 @@ class Job:
         made = segment(
             scene,
             self.method,
-            method_options=self._guided_options(),
+            method_options=self._options_beside(),
             options=SegmentOptions(
                 evidence=evidence,
                 views=views,
@@ -74,17 +75,29 @@ class Job:
         )
         return made.layer
 
-    def _guided_options(self) -> Any:
-        """Options of a method that takes features besides, if some are given; else None."""
+    def _options_beside(self) -> Any:
+        """Options that name what the method takes besides, where some is given; else None."""
         method = self.method
-        if method.guidance is None or self.options.guidance is None:
+        if not (method.companions and self.options.companions):
             return None
-        seen = guidance_for(
-            self.scene,
-            self.bench,
-            options=self.options,
-            backend=self.backend,
-            observer=self.observer,
-        )
+        named: dict[str, str] = {}
+        for option, kinds in method.companions.items():
+            seen = companion_for(
+                self.scene,
+                self.bench,
+                option,
+                kinds,
+                options=self.options,
+                backend=self.backend,
+                observer=self.observer,
+            )
+            if seen is not None:
+                named[option] = seen.name
+        if not named:
+            wanted = sorted({kind for kinds in method.companions.values() for kind in kinds})
+            raise InputError(
+                f"companions: expected a model that gives {' or '.join(wanted)}, got "
+                f"{', '.join(self.options.companions)}."
+            )
         chosen = method.published_options if self.options.published else method.options()
-        return replace(chosen, **{method.guidance: seen.name})
+        return replace(chosen, **named)

@@ -20,9 +20,9 @@ class BenchOptions:
     evidence in which {scene} stands for the scene's name. A method takes the first that gives what
     it needs."""
 
-    guidance: str | None = None
-    """Who sees features for the methods that take them besides their evidence, named in the same
-    way; None gives them none."""
+    companions: tuple[str, ...] = ()
+    """Who sees what methods take besides their evidence, such as features and masks, named in the
+    same way. Each option of a method takes the first that gives what it may name."""
 
     prompter: str = "classical"
     """Who turns strokes into a mask: a model that answers points, named in the same way."""

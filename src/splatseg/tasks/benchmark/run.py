@@ -108,9 +108,9 @@ def bench(
     chosen = find_protocol(protocol)
     chosen = chosen.with_switches(dict(switch_value(chosen, one) for one in options.switches))
     methods = [find_method(name) for name in options.methods]
-    if options.guidance is not None and not any(method.guidance for method in methods):
+    if options.companions and not any(method.companions for method in methods):
         raise InputError(
-            "guidance: expected a method that takes features besides its evidence, got "
+            "companions: expected a method that takes more than its evidence, got "
             f"{', '.join(options.methods)}."
         )
     scenes = asked_scenes(chosen, data, options)
@@ -224,8 +224,8 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
     method = job.method
     chosen = method.published_options if job.options.published else method.options()
     # Left out where there is none: results of versions that did not know it stay what they are.
-    given = method.guidance is not None and job.options.guidance is not None
-    guidance = {"guidance": job.options.guidance} if given else {}
+    given = bool(method.companions) and bool(job.options.companions)
+    companions = {"companions": list(job.options.companions)} if given else {}
     return plain_object(
         "made",
         {
@@ -237,7 +237,7 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
             "published": job.options.published,
             "seed": job.options.seed,
             "models": list(job.options.models),
-            **guidance,
+            **companions,
             "prompter": _recorded_model(job.prompter),
             "grounder": _recorded_model(job.grounder),
             "gaussians": digest,

@@ -77,30 +77,35 @@ def seen_for(
     return _seen(choice, scene, options=options, backend=backend, observer=observer)
 
 
-def guidance_for(
+def companion_for(
     scene: Scene,
     bench: BenchmarkScene,
+    option: str,
+    kinds: tuple[EvidenceKind, ...],
     *,
     options: BenchOptions,
     backend: BackendName,
     observer: Observer,
-) -> Seen:
-    """Features that methods take besides their evidence, of the model that `guidance` names.
+) -> Seen | None:
+    """What a method takes besides its evidence, of the first model of `companions` that gives it.
 
     Args:
         scene: The fitted scene.
         bench: The benchmark's scene.
+        option: The method's option that names it.
+        kinds: What it may be.
         options: Who sees.
         backend: Who draws views without photographs.
         observer: Is told of the progress.
 
-    Raises:
-        InputError: If it gives no features.
+    Returns:
+        What was seen; None where no model gives it.
     """
-    named = options.guidance or ""
-    choice = _choice(named, bench, ("features",), words=False)
+    found = (_choice(named, bench, kinds, words=False) for named in options.companions)
+    choice = next((one for one in found if one is not None), None)
     if choice is None:
-        raise InputError(f"guidance: expected a model that gives features, got {named or 'none'}.")
+        observer.note(f"{option}: no model of `companions` gives {' or '.join(kinds)}")
+        return None
     return _seen(choice, scene, options=options, backend=backend, observer=observer)
 
 
