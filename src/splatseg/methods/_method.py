@@ -55,7 +55,7 @@ class MethodInputs:
     on from it; None keeps none."""
 
     def features(self, option: str) -> FeatureEvidence | None:
-        """The features that an option names, of the kinds it may be of; None where it names none."""
+        """The features that an option names; None where it names none."""
         return cast("FeatureEvidence | None", self.companions.get(option))
 
     @property
