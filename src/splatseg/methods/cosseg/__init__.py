@@ -34,7 +34,7 @@ from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
 def run(inputs: MethodInputs, options: CossegOptions) -> Layer:
     """Find labels of objects, or train the decoder and read it, as the options say."""
     if options.decide == "objects":
-        return _objects(inputs, options)
+        return _closed_form(inputs, options)
     features = train_cosseg(
         inputs.gaussians,
         inputs.views,
@@ -49,7 +49,7 @@ def run(inputs: MethodInputs, options: CossegOptions) -> Layer:
     return features if options.readout == "rendered" else hard_labels(features, options)
 
 
-def _objects(inputs: MethodInputs, options: CossegOptions) -> Layer:
+def _closed_form(inputs: MethodInputs, options: CossegOptions) -> Layer:
     """Of label maps the classes of Gaussians, of tracks the objects with a class each."""
     masks = inputs.companions.get("masks")
     if masks is None:

@@ -37,7 +37,7 @@ from splatseg.lift.object_classes import (
     pool_objects,
 )
 from splatseg.lift.segments.table import SegmentSource
-from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods._trained_labels import TrainingContext, recorded_options
 from splatseg.methods.associate import associate_masks
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._distilled import distilled_features
@@ -154,7 +154,8 @@ def label_objects(
         scales = distilled.scales[:1] if options.semantic == "first" else deepest
         weights = distilled.weights
     tell(3)
-    return _labelled(tree, found, scales, weights, object_options, told=tell)
+    info = replace(found.info, method="cosseg", options=recorded_options(options))
+    return _labelled(tree, replace(found, info=info), scales, weights, object_options, told=tell)
 
 
 def _labelled(
@@ -248,6 +249,8 @@ def _with_classes(
         objects,
         info=replace(
             objects.info,
+            method=info.method,
+            options=info.options,
             class_of=kinds,
             names=names,
             details={**details, "mean_class_probability": round(mean, 4)},

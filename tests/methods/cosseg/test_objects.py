@@ -1,0 +1,154 @@
+"""Labels of objects on a wall of two halves, each an object."""
+
+from dataclasses import replace
+
+import torch
+
+from splatseg.core import LabelMap, Labels
+from splatseg.lift.object_classes import ObjectClassOptions, pool_objects
+from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods.cosseg import CossegOptions
+from splatseg.methods.cosseg._objects import CategoryMaps, ObjectLabels, label_objects
+
+from .conftest import Maps
+
+
+class Masks:
+    """The masks of each view, as association takes them."""
+
+    overlapping, persistent = True, False
+
+    def __init__(self, halves) -> None:
+        self.sets = {view.name: halves.masks(view) for view in halves.views}
+
+    @property
+    def view_names(self):
+        return tuple(self.sets)
+
+    def segments_of(self, name):
+        return self.sets[name]
+
+    def categories_of(self, name):
+        return {}
+
+
+def labelled(halves, maps, *, features=True, options=None, **more) -> ObjectLabels:
+    return label_objects(
+        halves.gaussians, halves.views, maps, features=halves.blocks if features else None,
+        masks=Masks(halves), options=CossegOptions(**more),
+        object_options=options or ObjectClassOptions(), classes=None,
+        context=TrainingContext(backend="auto"),
+    )  # fmt: skip
+
+
+def strip(halves, views=("v0", "v1")) -> Maps:
+    """Some views give a part of the left half to the right one."""
+    maps = dict(halves.evidence.maps)
+    for name in views:
+        ids = maps[name].ids.clone()
+        ids[:, 4:10] = 8
+        maps[name] = LabelMap(ids=ids)
+    return Maps(maps)
+
+
+def away(halves):
+    return halves.means[:, 0].abs() > 0.15
+
+
+def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None:
+    found = labelled(halves, strip(halves, ("v0", "v1", "v2")))
+    right = found.classes.ids.long() == halves.side
+    assert bool(right[away(halves)].all())
+    assert found.classes.candidates is not None
+    assert found.classes.shares is not None
+    assert float(found.classes.shares.sum(dim=1).max()) <= 1.001
+    assert set(found.objects.info.class_of.values()) == {3, 8}
+    sure = found.objects.info.details["class_probability"]
+    assert set(sure) == {str(id) for id in found.objects.info.class_of}
+    assert all(0.5 < one <= 1 for one in sure.values())
+    told: list[tuple[int, int]] = []
+    again = label_objects(
+        halves.gaussians, halves.views[::-1], strip(halves, ("v0", "v1", "v2")),
+        features=halves.blocks, masks=Masks(halves), options=CossegOptions(),
+        object_options=ObjectClassOptions(), classes=None,
+        context=TrainingContext(backend="auto"), told=lambda *step: told.append(step),
+    )  # fmt: skip
+    assert torch.equal(again.classes.ids, found.classes.ids)
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_what_is_in_no_object_keeps_its_votes(halves) -> None:
+    """The masks of the left half are missing."""
+    masks = Masks(halves)
+    for name, one in masks.sets.items():
+        masks.sets[name] = type(one).from_dense(torch.stack([one.dense(1)]))
+    found = label_objects(
+        halves.gaussians, halves.views, strip(halves), features=None, masks=masks,
+        options=CossegOptions(), object_options=ObjectClassOptions(), classes=None,
+        context=TrainingContext(backend="auto"),
+    )  # fmt: skip
+    left = (halves.side == 3) & away(halves)
+    ids = found.classes.ids[left]
+    assert 3 in ids.tolist()
+    right = (halves.side == 8) & away(halves)
+    assert bool((found.classes.ids[right] == 8).all())
+
+
+def pooled_features(halves, monkeypatch, **change):
+    """The features that objects are pooled of."""
+    kept: list[list[torch.Tensor]] = []
+
+    def keep(objects, votes, scales, weights):
+        kept.append([scale.clone() for scale in scales])
+        return pool_objects(objects, votes, scales, weights)
+
+    monkeypatch.setattr("splatseg.methods.cosseg._objects.pool_objects", keep)
+    labelled(halves, halves.evidence, **change)
+    return kept[0]
+
+
+def test_options_say_which_features_are_pooled(halves, monkeypatch) -> None:
+    usual = pooled_features(halves, monkeypatch)
+    assert [one.shape[1] for one in usual] == [3, 2]
+    first = pooled_features(halves, monkeypatch, semantic="first")
+    deepest = pooled_features(halves, monkeypatch, semantic="deepest")
+    assert torch.equal(first[0], usual[0])
+    assert torch.equal(deepest[0], usual[1])
+    assert (len(first), len(deepest)) == (1, 1)
+    small = pooled_features(halves, monkeypatch, lifted_side=8)
+    assert not torch.equal(small[0], usual[0])
+    reduced = pooled_features(halves, monkeypatch, components=2)
+    assert [one.shape[1] for one in reduced] == [2, 2]
+
+
+def test_tracks_become_categories() -> None:
+    ids = torch.tensor([[1, 2, 9], [-1, 5, 2]], dtype=torch.int32)
+    maps = CategoryMaps(Maps({"v": LabelMap(ids=ids)}), {1: 7, 2: 8, 5: 7})
+    assert maps.view_names == ("v",)
+    assert maps.label_map("v").ids.tolist() == [[7, 8, -1], [-1, 7, 8]]
+    empty = CategoryMaps(Maps({"v": LabelMap(ids=ids)}), {})
+    assert bool((empty.label_map("v").ids == -1).all())
+
+
+def test_labels_of_tracks_are_objects_with_classes(halves) -> None:
+    maps = CategoryMaps(halves.evidence, {3: 30, 8: 80})
+    found = labelled(halves, maps)
+    assert isinstance(found.objects, Labels)
+    kinds = found.objects.info.class_of
+    of = torch.tensor([kinds.get(int(id), -1) for id in found.objects.ids])
+    assert bool((of == halves.side * 10)[away(halves)].all())
+
+
+def test_names_are_those_of_classes(halves) -> None:
+    from splatseg.core import ClassInfo, ClassTable
+
+    table = ClassTable(rows=(ClassInfo(id=3, name="board"), ClassInfo(id=8, name="door")))
+    found = label_objects(
+        halves.gaussians, halves.views, halves.evidence, features=halves.blocks,
+        masks=Masks(halves), options=CossegOptions(), object_options=ObjectClassOptions(),
+        classes=table, context=TrainingContext(backend="auto"),
+    )  # fmt: skip
+    assert found.classes.info.names == {3: "board", 8: "door"}
+    names = set(found.objects.info.names.values())
+    assert {name.split()[0] for name in names} == {"board", "door"}
+    assert replace(found.objects).info.names == found.objects.info.names

@@ -1,0 +1,72 @@
+"""The method as `segment` runs it, on a generated room."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from splatseg.cli import main
+from splatseg.core import Features, Labels
+from splatseg.errors import InputError
+from splatseg.io.scene import load_scene
+from splatseg.methods.cosseg import CossegOptions
+from splatseg.tasks.segment import SegmentOptions, segment
+
+LABELS = SegmentOptions(evidence="labels_semantic")
+TRACKS = SegmentOptions(evidence="labels_tracked")
+
+
+@pytest.fixture(scope="module")
+def scene(fitted_room, tmp_path_factory) -> Path:
+    return Path(shutil.copytree(fitted_room, tmp_path_factory.mktemp("cosseg") / "scene"))
+
+
+def test_classes_by_objects_and_features(scene) -> None:
+    options = CossegOptions(features="features_dino", masks="masks_sam")
+    made = segment(load_scene(scene), "cosseg", options=LABELS, method_options=options)
+    layer = made.layer
+    assert isinstance(layer, Labels)
+    assert layer.info.method == "cosseg"
+    known = load_scene(scene).classes
+    assert known is not None
+    assert {id for id in layer.ids.tolist() if id >= 0} <= {row.id for row in known.rows}
+    assert float((layer.ids >= 0).float().mean()) > 0.95
+
+
+def test_objects_of_tracks_have_classes(scene) -> None:
+    options = CossegOptions(features="features_dino", masks="masks_sam")
+    layer = segment(load_scene(scene), "cosseg", options=TRACKS, method_options=options).layer
+    assert isinstance(layer, Labels)
+    present = {id for id in layer.ids.tolist() if id >= 0}
+    assert len(present) > 5
+    assert set(layer.info.class_of) <= present | set(layer.info.names)
+    assert layer.info.class_of
+
+
+def test_the_decoder_of_features_alone(scene) -> None:
+    options = CossegOptions(
+        features="features_dino", decide="decoder", spatial="none", steps=5, readout="rendered"
+    )
+    layer = segment(load_scene(scene), "cosseg", options=LABELS, method_options=options).layer
+    assert isinstance(layer, Features)
+    assert layer.info.details["blocks"] == ["block3", "block6", "block9", "block12"]
+
+
+def test_what_is_missing_is_told_in_one_sentence(scene) -> None:
+    with pytest.raises(InputError, match="masks: expected evidence of masks, such as masks_sam"):
+        segment(load_scene(scene), "cosseg", options=LABELS)
+    wrong = CossegOptions(features="masks_sam", masks="masks_sam")
+    with pytest.raises(InputError, match="features: expected evidence of features, got 'masks_sa"):
+        segment(load_scene(scene), "cosseg", options=LABELS, method_options=wrong)
+    nothing = CossegOptions(features="nothing", masks="masks_sam")
+    with pytest.raises(InputError, match="nothing"):
+        segment(load_scene(scene), "cosseg", options=LABELS, method_options=nothing)
+
+
+def test_from_the_command_line(scene, capsys) -> None:
+    words = ["segment", str(scene), "--method", "cosseg", "--evidence", "labels_semantic"]
+    assert main(words) == 2
+    assert "masks: expected evidence of masks" in capsys.readouterr().err
+    words += ["--masks", "masks_sam", "--features", "features_dino", "--layer", "classes"]
+    assert main(words) == 0
+    assert (scene / "layers" / "classes.npz").is_file()
