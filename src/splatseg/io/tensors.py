@@ -25,6 +25,9 @@ _TYPES = {
     "I32": (torch.int32, 4),
     "U8": (torch.uint8, 1),
 }
+SAFETENSORS_NAMES = {dtype: name for name, (dtype, _) in _TYPES.items()}
+"""What safetensors call the types that are read and written."""
+
 _MAX_HEADER = 100_000_000
 _MAX_SIDE = 1 << 40
 _CONVERT = (
@@ -50,7 +53,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     if path.suffix == ".npz":
         return _npz(path)
     if path.suffix == ".safetensors":
-        return _safetensors(path)
+        return read_safetensors(path)[0]
     if path.suffix in (".pth", ".pt", ".bin", ".ckpt"):
         raise InputError(
             f"{path}: expected .safetensors or .npz, got a pickle, which can run code; where you "
@@ -68,18 +71,24 @@ def _npz(path: Path) -> dict[str, Tensor]:
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
-def _safetensors(path: Path) -> dict[str, Tensor]:
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """All tensors of a ``.safetensors`` file by name, and the words that its header has of them.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is damaged, or holds types that are not numbers.
+    """
     data = read_bytes(path, "a safetensors file")
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(_MAX_HEADER, len(data) - 8):
         raise FileFormatError(f"{path}: expected a safetensors file, its header is cut off.")
     header = parse_object(data[8 : 8 + length], where=f"{path}: header")
     body = memoryview(data)[8 + length :]
-    return {
-        name: _tensor(path, name, entry, body)
-        for name, entry in header.items()
-        if name != "__metadata__"
-    }
+    words = header.pop("__metadata__", {})
+    if not isinstance(words, dict) or not all(isinstance(text, str) for text in words.values()):  # pyright: ignore[reportUnknownVariableType]
+        raise FileFormatError(f"{path}: expected text in __metadata__, got {quoted(words)}.")
+    tensors = {name: _tensor(path, name, entry, body) for name, entry in header.items()}
+    return tensors, cast("dict[str, str]", words)
 
 
 def _tensor(path: Path, name: str, entry: Any, body: memoryview) -> Tensor:
