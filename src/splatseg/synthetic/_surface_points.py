@@ -18,6 +18,7 @@ from splatseg.synthetic._views import look_at
 
 _WIDTH, _HEIGHT = 96, 64
 _POINTS_A_VIEW = 2000
+_MIN_VIEWS = 8
 _REACH = 40.0
 _NEAR = 3.0
 _CLEARANCE = 0.15
@@ -29,8 +30,8 @@ class SurfaceOptions:
     """How far points are from what they stand for. The defaults are exact points."""
 
     views: int | None = None
-    """From how many places the scene is seen; None takes one for each 2000 points. 1 is a partial
-    view: what a single camera sees."""
+    """From how many places the scene is seen; None takes one for each 2000 points, and at
+    least eight. 1 is a partial view: what a single camera sees."""
 
     detail: float = 0.0
     """In [0, 1]: 0 takes the pixels of a view alike, 1 those at edges and texture eight times as
@@ -116,7 +117,7 @@ def surface_points(
     check_range("seed", seed, 0, 2**63 - 1)
     chosen = SurfaceOptions() if options is None else options
     rng = np.random.default_rng([seed, scene.seed, 37])
-    views = chosen.views or math.ceil(count / _POINTS_A_VIEW)
+    views = chosen.views or max(_MIN_VIEWS, math.ceil(count / _POINTS_A_VIEW))
     pieces: list[SurfaceCloud] = []
     # A view may see the sky: what is missing then comes from further views.
     for _ in range(_MAX_ROUNDS * views if chosen.views is None else views):
