@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -148,13 +148,17 @@ class ResidualBlock(nn.Module):
         """
         width = self.exit.linear.in_features
         size = max(16, _VALUES // (width * neighbours.shape[1]))
-        blocks = list(_blocks(neighbours, len(positions) if self.training else size))
+        size = len(positions) if self.training else size
         squared = self.variant.distance == "squared"
         first = _encoder(self.encode1.affine(), positions, squared=squared)
+        if self.training:  # a batch norm counts what it sees
+            first = _once(first)
         second = self._second(first, positions, squared=squared)
 
         pool1 = self.pool1.prepare(self.entry(features))
-        pooled = torch.cat([pool1(first(near, rows), near, rows) for near, rows in blocks])
+        pooled = torch.cat(
+            [pool1(first(near, rows), near, rows) for near, rows in _blocks(neighbours, size)]
+        )
         pool2, leave = self.pool2.prepare(pooled), self.exit.affine()
         shortcut, slope = self.shortcut.affine(), self.variant.sum_slope
         return torch.cat(
@@ -163,7 +167,7 @@ class ResidualBlock(nn.Module):
                     leave(pool2(second(near, rows), near, rows)) + shortcut(features[rows]),
                     slope,
                 )
-                for near, rows in blocks
+                for near, rows in _blocks(neighbours, size)
             ]
         )
 
@@ -177,7 +181,7 @@ class ResidualBlock(nn.Module):
 def sample(
     features: Float[Tensor, "n channels"],
     neighbours: Int32[Tensor, "n k"],
-    kept: Float[Tensor, "m"],
+    kept: Int64[Tensor, "m"],
     *,
     variant: RandlaVariant,
 ) -> Float[Tensor, "m channels"]:
@@ -218,6 +222,18 @@ def _encoder(affine: Affine, positions: Tensor, *, squared: bool) -> Encode:
         return affine.finish(pairs.reshape(*near.shape, -1) + points[rows])
 
     return encode
+
+
+def _once(encode: Encode) -> Encode:
+    """An encoding of all points at once, which is asked for twice and made once."""
+    found: list[Tensor] = []
+
+    def encoded(near: Tensor, rows: slice) -> Tensor:
+        if not found:
+            found.append(encode(near, rows))
+        return found[0]
+
+    return encoded
 
 
 def _blocks(neighbours: Tensor, size: int) -> Iterator[tuple[Tensor, slice]]:

@@ -110,8 +110,7 @@ def point_pyramid(
     """
     check_shape("positions", positions, (None, 3))
     check_finite("positions", positions)
-    if not 0 <= seed < 1 << 63:
-        raise RangeError(f"seed: expected 0 or more, below 2^63, got {seed}.")
+    check_seed(seed)
     _check_enough(len(positions), options)
     points = positions.detach().cpu()
     order = np.random.default_rng(seed).permutation(len(points))
@@ -122,10 +121,10 @@ def point_pyramid(
     for ratio in options.ratios:
         level = points[kept[-1]]
         index = NeighbourIndex(level)
-        neighbours.append(_nearest(index, level, options.neighbours, torch.int32))
+        neighbours.append(nearest_rows(index, level, options.neighbours, torch.int32))
         chosen = torch.from_numpy(np.sort(order[: len(level) // ratio]))
         pool.append(torch.searchsorted(kept[-1], chosen))
-        nearest = _nearest(NeighbourIndex(points[chosen]), level, 1, torch.int64)
+        nearest = nearest_rows(NeighbourIndex(points[chosen]), level, 1, torch.int64)
         up.append(nearest[:, 0])
         kept.append(chosen)
     return PointPyramid(
@@ -176,6 +175,16 @@ def join_pyramids(pyramids: Sequence[PointPyramid]) -> PointPyramid:
     )
 
 
+def check_seed(seed: int) -> None:
+    """Refuse seeds that no generator takes.
+
+    Raises:
+        RangeError: If it is negative, or 2^63 or more.
+    """
+    if not 0 <= seed < 1 << 63:
+        raise RangeError(f"seed: expected 0 or more, below 2^63, got {seed}.")
+
+
 def _check_enough(count: int, options: PyramidOptions) -> None:
     needed = min_points(options.neighbours, options.ratios)
     if count > _MAX_POINTS:
@@ -192,7 +201,8 @@ def _check_enough(count: int, options: PyramidOptions) -> None:
     )
 
 
-def _nearest(index: NeighbourIndex, queries: Tensor, k: int, dtype: torch.dtype) -> Tensor:
+def nearest_rows(index: NeighbourIndex, queries: Tensor, k: int, dtype: torch.dtype) -> Tensor:
+    """The k nearest points of each query, (m, k), searched in blocks to bound memory."""
     found = torch.empty(len(queries), k, dtype=dtype)
     for start in range(0, len(queries), _QUERIES):
         rows = slice(start, start + _QUERIES)
