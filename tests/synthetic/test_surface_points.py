@@ -21,7 +21,7 @@ def scene() -> SyntheticScene:
 
 @pytest.fixture(scope="module")
 def exact(scene) -> SurfaceCloud:
-    return surface_points(scene, 3000, seed=1)
+    return surface_points(scene, 3000, seed=1, options=SurfaceOptions(views=20))
 
 
 def off_surface(scene: SyntheticScene, cloud: SurfaceCloud, margin: float) -> torch.Tensor:
@@ -43,17 +43,20 @@ def test_exact_points_lie_on_the_object_they_name(scene, exact):
     torch.testing.assert_close(exact.normals.norm(dim=-1), torch.ones(3000))
     # Points of solids leave them along their normals.
     moved = exact.positions.double() + 4e-3 * exact.normals.double()
+    left: list[torch.Tensor] = []
     for item in scene.primitives:
         mine = (exact.instance == item.instance) & ~item.contains(exact.positions.double(), -2e-3)
         mine &= item.contains(exact.positions.double(), 1e-4)
-        if item.shape != "plane" and bool(mine.any()) and min(item.half_size) > 0.02:
-            assert float(item.contains(moved[mine], -1e-3).float().mean()) < 0.05
+        if item.shape != "plane" and min(item.half_size) > 0.02:
+            left.append(~item.contains(moved[mine], -1e-3))
+    assert len(torch.cat(left)) > 500
+    assert float(torch.cat(left).float().mean()) > 0.97
 
 
 def test_points_are_of_many_objects_and_the_seed_decides(scene, exact):
-    assert len(exact.instance.unique()) > 0.5 * len(scene.objects)
-    again = surface_points(scene, 3000, seed=1)
-    other = surface_points(scene, 3000, seed=2)
+    assert len(exact.instance.unique()) > 0.6 * len(scene.objects)
+    again = surface_points(scene, 3000, seed=1, options=SurfaceOptions(views=20))
+    other = surface_points(scene, 3000, seed=2, options=SurfaceOptions(views=20))
     assert torch.equal(again.positions, exact.positions)
     assert torch.equal(again.colours, exact.colours)
     assert not torch.equal(other.positions, exact.positions)

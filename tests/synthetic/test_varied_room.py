@@ -113,7 +113,11 @@ def test_the_seed_decides():
 def test_the_living_room_is_the_one_it_was():
     """Its numbers stand in documents and in results that were measured on it."""
     rows = [
-        (p.shape, p.instance, *(round(v, 6) + 0.0 for v in (*p.centre, *p.half_size, p.yaw, p.tilt)))
+        (
+            p.shape,
+            p.instance,
+            *(round(v, 6) + 0.0 for v in (*p.centre, *p.half_size, p.yaw, p.tilt)),
+        )
         for p in room(seed=0).primitives
     ]
     digest = hashlib.sha256(repr(rows).encode()).hexdigest()

@@ -182,7 +182,7 @@ def _jutting_corner(b: Builder, plan: FloorPlan, texture: Texture) -> None:
     x, y = float(b.rng.choice([-1, 1])), float(b.rng.choice([-1, 1]))
     cx, cy = x * (plan.half_x - w), y * (plan.half_y - d)
     if plan.take((cx - w, cy - d, cx + w, cy + d)):
-        # North and south walls run along x, the west wall's own x along y, the east wall's along -y.
+        # A wall's own x is x in the north, y in the west, -x in the south, -y in the east.
         plan.take_wall(0 if y > 0 else 2, cx if y > 0 else -cx, 2 * w)
         plan.take_wall(3 if x > 0 else 1, -cy if x > 0 else cy, 2 * d)
         b.object("wall", f"corner {len(b.objects) + 1}", at=(cx, cy, 0.0), parent=WALL)

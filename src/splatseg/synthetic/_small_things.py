@@ -106,9 +106,10 @@ def keyboard(b: Builder, at: Vector, yaw: float, parent: int) -> None:
     _begin(b, "keyboard", at, parent, yaw=yaw + b.jitter(0.1))
     grey = float(b.rng.choice([0.1, 0.85]))
     case = painted((grey, grey, grey), spread=0.2)
+    tone = 0.5 * grey + 0.2
     keys = Texture(
         kind="checker",
-        palette=shades((0.5 * grey + 0.2,) * 3, spread=0.5),
+        palette=shades((tone, tone, tone), spread=0.5),
         scale=0.02,
     )
     b.solid("box", (0, 0, 0.008), (0.21, 0.07, 0.008), case)

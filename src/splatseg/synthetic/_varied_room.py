@@ -137,7 +137,9 @@ def _table_with_chairs(b: Builder, plan: FloorPlan) -> None:
         return
     table = furniture.table(b, stand, (w, d, float(b.rng.uniform(0.71, 0.76))), is_round=is_round)
     frame, top = b.frame, _top_of(b, table)
-    places = [(x, y, top) for x in np.arange(-w / 2 + 0.25, w / 2 - 0.2, 0.35) for y in (-0.2, 0.2)]
+    places = [
+        (float(x), y, top) for x in np.arange(-w / 2 + 0.25, w / 2 - 0.2, 0.35) for y in (-0.2, 0.2)
+    ]
     small.things_on(b, places, table, kinds=_ON_TABLES, share=float(b.rng.uniform(0.1, 0.5)))
     swivel = b.rng.random() < 0.3
     each = 1 if is_round else max(1, int(w / 0.65))
