@@ -1,0 +1,94 @@
+"""Training of the shipped encoder: by seed, and the same whether it was interrupted or not."""
+
+import sys
+from dataclasses import replace
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "train_point_network"
+
+
+@pytest.fixture(scope="module")
+def script():
+    loader = SourceFileLoader("train_point_network", str(SCRIPT))
+    spec = spec_from_loader(loader.name, loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    # Dataclasses look their module up.
+    sys.modules[loader.name] = module
+    loader.exec_module(module)
+    yield module
+    del sys.modules[loader.name]
+
+
+@pytest.fixture(scope="module")
+def recipe(script):
+    return script.Recipe(
+        rooms=1, streets=1, held_out_rooms=1, held_out_streets=0, points_per_room=9000,
+        points_per_street=9000, points_per_crop=4200, steps=4,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def clouds(script, recipe, tmp_path_factory):
+    return script.clouds(recipe, tmp_path_factory.mktemp("clouds"))
+
+
+def test_clouds_are_kept_and_labels_count_through_both_tables(script, clouds):
+    room, street = clouds
+    assert room.labels.max() < script.ROOMS <= street.labels[street.labels >= 0].min()
+    assert street.labels.max() < script.ROOMS + script.STREETS
+    assert (room.labels == -1).mean() < 0.1
+
+
+def test_a_grid_keeps_a_point_a_cell(script, clouds):
+    fine = script.gridded(clouds[0], 0.1, np.random.default_rng(0))
+    cells = np.unique(np.floor(clouds[0].positions / 0.1), axis=0)
+    assert len(fine.labels) == len(cells)
+    assert set(fine.labels) <= set(clouds[0].labels)
+    one = replace(clouds[0], positions=np.zeros_like(clouds[0].positions))
+    mean = script.gridded(one, 0.1, np.random.default_rng(0))
+    np.testing.assert_allclose(mean.colours[0], one.colours.mean(axis=0), atol=1e-3)
+
+
+def test_other_domain_has_no_say(script):
+    logits = torch.zeros(2, script.ROOMS + script.STREETS)
+    shares = script.masked(logits, torch.tensor([0, script.ROOMS])).softmax(dim=1)
+    assert float(shares[0, script.ROOMS :].sum()) == 0
+    assert float(shares[1, : script.ROOMS].sum()) == 0
+
+
+def test_what_was_interrupted_ends_the_same(script, recipe, clouds, tmp_path, monkeypatch):
+    monkeypatch.setattr(script, "CHECKPOINT_EVERY", 2)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    whole, _ = script.train(recipe, clouds, tmp_path / "a")
+    drawn = script.drawn
+
+    def stop(clouds, recipe, step):
+        if step == 3:
+            raise KeyboardInterrupt
+        return drawn(clouds, recipe, step)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(script, "drawn", stop)
+        with pytest.raises(KeyboardInterrupt):
+            script.train(recipe, clouds, tmp_path / "b")
+    resumed, _ = script.train(recipe, clouds, tmp_path / "b")
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, resumed.state_dict()[name]), name
+    with pytest.raises(SystemExit, match="another recipe"):
+        script.train(replace(recipe, seed=1), clouds, tmp_path / "b")
+
+
+def test_scores_are_of_the_classes_that_are_there(script, recipe, clouds):
+    net = script.RandlaNet(script.CONFIG).eval()
+    report = script.scores(net, clouds[:1], colour=True)
+    assert set(report["rooms"]) > {"mIoU", "accuracy", "wall", "floor"}
+    assert all(0 <= value <= 1 for value in report["rooms"].values())
+    assert report["streets"]["mIoU"] == 0.0
