@@ -34,7 +34,7 @@ def drive_cameras(
     Args:
         scene: A scene with a `drive`.
         count: Number of views.
-        test_every: Every so-manieth view has the split ``test``; 0 for none.
+        test_every: Of how many views one has the split ``test``; 0 for none.
         width: Pixels a row.
         height: Rows.
         field_of_view: Horizontal, degrees.

@@ -110,7 +110,7 @@ def _curtains(b: Builder, plan: FloorPlan, stand: Stand, wide: float, top: float
     """A rail, and folds of cloth on both sides of a window, down to the sill or the floor."""
     kind: TextureName = "stripes" if b.rng.random() < 0.3 else "weave"
     cloth = b.cloth(kind=kind, scale=0.15)
-    free = plan.hang_free(stand, 2 * wide + 0.6)
+    free = plan.take_below(stand, 2 * wide + 0.6)
     low = 0.03 if free else 0.72
     _on_wall(b, "curtain", "curtain", stand, 0.0)
     b.solid("box", (0, -0.15, top + 0.1), (wide + 0.28, 0.012, 0.012), metal(b))

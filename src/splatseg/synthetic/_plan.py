@@ -101,7 +101,7 @@ class FloorPlan:
                 return stand
         return None
 
-    def hang_free(self, stand: Stand, width: float) -> bool:
+    def take_below(self, stand: Stand, width: float) -> bool:
         """Take the wall below something that hangs, where nothing stands before it."""
         if stand.wall is None:
             return False
