@@ -21,6 +21,7 @@ PACKAGES = (
     "io.video",
     "lift",
     "lift.training",
+    "lift.point_network",
     "methods",
     "models",
     "models.classical",

@@ -17,8 +17,8 @@ _EXPECTED = "a checkpoint of PyTorch 1.6 or later, or safetensors"
 class Inert:
     """Stands for every class and function that a checkpoint names besides those of tensors.
 
-    Checkpoints of Lightning hold callbacks and options, others numbers of NumPy, which are of no
-    use here. Whatever would be made of them becomes a dictionary that nobody reads.
+    Checkpoints of Lightning hold callbacks and options, which are of no use here. Whatever would
+    be made of them becomes a dictionary that nobody reads.
     """
 
     def __new__(cls, *arguments: object) -> Any:
@@ -26,11 +26,24 @@ class Inert:
         return OrderedDict[Any, Any]()
 
 
+class InertNumber:
+    """Stands for NumPy's numbers and arrays, whose states are not those of dictionaries.
+
+    Training programs leave their best scores in checkpoints.
+    """
+
+    def __init__(self, *arguments: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        """Forget it."""
+
+
 def read_torch_file(path: Path) -> object:
     """What a file of PyTorch holds, by `torch.load` with ``weights_only``: nothing in it is run.
 
-    Classes that it names, other than those of tensors, become `Inert`. Tensors are mapped from the
-    file: they must be copied before the file is changed.
+    Classes that it names, other than those of tensors, become `Inert` or `InertNumber`. Tensors
+    are mapped from the file: they must be copied before it is changed.
 
     Raises:
         MissingFileError: If there is no such file.
@@ -39,9 +52,9 @@ def read_torch_file(path: Path) -> object:
     with reading(path, _EXPECTED):
         if path.stat().st_size and not zipfile.is_zipfile(path):
             raise FileFormatError(f"{path}: expected {_EXPECTED}, got another kind of file.")
-        named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
         try:
-            with torch.serialization.safe_globals([(Inert, name) for name in named]):
+            named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+            with torch.serialization.safe_globals([(_stand_in(name), name) for name in named]):
                 # Mapped and not read: optimizers' states, which are as large as the weights,
                 # are never touched.
                 return cast(
@@ -52,3 +65,7 @@ def read_torch_file(path: Path) -> object:
                 f"{path}: expected a checkpoint of tensors and plain values, got one that only the "
                 "program it is of can read; its state_dict saved as safetensors is taken."
             ) from error
+
+
+def _stand_in(name: str) -> type:
+    return InertNumber if name.startswith("numpy.") else Inert

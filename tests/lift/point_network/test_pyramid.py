@@ -158,8 +158,11 @@ def test_batches_that_do_not_fit() -> None:
     two = pyramid_of(points, RandlaConfig(widths=(4,), neighbours=4, ratios=(2,)))
     with pytest.raises(InputError, match="pyramids: expected at least one, got none"):
         join_pyramids([])
-    with pytest.raises(InputError, match=r"the same number of levels, got \[2, 4\]"):
+    three = pyramid_of(points, RandlaConfig(widths=(4,), neighbours=3, ratios=(2,)))
+    with pytest.raises(InputError, match=r"got neighbours \[4\] and \[4, 4, 4\]"):
         join_pyramids([one, two])
+    with pytest.raises(InputError, match=r"got neighbours \[3\] and \[4\]"):
+        join_pyramids([two, three])
 
 
 def test_a_pyramid_moves_to_a_device() -> None:

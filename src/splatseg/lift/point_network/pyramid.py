@@ -136,6 +136,7 @@ def point_pyramid(
     )
 
 
+@boundary
 def join_pyramids(pyramids: Sequence[PointPyramid]) -> PointPyramid:
     """Several pyramids as one, for a batch: no point sees a point of another one.
 
@@ -143,32 +144,28 @@ def join_pyramids(pyramids: Sequence[PointPyramid]) -> PointPyramid:
         pyramids: At least one, of the same options. Rows of level 0 follow each other.
 
     Raises:
-        InputError: If there is none, or their levels differ in number.
+        InputError: If there is none, or their levels or neighbours differ in number.
     """
     if not pyramids:
         raise InputError("pyramids: expected at least one, got none.")
-    counts = sorted({len(one.kept) for one in pyramids})
-    if len(counts) > 1:
-        raise InputError(f"pyramids: expected the same number of levels, got {counts}.")
-    starts = np.cumsum([[0] * counts[0], *(one.sizes for one in pyramids)], axis=0)[:-1]
+    shapes = sorted({tuple(near.shape[1] for near in one.neighbours) for one in pyramids})
+    if len(shapes) > 1:
+        raise InputError(
+            "pyramids: expected the same levels with as many neighbours, got neighbours "
+            f"{' and '.join(str(list(shape)) for shape in shapes)}."
+        )
+    starts = np.cumsum([[0] * (len(shapes[0]) + 1), *(p.sizes for p in pyramids)], axis=0)[:-1]
 
     def joined(name: str, ahead: int, level: int) -> Tensor:
+        """A field at a level, of which the values are rows of the level so many ahead."""
         parts = (getattr(one, name)[level] for one in pyramids)
         shifts = (int(start[level + ahead]) for start in starts)
         return torch.cat([part + shift for part, shift in zip(parts, shifts, strict=True)])
 
-    levels = range(counts[0] - 1)
+    levels = range(len(shapes[0]))
     return PointPyramid(
         positions=torch.cat([one.positions for one in pyramids]),
-        kept=tuple(
-            torch.cat(
-                [
-                    one.kept[level] + int(start[0])
-                    for one, start in zip(pyramids, starts, strict=True)
-                ]
-            )
-            for level in range(counts[0])
-        ),
+        kept=tuple(joined("kept", -level, level) for level in range(len(shapes[0]) + 1)),
         neighbours=tuple(joined("neighbours", 0, level) for level in levels),
         pool=tuple(joined("pool", 0, level) for level in levels),
         up=tuple(joined("up", 1, level) for level in levels),

@@ -6,6 +6,7 @@ from support.fuzz.targets import (
     evidence,
     own,
     pictures,
+    points,
     splats,
     surfaces,
 )
@@ -19,6 +20,7 @@ __all__ = [
     "evidence",
     "own",
     "pictures",
+    "points",
     "splats",
     "surfaces",
 ]
