@@ -92,3 +92,43 @@ def test_scores_are_of_the_classes_that_are_there(script, recipe, clouds):
     assert set(report["rooms"]) > {"mIoU", "accuracy", "wall", "floor"}
     assert all(0 <= value <= 1 for value in report["rooms"].values())
     assert report["streets"]["mIoU"] == 0.0
+
+
+def test_offsets_and_positions_start_at_one_size(script):
+    """Offsets of 8 cm count more than a metre aside, and than they did."""
+    net = script.RandlaNet(script.CONFIG)
+    weight = net.encoder.blocks[0].encode1.linear.weight
+    before = weight.detach().abs().mean(dim=0)
+    script.balance(net)
+    after = weight.detach().abs().mean(dim=0)
+    assert bool((0.08 * after[1:4] > 5 * after[[4, 5, 7, 8]].max()).all())
+    assert bool((0.08 * before[1:4] < before[[4, 5, 7, 8]].min()).all())
+
+
+def test_rare_classes_weigh_more(script, clouds):
+    weights = script.class_weights(clouds)
+    room = clouds[0].labels[clouds[0].labels >= 0]
+    shares = np.bincount(room, minlength=script.ROOMS) / len(room)
+    assert float(weights[shares.argmax()]) == weights[: script.ROOMS].min()
+    missing = np.flatnonzero(shares == 0)
+    np.testing.assert_allclose(weights[missing], 0.02**-0.5, rtol=1e-5)
+
+
+def test_calibration_takes_the_mean_over_crops(script, recipe, clouds, monkeypatch):
+    monkeypatch.setattr(script, "CALIBRATION", 2)
+    torch.manual_seed(0)
+    net = script.RandlaNet(script.CONFIG)
+    script.calibrate(net, clouds, recipe)
+    assert not net.training
+    inputs = [script.drawn(clouds, recipe, recipe.steps + 1 + i)[1] for i in range(2)]
+    first = net.encoder.start
+    means = torch.stack([first.linear(x).mean(dim=0) for x in inputs]).mean(dim=0)
+    torch.testing.assert_close(first.norm.running_mean, means, rtol=1e-3, atol=1e-4)
+
+
+def test_what_is_scored_is_what_is_written(script):
+    net = script.RandlaNet(script.CONFIG)
+    script.round_encoder(net)
+    for parameter in net.encoder.parameters():
+        if parameter.ndim == 2:
+            assert torch.equal(parameter, parameter.half().float())
