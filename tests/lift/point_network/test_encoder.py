@@ -12,9 +12,10 @@ from splatseg.lift.point_network import (
     RandlaConfig,
     RandlaEncoder,
     RandlaVariant,
-    block,
+    blocks,
 )
 from splatseg.lift.point_network.layers import SharedMlp
+from splatseg.render.cpu import set_threads, threads
 
 from .conftest import pyramid_of, randomised, scene, small_config
 from .reference import Dialect, Layer, LayerOf, ScoreOf, encoder_levels, published_ten
@@ -95,44 +96,55 @@ def test_epsilon_is_honoured() -> None:
 
 
 @pytest.mark.parametrize("values", [1, 640, 4096])
-def test_blocks_of_points_are_the_whole(values: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("threads", [1, 3])
+def test_blocks_of_points_are_the_whole(
+    values: int, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = small_config()
     encoder = randomised(RandlaEncoder(config))
     positions, colours = scene(400)
     pyramid = pyramid_of(positions, config)
     inputs = torch.cat((positions, colours), dim=1)
-    monkeypatch.setattr(block, "_VALUES", 1 << 40)
     whole = encoder(pyramid, inputs)
-    monkeypatch.setattr(block, "_VALUES", values)
+    assert whole[0].requires_grad
     seen: list[int] = []
-    cut = block._blocks
+    made = blocks._made
 
-    def counted(neighbours: Tensor, size: int):
-        seen.append(size)
-        return cut(neighbours, size)
+    def counted(make: blocks.Make, neighbours: Tensor, rows: slice) -> Tensor:
+        found = made(make, neighbours, rows)
+        seen.append(len(found))
+        return found
 
-    monkeypatch.setattr(block, "_blocks", counted)
-    in_blocks = encoder(pyramid, inputs)
-    assert min(seen) == max(16, values // (2 * 8 * 4)) < 400
+    monkeypatch.setattr(blocks, "VALUES", values)
+    monkeypatch.setattr(blocks, "_made", counted)
+    monkeypatch.setattr(blocks._native, "threads", lambda: threads)
+    in_blocks = encoder.requires_grad_(False)(pyramid, inputs)
+    # Three passes and the sampling of level 0, and so on; the widest blocks are of 4 channels.
+    assert max(seen) == min(400, max(16, values // (4 * 4)))
+    assert sum(seen) == 3 * (400 + 200 + 66) + 200 + 66 + 33
     for one, two in zip(whole, in_blocks, strict=True):
         assert torch.allclose(one, two, rtol=1e-5, atol=1e-6)
 
 
 def test_threads_do_not_change_features() -> None:
     config = RandlaConfig(widths=(16, 32), neighbours=16, ratios=(4, 4))
-    encoder = randomised(RandlaEncoder(config))
+    encoder = randomised(RandlaEncoder(config)).requires_grad_(False)
     positions, colours = scene(3000)
     pyramid = pyramid_of(positions, config)
-    before = torch.get_num_threads()
+    before = torch.get_num_threads(), threads()
     try:
         found = []
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            set_threads(count)
             found.append(encoder(pyramid, torch.cat((positions, colours), dim=1)))
+            assert torch.get_num_threads() == count
     finally:
-        torch.set_num_threads(before)
-    for one, two in zip(*found, strict=True):
-        assert torch.equal(one, two)
+        torch.set_num_threads(before[0])
+        set_threads(before[1])
+    for others in found[1:]:
+        for one, two in zip(found[0], others, strict=True):
+            assert torch.equal(one, two)
 
 
 def plain_block(part, positions: Tensor, features: Tensor, neighbours: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ with the softmax over neighbours, for each channel by itself. :math:`W x_k` is
 **Dilated residual block.** Encoding and pooling twice, then a sum with a shortcut.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -30,13 +30,12 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from splatseg.lift.point_network.blocks import Make, in_blocks
 from splatseg.lift.point_network.config import RandlaVariant
 from splatseg.lift.point_network.layers import Affine, SharedMlp
 
-_VALUES = 1 << 18
-"""Numbers of the largest array of a block of points, which is to stay in the processor's caches."""
-
 Encode = Callable[[Tensor, slice], Tensor]
+"""Encodes the neighbours of some points, given those and the rows of the points."""
 
 
 class AttentivePooling(nn.Module):
@@ -53,26 +52,30 @@ class AttentivePooling(nn.Module):
         width = 2 * features
         self.score = nn.Linear(width, width, bias=False)
         self.mlp = SharedMlp(width, outputs, slope=variant.slope, epsilon=variant.epsilon)
-        self.own = variant.paired_features == "own"
+        self.is_own = variant.paired_features == "own"
 
-    def prepare(self, features: Float[Tensor, "n half"]) -> "Pooling":
-        """The pooling of all points of a level, of which some can be asked for."""
+    def entries(self, features: Float[Tensor, "m half"]) -> Float[Tensor, "m half+width"]:
+        """Features and their part of the scores, side by side: one gather brings both."""
         half = features.shape[1]
-        weight = self.score.weight
+        return torch.cat((features, functional.linear(features, self.score.weight[:, :half])), 1)
+
+    def over(self, table: Float[Tensor, "n half+width"]) -> "Pooling":
+        """The pooling of a level, given the entries of its points."""
+        half = self.score.in_features // 2
         return Pooling(
-            table=torch.cat((features, functional.linear(features, weight[:, :half])), dim=1),
-            weight=weight[:, half:],
+            table=table,
+            weight=self.score.weight[:, half:],
             mlp=self.mlp.affine(),
-            own=self.own,
+            is_own=self.is_own,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pooling:
-    """An attentive pooling with the features of a level."""
+    """An attentive pooling of a level."""
 
     table: Float[Tensor, "n half+width"]
-    """Features of each point and their part of the scores, side by side: one gather brings both."""
+    """`AttentivePooling.entries` of each point."""
 
     weight: Float[Tensor, "width half"]
     """The part of the scores that encodings have."""
@@ -80,7 +83,7 @@ class Pooling:
     mlp: Affine
     """What follows."""
 
-    own: bool
+    is_own: bool
     """Whether the features are those of the point itself."""
 
     def __call__(
@@ -94,19 +97,20 @@ class Pooling:
             rows: The points.
         """
         k, m, half = encoding.shape
-        if self.own:
+        if self.is_own:
             seen = self.table[rows].expand(k, m, -1)
         else:
             seen = self.table.index_select(0, near.reshape(-1)).reshape(k, m, -1)
-        features, scores = seen[..., :half], seen[..., half:]
+        features, scores = seen.split((half, 2 * half), dim=-1)
         pairs = torch.addmm(
             scores.reshape(k * m, -1), encoding.reshape(k * m, half), self.weight.T
         ).reshape(k, m, -1)
         # The largest is taken away for the range of exponentials, and does not change the shares.
         shares = pairs.sub_(pairs.detach().amax(dim=0)).exp_()
         total = shares.sum(dim=0)
+        of_features, of_encoding = shares.split(half, dim=-1)
         pooled = torch.cat(
-            ((features * shares[..., :half]).sum(0), (encoding * shares[..., half:]).sum(0)), dim=1
+            ((features * of_features).sum(dim=0), (encoding * of_encoding).sum(dim=0)), dim=1
         )
         return self.mlp(pooled / total)
 
@@ -143,33 +147,32 @@ class ResidualBlock(nn.Module):
     ) -> Float[Tensor, "n twice_width"]:
         """The block of all points of a level.
 
-        While evaluating, points are gone through in blocks, so memory besides the result is for 3 d
-        numbers a point; batch norms of training need all at once.
+        Without gradients, points are gone through in blocks, so memory besides the result is for
+        3 d numbers a point; otherwise for some 10 d of each pair of neighbours.
         """
-        width = self.exit.linear.in_features
-        size = max(16, _VALUES // (width * neighbours.shape[1]))
-        size = len(positions) if self.training else size
+        recorded = self.training or torch.is_grad_enabled()
         squared = self.variant.distance == "squared"
         first = _encoder(self.encode1.affine(), positions, squared=squared)
-        if self.training:  # a batch norm counts what it sees
+        if recorded:  # a batch norm counts what it sees
             first = _once(first)
         second = self._second(first, positions, squared=squared)
 
-        pool1 = self.pool1.prepare(self.entry(features))
-        pooled = torch.cat(
-            [pool1(first(near, rows), near, rows) for near, rows in _blocks(neighbours, size)]
+        def made(make: Make) -> Tensor:
+            width = self.exit.linear.in_features
+            return in_blocks(make, neighbours, width=width, is_recorded=recorded)
+
+        entry = self.entry.affine()
+        pool1 = self.pool1.over(made(lambda _, rows: self.pool1.entries(entry(features[rows]))))
+        pool2 = self.pool2.over(
+            made(lambda near, rows: self.pool2.entries(pool1(first(near, rows), near, rows)))
         )
-        pool2, leave = self.pool2.prepare(pooled), self.exit.affine()
-        shortcut, slope = self.shortcut.affine(), self.variant.sum_slope
-        return torch.cat(
-            [
-                functional.leaky_relu_(
-                    leave(pool2(second(near, rows), near, rows)) + shortcut(features[rows]),
-                    slope,
-                )
-                for near, rows in _blocks(neighbours, size)
-            ]
-        )
+        leave, shortcut, slope = self.exit.affine(), self.shortcut.affine(), self.variant.sum_slope
+
+        def left(near: Tensor, rows: slice) -> Tensor:
+            found = leave(pool2(second(near, rows), near, rows)) + shortcut(features[rows])
+            return functional.leaky_relu_(found, slope)
+
+        return made(left)
 
     def _second(self, first: Encode, positions: Tensor, *, squared: bool) -> Encode:
         affine = self.encode2.affine()
@@ -195,13 +198,12 @@ def sample(
     """
     if variant.sampling == "own":
         return features[kept]
-    size = max(16, _VALUES // (features.shape[1] * neighbours.shape[1]))
-    return torch.cat(
-        [
-            features.index_select(0, near.reshape(-1)).reshape(*near.shape, -1).amax(dim=0)
-            for near, _ in _blocks(neighbours[kept], size)
-        ]
-    )
+    width, recorded = features.shape[1], torch.is_grad_enabled()
+
+    def largest(near: Tensor, _: slice) -> Tensor:
+        return features.index_select(0, near.reshape(-1)).reshape(*near.shape, -1).amax(dim=0)
+
+    return in_blocks(largest, neighbours[kept], width=width, is_recorded=recorded)
 
 
 def _encoder(affine: Affine, positions: Tensor, *, squared: bool) -> Encode:
@@ -234,13 +236,3 @@ def _once(encode: Encode) -> Encode:
         return found[0]
 
     return encoded
-
-
-def _blocks(neighbours: Tensor, size: int) -> Iterator[tuple[Tensor, slice]]:
-    """Rows of a level in blocks, each with its neighbours.
-
-    They are (k, m), so that a sum over neighbours is a sum of whole arrays.
-    """
-    for start in range(0, len(neighbours), size):
-        rows = slice(start, start + size)
-        yield neighbours[rows].T.contiguous(), rows

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.lift.point_network.block import ResidualBlock, sample
 from splatseg.lift.point_network.config import RandlaConfig
@@ -16,9 +17,10 @@ from splatseg.lift.point_network.pyramid import PointPyramid
 class RandlaEncoder(nn.Module):
     """The encoder of RandLA-Net (Hu et al. 2020), to be trained or frozen.
 
-    In training mode (``train()``) batch norms take the statistics of all points of a call, and a
-    call holds a few numbers for every pair of neighbours and channel; frozen (``eval()``) it goes
-    through the points in blocks, with the same result whatever their size.
+    In training mode (``train()``) batch norms take the statistics of all points of a call, which
+    holds some ten numbers for every pair of neighbours and channel, as it does wherever gradients
+    are recorded. Frozen (``eval()``, without gradients) it goes through the points in blocks, with
+    the same result on any number of threads.
 
     Args:
         config: Its shape; `RandlaConfig.classes` is of no concern.
@@ -75,6 +77,15 @@ class RandlaEncoder(nn.Module):
                 f"pyramid: expected {len(self.blocks)} levels with neighbours, "
                 f"got {len(pyramid.neighbours)}."
             )
+        if self.training or (torch.is_grad_enabled() and self._has_gradients(inputs)):
+            return self._levels(pyramid, inputs)
+        with torch.no_grad(), one_torch_thread():
+            return self._levels(pyramid, inputs)
+
+    def _has_gradients(self, inputs: Tensor) -> bool:
+        return inputs.requires_grad or any(one.requires_grad for one in self.parameters())
+
+    def _levels(self, pyramid: PointPyramid, inputs: Tensor) -> tuple[Tensor, ...]:
         features = self.start(inputs)
         levels: list[Tensor] = []
         for level, block in enumerate(self.blocks):
@@ -87,20 +98,3 @@ class RandlaEncoder(nn.Module):
             )
             levels.append(features)
         return tuple(levels)
-
-
-def freeze(encoder: RandlaEncoder) -> RandlaEncoder:
-    """The same encoder, evaluating and without gradients."""
-    return encoder.eval().requires_grad_(False)  # noqa: FBT003
-
-
-def initial_encoder(config: RandlaConfig, *, seed: int) -> RandlaEncoder:
-    """An encoder with random weights, the same for every seed on any machine."""
-    generator = torch.Generator().manual_seed(seed)
-    encoder = RandlaEncoder(config)
-    with torch.no_grad():
-        for parameter in encoder.parameters():
-            if parameter.ndim == 2:
-                spread = (2 / parameter.shape[1]) ** 0.5
-                parameter.copy_(torch.randn(parameter.shape, generator=generator) * spread)
-    return encoder

@@ -111,16 +111,8 @@ def spatial_features(
     check_seed(seed)
     if encoder.colour and colours is None:
         raise InputError(f"colours: {encoder.source} takes colours of points, got none.")
-    points, given = positions.detach().cpu().double(), colours if encoder.colour else None
-    scale = options.metres_per_unit
-    if scale is None:
-        scale = encoder.inputs.grid_size / _spacing(points, seed)
-    metres = points * scale
-    if len(metres) and not float(metres.abs().max()) <= MAX_METRES:
-        raise RangeError(
-            f"positions: expected a scene of at most {MAX_METRES:g} metres, got "
-            f"{float(metres.abs().max()):g} with {scale:g} metres a unit."
-        )
+    metres, scale = _in_metres(positions.detach().cpu().double(), encoder, options, seed)
+    given = colours if encoder.colour else None
     rows = torch.arange(len(metres))
     if options.grid:
         averages = average_on_grid(metres, given, side=encoder.inputs.grid_size)
@@ -142,6 +134,23 @@ def spatial_features(
         metres_per_unit=scale,
         is_scale_assumed=options.metres_per_unit is None,
     )
+
+
+def _in_metres(
+    points: Tensor, encoder: PointEncoder, options: SpatialOptions, seed: int
+) -> tuple[Tensor, float]:
+    """Points in metres, and how many of them a unit is."""
+    scale = options.metres_per_unit
+    if scale is None:
+        scale = encoder.inputs.grid_size / _spacing(points, seed)
+    metres = points * scale
+    farthest = float(metres.abs().max()) if len(metres) else 0.0
+    if not farthest <= MAX_METRES:
+        raise RangeError(
+            f"positions: expected a scene of at most {MAX_METRES:g} metres, got {farthest:g} with "
+            f"{scale:g} metres a unit."
+        )
+    return metres, scale
 
 
 def _spacing(points: Tensor, seed: int) -> float:
