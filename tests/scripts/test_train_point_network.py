@@ -30,7 +30,7 @@ def script():
 def recipe(script):
     return script.Recipe(
         rooms=1, streets=1, held_out_rooms=1, held_out_streets=0, points_per_room=9000,
-        points_per_street=9000, points_per_crop=4200, steps=4,
+        points_per_street=9000, points_per_crop=4200, steps=4, settling_steps=3,
     )  # fmt: skip
 
 
@@ -56,6 +56,19 @@ def test_a_grid_keeps_a_point_a_cell(script, clouds):
     np.testing.assert_allclose(mean.colours[0], one.colours.mean(axis=0), atol=1e-3)
 
 
+def test_the_second_part_keeps_the_statistics(script, recipe, clouds, tmp_path):
+    net = script.RandlaNet(script.CONFIG)
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    adam = torch.optim.Adam(net.parameters(), lr=1e-3)
+    rates = torch.optim.lr_scheduler.ConstantLR(adam)
+    part = script.Part(net=net, adam=adam, rates=rates, start=0, end=1, are_norms_kept=True)
+    part.run(recipe, clouds, tmp_path / "part.pt")
+    for name, value in net.state_dict().items():
+        if "running" in name:
+            assert torch.equal(value, before[name])
+    assert not torch.equal(net.encoder.start.linear.weight, before["encoder.start.linear.weight"])
+
+
 def test_other_domain_has_no_say(script):
     logits = torch.zeros(2, script.ROOMS + script.STREETS)
     shares = script.masked(logits, torch.tensor([0, script.ROOMS])).softmax(dim=1)
@@ -63,15 +76,18 @@ def test_other_domain_has_no_say(script):
     assert float(shares[1, : script.ROOMS].sum()) == 0
 
 
-def test_what_was_interrupted_ends_the_same(script, recipe, clouds, tmp_path, monkeypatch):
+@pytest.mark.parametrize("at", [3, 8])
+def test_what_was_interrupted_ends_the_same(script, recipe, clouds, at, tmp_path, monkeypatch):
+    """In the first part, and in the second, which begins at step 4 + 2."""
     monkeypatch.setattr(script, "CHECKPOINT_EVERY", 2)
+    monkeypatch.setattr(script, "CALIBRATION", 2)
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     whole, _ = script.train(recipe, clouds, tmp_path / "a")
     drawn = script.drawn
 
     def stop(clouds, recipe, step):
-        if step == 3:
+        if step == at:
             raise KeyboardInterrupt
         return drawn(clouds, recipe, step)
 
@@ -120,7 +136,7 @@ def test_calibration_takes_the_mean_over_crops(script, recipe, clouds, monkeypat
     net = script.RandlaNet(script.CONFIG)
     script.calibrate(net, clouds, recipe)
     assert not net.training
-    inputs = [script.drawn(clouds, recipe, recipe.steps + 1 + i)[1] for i in range(2)]
+    inputs = [script.drawn(clouds, recipe, recipe.steps + i)[1] for i in range(2)]
     first = net.encoder.start
     means = torch.stack([first.linear(x).mean(dim=0) for x in inputs]).mean(dim=0)
     torch.testing.assert_close(first.norm.running_mean, means, rtol=1e-3, atol=1e-4)
