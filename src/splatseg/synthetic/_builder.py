@@ -77,6 +77,7 @@ class Builder:
     """Collects objects and their solids. Solids are placed in the frame of their object."""
 
     rng: np.random.Generator
+    classes: ClassTable = ROOM_CLASSES
     primitives: list[Primitive] = field(default_factory=list[Primitive])
     objects: list[ObjectInfo] = field(default_factory=list[ObjectInfo])
     frame: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -95,7 +96,7 @@ class Builder:
         self.objects.append(
             ObjectInfo(
                 id=len(self.objects) + 1,
-                class_id=ROOM_CLASSES.by_name(class_name).id,
+                class_id=self.classes.by_name(class_name).id,
                 name=name,
                 parent=parent,
             )
@@ -114,19 +115,13 @@ class Builder:
         taper: float = 1.0,
     ) -> None:
         """Add a solid to the object begun last; `centre` is in the object's frame."""
-        x, y, z, turn = self.frame
-        c, s = math.cos(turn), math.sin(turn)
         self.primitives.append(
             Primitive(
                 shape=shape,
-                centre=(
-                    x + c * centre[0] - s * centre[1],
-                    y + s * centre[0] + c * centre[1],
-                    z + centre[2],
-                ),
+                centre=self.spot(centre),
                 half_size=half_size,
                 instance=len(self.objects),
-                yaw=turn + yaw,
+                yaw=self.frame[3] + yaw,
                 tilt=tilt,
                 taper=taper,
                 texture=texture,
@@ -139,6 +134,12 @@ class Builder:
         for x in (-half_x, half_x):
             for y in (-half_y, half_y):
                 self.solid("box", (x, y, height / 2), (thick, thick, height / 2), texture)
+
+    def spot(self, offset: Vector) -> Vector:
+        """World position of a place in the frame of the object begun last."""
+        x, y, z, turn = self.frame
+        c, s = math.cos(turn), math.sin(turn)
+        return (x + c * offset[0] - s * offset[1], y + s * offset[0] + c * offset[1], z + offset[2])
 
     def wood(self, *, scale: float = 0.16) -> Texture:
         return Texture(kind="wood", palette=WOODS[self.rng.integers(len(WOODS))], scale=scale)

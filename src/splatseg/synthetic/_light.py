@@ -18,6 +18,8 @@ from splatseg.synthetic._scene import SyntheticScene
 from splatseg.synthetic._shapes import Primitive
 
 _CELL = 0.06
+_MAX_CELLS = 500_000
+_LIFT = 1.5
 _STEPS = 28
 _ABSORPTION = 45.0
 _DAYLIGHT = (1.0, 0.98, 0.95)
@@ -34,6 +36,9 @@ class LightVolume:
     values: Float[Tensor, "1 7 nz ny nx"]
     """Daylight (x, y, z), lamplight (x, y, z), openness in [0, 1]."""
 
+    cell: float
+    """Edge of the cells in which solids were looked for, metres."""
+
     def irradiance(
         self,
         points: Float[Tensor, "n 3"],
@@ -42,7 +47,7 @@ class LightVolume:
         ambient: float,
     ) -> Float[Tensor, "n 3"]:
         """Red, green and blue light that falls on surfaces, without the sun."""
-        value = _sample(self.values, points + 0.09 * normals, self.low, self.high)
+        value = _sample(self.values, points + _LIFT * self.cell * normals, self.low, self.high)
         day, lamp, open_ = value[:, :3], value[:, 3:6], value[:, 6:]
         sky = 0.5 + 0.12 * normals[:, 2:]
         out = ambient * sky * (0.25 + 0.75 * open_)
@@ -59,7 +64,10 @@ class LightVolume:
 def light_volume(scene: SyntheticScene) -> LightVolume:
     """The light of a scene, computed at the first call."""
     low, high = (torch.tensor(corner, dtype=torch.float32) for corner in scene.bounds)
-    shape = [max(2, int(n)) for n in ((high - low) / (2 * _CELL)).ceil().tolist()]
+    # Large scenes get larger cells; a room of up to 108 cubic metres has those of 6 cm.
+    volume = float((high - low).prod())
+    cell = max(_CELL, (volume / _MAX_CELLS) ** (1 / 3))
+    shape = [max(2, int(n)) for n in ((high - low) / (2 * cell)).ceil().tolist()]
     solid = _occupancy(scene, low, high, [2 * n for n in shape])
     points = _cell_centres(low, high, shape)
     day, lamp = torch.zeros_like(points), torch.zeros_like(points)
@@ -75,8 +83,14 @@ def light_volume(scene: SyntheticScene) -> LightVolume:
         low=low,
         high=high,
         values=torch.cat(
-            (_volume(day, shape), _volume(lamp, shape), _openness(solid)), dim=1
+            (
+                _volume(day, shape),
+                _volume(lamp, shape),
+                _openness(solid, around=0.0 if scene.is_outdoor else 1.0),
+            ),
+            dim=1,
         ).contiguous(),
+        cell=cell,
     )
 
 
@@ -97,21 +111,34 @@ def _occupancy(
     scene: SyntheticScene, low: Tensor, high: Tensor, shape: list[int]
 ) -> Float[Tensor, "1 1 nz ny nx"]:
     """1 where a solid that gives no light is; planes are too thin to count."""
-    points = _cell_centres(low, high, shape)
-    inside = torch.zeros(len(points), dtype=torch.bool)
+    points = _cell_centres(low, high, shape).reshape(shape[2], shape[1], shape[0], 3)
+    inside = torch.zeros(points.shape[:3], dtype=torch.bool)
+    step = (high - low) / torch.tensor(shape)
     for primitive in scene.primitives:
         if primitive.shape == "plane" or primitive.texture.glow > 0:
             continue
         centre = torch.tensor(primitive.centre, dtype=torch.float32)
-        near = ((points - centre).abs() <= primitive.radius + 0.03).all(dim=-1).nonzero()[:, 0]
-        inside[near] |= primitive.contains(points[near], 0.02)
+        reach = primitive.radius + 0.03
+        first = ((centre - reach - low) / step).floor().clamp_min(0).int().tolist()
+        last = ((centre + reach - low) / step).ceil().clamp_min(0).int().tolist()
+        near = tuple(slice(a, z) for a, z in zip(first[::-1], last[::-1], strict=True))
+        cells = points[near]
+        inside[near] |= primitive.contains(cells.reshape(-1, 3), 0.02).reshape(cells.shape[:3])
+    inside = inside.reshape(-1)
     return _volume(inside.float().unsqueeze(-1), shape)
 
 
-def _openness(solid: Float[Tensor, "1 1 nz ny nx"]) -> Float[Tensor, "1 1 mz my mx"]:
-    """Share of free space within about half a metre; outside the bounds nothing is free."""
+def _openness(
+    solid: Float[Tensor, "1 1 nz ny nx"], *, around: float
+) -> Float[Tensor, "1 1 mz my mx"]:
+    """Share of free space within four cells of twice the size (half a metre in a room).
+
+    Outside the bounds nothing is free in a room (`around` 1), everything under a sky (0) but
+    below the ground.
+    """
     coarse = functional.avg_pool3d(solid, 2)
-    padded = functional.pad(coarse, (4,) * 6, value=1.0)
+    padded = functional.pad(coarse, (4,) * 6, value=around)
+    padded[:, :, :4] = 1.0
     blurred = functional.avg_pool3d(functional.avg_pool3d(padded, 5, stride=1), 5, stride=1)
     return 1 - blurred
 

@@ -164,29 +164,42 @@ def _shaded(scene: SyntheticScene, camera: Camera, order: Tensor) -> UInt8[Tenso
         origin, directions = camera.rays(centres + torch.tensor(shift))
         directions = directions.float()
         distance, which = cast(scene, origin, directions)
-        total += _shade(scene, origin.float(), directions, distance, which)
-    mean = total / 4
-    # The film: linear light to sRGB with a soft shoulder, so that nothing burns out.
-    srgb = (1 - torch.exp(-_EXPOSURE * mean)).clamp(0, 1) ** (1 / 2.2)
+        total += shade(scene, origin.float(), directions, distance, which)[0]
+    srgb = film(total / 4)
     return _unordered((255 * srgb).round().to(torch.uint8), order, camera)
 
 
-def _shade(
+def film(linear: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Linear light to sRGB in [0, 1], with a soft shoulder so that nothing burns out."""
+    return (1 - torch.exp(-_EXPOSURE * linear)).clamp(0, 1) ** (1 / 2.2)
+
+
+def classes_of(scene: SyntheticScene) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+    """Class and instance of each solid of a scene, int32."""
+    tables = _tables(scene)
+    return tables.semantic, tables.instance
+
+
+def shade(
     scene: SyntheticScene,
     origin: Tensor,
     directions: Tensor,
     distance: Tensor,
     which: Tensor,
-) -> Float[Tensor, "n 3"]:
-    """Linear light that comes back along each ray."""
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Linear light that comes back along each ray, and unit normals that face its start.
+
+    Normals are zero where a ray meets nothing.
+    """
     tables = _tables(scene)
     out = torch.tensor(_BACKGROUND).pow(2.2).repeat(len(which), 1)
+    facing = torch.zeros_like(out)
     # Rays of one solid beside each other, so that each solid is one matrix product.
     order = torch.argsort(which, stable=True)
     counts = torch.bincount(which + 1, minlength=len(scene.primitives) + 1).tolist()
     order = order[counts[0] :]
     if not len(order):
-        return out
+        return out, facing
     points = origin + distance[order].unsqueeze(-1) * directions[order]
     albedo, outward = torch.empty_like(points), torch.empty_like(points)
     glow = points.new_zeros(len(points), 1)
@@ -211,13 +224,14 @@ def _shade(
     if scene.sun is not None:
         light = light + _sunlight(scene, scene.sun, points, outward)
     out[order] = albedo * torch.where(glow > 0, glow, light)
-    return out
+    facing[order] = outward
+    return out, facing
 
 
 def _sunlight(
     scene: SyntheticScene, direction: Vector, points: Tensor, outward: Tensor
 ) -> Float[Tensor, "n 3"]:
-    """Sunshine that falls in through the glowing planes, with hard shadows."""
+    """Sunshine with hard shadows; indoors it falls in through the glowing planes."""
     tables = _tables(scene)
     sun = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
     cosine = outward @ sun
@@ -240,11 +254,12 @@ def _sunlight(
         t = intersect(item.shape, start, (matrix @ sun).expand_as(start), taper=item.taper)
         return tried[torch.isfinite(t)]
 
-    windows = [
-        i for i, p in enumerate(scene.primitives) if p.texture.glow > 0 and p.shape == "plane"
-    ]
-    seen = torch.unique(torch.cat([met(i) for i in windows] or [lit[:0]]))
-    lit, starts, spots = lit[seen], starts[seen], spots[seen]
+    if not scene.is_outdoor:
+        panes = [
+            i for i, p in enumerate(scene.primitives) if p.texture.glow > 0 and p.shape == "plane"
+        ]
+        seen = torch.unique(torch.cat([met(i) for i in panes] or [lit[:0]]))
+        lit, starts, spots = lit[seen], starts[seen], spots[seen]
     sunny = torch.ones(len(lit), dtype=torch.bool)
     for i, item in enumerate(scene.primitives):
         if item.texture.glow <= 0 and item.shape != "plane":

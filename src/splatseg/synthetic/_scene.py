@@ -41,7 +41,14 @@ class SyntheticScene:
     """Lowest and highest corner of the space where light is computed and cameras stand."""
 
     sun: Vector | None = None
-    """Direction towards the sun. It shines in through the planes that glow; None is night."""
+    """Direction towards the sun; None is a night, or overcast. In a room it shines in through the
+    planes that glow."""
+
+    is_outdoor: bool = False
+    """Whether there is a sky instead of walls around `bounds`: the sun shines everywhere."""
+
+    drive: tuple[Vector, ...] = ()
+    """Corners of a line on the ground that a vehicle with cameras follows; none in a room."""
 
     ambient: float = 1.0
     """Brightness of the light that comes from everywhere; 1 suits a room with a window."""
