@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import torch
 
-from splatseg.core import LabelMap, Labels
+from splatseg.core import LabelMap
 from splatseg.lift.object_classes import ObjectClassOptions, pool_objects
 from splatseg.methods._trained_labels import TrainingContext
 from splatseg.methods.cosseg import CossegOptions
-from splatseg.methods.cosseg._objects import CategoryMaps, ObjectLabels, label_objects
+from splatseg.methods.cosseg._objects import ObjectLabels, label_objects
 
 from .conftest import Maps
 
@@ -32,12 +32,12 @@ class Masks:
         return {}
 
 
-def labelled(halves, maps, *, features=True, options=None, **more) -> ObjectLabels:
+def labelled(halves, maps, *, features=True, options=None, categories=None, **more) -> ObjectLabels:
     return label_objects(
         halves.gaussians, halves.views, maps, features=halves.blocks if features else None,
         masks=Masks(halves), options=CossegOptions(**more),
         object_options=options or ObjectClassOptions(), classes=None,
-        context=TrainingContext(backend="auto"),
+        context=TrainingContext(backend="auto"), categories=categories,
     )  # fmt: skip
 
 
@@ -121,19 +121,9 @@ def test_options_say_which_features_are_pooled(halves, monkeypatch) -> None:
     assert [one.shape[1] for one in reduced] == [2, 2]
 
 
-def test_tracks_become_categories() -> None:
-    ids = torch.tensor([[1, 2, 9], [-1, 5, 2]], dtype=torch.int32)
-    maps = CategoryMaps(Maps({"v": LabelMap(ids=ids)}), {1: 7, 2: 8, 5: 7})
-    assert maps.view_names == ("v",)
-    assert maps.label_map("v").ids.tolist() == [[7, 8, -1], [-1, 7, 8]]
-    empty = CategoryMaps(Maps({"v": LabelMap(ids=ids)}), {})
-    assert bool((empty.label_map("v").ids == -1).all())
-
-
 def test_labels_of_tracks_are_objects_with_classes(halves) -> None:
-    maps = CategoryMaps(halves.evidence, {3: 30, 8: 80})
-    found = labelled(halves, maps)
-    assert isinstance(found.objects, Labels)
+    found = labelled(halves, halves.evidence, categories={3: {30: 5.0, 80: 2.0}, 8: {80: 1.0}})
+    assert found.classes is None
     kinds = found.objects.info.class_of
     of = torch.tensor([kinds.get(int(id), -1) for id in found.objects.ids])
     assert bool((of == halves.side * 10)[away(halves)].all())

@@ -4,3 +4,4 @@ from splatseg.lift.object_classes.classify import ObjectClassOptions as ObjectCl
 from splatseg.lift.object_classes.classify import classify_objects as classify_objects
 from splatseg.lift.object_classes.pooling import PooledObjects as PooledObjects
 from splatseg.lift.object_classes.pooling import pool_objects as pool_objects
+from splatseg.lift.object_classes.pooling import with_categories as with_categories

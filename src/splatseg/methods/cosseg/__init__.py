@@ -20,13 +20,13 @@ References:
 
 from collections.abc import Mapping
 
-from splatseg.core import Layer
+from splatseg.core import ClassTable, Layer
 from splatseg.errors import InputError
-from splatseg.io.evidence import Evidence, TrackedEvidence
+from splatseg.io.evidence import TrackedEvidence
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods._trained_labels import context_of, hard_labels
-from splatseg.methods.cosseg._objects import CategoryMaps, label_objects
+from splatseg.methods.cosseg._objects import label_objects
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
 
@@ -62,21 +62,33 @@ def _closed_form(inputs: MethodInputs, options: CossegOptions) -> Layer:
     found = label_objects(
         inputs.gaussians,
         inputs.views,
-        CategoryMaps(evidence, _categories(evidence)) if tracked else evidence,
+        evidence,
         features=inputs.features("features"),
         masks=EvidenceSegments(evidence=masks),
         options=options,
         object_options=options.classification,
         classes=inputs.categories if tracked else inputs.label_names,
         context=context_of(inputs),
+        categories=_categories(evidence, inputs.categories) if tracked else None,
         told=inputs.progress,
     )
-    return found.objects if tracked else found.classes
+    return found.objects if found.classes is None else found.classes
 
 
-def _categories(evidence: Evidence) -> Mapping[int, int]:
-    """The category of each track."""
-    return EvidenceSegments(evidence=evidence).categories_of("")
+def _categories(
+    evidence: TrackedEvidence, table: ClassTable | None
+) -> Mapping[int, Mapping[int, float]]:
+    """How many pixels under each track were taken for which class."""
+    if table is None:
+        raise InputError(
+            f"{evidence.folder}: expected a table of classes to tell what tracks are of, and "
+            "neither the capture nor the evidence has one."
+        )
+    ids = {row.name: row.id for row in table.rows}
+    return {
+        track.id: {ids[name]: float(votes) for name, votes in track.votes.items() if name in ids}
+        for track in evidence.tracks
+    }
 
 
 METHOD = Method(

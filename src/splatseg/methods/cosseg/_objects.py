@@ -22,8 +22,6 @@ from splatseg.core import (
     UNLABELLED,
     ClassTable,
     Gaussians,
-    InstanceTree,
-    LabelMap,
     Labels,
     LabelSource,
     LayerInfo,
@@ -35,6 +33,7 @@ from splatseg.lift.object_classes import (
     PooledObjects,
     classify_objects,
     pool_objects,
+    with_categories,
 )
 from splatseg.lift.segments.table import SegmentSource
 from splatseg.methods._trained_labels import TrainingContext, recorded_options
@@ -51,35 +50,11 @@ _CANDIDATES = 16
 class ObjectLabels:
     """What objects are."""
 
-    classes: Labels
-    """The class of each Gaussian, soft."""
+    classes: Labels | None
+    """The class of each Gaussian, soft; None where labels are of tracks."""
 
     objects: Labels
     """Which object it is of, with the class of each."""
-
-
-@dataclass(frozen=True, slots=True)
-class CategoryMaps:
-    """Label maps of classes, from maps of tracks and the category of each track."""
-
-    maps: LabelSource
-    categories: Mapping[int, int]
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """Views that have maps."""
-        return self.maps.view_names
-
-    def label_map(self, name: str) -> LabelMap:
-        """The map of a view; pixels of tracks without a category have no label."""
-        found = self.maps.label_map(name)
-        most = max(self.categories, default=0)
-        table = torch.full((most + 2,), UNLABELLED, dtype=torch.int32)
-        for track, category in self.categories.items():
-            table[track] = category
-        ids = found.ids.long()
-        known = torch.where((ids >= 0) & (ids <= most), ids, most + 1)
-        return replace(found, ids=table[known])
 
 
 def label_objects(
@@ -93,6 +68,7 @@ def label_objects(
     object_options: ObjectClassOptions,
     classes: ClassTable | None,
     context: TrainingContext,
+    categories: Mapping[int, Mapping[int, float]] | None = None,
     told: Callable[[int, int], None] | None = None,
 ) -> ObjectLabels:
     """Associate masks, and find the class of each object.
@@ -100,13 +76,14 @@ def label_objects(
     Args:
         gaussians: The Gaussians of the scene.
         views: Those whose labels, features and masks count.
-        evidence: Label maps of classes.
+        evidence: Label maps, of classes or of tracks.
         features: Several blocks of a network; None takes votes of each object alone.
         masks: Masks of objects, parts and groups.
         options: How features are reduced and lifted.
         object_options: How votes and features are weighed.
         classes: Names of the classes.
         context: Render options and backend.
+        categories: Of tracks, how much speaks for which class. None: labels are classes.
         told: Called with the stages done and all there are.
 
     Raises:
@@ -155,25 +132,17 @@ def label_objects(
         weights = distilled.weights
     tell(3)
     info = replace(found.info, method="cosseg", options=recorded_options(options))
-    return _labelled(tree, replace(found, info=info), scales, weights, object_options, told=tell)
-
-
-def _labelled(
-    tree: InstanceTree,
-    votes: Labels,
-    scales: Sequence[Tensor],
-    weights: Float[Tensor, "n"],
-    options: ObjectClassOptions,
-    *,
-    told: Callable[[int], None],
-) -> ObjectLabels:
+    votes = replace(found, info=info)
     objects = tree.cut("object")
     pooled = pool_objects(objects, votes, scales, weights)
-    probabilities = classify_objects(pooled, options=options)
-    told(4)
+    if categories is not None:
+        pooled = with_categories(pooled, categories)
+    probabilities = classify_objects(pooled, options=object_options)
+    tell(4)
+    names = {} if classes is None else {row.id: row.name for row in classes.rows}
     return ObjectLabels(
-        classes=_spread(objects, votes, pooled, probabilities),
-        objects=_with_classes(objects, pooled, probabilities, votes.info),
+        classes=_spread(objects, votes, pooled, probabilities) if categories is None else None,
+        objects=_with_classes(objects, pooled, probabilities, replace(info, names=names)),
     )
 
 
