@@ -48,7 +48,6 @@ def right(halves, features: Features) -> float:
         {"spatial": "none"},
         {"semantic": "none", "steps": 150},
         {"spatial": "first", "semantic": "first"},
-        {"semantic": "deepest"},
         {"points": "blocks", "block_points": 200},
         {"points": "visible"},
         {"blend": "features"},
@@ -88,7 +87,6 @@ def replace_evidence(halves, evidence):
     "change",
     [
         {"semantic": "first"},
-        {"semantic": "deepest"},
         {"semantic": "none"},
         {"spatial": "first"},
         {"spatial": "none"},

@@ -108,16 +108,14 @@ def pooled_features(halves, monkeypatch, **change):
 
 
 def test_options_say_which_features_are_pooled(halves, monkeypatch) -> None:
-    usual = pooled_features(halves, monkeypatch)
+    usual = pooled_features(halves, monkeypatch, compared="all")
     assert [one.shape[1] for one in usual] == [3, 2]
-    first = pooled_features(halves, monkeypatch, semantic="first")
-    deepest = pooled_features(halves, monkeypatch, semantic="deepest")
-    assert torch.equal(first[0], usual[0])
+    deepest = pooled_features(halves, monkeypatch)
+    assert len(deepest) == 1
     assert torch.equal(deepest[0], usual[1])
-    assert (len(first), len(deepest)) == (1, 1)
     small = pooled_features(halves, monkeypatch, lifted_side=8)
-    assert not torch.equal(small[0], usual[0])
-    reduced = pooled_features(halves, monkeypatch, components=2)
+    assert not torch.equal(small[0], deepest[0])
+    reduced = pooled_features(halves, monkeypatch, compared="all", components=2)
     assert [one.shape[1] for one in reduced] == [2, 2]
 
 

@@ -276,6 +276,14 @@ def test_features_besides_the_evidence(run_room, walk, tmp_path) -> None:
         del _registry._REGISTERED["guided"]
 
 
+def test_companions_of_the_command_reach_the_run(walk, tmp_path, capsys) -> None:
+    words = ["bench", "cosseg-replica-semantic", "--data", walk / "replica", "-o", tmp_path / "out"]
+    words += ["--method", "uplift", "--companion", "features_dino", "--quiet"]
+    assert main([str(word) for word in words]) == 2
+    said = capsys.readouterr().err
+    assert "companions: expected a method that takes more than its evidence, got uplift" in said
+
+
 def test_void_of_the_truth_is_left_out(run_room, walk, tmp_path) -> None:
     """0 in a map is none: what lies there is neither right nor wrong."""
     data = copied(walk, "replica", tmp_path)

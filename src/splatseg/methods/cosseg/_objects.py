@@ -127,8 +127,7 @@ def label_objects(
             render_options=context.render_options,
             backend=context.backend,
         )
-        deepest = distilled.scales[-1:] if options.semantic == "deepest" else distilled.scales
-        scales = distilled.scales[:1] if options.semantic == "first" else deepest
+        scales = distilled.scales[-1:] if options.compared == "deepest" else distilled.scales
         weights = distilled.weights
     tell(3)
     info = replace(found.info, method="cosseg", options=recorded_options(options))

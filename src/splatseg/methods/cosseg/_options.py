@@ -13,7 +13,8 @@ from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
 from splatseg.methods.cosseg._distilled import Division
 
-Semantic = Literal["all", "first", "deepest", "none"]
+Compared = Literal["deepest", "all"]
+Semantic = Literal["all", "first", "none"]
 Spatial = Literal["all", "first", "none"]
 Decide = Literal["objects", "decoder"]
 Points = Literal["visible", "all", "blocks"]
@@ -45,9 +46,12 @@ class CossegOptions(LabelTrainingOptions):
     gets the class that its own votes and those of objects that look like it speak for. decoder:
     a network that is given features and space is trained, as published."""
 
+    compared: Compared = "deepest"
+    """Which blocks tell that objects look alike: the deepest, which knows classes best, or all."""
+
     semantic: Semantic = "all"
-    """Which blocks are used. all: each, by the decoder at a scale of its own. first: the
-    shallowest alone, at the Gaussians themselves. deepest: the last. none: space alone."""
+    """Which blocks the decoder is given. all: each at a scale of its own. first: the shallowest
+    alone, at the Gaussians themselves. none: space alone."""
 
     lifted_side: int = 256
     """Longest side, in pixels, of the views through which features are lifted; they come in
@@ -112,6 +116,7 @@ class CossegOptions(LabelTrainingOptions):
     def __post_init__(self) -> None:
         LabelTrainingOptions.__post_init__(self)
         check_choice("decide", self.decide, get_args(Decide))
+        check_choice("compared", self.compared, get_args(Compared))
         check_choice("semantic", self.semantic, get_args(Semantic))
         check_choice("spatial", self.spatial, get_args(Spatial))
         check_choice("division", self.division, get_args(Division))

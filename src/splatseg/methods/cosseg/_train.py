@@ -202,8 +202,8 @@ def _given(
         )
     encoder = None if options.spatial == "none" else load_point_encoder(options.encoder)
     scales: Sequence[Tensor] = () if distilled is None else distilled.scales
-    if options.semantic in ("first", "deepest"):
-        scales = scales[:1] if options.semantic == "first" else scales[-1:]
+    if options.semantic == "first":
+        scales = scales[:1]
     return _Given(
         gaussians=gaussians,
         chosen=chosen,
