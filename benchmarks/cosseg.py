@@ -36,7 +36,6 @@ from splatseg.core import Features, InstanceTree, Labels, Layer
 from splatseg.io.scene import load_scene
 from splatseg.lift import label_map
 from splatseg.lift.heads import ClassifierHead
-from splatseg.lift.view_renderer import ViewRenderer
 from splatseg.methods import find_method
 from splatseg.tasks.segment import SegmentOptions, segment
 
@@ -92,8 +91,7 @@ def drawn(bench: ScoredScene, layer: Layer, row: str) -> Path:
     head, folder = ClassifierHead.of(flat), bench.work / row
     folder.mkdir(parents=True, exist_ok=True)
     for view in bench.scene.test_views:
-        with ViewRenderer(bench.scene.gaussians, view.camera) as renderer:
-            ids = head.label_map(renderer, flat).ids
+        ids = head.label_map(bench.scene.gaussians, view.camera, flat).ids
         Image.fromarray(ids.clamp_min(0).numpy().astype(np.uint16)).save(
             folder / f"{view.name}.png"
         )
