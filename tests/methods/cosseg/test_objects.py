@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import torch
 
-from splatseg.core import LabelMap
-from splatseg.lift.object_classes import ObjectClassOptions, pool_objects
+from splatseg.core import LabelMap, Labels
+from splatseg.lift.object_classes import ObjectClassOptions, PooledObjects, pool_objects
 from splatseg.methods._trained_labels import TrainingContext
 from splatseg.methods.cosseg import CossegOptions
-from splatseg.methods.cosseg._objects import ObjectLabels, label_objects
+from splatseg.methods.cosseg._objects import ObjectLabels, label_objects, named_by_tracks
 
 from .conftest import Maps
 
@@ -125,6 +125,29 @@ def test_labels_of_tracks_are_objects_with_classes(halves) -> None:
     kinds = found.objects.info.class_of
     of = torch.tensor([kinds.get(int(id), -1) for id in found.objects.ids])
     assert bool((of == halves.side * 10)[away(halves)].all())
+
+
+def test_objects_have_the_ids_of_the_tracks_that_cover_them_best() -> None:
+    objects = Labels(
+        ids=torch.tensor([1, 2, 4, -1]), confidence=torch.ones(4),
+        candidates=torch.tensor([[1, 2], [2, -1], [4, 1], [-1, -1]]), shares=torch.ones(4, 2) / 2,
+    )  # fmt: skip
+    pooled = PooledObjects(
+        ids=torch.tensor([1, 2, 4]),
+        classes=torch.tensor([5, 9]),
+        votes=torch.tensor([[10.0, 8], [9, 1], [3, 0]]).double(),
+        features=torch.tensor([[1.0], [2], [3]]).double(),
+        known=torch.tensor([True, False, True]),
+    )
+    # 8 + 9 is more than 10 + 1, and nothing is left for the third.
+    named, found = named_by_tracks(objects, pooled)
+    assert named.ids.tolist() == [9, 5, 10, -1]
+    assert named.candidates is not None
+    assert named.candidates.tolist() == [[9, 5], [5, -1], [10, 9], [-1, -1]]
+    assert found.ids.tolist() == [5, 9, 10]
+    assert found.votes.tolist() == [[9, 1], [10, 8], [3, 0]]
+    assert found.features[:, 0].tolist() == [2, 1, 3]
+    assert found.known.tolist() == [False, True, True]
 
 
 def test_names_are_those_of_classes(halves) -> None:

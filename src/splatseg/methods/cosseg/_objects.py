@@ -10,6 +10,7 @@ gets the class that its own votes and those of objects that look like it speak f
 with :math:`s_{ik}` its share in object k and :math:`v_{ic}` its own votes. Nothing is trained.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -135,6 +136,7 @@ def label_objects(
     objects = tree.cut("object")
     pooled = pool_objects(objects, votes, scales, weights)
     if categories is not None:
+        objects, pooled = named_by_tracks(objects, pooled)
         pooled = with_categories(pooled, categories)
     probabilities = classify_objects(pooled, options=object_options)
     tell(4)
@@ -142,6 +144,50 @@ def label_objects(
     return ObjectLabels(
         classes=_spread(objects, votes, pooled, probabilities) if categories is None else None,
         objects=_with_classes(objects, pooled, probabilities, replace(info, names=names)),
+    )
+
+
+def named_by_tracks(objects: Labels, pooled: PooledObjects) -> tuple[Labels, PooledObjects]:
+    """Objects with the ids of tracks, each track's for one object at most.
+
+    The assignment has the largest sum of votes (Kuhn 1955). Objects that are left over have ids
+    above those of all tracks.
+
+    Args:
+        objects: Which object each Gaussian is of.
+        pooled: The objects with their votes for tracks.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    votes = pooled.votes.numpy()
+    rows, columns = linear_sum_assignment(votes, maximize=True)
+    tracks = pooled.classes.tolist()
+    given = {
+        int(row): tracks[column]
+        for row, column in zip(rows, columns, strict=True)
+        if votes[row, column] > 0
+    }
+    fresh = itertools.count(max([0, *tracks]) + 1)
+    names = torch.tensor(
+        [given[row] if row in given else next(fresh) for row in range(len(votes))],
+        dtype=torch.int64,
+    )
+    # The last row is of -1.
+    table = torch.full((max([0, *pooled.ids.tolist()]) + 2,), UNLABELLED)
+    table[pooled.ids] = names
+    candidates = objects.candidates
+    found = replace(
+        objects,
+        ids=table[objects.ids.cpu().long()].int(),
+        candidates=None if candidates is None else table[candidates.cpu().long()].int(),
+    )
+    order = torch.argsort(names)
+    return found, replace(
+        pooled,
+        ids=names[order],
+        votes=pooled.votes[order],
+        features=pooled.features[order],
+        known=pooled.known[order],
     )
 
 
