@@ -11,6 +11,7 @@ Every row is a process of its own, so that its seconds and its peak of memory ar
 - `logits`, `probabilities`, `identity`, `cosseg`: by default; `published`: `cosseg --published`;
   `decoder`: `cosseg --decide decoder`. `--set OPTION=VALUE` changes options of the method.
 - `associate`: of tracks.
+- `walk`: votes smoothed by a random walk over neighbours alike in colour and features.
 
 Label maps of classes are scored by ``score.py semantic``; of tracks by ``instances`` and
 ``panoptic``, with the class of each instance.
@@ -34,7 +35,7 @@ from scored import _SCORE, ScoredScene
 
 from splatseg.core import Features, InstanceTree, Labels, Layer
 from splatseg.io.scene import load_scene
-from splatseg.lift import label_map
+from splatseg.lift import CompletionOptions, complete, label_map
 from splatseg.lift.heads import ClassifierHead
 from splatseg.methods import find_method
 from splatseg.tasks.segment import SegmentOptions, segment
@@ -56,6 +57,8 @@ def made(scene: Any, row: str, evidence: str, changes: dict[str, Any], seed: int
     """The layer of a row."""
     if row == "object_vote":
         return object_vote(scene, evidence)
+    if row == "walk":
+        return random_walk(scene, evidence)
     name, own, shared = METHODS[row]
     method = find_method(name)
     base = method.published_options if shared.get("published") else method.options()
@@ -79,6 +82,16 @@ def object_vote(scene: Any, evidence: str) -> Labels:
         if len(own):
             out[inside] = int(torch.bincount(own).argmax())
     return Labels(ids=out.int(), confidence=torch.ones(len(out)), info=votes.info)
+
+
+def random_walk(scene: Any, evidence: str) -> Layer:
+    """Votes smoothed over neighbours that look alike, by the deepest block of features_dino."""
+    votes = made(scene, "majority", evidence, {"candidates": 8}, 0)
+    features = segment(scene, "features", options=SegmentOptions(evidence="features_dino")).layer
+    if not isinstance(votes, Labels) or not isinstance(features, Features):
+        raise TypeError
+    options = CompletionOptions(smoothing=200, smoothing_steps=20, completed_layer="hard")
+    return complete(scene.gaussians, votes, features=features, options=options)
 
 
 def drawn(bench: ScoredScene, layer: Layer, row: str) -> Path:
@@ -172,7 +185,9 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--evidence", default="labels_semantic_hard")
-    parser.add_argument("--rows", nargs="+", choices=[*METHODS, "object_vote"], required=True)
+    parser.add_argument(
+        "--rows", nargs="+", choices=[*METHODS, "object_vote", "walk"], required=True
+    )
     parser.add_argument("--set", nargs="*", default=[], metavar="OPTION=VALUE")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, help="keep label maps here")
