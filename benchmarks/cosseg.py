@@ -34,8 +34,9 @@ from PIL import Image
 from scored import _SCORE, ScoredScene
 
 from splatseg.core import Features, InstanceTree, Labels, Layer
+from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
-from splatseg.lift import CompletionOptions, complete, label_map
+from splatseg.lift import CompletionOptions, UpliftOptions, complete, label_map, uplift
 from splatseg.lift.heads import ClassifierHead
 from splatseg.methods import find_method
 from splatseg.tasks.segment import SegmentOptions, segment
@@ -86,9 +87,12 @@ def object_vote(scene: Any, evidence: str) -> Labels:
 
 def random_walk(scene: Any, evidence: str) -> Layer:
     """Votes smoothed over neighbours that look alike, by the deepest block of features_dino."""
-    votes = made(scene, "majority", evidence, {"candidates": 8}, 0)
+    if scene.source is None:
+        raise ValueError
+    found = open_evidence(scene.source / evidence)
+    votes = uplift(scene.gaussians, scene.train_views, found, options=UpliftOptions(candidates=8))
     features = segment(scene, "features", options=SegmentOptions(evidence="features_dino")).layer
-    if not isinstance(votes, Labels) or not isinstance(features, Features):
+    if not isinstance(features, Features):
         raise TypeError
     options = CompletionOptions(smoothing=200, smoothing_steps=20, completed_layer="hard")
     return complete(scene.gaussians, votes, features=features, options=options)
