@@ -1,0 +1,150 @@
+"""Gaussians and decoder trained together, on the wall of two halves."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from splatseg.core import LabelMap
+from splatseg.errors import InputError, RangeError
+from splatseg.methods._label_models import linear_start
+from splatseg.methods.cosseg._distilled import distilled_features
+from splatseg.methods.cosseg._fusion import FusionShape, decode_all
+from splatseg.methods.cosseg._joint import JointOptions, LabelLoss, train_jointly
+from splatseg.methods.cosseg._points import PointSource
+from splatseg.render import render
+
+from .conftest import Maps
+
+DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
+IDS = torch.tensor([3, 8])
+
+
+@pytest.fixture(scope="module")
+def photographed(halves, tmp_path_factory):
+    """The views, each with a photograph of the wall a little brighter than it is."""
+    folder = tmp_path_factory.mktemp("photographs")
+    found = []
+    for view in halves.views:
+        image = render(halves.gaussians, view.camera, backend=DRAWN_BY).image.clamp(0, 1)
+        pixels = (image.numpy() * 0.8 + 0.15) * 255
+        path = folder / f"{view.name}.png"
+        Image.fromarray(pixels.astype(np.uint8)).save(path)
+        found.append(replace(view, image=path))
+    return found
+
+
+def label_loss(halves, evidence=None, **changes) -> LabelLoss:
+    distilled = distilled_features(
+        halves.gaussians, halves.views, halves.blocks, components=8, division="mean",
+        backend=DRAWN_BY,
+    )  # fmt: skip
+    source = PointSource(
+        gaussians=halves.gaussians, scales=distilled.scales, encoder=None, spatial="none",
+        metres_per_unit=None, up=None, seed=0,
+    )  # fmt: skip
+    raw = source.raw(torch.arange(len(halves.gaussians)))
+    points = raw.scaled(raw.scalings(), len(halves.gaussians))
+    rng = np.random.default_rng(1)
+    shape = FusionShape(inputs=points.inputs.widths, decoded=(6,), head=(4,))
+    weight, bias = linear_start(4, 2, rng)
+    weights = shape.start(rng) | {"classifier.weight": weight, "classifier.bias": bias}
+    given = {"ids": IDS, "weight": 0.1, "rate": 0.02, "backend": DRAWN_BY} | changes
+    return LabelLoss(points, weights, evidence or halves.evidence, **given)
+
+
+def test_the_loss_by_hand(halves) -> None:
+    loss = label_loss(halves, weight=0.5)
+    view, rows = halves.views[1], torch.arange(len(halves.gaussians))
+    found = loss(view, halves.gaussians, rows).detach()
+    decoded = decode_all(loss._points.inputs, loss.weights)
+    image = render(halves.gaussians, view.camera, decoded, backend=DRAWN_BY, warp="nearest").image
+    shown = image.reshape(-1, 4)
+    weights = loss.weights
+    logits = (shown @ weights["classifier.weight"].T + weights["classifier.bias"]).detach()
+    label = (halves.ids(view).reshape(-1) == 8).long()
+    each = -torch.log_softmax(logits, dim=1)[torch.arange(len(label)), label]
+    assert float(found) == pytest.approx(0.5 * float(each.mean()) / math.log(2), rel=1e-4)
+    assert loss.losses == [pytest.approx(float(found) / 0.5)]
+
+
+def test_pixels_without_a_label_say_nothing(halves) -> None:
+    view, rows = halves.views[0], torch.arange(len(halves.gaussians))
+    nothing = Maps({view.name: LabelMap(ids=torch.full((24, 32), -1, dtype=torch.int32))})
+    assert float(label_loss(halves, nothing)(view, halves.gaussians, rows)) == 0.0
+    half = halves.ids(view).clone()
+    half[:12] = -1
+    some = label_loss(halves, Maps({view.name: LabelMap(ids=half)}))
+    whole = label_loss(halves)
+    first, second = (one(view, halves.gaussians, rows).detach() for one in (some, whole))
+    assert float(first) != float(second)
+
+
+def trained(halves, photographed, *, seed=0, rate=0.02, **changes):
+    loss = label_loss(halves, rate=rate, weight=changes.get("label_weight", 0.1))
+    options = JointOptions(**{"joint_steps": 24} | changes)
+    return loss, train_jointly(
+        halves.gaussians, photographed, loss, options=options, backend=DRAWN_BY, seed=seed
+    )
+
+
+def test_both_are_learnt(halves, photographed) -> None:
+    told: list[tuple[int, int]] = []
+    loss = label_loss(halves)
+    found = train_jointly(
+        halves.gaussians, photographed, loss, options=JointOptions(joint_steps=60),
+        backend=DRAWN_BY, seed=0, progress=lambda *step: told.append(step),
+    )  # fmt: skip
+    assert told[-1] == (60, 60)
+    assert np.mean(loss.losses[-8:]) < 0.5 * np.mean(loss.losses[:8])
+    assert len(found) == len(halves.gaussians)
+    assert not torch.equal(found.sh, halves.gaussians.sh)
+    with Image.open(photographed[0].image) as photograph:
+        wanted = torch.from_numpy(np.array(photograph)).float() / 255
+    before, after = (
+        float((render(g, photographed[0].camera, backend=DRAWN_BY).image - wanted).abs().mean())
+        for g in (halves.gaussians, found)
+    )
+    assert after < 0.8 * before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"rgb_weight": 0.8}, {"label_weight": 3.0}, {"joint_start": 0.1}, {"joint_steps": 20}],
+)
+def test_each_option_makes_a_difference(halves, photographed, change) -> None:
+    _, usual = trained(halves, photographed)
+    _, changed = trained(halves, photographed, **change)
+    assert not torch.equal(usual.means, changed.means)
+
+
+def test_labels_move_gaussians_and_bits_repeat(halves, photographed) -> None:
+    _, without = trained(halves, photographed, label_weight=0.0)
+    _, labelled = trained(halves, photographed)
+    assert not torch.equal(without.means, labelled.means)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        first, one = trained(halves, photographed)
+        torch.set_num_threads(2)
+        second, two = trained(halves, photographed)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(one.means, two.means)
+    assert all(torch.equal(first.weights[name], second.weights[name]) for name in first.weights)
+
+
+def test_what_cannot_be_is_refused(halves, photographed) -> None:
+    with pytest.raises(InputError, match="photographs of all of them, 4 of 4 have none, .* v0"):
+        train_jointly(
+            halves.gaussians, halves.views, label_loss(halves), options=JointOptions(),
+            backend=DRAWN_BY, seed=0,
+        )  # fmt: skip
+    for change in (
+        {"joint_steps": 0}, {"rgb_weight": 1.1}, {"joint_start": -0.1}, {"label_weight": -1.0},
+    ):  # fmt: skip
+        with pytest.raises(RangeError, match=next(iter(change))):
+            JointOptions(**change)
