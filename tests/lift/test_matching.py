@@ -135,7 +135,7 @@ def test_large_photographs_are_read_smaller() -> None:
 
 
 def test_a_coarser_pixel_takes_what_is_at_its_middle() -> None:
-    from splatseg.lift.segments.table import reduced_segments
+    from splatseg.lift.segments.reduced import reduced_segments
 
     ids = torch.arange(12, dtype=torch.int32).view(2, 6)
     found = reduced_segments(LabelMap(ids=ids), 3)

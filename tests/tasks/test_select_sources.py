@@ -13,6 +13,7 @@ from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer, sc
 from splatseg.lift.affinity import AffinityHead
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, select
+from support.observers import Stopping
 
 
 @pytest.fixture
@@ -121,6 +122,29 @@ def test_trees_come_first_then_features_then_masks_and_labels_last(room, monkeyp
         taken()
     only_masks(room, name, monkeypatch)
     assert taken("all") == ("masks", name)
+
+
+def test_each_file_is_read_once_to_choose_and_the_choice_is_said_once(room, monkeypatch) -> None:
+    """Two masks and labels beside features that tell nothing: every opener of auto looks."""
+    scene = load_scene(room)
+    count = len(scene.gaussians)
+    labels = Labels(ids=torch.arange(count).int() % 3 + 1, confidence=torch.ones(count))
+    save_scene_layer(labels, room, "classes")
+    save_scene_layer(Features(values=torch.ones(count, 2)), room, "plain")
+    read: list[str] = []
+
+    def counted(root, name):
+        read.append(name)
+        return load_scene_layer(root, name)
+
+    monkeypatch.setattr("splatseg.tasks.scene_parts.load_scene_layer", counted)
+    observer = Stopping()
+    made = select(scene, click(scene), observer=observer)
+    assert made.source == "layer"
+    assert sorted(read) == ["classes", "classes", "plain"], "once to choose, once to use"
+    assert [note for note in observer.heard if "selecting by" in note] == [
+        "selecting by layer classes (see from_layer)"
+    ]
 
 
 def test_features_have_to_be_named_or_affinity_features(room) -> None:

@@ -16,6 +16,7 @@ from splatseg.core.layers import Features, Labels, Selection
 from splatseg.core.soft_labels import merged_candidates
 from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
 from splatseg.core.tree_levels import TreeLevel as TreeLevel
+from splatseg.core.tree_levels import tree_level as tree_level
 from splatseg.errors import InputError, RangeError
 
 _FOLLOWS: dict[TreeLevel, tuple[TreeLevel | None, ...]] = {
@@ -351,30 +352,6 @@ def node_row(node: TreeNode) -> dict[str, Any]:
         "segments": node.segments,
         "views": node.views,
     }
-
-
-@boundary
-def tree_level(text: str) -> TreeLevel | float:
-    """A level by name, or a granularity, as people write them.
-
-    Raises:
-        InputError: If it is neither.
-
-    Example:
-        >>> tree_level("part"), tree_level("0.25")
-        ('part', 0.25)
-    """
-    if text in TREE_LEVELS:
-        return text
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= 1:
-        raise InputError(
-            f"level: expected {', '.join(TREE_LEVELS)} or a number from 0 to 1, got {text!r}."
-        )
-    return value
 
 
 def _check_node(node: TreeNode, by_id: Mapping[int, TreeNode]) -> None:

@@ -51,6 +51,43 @@ class Offer:
     observer: Observer
     backend: BackendName = "auto"
 
+    known: dict[str, "LayerFacts"] = field(default_factory=dict[str, "LayerFacts"])
+    """What was learnt of layers so far: openers ask in turn, and each file is read once."""
+
+    def facts(self, name: str) -> "LayerFacts":
+        """What a layer is, without keeping it."""
+        if name not in self.known:
+            self.known[name] = LayerFacts.of(whole_layer(self.scene, name, self.layers))
+        return self.known[name]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerFacts:
+    """What a layer is chosen by."""
+
+    rank: int | None
+    """0 for trees, 1 for labels of instances, 2 for other labels; None for what has no ids."""
+
+    is_affinity: bool
+    """Whether it is of features that tell what belongs together."""
+
+    evidence: str | None
+    """Name of the evidence that it was made from."""
+
+    @classmethod
+    def of(cls, layer: Layer) -> "LayerFacts":
+        """Those of a layer."""
+        rank = None
+        if isinstance(layer, InstanceTree):
+            rank = 0
+        elif isinstance(layer, Labels):
+            rank = 1 if layer.info.instances else 2
+        return cls(
+            rank=rank,
+            is_affinity=isinstance(layer, Features) and (layer.info.head or {}).get("kind") == KIND,
+            evidence=layer.info.evidence,
+        )
+
 
 Opener = Callable[[Offer], OpenedSource | None]
 """Opens a source; None where the scene has nothing of its kind. What is named and is not there,
@@ -86,11 +123,14 @@ def open_source(offer: Offer) -> OpenedSource:
 
 def _open_layer(offer: Offer) -> OpenedSource | None:
     """The layer that is named, or the one that says most of instances."""
-    name = offer.options.from_layer or _best_layer(offer)
-    return None if name is None else _layer_source(offer, name)
+    return _layer_source(offer, offer.options.from_layer or _best_layer(offer))
 
 
-def _layer_source(offer: Offer, name: str) -> OpenedSource | None:
+def _layer_source(offer: Offer, name: str | None) -> OpenedSource | None:
+    if name is None:
+        return None
+    if offer.options.from_layer is None:
+        offer.observer.note(f"selecting by layer {name} (see from_layer)")
     layer = whole_layer(offer.scene, name, offer.layers, option="from_layer")
     if not isinstance(layer, Labels | InstanceTree):
         if offer.options.source == "auto":
@@ -105,27 +145,15 @@ def _open_tree(offer: Offer) -> OpenedSource | None:
     """A tree of the scene, where no layer is named."""
     if offer.options.from_layer is not None:
         return None
-    name = _best_layer(offer, trees_only=True)
-    return None if name is None else _layer_source(offer, name)
+    name = _best_layer(offer)
+    is_tree = name is not None and offer.facts(name).rank == 0
+    return _layer_source(offer, name if is_tree else None)
 
 
-def _best_layer(offer: Offer, *, trees_only: bool = False) -> str | None:
+def _best_layer(offer: Offer) -> str | None:
     """A tree before labels of instances before other labels; of equals the first by name."""
-    best: tuple[int, str] | None = None
-    for name in _layer_names(offer):
-        layer = whole_layer(offer.scene, name, offer.layers)
-        if isinstance(layer, InstanceTree):
-            rank = 0
-        elif isinstance(layer, Labels) and not trees_only:
-            rank = 1 if layer.info.instances else 2
-        else:
-            continue
-        if best is None or (rank, name) < best:
-            best = (rank, name)
-    if best is None:
-        return None
-    offer.observer.note(f"selecting by layer {best[1]} (see from_layer)")
-    return best[1]
+    ranked = ((offer.facts(name).rank, name) for name in _layer_names(offer))
+    return min(((rank, name) for rank, name in ranked if rank is not None), default=(0, None))[1]
 
 
 def _layer_names(offer: Offer) -> list[str]:
@@ -157,11 +185,8 @@ def _open_features(offer: Offer) -> OpenedSource | None:
 
 
 def _affinity_layer(offer: Offer) -> str | None:
-    for name in _layer_names(offer):
-        layer = whole_layer(offer.scene, name, offer.layers)
-        if isinstance(layer, Features) and (layer.info.head or {}).get("kind") == KIND:
-            return name
-    return None
+    names = (name for name in _layer_names(offer) if offer.facts(name).is_affinity)
+    return next(names, None)
 
 
 def _guidance(offer: Offer, layer: Features) -> Callable[[View], FeatureMap | None] | None:
@@ -191,8 +216,9 @@ def _open_masks(offer: Offer) -> OpenedSource | None:
     if evidence is None:
         return None
     for name in _layer_names(offer):
-        layer = whole_layer(scene, name, offer.layers)
-        if isinstance(layer, InstanceTree) and layer.info.evidence == evidence:
+        facts = offer.facts(name)
+        if facts.rank == 0 and facts.evidence == evidence:
+            layer = whole_layer(scene, name, offer.layers)
             source = LayerSource(layer, scene.gaussians, name=name, views=offer.views)
             offer.observer.note(f"selecting by masks {evidence}, associated in layer {name}")
             return OpenedSource(source=source, name="masks", layer=name, evidence=evidence)

@@ -75,11 +75,9 @@ def prompter_of(
         InputError: If there is no such model, or it answers no points.
     """
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    is_model = name_of(named) in model_names()
-    if not is_model and named in evidence_names(folders):
-        model: Model = recorded_model(find_evidence(folders, named), views=scene.views)
-    elif not is_model and Path(named).is_dir():
-        model = recorded_model(named, views=scene.views)
+    folder = find_evidence(folders, named) if named in evidence_names(folders) else Path(named)
+    if name_of(named) not in model_names() and folder.is_dir():
+        model: Model = recorded_model(folder, views=scene.views)
     else:
         model = model_of(named, download=download, device=device, report=report)
     if not isinstance(model, PromptableMasks):

@@ -37,6 +37,7 @@ from splatseg.lift.segments.panoptic import merge_panoptic
 from splatseg.methods import Method, MethodInputs, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._segment_inputs import named_companions, trained_features
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.fit_quality import fit_quality
 from splatseg.tasks.scene_parts import layer_of, views_asked, views_recorded
@@ -155,7 +156,7 @@ def segment(
     options = options or SegmentOptions()
     method = find_method(method) if isinstance(method, str) else method
     chosen = _method_options(method, method_options, options)
-    trained = _trained(scene, method, chosen, layers)
+    trained = trained_features(scene, method, chosen, layers)
     evidence_name, evidence = _evidence(scene, method, options, trained)
     merged = _classes_to_merge(scene, options, evidence, layers)
     check_name("layer", name := options.layer or evidence_name)
@@ -163,7 +164,7 @@ def segment(
         gaussians=scene.gaussians,
         views=_views(scene, evidence, options.views, observer),
         evidence=evidence,
-        companions=_companions(scene, method, chosen),
+        companions=named_companions(scene, method, chosen),
         trained=trained,
         classes=scene.classes,
         metres_per_unit=scene.metres_per_unit,
@@ -350,39 +351,6 @@ def _evidence(
     evidence = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
     method.check_evidence(evidence)
     return folder.name, evidence
-
-
-def _trained(
-    scene: Scene, method: Method, options: Any, layers: Mapping[str, Layer] | None
-) -> Features | None:
-    """The layer that the method's options name to be read again, if they name one."""
-    name = None if method.trained is None else getattr(options, method.trained)
-    if name is None:
-        return None
-    layer = layer_of(scene, name, layers)
-    if not isinstance(layer, Features):
-        raise InputError(
-            f"{method.trained}: expected a layer of features, got {name!r} of {layer_kind(layer)}."
-        )
-    return layer
-
-
-def _companions(scene: Scene, method: Method, options: Any) -> dict[str, Evidence]:
-    """The evidence that the method's options name besides, by option."""
-    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
-    found: dict[str, Evidence] = {}
-    for option, kinds in method.companions.items():
-        asked = getattr(options, option)
-        if asked is None:
-            continue
-        evidence = open_evidence(find_evidence(folders, asked))
-        if evidence.kind not in kinds:
-            raise InputError(
-                f"{option}: expected evidence of {' or '.join(kinds)}, got {asked!r} of "
-                f"{evidence.kind}."
-            )
-        found[option] = evidence
-    return found
 
 
 def _views(

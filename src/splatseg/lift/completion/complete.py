@@ -224,7 +224,7 @@ def _check(
 
 def _known(labels: Labels, options: CompletionOptions) -> NDArray[np.bool_]:
     """Which Gaussians have a label of their own, or surely none."""
-    known = (labels.ids != UNLABELLED) | _nothing(labels)
+    known = labels.ids != UNLABELLED
     if labels.inferred is not None:
         known &= ~labels.inferred
     if labels.evidence is not None:

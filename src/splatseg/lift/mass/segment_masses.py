@@ -113,8 +113,7 @@ def _covered(pieces: Pieces, sums: Sequence[Any], count: int) -> Float[Tensor, "
     inside = np.bincount(pieces.segments.indices, minlength=pieces.segments.shape[1]) > 0
     total = np.zeros(count)
     for part in sums:
-        kept = np.repeat(inside, np.diff(part.indptr))
-        total += np.bincount(part.indices[kept], part.data[kept], minlength=count)
+        total += inside.astype(np.float64) @ part
     return torch.from_numpy(total.astype(np.float32))
 
 

@@ -32,7 +32,7 @@ from splatseg.core import (
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.label_maps import label_map
-from splatseg.lift.segments.table import reduced_segments
+from splatseg.lift.segments.reduced import reduced_segments
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from splatseg.core import UNLABELLED, Gaussians, LabelMap, MaskSet, SegmentSource, View
 from splatseg.lift.memberships import MembershipOptions, fit_memberships
-from splatseg.lift.segments.table import SegmentTable, reduced_segments
+from splatseg.lift.segments.reduced import reduced_segments
+from splatseg.lift.segments.table import SegmentTable
 from splatseg.lift.segments.tree_labels import TreeVotes
 from splatseg.render import RenderOptions
 

@@ -5,21 +5,18 @@ neither the order in which views come nor what their segments are called has any
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
     Gaussians,
     LabelMap,
     MaskSet,
-    Rle,
     SegmentSource,
     View,
     camera_of_map,
@@ -29,6 +26,7 @@ from splatseg.lift.mass.products import entries_of, sparse_product
 from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
 from splatseg.lift.segments.clustering import Agreement
 from splatseg.lift.segments.entries import SegmentEntries
+from splatseg.lift.segments.reduced import reduced_segments
 from splatseg.lift.segments.shared import shared_masses
 from splatseg.render import RenderOptions
 
@@ -313,25 +311,6 @@ def _shares_of(covered: NDArray[np.float64], visible: NDArray[np.float64]) -> ND
     """Shares of what is visible; 1 where next to nothing is."""
     shares = np.where(visible > _MIN_WEIGHT, covered / np.maximum(visible, _MIN_WEIGHT), 1.0)
     return shares.clip(0, 1).astype(np.float32)
-
-
-def reduced_segments(segments: LabelMap | MaskSet, longest: int) -> LabelMap | MaskSet:
-    """Segments on a coarser grid: each pixel takes what is at its middle."""
-    height, width = segments.height, segments.width
-    share = longest / max(height, width)
-    if share >= 1:
-        return segments
-    h, w = max(1, round(share * height)), max(1, round(share * width))
-    down = ((torch.arange(h) + 0.5) * height / h).long()
-    across = ((torch.arange(w) + 0.5) * width / w).long()
-
-    def taken(picture: Tensor) -> Tensor:
-        return picture[down.unsqueeze(1), across]
-
-    if isinstance(segments, LabelMap):
-        return LabelMap(ids=taken(segments.ids.cpu()))
-    masks = tuple(Rle.encode(taken(mask.decode())) for mask in segments.masks)
-    return replace(segments, height=h, width=w, masks=masks)
 
 
 def _add(

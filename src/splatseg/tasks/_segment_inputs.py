@@ -1,0 +1,45 @@
+"""What the options of a method name besides its evidence."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from splatseg.core import Features, Layer, Scene
+from splatseg.core.instance_tree import layer_kind
+from splatseg.errors import InputError
+from splatseg.io.evidence import Evidence, find_evidence, open_evidence
+from splatseg.methods import Method
+from splatseg.tasks.scene_parts import layer_of
+
+
+def trained_features(
+    scene: Scene, method: Method, options: Any, layers: Mapping[str, Layer] | None
+) -> Features | None:
+    """The layer that the method's options name to be read again, if they name one."""
+    name = None if method.trained is None else getattr(options, method.trained)
+    if name is None:
+        return None
+    layer = layer_of(scene, name, layers)
+    if not isinstance(layer, Features):
+        raise InputError(
+            f"{method.trained}: expected a layer of features, got {name!r} of {layer_kind(layer)}."
+        )
+    return layer
+
+
+def named_companions(scene: Scene, method: Method, options: Any) -> dict[str, Evidence]:
+    """The evidence that the method's options name besides, by option."""
+    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
+    found: dict[str, Evidence] = {}
+    for option, kinds in method.companions.items():
+        asked = getattr(options, option)
+        if asked is None:
+            continue
+        evidence = open_evidence(find_evidence(folders, asked))
+        if evidence.kind not in kinds:
+            raise InputError(
+                f"{option}: expected evidence of {' or '.join(kinds)}, got {asked!r} of "
+                f"{evidence.kind}."
+            )
+        found[option] = evidence
+    return found
