@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
-from splatseg.core import LabelMap, Labels
+from splatseg.core import LabelMap, Labels, LayerInfo
+from splatseg.errors import RangeError
 from splatseg.lift.object_classes import ObjectClassOptions, PooledObjects, pool_objects
 from splatseg.methods._trained_labels import TrainingContext
 from splatseg.methods.cosseg import CossegOptions
+from splatseg.methods.cosseg._object_shares import own_share_of
 from splatseg.methods.cosseg._objects import ObjectLabels, label_objects, named_by_tracks
 
 from .conftest import Maps
@@ -163,3 +166,46 @@ def test_names_are_those_of_classes(halves) -> None:
     names = set(found.objects.info.names.values())
     assert {name.split()[0] for name in names} == {"board", "door"}
     assert replace(found.objects).info.names == found.objects.info.names
+
+
+def test_own_votes_share_in_the_class_where_views_err_independently(halves, monkeypatch) -> None:
+    """All views give a strip of the left half to the right one: objects repair it, votes do not."""
+    maps = strip(halves, ("v0", "v1", "v2"))
+    own = labelled(halves, maps, own_share=1.0).classes
+    none = labelled(halves, maps, own_share=0.0).classes
+    assert none.info.details["own_share"] == 0
+    wrong = (own.ids.long() != halves.side) & away(halves)
+    assert bool(wrong.any())
+    assert not bool(((none.ids.long() != halves.side) & away(halves)).any())
+    both = labelled(halves, maps, own_share=0.25).classes
+    share = both.shares[wrong, 0] + both.shares[wrong, 1]
+    assert torch.allclose(share, torch.ones_like(share), atol=1e-4)
+    row = torch.nonzero(wrong)[0, 0]
+
+    def of(layer, id):
+        return float(layer.shares[row][layer.candidates[row] == id].sum())
+
+    for id in (3, 8):
+        expected = 0.25 * of(own, id) + 0.75 * of(none, id)
+        assert abs(of(both, id) - expected) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("correlation", "limit", "expected"),
+    [(0.1, 0.4, 0.75), (0.4, 0.4, 0.0), (0.9, 0.4, 0.0), (-0.2, 0.4, 1.0), (None, 0.4, 0.0),
+     (0.1, 0.0, 0.0)],
+)  # fmt: skip
+def test_the_share_of_own_votes_falls_with_the_correlation_of_views(
+    correlation, limit, expected
+) -> None:
+    votes = Labels(
+        ids=torch.zeros(1), confidence=torch.ones(1), info=LayerInfo(view_correlation=correlation)
+    )
+    assert own_share_of(CossegOptions(max_correlation=limit), votes) == pytest.approx(expected)
+    assert own_share_of(CossegOptions(max_correlation=limit, own_share=0.3), votes) == 0.3
+
+
+@pytest.mark.parametrize("name", ["own_share", "max_correlation"])
+def test_shares_beyond_one_are_refused(name) -> None:
+    with pytest.raises(RangeError, match=rf"^{name}: expected a value in \[0, 1\], got 1\.5\."):
+        CossegOptions(**{name: 1.5})

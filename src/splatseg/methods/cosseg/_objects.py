@@ -3,11 +3,9 @@ r"""Labels of objects in closed form: votes of all pixels of an object, and of o
 Masks are associated into objects (`methods.associate`), which need no names; labels vote for
 classes on the Gaussians, and features are lifted onto them, as for the decoder. Then each object
 gets the class that its own votes and those of objects that look like it speak for
-(`lift.object_classes`), and a Gaussian that is in several objects in part gets
-
-.. math:: P_{ic} = \sum_k s_{ik} r_{kc} + \Bigl(1 - \sum_k s_{ik}\Bigr) v_{ic} / \sum_{c'} v_{ic'}
-
-with :math:`s_{ik}` its share in object k and :math:`v_{ic}` its own votes. Nothing is trained.
+(`lift.object_classes`), and a Gaussian that is in several objects in part gets the classes of its
+objects by its shares in them, together with what its own votes say (`_object_shares`). Nothing is
+trained.
 """
 
 import itertools
@@ -16,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import (
@@ -41,10 +38,8 @@ from splatseg.methods._trained_labels import TrainingContext, recorded_options
 from splatseg.methods.associate import associate_masks
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._distilled import distilled_features
+from splatseg.methods.cosseg._object_shares import CANDIDATES, own_share_of, spread
 from splatseg.methods.cosseg._options import CossegOptions
-
-_CANDIDATES = 16
-"""Ids of a Gaussian whose votes are counted, and kept of the result."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,7 +96,7 @@ def label_objects(
         gaussians,
         views,
         evidence,
-        options=UpliftOptions(candidates=_CANDIDATES),
+        options=UpliftOptions(candidates=CANDIDATES),
         classes=classes,
         render_options=context.render_options,
         backend=context.backend,
@@ -135,6 +130,7 @@ def label_objects(
     votes = replace(found, info=info)
     objects = tree.cut("object")
     pooled = pool_objects(objects, votes, scales, weights)
+    own_share = own_share_of(options, votes)
     if categories is not None:
         objects, pooled = named_by_tracks(objects, pooled)
         pooled = with_categories(pooled, categories)
@@ -142,7 +138,9 @@ def label_objects(
     tell(4)
     names = {} if classes is None else {row.id: row.name for row in classes.rows}
     return ObjectLabels(
-        classes=_spread(objects, votes, pooled, probabilities) if categories is None else None,
+        classes=(
+            spread(objects, votes, pooled, probabilities, own_share) if categories is None else None
+        ),
         objects=_with_classes(objects, pooled, probabilities, replace(info, names=names)),
     )
 
@@ -188,51 +186,6 @@ def named_by_tracks(objects: Labels, pooled: PooledObjects) -> tuple[Labels, Poo
         votes=pooled.votes[order],
         features=pooled.features[order],
         known=pooled.known[order],
-    )
-
-
-def _spread(objects: Labels, votes: Labels, pooled: PooledObjects, probabilities: Tensor) -> Labels:
-    """Classes of objects on the Gaussians, by their shares; what is left are own votes."""
-    if votes.candidates is None or votes.shares is None:
-        return votes
-    count, width = len(objects), len(pooled.classes)
-    total = torch.zeros(count, width + 1)
-    decided = probabilities.sum(dim=1) > 0
-    own = torch.ones(count)
-    if objects.candidates is not None and objects.shares is not None:
-        members, shares = objects.candidates.cpu().long().T, objects.shares.cpu().float().T
-        # Shares that were solved for each by itself may add up to more than 1.
-        shares = (shares / shares.sum(dim=0).clamp_min(1.0)).contiguous()
-        members = members.contiguous()
-    else:
-        members, shares = objects.ids.cpu().long()[None], torch.ones(1, count)
-    for member, given in zip(members, shares, strict=True):
-        row = torch.searchsorted(pooled.ids, member).clamp_max(len(pooled.ids) - 1)
-        there = (member != UNLABELLED) & (pooled.ids[row] == member) & decided[row]
-        share = torch.where(there, given, 0.0)
-        total[:, :width] += probabilities[row].float() * share[:, None]
-        own -= share
-    for rank in range(votes.candidates.shape[1]):
-        ids = votes.candidates[:, rank].cpu().long().contiguous()
-        column = torch.searchsorted(pooled.classes, ids).clamp_max(width - 1)
-        column = torch.where(ids == UNLABELLED, width, column)
-        share = votes.shares[:, rank].cpu().float() * own.clamp_min(0)
-        total.scatter_add_(1, column[:, None], share[:, None])
-    return _soft(total[:, :width], pooled, votes)
-
-
-def _soft(shares: Float[Tensor, "n classes"], pooled: PooledObjects, votes: Labels) -> Labels:
-    kept = min(_CANDIDATES, shares.shape[1])
-    # Stable: of equals the one with the smaller id.
-    order = torch.sort(shares, dim=1, descending=True, stable=True)
-    best, column = order.values[:, :kept], order.indices[:, :kept]
-    ids = torch.where(best > 0, pooled.classes[column], UNLABELLED).int()
-    return replace(
-        votes,
-        ids=ids[:, 0],
-        confidence=best[:, 0].clamp(0, 1),
-        candidates=ids,
-        shares=best,
     )
 
 

@@ -60,6 +60,13 @@ class CossegOptions(LabelTrainingOptions):
     classification: ObjectClassOptions = field(default_factory=ObjectClassOptions)
     """How votes and features of objects are weighed."""
 
+    own_share: float | None = None
+    """Share, in [0, 1], that a Gaussian's own votes have in its class beside its object's. None:
+    the more the less neighbouring views err alike, as measured. Of tracks none."""
+
+    max_correlation: float = 1 / 3
+    """Correlation of neighbouring views, in [0, 1], from which on own votes have no share."""
+
     spatial: Spatial = "all"
     """Which levels of the point network are used. all: each is joined to what is decoded there.
     first: the last one alone, of the widest neighbourhood. none: each Gaussian is decoded from its
@@ -138,6 +145,9 @@ class CossegOptions(LabelTrainingOptions):
         check_rate("rate", self.rate)
         check_rate("transition_rate", self.transition_rate)
         check_range("min_share", self.min_share, 0.0, 1.0)
+        check_range("max_correlation", self.max_correlation, 0.0, 1.0)
+        if self.own_share is not None:
+            check_range("own_share", self.own_share, 0.0, 1.0)
         if self.spatial == "none" and self.semantic == "none":
             raise RangeError("semantic, spatial: expected one of the two, got neither.")
 
