@@ -4,11 +4,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from splatseg.cli import main
 from splatseg.core import Features, Labels
 from splatseg.errors import InputError
-from splatseg.io.scene import load_scene
+from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods.cosseg import CossegOptions
 from splatseg.tasks.segment import SegmentOptions, segment
 
@@ -70,3 +71,48 @@ def test_from_the_command_line(scene, capsys) -> None:
     words += ["--masks", "masks_sam", "--features", "features_dino", "--layer", "classes"]
     assert main(words) == 0
     assert (scene / "layers" / "classes.npz").is_file()
+
+
+def joint_words(scene: Path, folder: Path) -> list[str]:
+    return [
+        "segment", str(scene), "--method", "cosseg", "--evidence", "labels_semantic",
+        "--decide", "decoder", "--features", "features_dino", "--spatial", "none",
+        "--joint", str(folder), "--joint-steps", "3", "--layer", "joint", "--quiet",
+    ]  # fmt: skip
+
+
+def test_gaussians_that_learnt_along_are_a_new_scene(scene, tmp_path, capsys) -> None:
+    """The old scene is as it was; the layer belongs to the new one."""
+    folder = tmp_path / "new"
+    assert main(joint_words(scene, folder)) == 0
+    assert str(folder / "layers" / "joint.npz") in capsys.readouterr().out
+    old, new = load_scene(scene), load_scene(folder)
+    assert len(new.gaussians) == len(old.gaussians)
+    assert not torch.equal(new.gaussians.means, old.gaussians.means)
+    assert new.provenance["refined"]["layer"] == "joint"
+    layer = load_scene_layer(folder, "joint")
+    assert isinstance(layer, Labels)
+    assert layer.info.details["steps"] == 3
+    assert not (scene / "layers" / "joint.npz").exists()
+    assert [view.name for view in new.views] == [view.name for view in old.views]
+    # The same again is the same.
+    again = tmp_path / "again"
+    assert main(joint_words(scene, again)) == 0
+    assert torch.equal(load_scene(again).gaussians.means, new.gaussians.means)
+
+
+def test_a_new_scene_is_refused_before_the_work(scene, tmp_path, capsys) -> None:
+    folder = tmp_path / "new"
+    folder.mkdir()
+    (folder / "mine").write_text("kept")
+    assert main(joint_words(scene, folder)) == 2
+    assert "expected a new folder" in capsys.readouterr().err
+    words = joint_words(scene, tmp_path / "other")
+    assert main([*words, "--resume"]) == 2
+    assert "resume: a training with joint keeps nothing to go on from" in capsys.readouterr().err
+    assert main([*words, "--report"]) == 2
+    assert "with joint the layer is of a new one" in capsys.readouterr().err
+    words[words.index("decoder")] = "objects"
+    assert main([*words, "--masks", "masks_sam"]) == 2
+    assert "joint: goes with decide decoder, got objects" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

@@ -251,6 +251,11 @@ def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
 
 
 def _check_outputs(command: Command, method: Method) -> None:
+    if method.refines is not None and getattr(command.options, method.refines) is not None:
+        raise InputError(
+            f"export, report: are of this scene, and with {method.refines} the layer is of a new "
+            "one; export or report that layer afterwards."
+        )
     gives = method.gives(command.options)
     if gives not in ("labels", "tree"):
         raise InputError(

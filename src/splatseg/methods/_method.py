@@ -72,6 +72,15 @@ class MethodInputs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Refined:
+    """A layer of Gaussians that learnt along, see `Method.refines`."""
+
+    layer: Layer
+    gaussians: Gaussians
+    """Row for row those that were given."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Method:
     """A way from evidence of views to a layer of the scene.
 
@@ -99,7 +108,7 @@ class Method:
     options: type[Any]
     """Frozen dataclass of its options: fields become flags, the strings below them help."""
 
-    run: Callable[[MethodInputs, Any], Layer]
+    run: Callable[[MethodInputs, Any], Layer | Refined]
     """Makes the layer, from the inputs and an instance of `options`."""
 
     returns: Returns = "labels"
@@ -127,6 +136,10 @@ class Method:
     """Name of the option that names a layer of features which the method made before, to be read
     in another way without training again; None where it takes none."""
 
+    refines: str | None = None
+    """Name of the option that names the folder of a new scene, whose Gaussians learn along with
+    the layer; None where Gaussians always stay as they are."""
+
     readouts: Mapping[str, Returns] = field(default_factory=dict[str, Returns])
     """What it gives by its option ``readout``, where that is not `returns`."""
 
@@ -144,7 +157,7 @@ class Method:
             raise InputError(
                 f"method {self.name!r}: expected a default for every option ({error})."
             ) from error
-        named = (*self.companions, self.trained, "readout" if self.readouts else None)
+        named = (*self.companions, self.trained, self.refines, "readout" if self.readouts else None)
         for option in named:
             if option is not None and option not in self.option_names():
                 raise InputError(f"method {self.name!r}: expected an option {option!r}.")

@@ -34,9 +34,10 @@ from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.lift.completion.complete import CompletionOptions, complete
 from splatseg.lift.segments.panoptic import merge_panoptic
-from splatseg.methods import Method, MethodInputs, find_method
+from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._refined_scene import refined_folder, save_refined
 from splatseg.tasks._segment_inputs import named_companions, trained_features
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.fit_quality import fit_quality
@@ -95,6 +96,13 @@ class Segmentation:
     views: tuple[View, ...]
     timings: Mapping[str, float]
     """Seconds by stage."""
+
+    refined: Scene | None = None
+    """The scene with Gaussians that learnt along, which the layer belongs to; None where they stay
+    as they are."""
+
+    folder: Path | None = None
+    """Where that scene is to be written."""
 
     warnings: tuple[str, ...] = ()
     """What should be known of it, in sentences: that the scene is too poor to carry labels."""
@@ -156,6 +164,7 @@ def segment(
     options = options or SegmentOptions()
     method = find_method(method) if isinstance(method, str) else method
     chosen = _method_options(method, method_options, options)
+    folder = refined_folder(method, chosen, checkpoints)
     trained = trained_features(scene, method, chosen, layers)
     evidence_name, evidence = _evidence(scene, method, options, trained)
     merged = _classes_to_merge(scene, options, evidence, layers)
@@ -173,19 +182,25 @@ def segment(
         seed=options.seed,
         checkpoints=(
             training_checkpoints(scene, name, method, checkpoints, observer)
-            if trained is None
+            if trained is None and folder is None
             else None
         ),
     )
     timings = {"open": time.monotonic() - started}
     warnings = _checked_fit(scene, backend, timings, observer)
     with told_how_to_resume(inputs.checkpoints, observer):
-        layer = _run(method, inputs, chosen, timings, observer)
+        made = _run(method, inputs, chosen, timings, observer)
+        refined = None
+        if isinstance(made, Refined):
+            refined = replace(scene, gaussians=made.gaussians)
+            scene, made = refined, made.layer
+        layer = made
         if options.complete and method.complete and not options.published:
             layer = _completed(scene, layer, completion, timings)
         layer = _panoptic(scene, layer, merged, method)
     layer = _described(layer, method, evidence_name, inputs, options)
-    return replace(_segmentation(layer, name, inputs, timings), warnings=warnings)
+    found = _segmentation(layer, name, inputs, timings)
+    return replace(found, warnings=warnings, refined=refined, folder=folder)
 
 
 def _checked_fit(
@@ -210,9 +225,15 @@ def _checked_fit(
 def save_segmentation(made: Segmentation, root: Path) -> Path:
     """Write the layer into the scene's folder; then its training needs its checkpoint no more.
 
+    Where Gaussians learnt along, the layer is written with them into a new scene.
+
     Returns:
         The file of the layer.
     """
+    if made.refined is not None and made.folder is not None:
+        return save_refined(
+            made.refined, made.folder, made.layer, made.name, evidence=made.evidence
+        )
     path = save_scene_layer(made.layer, root, made.name)
     if made.checkpoint is not None:
         discard_checkpoint_file(made.checkpoint)
@@ -225,13 +246,13 @@ def _run(
     options: Any,
     timings: dict[str, float],
     observer: Observer,
-) -> Layer:
+) -> Layer | Refined:
     """Run the method as the stage ``segment``."""
     with observer.stage("segment") as step:
         began = time.monotonic()
-        layer = method.run(replace(inputs, progress=step), options)
+        found = method.run(replace(inputs, progress=step), options)
         timings[method.name] = time.monotonic() - began
-    return layer
+    return found
 
 
 def _segmentation(

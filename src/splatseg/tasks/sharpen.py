@@ -47,6 +47,7 @@ from splatseg.methods import keeps_ids
 from splatseg.render import BackendName
 from splatseg.selection import layer_called
 from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._refined_scene import own_evidence
 from splatseg.tasks.new_scene import check_new_folder
 from splatseg.tasks.scene_parts import mask_use, views_that_made
 
@@ -144,7 +145,7 @@ def sharpen_scene(
     layers = {**document.layers, **_sharpened(document, options.layer, merged(layer, found))}
     new = _sharpened_scene(scene, options, how, found, psnr=[before, after])
     document = Document(scene=new, layers=layers)
-    saved = save_document(document, folder, evidence=_own_evidence(evidence, scene))
+    saved = save_document(document, folder, evidence=own_evidence(evidence, scene))
     return SharpenedScene(
         folder=folder,
         document=saved,
@@ -228,14 +229,6 @@ def _sharpened_scene(
         exposures = recorded_exposures(scene.provenance) | dict(found.exposures)
         provenance[EXPOSURES] = exposures_record(exposures)
     return replace(scene, gaussians=found.gaussians, provenance=provenance)
-
-
-def _own_evidence(evidence: Evidence, scene: Scene) -> tuple[Path, ...]:
-    """Evidence that lies in the scene's own folder, which the new one could not find."""
-    if scene.root is None:
-        return ()
-    inside = evidence.folder.resolve().parent == (scene.root / "evidence").resolve()
-    return (evidence.folder,) if inside else ()
 
 
 def _sharpened(document: Document, address: str, labels: Labels) -> dict[str, Layer]:

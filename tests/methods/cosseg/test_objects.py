@@ -59,7 +59,7 @@ def away(halves):
 
 
 def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None:
-    found = labelled(halves, strip(halves, ("v0", "v1", "v2")))
+    found = labelled(halves, strip(halves, ("v0", "v1", "v2")), candidates=2)
     right = found.classes.ids.long() == halves.side
     assert bool(right[away(halves)].all())
     assert found.classes.candidates is not None
@@ -72,11 +72,13 @@ def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None
     told: list[tuple[int, int]] = []
     again = label_objects(
         halves.gaussians, halves.views[::-1], strip(halves, ("v0", "v1", "v2")),
-        features=halves.blocks, masks=Masks(halves), options=CossegOptions(),
+        features=halves.blocks, masks=Masks(halves), options=CossegOptions(candidates=1),
         object_options=ObjectClassOptions(), classes=None,
         context=TrainingContext(backend="auto"), told=lambda *step: told.append(step),
     )  # fmt: skip
     assert torch.equal(again.classes.ids, found.classes.ids)
+    assert again.classes.candidates is None
+    assert again.classes.shares is None
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
@@ -171,13 +173,13 @@ def test_names_are_those_of_classes(halves) -> None:
 def test_own_votes_share_in_the_class_where_views_err_independently(halves, monkeypatch) -> None:
     """All views give a strip of the left half to the right one: objects repair it, votes do not."""
     maps = strip(halves, ("v0", "v1", "v2"))
-    own = labelled(halves, maps, own_share=1.0).classes
-    none = labelled(halves, maps, own_share=0.0).classes
+    own = labelled(halves, maps, own_share=1.0, candidates=2).classes
+    none = labelled(halves, maps, own_share=0.0, candidates=2).classes
     assert none.info.details["own_share"] == 0
     wrong = (own.ids.long() != halves.side) & away(halves)
     assert bool(wrong.any())
     assert not bool(((none.ids.long() != halves.side) & away(halves)).any())
-    both = labelled(halves, maps, own_share=0.25).classes
+    both = labelled(halves, maps, own_share=0.25, candidates=2).classes
     share = both.shares[wrong, 0] + both.shares[wrong, 1]
     assert torch.allclose(share, torch.ones_like(share), atol=1e-4)
     row = torch.nonzero(wrong)[0, 0]

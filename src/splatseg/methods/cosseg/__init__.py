@@ -24,29 +24,46 @@ from splatseg.core import ClassTable, Layer
 from splatseg.errors import InputError
 from splatseg.io.evidence import TrackedEvidence
 from splatseg.lift.segments.recorded import EvidenceSegments
-from splatseg.methods._method import Method, MethodInputs
+from splatseg.methods._method import Method, MethodInputs, Refined
 from splatseg.methods._trained_labels import context_of, hard_labels
 from splatseg.methods.cosseg._objects import label_objects
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
+from splatseg.methods.cosseg._train_jointly import train_cosseg_jointly as train_cosseg_jointly
 
 
-def run(inputs: MethodInputs, options: CossegOptions) -> Layer:
+def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
     """Find labels of objects, or train the decoder and read it, as the options say."""
     if options.decide == "objects":
         return _closed_form(inputs, options)
-    features = train_cosseg(
-        inputs.gaussians,
-        inputs.views,
-        inputs.evidence,
-        features=inputs.features("features"),
-        options=options,
-        classes=inputs.label_names,
-        metres_per_unit=inputs.metres_per_unit,
-        up=inputs.up,
-        context=context_of(inputs),
-    )
-    return features if options.readout == "rendered" else hard_labels(features, options)
+    features, gaussians = inputs.features("features"), None
+    if options.joint is None:
+        found = train_cosseg(
+            inputs.gaussians,
+            inputs.views,
+            inputs.evidence,
+            features=features,
+            options=options,
+            classes=inputs.label_names,
+            metres_per_unit=inputs.metres_per_unit,
+            up=inputs.up,
+            context=context_of(inputs),
+        )
+    else:
+        gaussians, found = train_cosseg_jointly(
+            inputs.gaussians,
+            inputs.views,
+            inputs.evidence,
+            features=features,
+            options=options,
+            classes=inputs.label_names,
+            metres_per_unit=inputs.metres_per_unit,
+            up=inputs.up,
+            context=context_of(inputs),
+            told=inputs.progress,
+        )
+    layer = found if options.readout == "rendered" else hard_labels(found, options)
+    return layer if gaussians is None else Refined(layer=layer, gaussians=gaussians)
 
 
 def _closed_form(inputs: MethodInputs, options: CossegOptions) -> Layer:
@@ -102,5 +119,6 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=CossegOptions.published(),
+    refines="joint",
     companions={"features": ("features",), "masks": ("masks",)},
 )

@@ -20,7 +20,7 @@ References:
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -182,3 +182,9 @@ def _headed(weights: Weights, decoded: Tensor) -> Tensor:
 
 def _uniform(rng: np.random.Generator, bound: float, shape: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(rng.uniform(-bound, bound, shape).astype(np.float32))
+
+
+def decoded_widths(decoded: Sequence[int], levels: int) -> tuple[int, ...]:
+    """Channels of each level; the last number stands for all that are not given."""
+    given = tuple(decoded[:levels])
+    return given + (given[-1],) * (levels - len(given))

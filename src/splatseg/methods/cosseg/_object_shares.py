@@ -24,7 +24,7 @@ from splatseg.lift.object_classes import PooledObjects
 from splatseg.methods.cosseg._options import CossegOptions
 
 CANDIDATES = 16
-"""Ids of a Gaussian whose votes are counted, and kept of the result."""
+"""Ids of a Gaussian whose votes are counted."""
 
 
 def own_share_of(options: CossegOptions, votes: Labels) -> float:
@@ -38,7 +38,13 @@ def own_share_of(options: CossegOptions, votes: Labels) -> float:
 
 
 def spread(
-    objects: Labels, votes: Labels, pooled: PooledObjects, probabilities: Tensor, own_share: float
+    objects: Labels,
+    votes: Labels,
+    pooled: PooledObjects,
+    probabilities: Tensor,
+    *,
+    own_share: float,
+    candidates: int,
 ) -> Labels:
     """Classes of objects on the Gaussians by their shares, and what own votes say.
 
@@ -48,6 +54,7 @@ def spread(
         pooled: The objects whose classes are known.
         probabilities: Of their classes, rows of zeros where nothing is known of one.
         own_share: Lambda, in [0, 1].
+        candidates: Ids kept of each Gaussian; with 1 the layer is hard.
 
     Returns:
         The votes with the result for ids, candidates and shares.
@@ -75,7 +82,7 @@ def spread(
         share = relabelled.shares[:, rank].cpu().float() * own
         total.scatter_add_(1, column[:, None], share[:, None])
     info = replace(votes.info, details={**votes.info.details, "own_share": round(own_share, 4)})
-    return _soft(total[:, :width], pooled, replace(votes, info=info))
+    return _kept(total[:, :width], pooled, replace(votes, info=info), candidates)
 
 
 def _memberships(objects: Labels) -> Iterator[tuple[Tensor, Tensor]]:
@@ -89,8 +96,11 @@ def _memberships(objects: Labels) -> Iterator[tuple[Tensor, Tensor]]:
     yield from zip(members.contiguous(), shares.contiguous(), strict=True)
 
 
-def _soft(shares: Float[Tensor, "n classes"], pooled: PooledObjects, votes: Labels) -> Labels:
-    kept = min(CANDIDATES, shares.shape[1])
+def _kept(
+    shares: Float[Tensor, "n classes"], pooled: PooledObjects, votes: Labels, candidates: int
+) -> Labels:
+    """The most likely ids."""
+    kept = min(candidates, shares.shape[1])
     # Stable: of equals the one with the smaller id.
     order = torch.sort(shares, dim=1, descending=True, stable=True)
     best, column = order.values[:, :kept], order.indices[:, :kept]
@@ -99,6 +109,6 @@ def _soft(shares: Float[Tensor, "n classes"], pooled: PooledObjects, votes: Labe
         votes,
         ids=ids[:, 0],
         confidence=best[:, 0].clamp(0, 1),
-        candidates=ids,
-        shares=best,
+        candidates=ids if candidates > 1 else None,
+        shares=best if candidates > 1 else None,
     )

@@ -130,7 +130,6 @@ def label_objects(
     votes = replace(found, info=info)
     objects = tree.cut("object")
     pooled = pool_objects(objects, votes, scales, weights)
-    own_share = own_share_of(options, votes)
     if categories is not None:
         objects, pooled = named_by_tracks(objects, pooled)
         pooled = with_categories(pooled, categories)
@@ -139,7 +138,16 @@ def label_objects(
     names = {} if classes is None else {row.id: row.name for row in classes.rows}
     return ObjectLabels(
         classes=(
-            spread(objects, votes, pooled, probabilities, own_share) if categories is None else None
+            spread(
+                objects,
+                votes,
+                pooled,
+                probabilities,
+                own_share=own_share_of(options, votes),
+                candidates=options.candidates,
+            )
+            if categories is None
+            else None
         ),
         objects=_with_classes(objects, pooled, probabilities, replace(info, names=names)),
     )

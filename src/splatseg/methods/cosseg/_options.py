@@ -12,6 +12,7 @@ from splatseg.lift.training import SamplingOptions
 from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
 from splatseg.methods.cosseg._distilled import Division
+from splatseg.methods.cosseg._joint_options import JointOptions
 
 Compared = Literal["deepest", "all"]
 Semantic = Literal["all", "first", "none"]
@@ -63,6 +64,10 @@ class CossegOptions(LabelTrainingOptions):
     own_share: float | None = None
     """Share, in [0, 1], that a Gaussian's own votes have in its class beside its object's. None:
     the more the less neighbouring views err alike, as measured. Of tracks none."""
+
+    candidates: int = 1
+    """Ids kept of each Gaussian, with `decide` objects. 1 makes a hard layer; with more it keeps
+    their shares and is rendered softly."""
 
     max_correlation: float = 1 / 3
     """Correlation of neighbouring views, in [0, 1], from which on own votes have no share."""
@@ -120,6 +125,14 @@ class CossegOptions(LabelTrainingOptions):
     rate: float = 3e-3
     """Adam's rate for the decoder."""
 
+    joint: Path | None = None
+    """Folder of a new scene whose Gaussians learn from photographs and labels together with the
+    decoder, as published; the layer is written there. None: Gaussians stay as they are, and
+    learning is faster."""
+
+    joint_training: JointOptions = field(default_factory=JointOptions)
+    """How they learn together."""
+
     def __post_init__(self) -> None:
         LabelTrainingOptions.__post_init__(self)
         check_choice("decide", self.decide, get_args(Decide))
@@ -136,6 +149,7 @@ class CossegOptions(LabelTrainingOptions):
             ("min_pixels", 0),
             ("block_points", 1),
             ("lifted_side", 1),
+            ("candidates", 1),
         ):
             if getattr(self, name) < least:
                 raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
@@ -148,6 +162,8 @@ class CossegOptions(LabelTrainingOptions):
         check_range("max_correlation", self.max_correlation, 0.0, 1.0)
         if self.own_share is not None:
             check_range("own_share", self.own_share, 0.0, 1.0)
+        if self.joint is not None and self.decide != "decoder":
+            raise RangeError(f"joint: goes with decide decoder, got {self.decide}.")
         if self.spatial == "none" and self.semantic == "none":
             raise RangeError("semantic, spatial: expected one of the two, got neither.")
 

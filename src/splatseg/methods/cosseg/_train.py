@@ -1,51 +1,35 @@
 """From label maps and features to a decoder of both, and what it says of every Gaussian."""
 
-import hashlib
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int64
-from torch import Tensor
 
-from splatseg.core import ClassTable, Features, Gaussians, LabelSource, LayerInfo, View
+from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
-from splatseg.errors import InputError
-from splatseg.lift.heads import ClassifierHead
 from splatseg.lift.mass.uplift import UpliftOptions, uplift
-from splatseg.lift.point_network import PointEncoder, load_point_encoder
-from splatseg.lift.training import TrainingResult, held_out_views
+from splatseg.lift.training import held_out_views
 from splatseg.methods._trained_labels import (
     LabelData,
     TrainingContext,
     label_data,
-    layer_info,
-    recorded_options,
     train_labels,
 )
 from splatseg.methods.cosseg._agreement import VoteAgreement
 from splatseg.methods.cosseg._blocks import BlockSource
+from splatseg.methods.cosseg._decoded_layer import decoded_layer
 from splatseg.methods.cosseg._distilled import (
-    DistilledFeatures,
-    distilled_features,
-    pixel_counts,
     view_pixel_counts,
 )
-from splatseg.methods.cosseg._fusion import FusionShape, Scaling, decode_all
+from splatseg.methods.cosseg._fusion import FusionShape, Scaling, decoded_widths
+from splatseg.methods.cosseg._given import Given, prepare
 from splatseg.methods.cosseg._model import FusionModel, PointsOf
 from splatseg.methods.cosseg._options import CossegOptions
 from splatseg.methods.cosseg._points import (
     PointSet,
-    PointSource,
-    RawPoints,
-    boxes,
-    check_decoded,
-    joined_blocks,
 )
 from splatseg.methods.cosseg._visible import VisiblePoints
 from splatseg.render import options_for
@@ -100,7 +84,7 @@ def train_cosseg(
     """
     options, context = options or CossegOptions(), context or TrainingContext()
     data = label_data(gaussians, views, evidence, options=options, context=context)
-    given = _given(
+    given = prepare(
         gaussians, data, features, options=options, context=context, frame=(metres_per_unit, up)
     )
     with one_torch_thread():
@@ -115,7 +99,7 @@ def train_cosseg(
         model = FusionModel(
             FusionShape(
                 inputs=everything.inputs.widths,
-                decoded=_widths(options.decoded, len(everything.inputs.widths)),
+                decoded=decoded_widths(options.decoded, len(everything.inputs.widths)),
                 head=options.head,
             ),
             len(data.ids),
@@ -132,100 +116,15 @@ def train_cosseg(
         result = train_labels(
             "cosseg", data, model, options=options, context=context, extra=given.settings
         )
-    return _layer(given, everything, data, result, classes=classes, seed=context.seed)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Given:
-    """What is decoded from."""
-
-    gaussians: Gaussians
-    chosen: Int64[Tensor, "m"]
-    distilled: DistilledFeatures | None
-    encoder: PointEncoder | None
-    source: PointSource
-    options: CossegOptions
-
-    def points_of(self, chosen: Int64[Tensor, "m"]) -> RawPoints:
-        """What stands beside some Gaussians."""
-        if self.options.points != "blocks" or self.encoder is None:
-            return self.source.raw(chosen)
-        means = self.gaussians.means.detach().cpu()
-        parts = boxes(means, chosen, self.options.block_points)
-        return joined_blocks([self.source.raw(part) for part in parts])
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What else must be the same to resume."""
-        digest = hashlib.sha256()
-        for scale in () if self.distilled is None else self.distilled.scales:
-            digest.update(scale.numpy().tobytes())
-        encoder = hashlib.sha256()
-        for value in () if self.encoder is None else self.encoder.encoder.state_dict().values():
-            encoder.update(value.numpy().tobytes())
-        return {"distilled": digest.hexdigest(), "point network": encoder.hexdigest()}
-
-
-def _given(
-    gaussians: Gaussians,
-    data: LabelData,
-    features: BlockSource | None,
-    *,
-    options: CossegOptions,
-    context: TrainingContext,
-    frame: tuple[float | None, tuple[float, float, float] | None],
-) -> _Given:
-    """Lift features, count pixels and load the point network, as far as they are asked for."""
-    if features is None and options.semantic != "none" and options.spatial == "none":
-        raise InputError("features: expected evidence of features to decode, got none.")
-    chosen, counts = torch.arange(len(gaussians)), None
-    if options.min_pixels > 0 or (options.division == "pixels" and features is not None):
-        counts = pixel_counts(
-            gaussians,
-            data.views,
-            render_options=context.render_options,
-            backend=context.backend,
-        )
-        chosen = check_decoded(counts >= options.min_pixels, options.min_pixels)
-    distilled = None
-    if features is not None and options.semantic != "none":
-        distilled = distilled_features(
-            gaussians,
-            data.views,
-            features,
-            components=options.components,
-            division=options.division,
-            pixels=counts,
-            longest_side=options.lifted_side,
-            render_options=context.render_options,
-            backend=context.backend,
-        )
-    encoder = None if options.spatial == "none" else load_point_encoder(options.encoder)
-    scales: Sequence[Tensor] = () if distilled is None else distilled.scales
-    if options.semantic == "first":
-        scales = scales[:1]
-    return _Given(
-        gaussians=gaussians,
-        chosen=chosen,
-        distilled=distilled,
-        encoder=encoder,
-        source=PointSource(
-            gaussians=gaussians,
-            scales=scales,
-            encoder=encoder,
-            spatial=options.spatial,
-            metres_per_unit=frame[0],
-            up=frame[1],
-            seed=context.seed,
-        ),
-        options=options,
+    return decoded_layer(
+        given,
+        everything,
+        data,
+        result,
+        blend=options.blend,
+        classes=classes,
+        seed=context.seed,
     )
-
-
-def _widths(decoded: Sequence[int], levels: int) -> tuple[int, ...]:
-    """Channels of each level; the last number stands for all that are not given."""
-    given = tuple(decoded[:levels])
-    return given + (given[-1],) * (levels - len(given))
 
 
 def _agreement(
@@ -250,7 +149,7 @@ def _agreement(
 
 @contextmanager
 def _points(
-    given: _Given,
+    given: Given,
     views: Sequence[View],
     *,
     scalings: Sequence[Sequence[Scaling]],
@@ -279,49 +178,3 @@ def _points(
         VisiblePoints(partial(make, held_out), memory=options.memory) as scored,
     ):
         yield points.of, scored.of
-
-
-def _layer(
-    given: _Given,
-    everything: PointSet,
-    data: LabelData,
-    result: TrainingResult,
-    *,
-    classes: ClassTable | None,
-    seed: int,
-) -> Features:
-    """What is decoded of every Gaussian, with the classifier that reads it."""
-    options = given.options
-    with one_torch_thread():
-        decoded = decode_all(everything.inputs, result.shared)
-    values = torch.zeros(len(everything.rows), decoded.shape[1])
-    there = everything.rows >= 0
-    values[there] = decoded[everything.rows[there]]
-    # Features say what a Gaussian is though no drawn pixel shows it.
-    weights = result.visibility.clone()
-    if given.distilled is not None:
-        weights = torch.maximum(weights, given.distilled.weights)
-    weights[~there] = 0
-    head = ClassifierHead(
-        ids=data.ids,
-        weight=result.shared["classifier.weight"],
-        bias=result.shared["classifier.bias"],
-        blend=options.blend,
-    )
-    info = layer_info(
-        "cosseg", recorded_options(options), data, result, head=head, classes=classes, seed=seed
-    )
-    return Features(values=values, weights=weights, info=_with_facts(info, given, everything))
-
-
-def _with_facts(info: LayerInfo, given: _Given, everything: PointSet) -> LayerInfo:
-    """The record, with what was decoded from."""
-    facts: dict[str, Any] = {"decoded": len(given.chosen)}
-    if given.distilled is not None:
-        facts["blocks"] = list(given.distilled.names)
-        facts["skipped"] = [name for name, done in given.distilled.steps.items() if not done]
-    if given.encoder is not None:
-        facts["point_network"] = given.encoder.source
-        facts["metres_per_unit"] = everything.metres_per_unit
-        facts["scale_assumed"] = given.source.metres_per_unit is None
-    return replace(info, details={**info.details, **facts})

@@ -1,0 +1,72 @@
+"""What a trained decoder says of every Gaussian, as a layer."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from splatseg.core import ClassTable, Features, LayerInfo
+from splatseg.core.threads import one_torch_thread
+from splatseg.lift.heads import Blend, ClassifierHead
+from splatseg.lift.training import TrainingResult
+from splatseg.methods._trained_labels import LabelData, layer_info, recorded_options
+from splatseg.methods.cosseg._fusion import decode_all
+from splatseg.methods.cosseg._given import Given
+from splatseg.methods.cosseg._points import PointSet
+
+
+def decoded_layer(
+    given: Given,
+    everything: PointSet,
+    data: LabelData,
+    result: TrainingResult,
+    *,
+    blend: Blend,
+    classes: ClassTable | None,
+    seed: int,
+) -> Features:
+    """What is decoded of every Gaussian, with the classifier that reads it.
+
+    Args:
+        given: What it is decoded from.
+        everything: All Gaussians that are decoded.
+        data: Label maps and their views.
+        result: The weights.
+        blend: Whether what is decoded is rendered and then classified, or probabilities rendered.
+        classes: Names of the ids.
+        seed: Of the training.
+    """
+    options = given.options
+    with one_torch_thread():
+        decoded = decode_all(everything.inputs, result.shared)
+    values = torch.zeros(len(everything.rows), decoded.shape[1])
+    there = everything.rows >= 0
+    values[there] = decoded[everything.rows[there]]
+    # Features say what a Gaussian is though no drawn pixel shows it.
+    weights = result.visibility.clone()
+    if given.distilled is not None:
+        weights = torch.maximum(weights, given.distilled.weights)
+    weights[~there] = 0
+    head = ClassifierHead(
+        ids=data.ids,
+        weight=result.shared["classifier.weight"],
+        bias=result.shared["classifier.bias"],
+        blend=blend,
+    )
+    info = layer_info(
+        "cosseg", recorded_options(options), data, result, head=head, classes=classes, seed=seed
+    )
+    return Features(values=values, weights=weights, info=_with_facts(info, given, everything))
+
+
+def _with_facts(info: LayerInfo, given: Given, everything: PointSet) -> LayerInfo:
+    """The record, with what was decoded from."""
+    facts: dict[str, Any] = {"decoded": len(given.chosen)}
+    if given.distilled is not None:
+        facts["blocks"] = list(given.distilled.names)
+        facts["skipped"] = [name for name, done in given.distilled.steps.items() if not done]
+    if given.encoder is not None:
+        facts["point_network"] = given.encoder.source
+        facts["metres_per_unit"] = everything.metres_per_unit
+        facts["scale_assumed"] = given.source.metres_per_unit is None
+    return replace(info, details={**info.details, **facts})
