@@ -39,6 +39,8 @@ from splatseg.lift import (
     label_map,
     uplift,
 )
+from splatseg.methods.cosseg import CossegOptions
+from splatseg.tasks.segment import SegmentOptions, segment
 
 _SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 
@@ -51,6 +53,7 @@ class Job:
     data: Path
     work: Path
     masks: str
+    cosseg: Sequence[str] = ()
 
     def draw(self, labels: Labels, views: Sequence[View], name: str, *, binary: int = 0) -> Path:
         """Label maps of views as PNG; with `binary` masks of that id."""
@@ -85,6 +88,30 @@ def camvid(job: Job) -> None:
             hard = complete(job.scene.gaussians, replace(labels, candidates=None, shares=None))
             drawn = job.draw(hard, scored, name)
             _classes(f"{title}, {name}", _score("semantic", drawn, truth), seconds)
+    truth = _subset(job.data / "semantic", held, job.work / "truth")
+    for words in job.cosseg:
+        begin = time.monotonic()
+        labels = _cosseg(job, words)
+        drawn = job.draw(labels, held, "cosseg")
+        said = _score("semantic", drawn, truth)
+        _classes(f"held-out frames, cosseg {words}", said, time.monotonic() - begin)
+
+
+def _cosseg(job: Job, words: str) -> Labels:
+    """The layer of ``cosseg`` with options such as ``masks=masks decide=objects``."""
+    base, changes = CossegOptions(), dict[str, Any]()
+    for word in words.split():
+        name, value = word.split("=")
+        kind = type(getattr(base, name))
+        changes[name] = kind(value) if kind in (int, float) else value
+        if value.replace(".", "").isdigit() and kind is type(None):
+            changes[name] = float(value)
+    return segment(
+        job.scene,
+        "cosseg",
+        options=SegmentOptions(evidence="labels_semantic"),
+        method_options=replace(base, **changes),
+    ).labels
 
 
 def dtu(job: Job) -> None:
@@ -212,6 +239,13 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--masks", default="masks", help="replica: evidence and layer of the scene")
+    parser.add_argument(
+        "--cosseg",
+        nargs="*",
+        default=[],
+        metavar="OPTIONS",
+        help='camvid: also this method, such as "masks=masks features=classical_features"',
+    )
     parser.add_argument("--work", type=Path, help="keep label maps here")
     arguments = parser.parse_args()
     temporary = None if arguments.work else tempfile.mkdtemp()
@@ -221,6 +255,7 @@ def main() -> None:
             data=arguments.data,
             work=arguments.work or Path(temporary or ""),
             masks=arguments.masks,
+            cosseg=arguments.cosseg,
         )
         {"camvid": camvid, "dtu": dtu, "replica": replica}[arguments.what](job)
     finally:

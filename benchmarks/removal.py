@@ -27,7 +27,7 @@ import json
 import math
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -159,10 +159,9 @@ class Pictures:
         return -10 * math.log10(max(statistics.fmean(errors), 1e-12))
 
 
-def things_of(data: Path, labels: Labels) -> dict[int, str]:
-    """Names of the things that some Gaussian is of."""
+def things_of(data: Path, present: Container[int]) -> dict[int, str]:
+    """Names of those ids that are of things."""
     table = json.loads((data / "metadata.json").read_text())
-    present = set(labels.present.tolist())
     return {
         row["id"]: row["name"]
         for row in table["instances"]
@@ -293,7 +292,7 @@ def main() -> None:
     if not isinstance(labels, Labels) or (args.split == "once" and labels.candidates is None):
         labels = lifted(document.scene, truth)
     document = Document(scene=document.scene, layers={LAYER: labels})
-    things = dict(list(things_of(args.data, labels).items())[:: args.every])
+    things = dict(list(things_of(args.data, set(labels.present.tolist())).items())[:: args.every])
     if args.ids:
         things = {thing: name for thing, name in things.items() if thing in args.ids}
     cut = CutOptions(keep_share=args.keep_share, min_side=args.min_side)
