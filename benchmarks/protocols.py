@@ -41,6 +41,7 @@ class Run:
     scene: str
     methods: tuple[str, ...]
     evidence: tuple[str, ...] = ()
+    companions: tuple[str, ...] = ()
     switches: tuple[str, ...] = ()
 
 
@@ -48,6 +49,7 @@ _TEXT, _CLASSES, _PANOPTIC, _TRACKED, _MASKS = (
     "features_text", "labels_semantic", "labels_panoptic", "labels_tracked", "masks_sam",
 )  # fmt: skip
 _ANY = ("scene_list=all",)
+_BESIDES = (_MASKS, "features_dino")
 RUNS = (
     Run(protocol="nvos", layout="nvos", scene="frontal",
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
@@ -78,13 +80,17 @@ RUNS = (
     Run(protocol="scannet-10", layout="scannet", scene="office", methods=("uplift", "features"),
         evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
     Run(protocol="cosseg-replica-semantic", layout="replica", scene="office",
-        methods=("uplift", "associate"), evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
+        methods=("uplift", "associate", "cosseg"), companions=_BESIDES,
+        evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
     Run(protocol="cosseg-replica-panoptic", layout="replica", scene="office",
-        methods=("uplift", "associate"), evidence=(_TRACKED, _PANOPTIC), switches=_ANY),
+        methods=("uplift", "associate", "cosseg"), companions=_BESIDES,
+        evidence=(_TRACKED, _PANOPTIC), switches=_ANY),
     Run(protocol="cosseg-scannet-semantic", layout="scannet", scene="office",
-        methods=("uplift", "associate"), evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
+        methods=("uplift", "associate", "cosseg"), companions=_BESIDES,
+        evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
     Run(protocol="cosseg-scannet-panoptic", layout="scannet", scene="office",
-        methods=("uplift", "associate"), evidence=(_TRACKED, _PANOPTIC), switches=_ANY),
+        methods=("uplift", "associate", "cosseg"), companions=_BESIDES,
+        evidence=(_TRACKED, _PANOPTIC), switches=_ANY),
 )  # fmt: skip
 
 
@@ -112,6 +118,7 @@ def _do(run: Run, asked: Any) -> None:
         options=BenchOptions(
             methods=run.methods,
             models=tuple(str(data / "evidence" / "{scene}" / name) for name in run.evidence),
+            companions=tuple(str(data / "evidence" / "{scene}" / name) for name in run.companions),
             steps=asked.steps,
             max_gaussians=asked.max_gaussians,
             switches=run.switches,
@@ -134,7 +141,7 @@ def _written(run: Run, asked: Any) -> tuple[Path, BenchmarkScene]:
     if not data.is_dir():
         write_layout(run.layout, source, data)
     (scene,) = read_benchmark(run.layout, data)
-    for name in run.evidence:
+    for name in (*run.evidence, *run.companions):
         if not (data / "evidence" / scene.name / name).is_dir():
             write_evidence(read_source(source), scene.capture, name, data / "evidence" / scene.name)
     return data, scene
