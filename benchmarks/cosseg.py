@@ -11,6 +11,8 @@ Every row is a process of its own, so that its seconds and its peak of memory ar
 - `logits`, `probabilities`, `identity`, `cosseg`: by default; `published`: `cosseg --published`;
   `decoder`: `cosseg --decide decoder`. `--set OPTION=VALUE` changes options of the method.
 - `associate`: of tracks.
+- `joint`: `decoder` with Gaussians that learn along (`--joint`); with the mean PSNR of test views,
+  before and after.
 - `walk`: votes smoothed by a random walk over neighbours alike in colour and features.
 
 Label maps of classes are scored by ``score.py semantic``; of tracks by ``instances`` and
@@ -33,13 +35,24 @@ import torch
 from PIL import Image
 from scored import _SCORE, ScoredScene
 
-from splatseg.core import Features, InstanceTree, Labels, Layer
+from splatseg.core import Features, InstanceTree, Labels, Layer, Scene
+from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene
-from splatseg.lift import CompletionOptions, UpliftOptions, complete, label_map, uplift
+from splatseg.lift import (
+    CompletionOptions,
+    GaussianField,
+    UpliftOptions,
+    complete,
+    label_map,
+    uplift,
+)
 from splatseg.lift.heads import ClassifierHead
 from splatseg.methods import find_method
 from splatseg.tasks.segment import SegmentOptions, segment
+
+_NEW = Path(tempfile.gettempdir()) / "splatseg-joint"
+"""Named, and never written."""
 
 METHODS = {
     "majority": ("uplift", {"correct_confusion": False}, {"complete": False}),
@@ -51,27 +64,40 @@ METHODS = {
     "cosseg": ("cosseg", {"features": "features_dino", "masks": "masks_sam"}, {}),
     "decoder": ("cosseg", {"features": "features_dino", "decide": "decoder"}, {}),
     "published": ("cosseg", {}, {"published": True}),
+    "joint": ("cosseg", {"features": "features_dino", "decide": "decoder", "joint": _NEW}, {}),
 }
 
 
-def made(scene: Any, row: str, evidence: str, changes: dict[str, Any], seed: int) -> Layer:
-    """The layer of a row."""
+def made(
+    scene: Scene, row: str, evidence: str, changes: dict[str, Any], seed: int
+) -> tuple[Layer, Scene]:
+    """The layer of a row, and the scene that it belongs to."""
     if row == "object_vote":
-        return object_vote(scene, evidence)
+        return object_vote(scene, evidence), scene
     if row == "walk":
-        return random_walk(scene, evidence)
+        return random_walk(scene, evidence), scene
     name, own, shared = METHODS[row]
     method = find_method(name)
     base = method.published_options if shared.get("published") else method.options()
     known = {each.name for each in fields(base)}
     chosen = replace(base, **{k: v for k, v in {**own, **changes}.items() if k in known})
+    if row == "joint":
+        inner = {k: v for k, v in changes.items() if k not in known}
+        chosen = replace(chosen, joint_training=replace(chosen.joint_training, **inner))
     options = SegmentOptions(evidence=evidence, layer="bench", seed=seed, **shared)
-    return segment(scene, name, options=options, method_options=chosen).layer
+    found = segment(scene, name, options=options, method_options=chosen)
+    return found.layer, found.refined or scene
+
+
+def quality(scene: Scene) -> float:
+    """Mean PSNR of renders against the photographs of test views, dB."""
+    field = GaussianField(scene.gaussians)
+    return float(np.mean([psnr(*render_and_photograph(field, v)) for v in scene.test_views]))
 
 
 def object_vote(scene: Any, evidence: str) -> Labels:
     """Each instance of `masks_sam` with the majority class of its Gaussians."""
-    votes = made(scene, "majority", evidence, {}, 0)
+    votes, _ = made(scene, "majority", evidence, {}, 0)
     tree = segment(scene, "associate", options=SegmentOptions(evidence="masks_sam")).layer
     if not isinstance(votes, Labels) or not isinstance(tree, InstanceTree):
         raise TypeError
@@ -164,11 +190,11 @@ def run_row(arguments: argparse.Namespace, row: str) -> None:
     scene = load_scene(arguments.scene)
     changes = {k: eval_value(v) for k, v in (one.split("=", 1) for one in arguments.set)}
     began = time.monotonic()
-    layer = made(scene, row, arguments.evidence, changes, arguments.seed)
+    layer, new = made(scene, row, arguments.evidence, changes, arguments.seed)
     seconds = time.monotonic() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     with tempfile.TemporaryDirectory() as temporary:
-        bench = ScoredScene(scene, arguments.data, arguments.work or Path(temporary))
+        bench = ScoredScene(new, arguments.data, arguments.work or Path(temporary))
         folder = drawn(bench, layer, row)
         if "tracked" not in arguments.evidence:
             said = bench.score("semantic", [folder], "semantic")
@@ -180,6 +206,8 @@ def run_row(arguments: argparse.Namespace, row: str) -> None:
             text = f"instance mIoU {said['mIoU']:.4f}  " + "  ".join(
                 f"{key} {more[key]:.4f}" for key in keys
             )
+        if new is not scene:
+            text += f"  PSNR {quality(scene):.2f} -> {quality(new):.2f} dB"
         text += f"  {frames_per_second(bench, layer):.2f} fps"
     learned = layer.info.details.get("learned_bytes", "")
     what = f"{arguments.data.name:7s} {arguments.evidence:22s} {row:14s}"

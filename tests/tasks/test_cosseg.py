@@ -9,6 +9,7 @@ import torch
 from splatseg.cli import main
 from splatseg.core import Features, Labels
 from splatseg.errors import InputError
+from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods.cosseg import CossegOptions
 from splatseg.tasks.segment import SegmentOptions, segment
@@ -116,3 +117,47 @@ def test_a_new_scene_is_refused_before_the_work(scene, tmp_path, capsys) -> None
     assert main([*words, "--masks", "masks_sam"]) == 2
     assert "joint: goes with decide decoder, got objects" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
+
+
+def test_panoptic_segments_become_objects_with_classes(scene) -> None:
+    """No other masks are named: the segments themselves are associated."""
+    shared = SegmentOptions(evidence="labels_panoptic")
+    options = CossegOptions(features="features_dino")
+    layer = segment(load_scene(scene), "cosseg", options=shared, method_options=options).layer
+    assert isinstance(layer, Labels)
+    present = {id for id in layer.ids.tolist() if id >= 0}
+    known = {row.id for row in load_scene(scene).classes.rows}
+    assert len(present) > 5
+    assert set(layer.info.class_of.values()) <= known
+    assert set(layer.info.class_of) >= present
+
+
+def decoded(scene: Path, evidence: str, **change) -> Labels:
+    options = CossegOptions(
+        features="features_dino", decide="decoder", spatial="none", steps=30, batch=512, **change
+    )
+    layer = segment(
+        load_scene(scene), "cosseg", options=SegmentOptions(evidence=evidence),
+        method_options=options,
+    ).layer  # fmt: skip
+    assert isinstance(layer, Labels)
+    return layer
+
+
+def test_a_decoder_of_segments_has_ids_that_mean_the_same_in_all_views(scene) -> None:
+    """Ids of tracks are as given, those of panoptic segments by association; both have classes."""
+    tracks = open_evidence(load_scene(scene).source / "labels_tracked")
+    layer = decoded(scene, "labels_tracked")
+    given = {track.id for track in tracks.tracks}
+    assert {id for id in layer.ids.tolist() if id >= 0} <= given
+    assert set(layer.info.class_of) <= given
+    assert layer.info.class_of
+    linked = decoded(scene, "labels_tracked", link="associate")
+    assert linked.info.class_of
+    assert linked.info.names != layer.info.names
+    panoptic = decoded(scene, "labels_panoptic")
+    assert panoptic.info.class_of
+    with pytest.raises(InputError, match="link: expected associate, since ids of panoptic"):
+        decoded(scene, "labels_panoptic", link="given")
+    with pytest.raises(InputError, match="link: expected segments of objects .panoptic, tracked"):
+        decoded(scene, "labels_semantic", link="associate")

@@ -22,10 +22,11 @@ from collections.abc import Mapping
 
 from splatseg.core import ClassTable, Layer
 from splatseg.errors import InputError
-from splatseg.io.evidence import TrackedEvidence
+from splatseg.io.evidence import PanopticEvidence, TrackedEvidence
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.methods._method import Method, MethodInputs, Refined
 from splatseg.methods._trained_labels import context_of, hard_labels
+from splatseg.methods.cosseg._linked import CategoryMaps, linked_labels
 from splatseg.methods.cosseg._objects import label_objects
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
@@ -37,11 +38,12 @@ def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
     if options.decide == "objects":
         return _closed_form(inputs, options)
     features, gaussians = inputs.features("features"), None
+    linked = linked_labels(inputs, options.link)
     if options.joint is None:
         found = train_cosseg(
             inputs.gaussians,
             inputs.views,
-            inputs.evidence,
+            linked.source,
             features=features,
             options=options,
             classes=inputs.label_names,
@@ -53,7 +55,7 @@ def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
         gaussians, found = train_cosseg_jointly(
             inputs.gaussians,
             inputs.views,
-            inputs.evidence,
+            linked.source,
             features=features,
             options=options,
             classes=inputs.label_names,
@@ -62,34 +64,38 @@ def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
             context=context_of(inputs),
             told=inputs.progress,
         )
-    layer = found if options.readout == "rendered" else hard_labels(found, options)
+    layer: Layer = found
+    if options.readout == "hard":
+        layer = linked.told(hard_labels(found, options))
     return layer if gaussians is None else Refined(layer=layer, gaussians=gaussians)
 
 
 def _closed_form(inputs: MethodInputs, options: CossegOptions) -> Layer:
-    """Of label maps the classes of Gaussians, of tracks the objects with a class each."""
-    masks = inputs.companions.get("masks")
-    if masks is None:
+    """Of label maps the classes of Gaussians, of segments the objects with a class each."""
+    evidence = inputs.evidence
+    masks = inputs.companions.get("masks", evidence)
+    if masks.kind == "labels":
         raise InputError(
             "masks: expected evidence of masks, such as masks_sam, to find objects by, got none; "
             "`decide` by decoder wants none."
         )
-    evidence = inputs.evidence
     tracked = isinstance(evidence, TrackedEvidence)
     found = label_objects(
         inputs.gaussians,
         inputs.views,
-        evidence,
+        CategoryMaps(evidence=evidence) if isinstance(evidence, PanopticEvidence) else evidence,
         features=inputs.features("features"),
         masks=EvidenceSegments(evidence=masks),
         options=options,
         object_options=options.classification,
-        classes=inputs.categories if tracked else inputs.label_names,
+        classes=inputs.label_names if evidence.kind == "labels" else inputs.categories,
         context=context_of(inputs),
         categories=_categories(evidence, inputs.categories) if tracked else None,
         told=inputs.progress,
     )
-    return found.objects if found.classes is None else found.classes
+    if found.classes is None or evidence.kind != "labels":
+        return found.objects
+    return found.classes
 
 
 def _categories(
@@ -112,7 +118,7 @@ METHOD = Method(
     name="cosseg",
     summary="labels are decoded from features of photographs and the shape in space",
     reference="CoSSegGaussians (Dou et al. 2024), eq. 2 to 5",
-    evidence=("labels", "tracked"),
+    evidence=("labels", "tracked", "panoptic"),
     options=CossegOptions,
     run=run,
     keeps_ids=True,
@@ -120,5 +126,5 @@ METHOD = Method(
     resumes=True,
     published=CossegOptions.published(),
     refines="joint",
-    companions={"features": ("features",), "masks": ("masks",)},
+    companions={"features": ("features",), "masks": ("masks", "panoptic", "tracked")},
 )

@@ -20,6 +20,7 @@ from splatseg.core import (
     UNLABELLED,
     ClassTable,
     Gaussians,
+    InstanceTree,
     Labels,
     LabelSource,
     LayerInfo,
@@ -35,7 +36,7 @@ from splatseg.lift.object_classes import (
 )
 from splatseg.lift.segments.table import SegmentSource
 from splatseg.methods._trained_labels import TrainingContext, recorded_options
-from splatseg.methods.associate import associate_masks
+from splatseg.methods.associate import associate
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._distilled import distilled_features
 from splatseg.methods.cosseg._object_shares import CANDIDATES, own_share_of, spread
@@ -74,7 +75,7 @@ def label_objects(
         views: Those whose labels, features and masks count.
         evidence: Label maps, of classes or of tracks.
         features: Several blocks of a network; None takes votes of each object alone.
-        masks: Masks of objects, parts and groups.
+        masks: Masks of objects, parts and groups; or segments of objects, which do not overlap.
         options: How features are reduced and lifted.
         object_options: How votes and features are weighed.
         classes: Names of the classes.
@@ -102,13 +103,7 @@ def label_objects(
         backend=context.backend,
     )
     tell(1)
-    tree = associate_masks(
-        gaussians,
-        views,
-        masks,
-        render_options=context.render_options,
-        backend=context.backend,
-    ).tree
+    objects = _associated(gaussians, views, masks, context)
     tell(2)
     scales: tuple[Tensor, ...] = (torch.zeros(len(gaussians), 1),)
     weights = torch.zeros(len(gaussians))
@@ -128,7 +123,6 @@ def label_objects(
     tell(3)
     info = replace(found.info, method="cosseg", options=recorded_options(options))
     votes = replace(found, info=info)
-    objects = tree.cut("object")
     pooled = pool_objects(objects, votes, scales, weights)
     if categories is not None:
         objects, pooled = named_by_tracks(objects, pooled)
@@ -151,6 +145,20 @@ def label_objects(
         ),
         objects=_with_classes(objects, pooled, probabilities, replace(info, names=names)),
     )
+
+
+def _associated(
+    gaussians: Gaussians, views: Sequence[View], segments: SegmentSource, context: TrainingContext
+) -> Labels:
+    """The objects that segments are of: those of a tree where segments may overlap."""
+    found = associate(
+        gaussians,
+        views,
+        segments,
+        render_options=context.render_options,
+        backend=context.backend,
+    )
+    return found.cut("object") if isinstance(found, InstanceTree) else found
 
 
 def named_by_tracks(objects: Labels, pooled: PooledObjects) -> tuple[Labels, PooledObjects]:

@@ -13,6 +13,7 @@ from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
 from splatseg.methods.cosseg._distilled import Division
 from splatseg.methods.cosseg._joint_options import JointOptions
+from splatseg.methods.cosseg._linked import Link
 
 Compared = Literal["deepest", "all"]
 Semantic = Literal["all", "first", "none"]
@@ -40,7 +41,14 @@ class CossegOptions(LabelTrainingOptions):
     decodes space alone."""
 
     masks: str | None = None
-    """Name of evidence of masks, such as masks_sam, that decide by `objects` wants."""
+    """Name of evidence of masks, such as masks_sam, by which `objects` are found. None takes the
+    segments that are labelled themselves, of tracks and of panoptic maps; maps of classes have
+    none."""
+
+    link: Link | None = None
+    """How a decoder's ids are linked over views. given: ids are of tracks or classes. associate:
+    segments become objects (`segment --method associate`) and have the ids of these. None: as
+    given, and panoptic segments by association."""
 
     decide: Decide = "objects"
     """How labels are found. objects: in closed form; masks are associated into objects, and each
@@ -136,6 +144,8 @@ class CossegOptions(LabelTrainingOptions):
     def __post_init__(self) -> None:
         LabelTrainingOptions.__post_init__(self)
         check_choice("decide", self.decide, get_args(Decide))
+        if self.link is not None:
+            check_choice("link", self.link, get_args(Link))
         check_choice("compared", self.compared, get_args(Compared))
         check_choice("semantic", self.semantic, get_args(Semantic))
         check_choice("spatial", self.spatial, get_args(Spatial))
