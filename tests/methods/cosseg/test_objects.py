@@ -10,7 +10,7 @@ from splatseg.errors import RangeError
 from splatseg.lift.object_classes import ObjectClassOptions, PooledObjects, pool_objects
 from splatseg.methods._trained_labels import TrainingContext
 from splatseg.methods.cosseg import CossegOptions
-from splatseg.methods.cosseg._object_shares import own_share_of
+from splatseg.methods.cosseg._object_shares import own_share
 from splatseg.methods.cosseg._objects import ObjectLabels, label_objects, named_by_tracks
 
 from .conftest import Maps
@@ -59,7 +59,7 @@ def away(halves):
 
 
 def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None:
-    found = labelled(halves, strip(halves, ("v0", "v1", "v2")), candidates=2)
+    found = labelled(halves, strip(halves, ("v0", "v1", "v2")), candidates=2, own_share=0.0)
     right = found.classes.ids.long() == halves.side
     assert bool(right[away(halves)].all())
     assert found.classes.candidates is not None
@@ -72,7 +72,7 @@ def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None
     told: list[tuple[int, int]] = []
     again = label_objects(
         halves.gaussians, halves.views[::-1], strip(halves, ("v0", "v1", "v2")),
-        features=halves.blocks, masks=Masks(halves), options=CossegOptions(candidates=1),
+        features=halves.blocks, masks=Masks(halves), options=CossegOptions(candidates=1, own_share=0.0),
         object_options=ObjectClassOptions(), classes=None,
         context=TrainingContext(backend="auto"), told=lambda *step: told.append(step),
     )  # fmt: skip
@@ -192,6 +192,16 @@ def test_own_votes_share_in_the_class_where_views_err_independently(halves, monk
         assert abs(of(both, id) - expected) < 1e-4
 
 
+def sure(ids, correlation=None) -> Labels:
+    """Each Gaussian has all its votes for one id."""
+    ids = torch.tensor(ids)
+    return Labels(
+        ids=ids, confidence=torch.ones(len(ids)), candidates=ids[:, None].repeat(1, 2),
+        shares=torch.tensor([[1.0, 0.0]]).repeat(len(ids), 1), evidence=torch.ones(len(ids)),
+        info=LayerInfo(view_correlation=correlation),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("correlation", "limit", "expected"),
     [(0.1, 0.4, 0.75), (0.4, 0.4, 0.0), (0.9, 0.4, 0.0), (-0.2, 0.4, 1.0), (None, 0.4, 0.0),
@@ -200,14 +210,35 @@ def test_own_votes_share_in_the_class_where_views_err_independently(halves, monk
 def test_the_share_of_own_votes_falls_with_the_correlation_of_views(
     correlation, limit, expected
 ) -> None:
-    votes = Labels(
-        ids=torch.zeros(1), confidence=torch.ones(1), info=LayerInfo(view_correlation=correlation)
-    )
-    assert own_share_of(CossegOptions(max_correlation=limit), votes) == pytest.approx(expected)
-    assert own_share_of(CossegOptions(max_correlation=limit, own_share=0.3), votes) == 0.3
+    votes = sure([5, 5, 7, 7], correlation)
+    objects = sure([1, 1, 2, 2])
+    found = own_share(CossegOptions(max_correlation=limit), objects, votes)
+    assert found.share == pytest.approx(expected)
+    assert found.heterogeneity == 0
+    given = CossegOptions(max_correlation=limit, own_share=0.3)
+    assert own_share(given, objects, votes).share == 0.3
+
+
+def test_own_votes_count_where_objects_are_none() -> None:
+    """Half of what Gaussians disagree about is between those of one object: (0 + 1/2) / 1."""
+    votes, objects = sure([5, 7, 5, 7], 0.9), sure([1, 1, 2, 3])
+    assert own_share(CossegOptions(), objects, votes).heterogeneity == 1
+    mixed = replace(votes, shares=torch.tensor([[0.5, 0.5]]).repeat(4, 1),
+                    candidates=torch.tensor([[5, 7]]).repeat(4, 1))  # fmt: skip
+    assert own_share(CossegOptions(), objects, mixed).heterogeneity == 0
+    shares = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.5, 0.5]])
+    half = replace(mixed, shares=shares)
+    # Objects 1, 2 and 3 have 2, 1 and 1 of the mass and half of it each disagrees.
+    found = own_share(CossegOptions(max_heterogeneity=0.4), objects, half)
+    assert found.heterogeneity == pytest.approx(0.5)
+    assert found.share == pytest.approx(0.25)
+    assert own_share(CossegOptions(max_heterogeneity=0.2), objects, half).share == 1
+    assert own_share(CossegOptions(max_heterogeneity=0.6), objects, half).share == 0
 
 
 @pytest.mark.parametrize("name", ["own_share", "max_correlation"])
 def test_shares_beyond_one_are_refused(name) -> None:
     with pytest.raises(RangeError, match=rf"^{name}: expected a value in \[0, 1\], got 1\.5\."):
         CossegOptions(**{name: 1.5})
+    with pytest.raises(RangeError, match="max_heterogeneity: expected above 0 and at most 1"):
+        CossegOptions(max_heterogeneity=0.0)

@@ -2,17 +2,20 @@ r"""Classes of objects, on the Gaussians.
 
 .. math:: P_{ic} = (1 - \lambda) \Bigl(\sum_k s_{ik} r_{kc}
           + \bigl(1 - \sum_k s_{ik}\bigr) q_{ic}\Bigr) + \lambda\, q_{ic}, \qquad
-          \lambda = \max(0,\, 1 - \rho / \rho_0)
+          \lambda = \max(1 - \rho / \rho_0,\; \eta / \eta_0 - 1),
+          \text{ in } [0, 1]
 
 with :math:`s_{ik}` the share of Gaussian i in object k, :math:`r_{kc}` what k is, and
 :math:`q_{ic}` what the Gaussian's own votes say, relabelled by how the evidence errs
 (`lift.mass.confusion`). Objects are found with errors of their own: where views err independently,
 and :math:`\rho`, the correlation of neighbouring views (`lift.mass.view_votes`), is small, the
 votes of each Gaussian know better; where errors hold over ranges of views they know nothing more.
+They also know better where objects are none: where much of the disagreement of votes, :math:`\eta`,
+is between the Gaussians of an object (`lift.object_classes.heterogeneity`).
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -20,21 +23,39 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Labels
 from splatseg.lift.mass.confusion import correct_confusion
-from splatseg.lift.object_classes import PooledObjects
+from splatseg.lift.object_classes import PooledObjects, heterogeneity
 from splatseg.methods.cosseg._options import CossegOptions
 
 CANDIDATES = 16
 """Ids of a Gaussian whose votes are counted."""
 
 
-def own_share_of(options: CossegOptions, votes: Labels) -> float:
-    """Lambda: how much of the answer are a Gaussian's own votes."""
-    if options.own_share is not None:
-        return options.own_share
-    correlation = votes.info.view_correlation
-    if correlation is None or options.max_correlation == 0:
-        return 0.0
-    return float(min(1.0, max(0.0, 1 - correlation / options.max_correlation)))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnShare:
+    """How much of the answer are a Gaussian's own votes, and why."""
+
+    share: float
+    """Lambda, in [0, 1]."""
+
+    correlation: float | None
+    heterogeneity: float
+
+
+def own_share(options: CossegOptions, objects: Labels, votes: Labels) -> OwnShare:
+    """Lambda, as given or from how the votes err.
+
+    Args:
+        options: The share, or the limits from which it follows.
+        objects: Which object each Gaussian is of.
+        votes: What label maps say of each, with candidates.
+    """
+    correlation, between = votes.info.view_correlation, heterogeneity(objects, votes)
+    share = options.own_share
+    if share is None:
+        share = between / options.max_heterogeneity - 1
+        if correlation is not None and options.max_correlation > 0:
+            share = max(share, 1 - correlation / options.max_correlation)
+    return OwnShare(share=min(1.0, max(0.0, share)), correlation=correlation, heterogeneity=between)
 
 
 def spread(
@@ -43,7 +64,7 @@ def spread(
     pooled: PooledObjects,
     probabilities: Tensor,
     *,
-    own_share: float,
+    own: OwnShare,
     candidates: int,
 ) -> Labels:
     """Classes of objects on the Gaussians by their shares, and what own votes say.
@@ -53,7 +74,7 @@ def spread(
         votes: What label maps say of each, with candidates.
         pooled: The objects whose classes are known.
         probabilities: Of their classes, rows of zeros where nothing is known of one.
-        own_share: Lambda, in [0, 1].
+        own: How much of the answer are own votes.
         candidates: Ids kept of each Gaussian; with 1 the layer is hard.
 
     Returns:
@@ -61,15 +82,15 @@ def spread(
     """
     count, width = len(objects), len(pooled.classes)
     total = torch.zeros(count, width + 1)
-    own = torch.full((count,), 1 - own_share)
+    left = torch.full((count,), 1 - own.share)
     for member, given in _memberships(objects):
         row = torch.searchsorted(pooled.ids, member).clamp_max(len(pooled.ids) - 1)
         there = (member != UNLABELLED) & (pooled.ids[row] == member)
         there &= probabilities[row].sum(dim=1) > 0
-        share = torch.where(there, given, 0.0) * (1 - own_share)
+        share = torch.where(there, given, 0.0) * (1 - own.share)
         total[:, :width] += probabilities[row].float() * share[:, None]
-        own -= share
-    own = own.clamp_min(0) + own_share
+        left -= share
+    left = left.clamp_min(0) + own.share
     relabelled = votes
     if votes.candidates is not None and votes.candidates.shape[1] > 1:
         relabelled = correct_confusion(votes, view_correlation=votes.info.view_correlation)
@@ -79,9 +100,14 @@ def spread(
         ids = relabelled.candidates[:, rank].cpu().long().contiguous()
         column = torch.searchsorted(pooled.classes, ids).clamp_max(width - 1)
         column = torch.where(ids == UNLABELLED, width, column)
-        share = relabelled.shares[:, rank].cpu().float() * own
+        share = relabelled.shares[:, rank].cpu().float() * left
         total.scatter_add_(1, column[:, None], share[:, None])
-    info = replace(votes.info, details={**votes.info.details, "own_share": round(own_share, 4)})
+    details = {
+        **votes.info.details,
+        "own_share": round(own.share, 4),
+        "heterogeneity": round(own.heterogeneity, 4),
+    }
+    info = replace(votes.info, details=details)
     return _kept(total[:, :width], pooled, replace(votes, info=info), candidates)
 
 

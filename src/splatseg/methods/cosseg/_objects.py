@@ -39,7 +39,7 @@ from splatseg.methods._trained_labels import TrainingContext, recorded_options
 from splatseg.methods.associate import associate
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._distilled import distilled_features
-from splatseg.methods.cosseg._object_shares import CANDIDATES, own_share_of, spread
+from splatseg.methods.cosseg._object_shares import CANDIDATES, own_share, spread
 from splatseg.methods.cosseg._options import CossegOptions
 
 
@@ -137,7 +137,7 @@ def label_objects(
                 votes,
                 pooled,
                 probabilities,
-                own_share=own_share_of(options, votes),
+                own=own_share(options, objects, votes),
                 candidates=options.candidates,
             )
             if categories is None

@@ -78,7 +78,12 @@ class CossegOptions(LabelTrainingOptions):
     their shares and is rendered softly."""
 
     max_correlation: float = 1 / 3
-    """Correlation of neighbouring views, in [0, 1], from which on own votes have no share."""
+    """Correlation of neighbouring views, in [0, 1], from which on own votes have no share, unless
+    objects are heterogeneous."""
+
+    max_heterogeneity: float = 0.22
+    """Share of the disagreement of votes, in (0, 1], that may be between the Gaussians of an object
+    before own votes have a share; they have all of it at twice as much."""
 
     spatial: Spatial = "all"
     """Which levels of the point network are used. all: each is joined to what is decoded there.
@@ -170,6 +175,10 @@ class CossegOptions(LabelTrainingOptions):
         check_rate("transition_rate", self.transition_rate)
         check_range("min_share", self.min_share, 0.0, 1.0)
         check_range("max_correlation", self.max_correlation, 0.0, 1.0)
+        if not 0 < self.max_heterogeneity <= 1:
+            raise RangeError(
+                f"max_heterogeneity: expected above 0 and at most 1, got {self.max_heterogeneity}."
+            )
         if self.own_share is not None:
             check_range("own_share", self.own_share, 0.0, 1.0)
         if self.joint is not None and self.decide != "decoder":
