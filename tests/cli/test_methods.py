@@ -18,6 +18,7 @@ from splatseg.methods import (
     Method,
     _registry,
     find_method,
+    keeps_boundaries,
     keeps_ids,
     method_names,
     methods,
@@ -75,6 +76,11 @@ def test_the_same_file_is_a_method_of_ours(small, splatseg, monkeypatch) -> None
     assert "the id with most votes" in splatseg("segment", "--method", "majority", "--help")[1]
     assert not keeps_ids("majority")
     assert keeps_ids("vote")
+    assert keeps_boundaries("vote")
+    # Its labels are not those of the label maps that they are from.
+    assert keeps_ids("cosseg")
+    assert not keeps_boundaries("cosseg")
+    assert not keeps_boundaries("majority")
 
 
 def test_no_more_than_ten_lines_of_code() -> None:
@@ -116,7 +122,7 @@ def test_flags_of_another_method_are_refused(small, splatseg) -> None:
     [
         ("uplit", "did you mean uplift"),
         ("asociate", "did you mean associate"),
-        ("xyzzy", "known: uplift, features, vote, associate, identity, saga, logits"),
+        ("xyzzy", "known: uplift, features, vote, associate, identity, saga, cosseg, logits"),
     ],
 )
 def test_an_unknown_method_gets_the_nearest_names(small, splatseg, name, said) -> None:

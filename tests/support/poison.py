@@ -448,6 +448,7 @@ def inner(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "methods.Method.options": method.options,
         "methods.Method.run": method.run,
         "methods.Method.evidence": ("labels",),
+        "methods.keeps_boundaries.method": "uplift",
         "methods.keeps_ids.method": "uplift",
         "methods.register_method.method": replace(method, name="own"),
         "methods.methods_table.methods": methods(),

@@ -5,6 +5,7 @@ from splatseg.methods._method import MethodInputs as MethodInputs
 from splatseg.methods._method import Refined as Refined
 from splatseg.methods._registry import ENTRY_POINT_GROUP as ENTRY_POINT_GROUP
 from splatseg.methods._registry import find_method as find_method
+from splatseg.methods._registry import keeps_boundaries as keeps_boundaries
 from splatseg.methods._registry import keeps_ids as keeps_ids
 from splatseg.methods._registry import method_names as method_names
 from splatseg.methods._registry import methods as methods

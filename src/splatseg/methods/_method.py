@@ -116,6 +116,10 @@ class Method:
     keeps_ids: bool = False
     """Whether the ids of the layer are those of the evidence, rather than new ones."""
 
+    repairs: bool = False
+    """Whether the layer differs on purpose from the label maps it was made from, so that boundaries
+    of things are not to be found in these."""
+
     seeded: bool = False
     """Whether the seed makes a difference."""
 

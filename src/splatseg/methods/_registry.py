@@ -90,6 +90,16 @@ def keeps_ids(method: object) -> bool:
     return isinstance(method, str) and method in method_names() and find_method(method).keeps_ids
 
 
+@boundary
+def keeps_boundaries(method: object) -> bool:
+    """Whether layers of this method have their boundaries where the label maps have them.
+
+    Args:
+        method: Its name, as the info of a layer has it; no method keeps none.
+    """
+    return keeps_ids(method) and not find_method(str(method)).repairs
+
+
 def _known() -> dict[str, EntryPoint]:
     own = {
         name: EntryPoint(

@@ -16,7 +16,7 @@ from splatseg.errors import InputError
 from splatseg.evaluate import psnr, render_and_photograph
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import CutOptions, GaussianField
-from splatseg.methods import keeps_ids
+from splatseg.methods import keeps_boundaries
 from splatseg.render import BackendName, render
 from splatseg.selection import Where
 from splatseg.tasks._observer import Observer
@@ -70,7 +70,7 @@ def _masks(document: Document, where: Where, cut: Cut) -> CutBy | None:
         if asked:
             raise InputError("cut: masks needs a layer made from label maps, got none.")
         return None
-    if not asked and (document.history or not keeps_ids(info.method)):
+    if not asked and (document.history or not keeps_boundaries(info.method)):
         return None
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
     zero_is_class = info.source_ids is not None

@@ -34,7 +34,7 @@ def refined_folder(
 
 
 def save_refined(
-    scene: Scene, folder: Path, layer: Layer, name: str, *, evidence: Evidence
+    scene: Scene, layer: Layer, folder: Path, name: str, *, evidence: Evidence
 ) -> Path:
     """Write the scene with the layer, whole or not at all; evidence of its own comes along.
 

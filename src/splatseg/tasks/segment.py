@@ -232,7 +232,7 @@ def save_segmentation(made: Segmentation, root: Path) -> Path:
     """
     if made.refined is not None and made.folder is not None:
         return save_refined(
-            made.refined, made.folder, made.layer, made.name, evidence=made.evidence
+            made.refined, made.layer, made.folder, made.name, evidence=made.evidence
         )
     path = save_scene_layer(made.layer, root, made.name)
     if made.checkpoint is not None:

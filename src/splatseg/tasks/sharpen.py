@@ -43,7 +43,7 @@ from splatseg.lift import (
     SharpenOptions,
     sharpen,
 )
-from splatseg.methods import keeps_ids
+from splatseg.methods import keeps_boundaries
 from splatseg.render import BackendName
 from splatseg.selection import layer_called
 from splatseg.tasks._observer import SILENT, Observer
@@ -263,7 +263,7 @@ def _source(
     evidence = open_evidence(find_evidence(folders, name), zero_is_class=zero)
     views = views_to_learn_from(scene, layer, evidence)
     check_map_sizes(evidence, views)
-    same = own and keeps_ids(layer.info.method)
+    same = own and keeps_boundaries(layer.info.method)
     if same and evidence.kind in ("labels", "tracked"):
         return evidence, evidence, views
     if evidence.kind not in ("masks", "panoptic", "tracked"):

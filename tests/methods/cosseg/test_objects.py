@@ -72,7 +72,7 @@ def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None
     told: list[tuple[int, int]] = []
     again = label_objects(
         halves.gaussians, halves.views[::-1], strip(halves, ("v0", "v1", "v2")),
-        features=halves.blocks, masks=Masks(halves), 
+        features=halves.blocks, masks=Masks(halves),
         options=CossegOptions(candidates=1, own_share=0.0),
         object_options=ObjectClassOptions(), classes=None,
         context=TrainingContext(backend="auto"), told=lambda *step: told.append(step),

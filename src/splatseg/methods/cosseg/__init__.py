@@ -122,6 +122,7 @@ METHOD = Method(
     options=CossegOptions,
     run=run,
     keeps_ids=True,
+    repairs=True,
     seeded=True,
     resumes=True,
     published=CossegOptions.published(),
