@@ -116,7 +116,7 @@ def _categories(
 
 METHOD = Method(
     name="cosseg",
-    summary="labels are decoded from features of photographs and the shape in space",
+    summary="labels that contradict each other, decided by objects or by a decoder of features",
     reference="CoSSegGaussians (Dou et al. 2024), eq. 2 to 5",
     evidence=("labels", "tracked", "panoptic"),
     options=CossegOptions,
