@@ -26,7 +26,7 @@ from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import SILENT, Observer
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import held_out_views
-from splatseg.tasks.benchmark.sight import bench_model, guidance_for, seen_for
+from splatseg.tasks.benchmark.sight import bench_model, companion_for, seen_for
 from support.red_square import save_strokes
 
 
@@ -229,11 +229,11 @@ def test_one_model_that_is_asked_for_two_things(tiny, tmp_path) -> None:
     shutil.copytree(tiny[1] / "wall", tmp_path / "wall")
     scene = load_scene(tmp_path / "wall")
     (found,) = read_benchmark("spin-nerf", tiny[0])
-    options = BenchOptions(models=("classical",), guidance="classical")
+    options = BenchOptions(models=("classical",), companions=("classical",))
     told = {"options": options, "backend": "auto", "observer": SILENT}
     for _ in range(2):
         masks = seen_for(find_method("associate"), scene, found, **told)
-        features = guidance_for(scene, found, **told)
+        features = companion_for(scene, found, "guidance", ("features",), **told)
         assert (masks.name, masks.kind) == ("classical", "masks")
         assert (features.name, features.kind) == ("classical.features", "features")
 
