@@ -23,10 +23,13 @@ def scene(fitted_room, tmp_path_factory) -> Path:
     return Path(shutil.copytree(fitted_room, tmp_path_factory.mktemp("cosseg") / "scene"))
 
 
-def test_classes_by_objects_and_features(scene) -> None:
-    options = CossegOptions(features="features_dino", masks="masks_sam")
-    made = segment(load_scene(scene), "cosseg", options=LABELS, method_options=options)
-    layer = made.layer
+def test_classes_by_objects_and_features(scene, capsys) -> None:
+    words = ["segment", str(scene), "--method", "cosseg", "--evidence", "labels_semantic"]
+    assert main(words) == 2
+    assert "masks: expected evidence of masks" in capsys.readouterr().err
+    words += ["--masks", "masks_sam", "--features", "features_dino", "--layer", "classes"]
+    assert main(words) == 0
+    layer = load_scene_layer(scene, "classes")
     assert isinstance(layer, Labels)
     assert layer.info.method == "cosseg"
     known = load_scene(scene).classes
@@ -65,15 +68,6 @@ def test_what_is_missing_is_told_in_one_sentence(scene) -> None:
         segment(load_scene(scene), "cosseg", options=LABELS, method_options=nothing)
 
 
-def test_from_the_command_line(scene, capsys) -> None:
-    words = ["segment", str(scene), "--method", "cosseg", "--evidence", "labels_semantic"]
-    assert main(words) == 2
-    assert "masks: expected evidence of masks" in capsys.readouterr().err
-    words += ["--masks", "masks_sam", "--features", "features_dino", "--layer", "classes"]
-    assert main(words) == 0
-    assert (scene / "layers" / "classes.npz").is_file()
-
-
 def joint_words(scene: Path, folder: Path) -> list[str]:
     return [
         "segment", str(scene), "--method", "cosseg", "--evidence", "labels_semantic",
@@ -96,10 +90,6 @@ def test_gaussians_that_learnt_along_are_a_new_scene(scene, tmp_path, capsys) ->
     assert layer.info.details["steps"] == 3
     assert not (scene / "layers" / "joint.npz").exists()
     assert [view.name for view in new.views] == [view.name for view in old.views]
-    # The same again is the same.
-    again = tmp_path / "again"
-    assert main(joint_words(scene, again)) == 0
-    assert torch.equal(load_scene(again).gaussians.means, new.gaussians.means)
 
 
 def test_a_new_scene_is_refused_before_the_work(scene, tmp_path, capsys) -> None:
