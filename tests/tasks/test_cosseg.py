@@ -64,7 +64,9 @@ def test_what_is_missing_is_told_in_one_sentence(scene) -> None:
     with pytest.raises(InputError, match="features: expected evidence of features, got 'masks_sa"):
         segment(load_scene(scene), "cosseg", options=LABELS, method_options=wrong)
     nothing = CossegOptions(features="nothing", masks="masks_sam")
-    with pytest.raises(InputError, match="nothing"):
+    with pytest.raises(
+        InputError, match="^features: expected one of those at hand .*masks_sam.*'nothing'"
+    ):
         segment(load_scene(scene), "cosseg", options=LABELS, method_options=nothing)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from splatseg.core import Features, Layer, Scene
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
-from splatseg.io.evidence import Evidence, find_evidence, open_evidence
+from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_evidence
 from splatseg.methods import Method
 from splatseg.tasks.scene_parts import layer_of
 
@@ -35,6 +35,10 @@ def named_companions(scene: Scene, method: Method, options: Any) -> dict[str, Ev
         asked = getattr(options, option)
         if asked is None:
             continue
+        names = evidence_names(folders)
+        if asked not in names:
+            known = ", ".join(names) or "there is none; `splatseg see` makes some"
+            raise InputError(f"{option}: expected one of those at hand ({known}), got {asked!r}.")
         evidence = open_evidence(find_evidence(folders, asked))
         if evidence.kind not in kinds:
             raise InputError(
