@@ -18,7 +18,9 @@ References:
     Hu et al., RandLA-Net: Efficient Semantic Segmentation of Large-Scale Point Clouds (2020).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TypeVar
 
 from splatseg.core import ClassTable, Layer
 from splatseg.errors import InputError
@@ -26,48 +28,47 @@ from splatseg.io.evidence import PanopticEvidence, TrackedEvidence
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.methods._method import Method, MethodInputs, Refined
 from splatseg.methods._trained_labels import context_of, hard_labels
-from splatseg.methods.cosseg._linked import CategoryMaps, linked_labels
+from splatseg.methods.cosseg._linked import CategoryMaps, LinkedLabels, linked_labels
 from splatseg.methods.cosseg._objects import label_objects
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
 from splatseg.methods.cosseg._train_jointly import train_cosseg_jointly as train_cosseg_jointly
+
+_Made = TypeVar("_Made")
 
 
 def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
     """Find labels of objects, or train the decoder and read it, as the options say."""
     if options.decide == "objects":
         return _closed_form(inputs, options)
-    features, gaussians = inputs.features("features"), None
     linked = linked_labels(inputs, options.link)
+    gaussians = None
     if options.joint is None:
-        found = train_cosseg(
-            inputs.gaussians,
-            inputs.views,
-            linked.source,
-            features=features,
-            options=options,
-            classes=inputs.label_names,
-            metres_per_unit=inputs.metres_per_unit,
-            up=inputs.up,
-            context=context_of(inputs),
-        )
+        found = _trained(train_cosseg, inputs, linked, options)
     else:
-        gaussians, found = train_cosseg_jointly(
-            inputs.gaussians,
-            inputs.views,
-            linked.source,
-            features=features,
-            options=options,
-            classes=inputs.label_names,
-            metres_per_unit=inputs.metres_per_unit,
-            up=inputs.up,
-            context=context_of(inputs),
-            told=inputs.progress,
-        )
+        train = partial(train_cosseg_jointly, told=inputs.progress)
+        gaussians, found = _trained(train, inputs, linked, options)
     layer: Layer = found
     if options.readout == "hard":
         layer = linked.told(hard_labels(found, options))
     return layer if gaussians is None else Refined(layer=layer, gaussians=gaussians)
+
+
+def _trained(
+    train: Callable[..., _Made], inputs: MethodInputs, linked: LinkedLabels, options: CossegOptions
+) -> _Made:
+    """What a training makes of the inputs."""
+    return train(
+        inputs.gaussians,
+        inputs.views,
+        linked.source,
+        features=inputs.features("features"),
+        options=options,
+        classes=inputs.label_names,
+        metres_per_unit=inputs.metres_per_unit,
+        up=inputs.up,
+        context=context_of(inputs),
+    )
 
 
 def _closed_form(inputs: MethodInputs, options: CossegOptions) -> Layer:

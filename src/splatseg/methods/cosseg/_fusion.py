@@ -31,6 +31,7 @@ from torch import Tensor
 from torch.nn.functional import embedding, leaky_relu
 
 from splatseg.errors import ShapeError
+from splatseg.methods._label_models import linear_start
 
 SLOPE = 0.2
 """Of the leaky ReLUs, as RandLA-Net has them."""
@@ -45,6 +46,10 @@ _LARGEST = 60000.0
 """What float16 holds."""
 
 Weights = Mapping[str, Tensor]
+
+
+START = 0xC055
+"""What the generator of first weights is seeded with besides the seed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -182,6 +187,13 @@ def _headed(weights: Weights, decoded: Tensor) -> Tensor:
 
 def _uniform(rng: np.random.Generator, bound: float, shape: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(rng.uniform(-bound, bound, shape).astype(np.float32))
+
+
+def first_weights(shape: FusionShape, classes: int, rng: np.random.Generator) -> dict[str, Tensor]:
+    """Of the decoder and of the classifier that reads it."""
+    start = shape.start(rng)
+    weight, bias = linear_start(shape.head[-1], classes, rng)
+    return start | {"classifier.weight": weight, "classifier.bias": bias}
 
 
 def decoded_widths(decoded: Sequence[int], levels: int) -> tuple[int, ...]:

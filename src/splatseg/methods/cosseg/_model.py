@@ -11,9 +11,8 @@ from torch import Tensor
 from splatseg.lift.heads import Blend
 from splatseg.lift.training import Batch, Parameter, Values
 from splatseg.methods._label_losses import TINY, LabelCounts
-from splatseg.methods._label_models import linear_start
 from splatseg.methods._robust_losses import LabelLoss, label_loss
-from splatseg.methods.cosseg._fusion import FusionShape, decode
+from splatseg.methods.cosseg._fusion import FusionShape, decode, first_weights
 from splatseg.methods.cosseg._points import PointSet
 
 Agreement = Callable[[Batch], Float[Tensor, "pixels"]]
@@ -56,9 +55,7 @@ class FusionModel:
         transition_rate: float,
         rng: np.random.Generator,
     ) -> None:
-        start = shape.start(rng)
-        weight, bias = linear_start(shape.head[-1], classes, rng)
-        start |= {"classifier.weight": weight, "classifier.bias": bias}
+        start = first_weights(shape, classes, rng)
         self._shared = {name: Parameter(start=one, rate=rate) for name, one in start.items()}
         if views:
             same = torch.eye(classes) * _STAYS

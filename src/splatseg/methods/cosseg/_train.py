@@ -24,7 +24,7 @@ from splatseg.methods.cosseg._decoded_layer import decoded_layer
 from splatseg.methods.cosseg._distilled import (
     view_pixel_counts,
 )
-from splatseg.methods.cosseg._fusion import FusionShape, Scaling, decoded_widths
+from splatseg.methods.cosseg._fusion import START, FusionShape, Scaling, decoded_widths
 from splatseg.methods.cosseg._given import Given, prepare
 from splatseg.methods.cosseg._model import FusionModel, PointsOf
 from splatseg.methods.cosseg._options import CossegOptions
@@ -33,9 +33,6 @@ from splatseg.methods.cosseg._points import (
 )
 from splatseg.methods.cosseg._visible import VisiblePoints
 from splatseg.render import options_for
-
-_START = 0xC055
-"""What the generator of first values is seeded with besides the seed."""
 
 _CANDIDATES = 8
 """Ids of a Gaussian whose votes count as agreement."""
@@ -111,7 +108,7 @@ def train_cosseg(
             agreement=agreement,
             views=len(data.views) if options.transitions == "views" else 0,
             transition_rate=options.transition_rate,
-            rng=np.random.default_rng((context.seed, _START)),
+            rng=np.random.default_rng((context.seed, START)),
         )
         result = train_labels(
             "cosseg", data, model, options=options, context=context, extra=given.settings

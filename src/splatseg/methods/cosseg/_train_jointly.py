@@ -9,18 +9,14 @@ from splatseg.core import ClassTable, Features, Gaussians, LabelSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.lift.training import TrainingResult
-from splatseg.methods._label_models import linear_start
 from splatseg.methods._trained_labels import TrainingContext, label_data
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._decoded_layer import decoded_layer
 from splatseg.methods.cosseg._distilled import pixel_counts
-from splatseg.methods.cosseg._fusion import FusionShape, decoded_widths
+from splatseg.methods.cosseg._fusion import START, FusionShape, decoded_widths, first_weights
 from splatseg.methods.cosseg._given import prepare
 from splatseg.methods.cosseg._joint import LabelLoss, train_jointly
 from splatseg.methods.cosseg._options import CossegOptions
-
-_START = 0xC055
-"""What the generator of first values is seeded with besides the seed."""
 
 
 @boundary
@@ -78,12 +74,10 @@ def train_cosseg_jointly(
         decoded=decoded_widths(options.decoded, len(everything.inputs.widths)),
         head=options.head,
     )
-    rng = np.random.default_rng((context.seed, _START))
-    start = shape.start(rng)
-    weight, bias = linear_start(shape.head[-1], len(data.ids), rng)
+    rng = np.random.default_rng((context.seed, START))
     loss = LabelLoss(
         everything,
-        start | {"classifier.weight": weight, "classifier.bias": bias},
+        first_weights(shape, len(data.ids), rng),
         evidence,
         ids=data.ids,
         weight=how.label_weight,
