@@ -139,6 +139,7 @@ def test_bits_do_not_depend_on_threads() -> None:
         ({"shrinkage": 1.5}, "shrinkage"),
         ({"feature_components": 0}, "feature_components: expected at least 1"),
         ({"rounds": 0}, "rounds: expected at least 1"),
+        ({"category_rounds": 0}, "category_rounds: expected at least 1"),
     ],
 )
 def test_options_out_of_range_are_refused(change, message) -> None:

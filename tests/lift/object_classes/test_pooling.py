@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from splatseg.core import Labels
-from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.lift.object_classes import pool_objects, with_categories
+from splatseg.errors import InputError, ShapeError
+from splatseg.lift.object_classes import pool_objects
 
 
 def labels(ids, **more) -> Labels:
@@ -49,14 +49,3 @@ def test_what_does_not_fit_is_refused() -> None:
         pool_objects(labels([1] * 5), voted(), (), ones)
     with pytest.raises(ShapeError, match="same Gaussians"):
         pool_objects(labels([1] * 5), voted(), (torch.ones(4, 1),), ones)
-
-
-def test_votes_for_tracks_are_votes_for_what_these_are() -> None:
-    pooled = pool_objects(labels([7, 7, -1, 3, 7]), voted(), (torch.ones(5, 1),), torch.ones(5))
-    found = with_categories(pooled, {4: {1: 3.0, 6: 1.0}, 9: {6: 2.0}, 2: {1: 0.0}, 77: {5: 1.0}})
-    assert found.classes.tolist() == [1, 5, 6]
-    expected = [[1.5, 0, 0.5 + 3], [2.25, 0, 0.75 + 3]]
-    torch.testing.assert_close(found.votes, torch.tensor(expected, dtype=torch.float64))
-    assert torch.equal(found.features, pooled.features)
-    with pytest.raises(RangeError, match="0 or more of id 4, got -1"):
-        with_categories(pooled, {4: {1: -1.0}})

@@ -133,6 +133,17 @@ def test_labels_of_tracks_are_objects_with_classes(halves) -> None:
     assert bool((of == halves.side * 10)[away(halves)].all())
 
 
+def test_rounds_tell_the_objects_of_a_track_apart(halves) -> None:
+    sure = {}
+    for rounds in (1, 10):
+        found = labelled(
+            halves, strip(halves), options=ObjectClassOptions(category_rounds=rounds),
+            categories={3: {30: 5.0}, 8: {80: 4.0, 30: 2.0}},
+        )  # fmt: skip
+        sure[rounds] = found.objects.info.details["mean_class_probability"]
+    assert sure[10] > sure[1]
+
+
 def test_objects_have_the_ids_of_the_tracks_that_cover_them_best() -> None:
     objects = Labels(
         ids=torch.tensor([1, 2, 4, -1]), confidence=torch.ones(4),

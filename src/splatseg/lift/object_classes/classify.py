@@ -72,6 +72,10 @@ class ObjectClassOptions:
     """Votes, in fully visible pixels, from which on an object counts fully for its class; one with
     fewer counts in proportion."""
 
+    category_rounds: int = 10
+    """Rounds in which categories of tracks are told apart by object
+    (`lift.object_classes.with_categories`), at least 1."""
+
     rounds: int = 8
     """Turns in which classes and covariances are found, at least 1."""
 
@@ -84,7 +88,7 @@ class ObjectClassOptions:
         if not 0 < self.vote_floor <= 1:
             raise RangeError(f"vote_floor: expected above 0 and at most 1, got {self.vote_floor}.")
         check_range("shrinkage", self.shrinkage, 0.0, 1.0)
-        for name in ("feature_components", "rounds"):
+        for name in ("feature_components", "rounds", "category_rounds"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
 

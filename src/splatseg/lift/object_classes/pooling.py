@@ -7,8 +7,8 @@ with :math:`v_{ic}` the votes of pixels for id c on Gaussian i (`lift.mass.uplif
 :math:`m_i` the blending weight that its feature rests on.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED, Labels
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.errors import InputError, ShapeError
 
 _ROWS = 1 << 16
 """Gaussians whose features are summed at a time."""
@@ -99,42 +99,6 @@ def pool_objects(
         votes=total.reshape(len(ids), max(len(classes), 1))[:, : len(classes)],
         features=features,
         known=seen > 0,
-    )
-
-
-@boundary
-def with_categories(
-    pooled: PooledObjects, categories: Mapping[int, Mapping[int, float]]
-) -> PooledObjects:
-    r"""Objects with votes for categories, where those for ids are votes for what these are.
-
-    .. math:: v_{kc} = \sum_t v_{kt} \frac{m_{tc}}{\sum_{c'} m_{tc'}}
-
-    A track that was taken for several things in turn votes for all of them.
-
-    Args:
-        pooled: Objects with votes for ids, such as tracks.
-        categories: m: of each id how much speaks for which category; one that is not known, or of
-            which nothing is known, votes for none.
-
-    Raises:
-        RangeError: If a number is negative or not finite.
-    """
-    for id, shares in categories.items():
-        for number in shares.values():
-            if not 0 <= number < float("inf"):
-                raise RangeError(f"categories: expected 0 or more of id {id}, got {number}.")
-    classes = sorted({kind for shares in categories.values() for kind in shares})
-    matrix = torch.zeros(len(pooled.classes), len(classes), dtype=torch.float64)
-    for row, id in enumerate(pooled.classes.tolist()):
-        shares = categories.get(id, {})
-        total = sum(shares.values())
-        for kind, number in shares.items():
-            matrix[row, classes.index(kind)] = number / total if total else 0.0
-    return replace(
-        pooled,
-        classes=torch.tensor(classes, dtype=torch.int64),
-        votes=(pooled.votes[:, :, None] * matrix).sum(dim=1),
     )
 
 

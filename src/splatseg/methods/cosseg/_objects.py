@@ -126,7 +126,7 @@ def label_objects(
     pooled = pool_objects(objects, votes, scales, weights)
     if categories is not None:
         objects, pooled = named_by_tracks(objects, pooled)
-        pooled = with_categories(pooled, categories)
+        pooled = with_categories(pooled, categories, rounds=object_options.category_rounds)
     probabilities = classify_objects(pooled, options=object_options)
     tell(4)
     names = {} if classes is None else {row.id: row.name for row in classes.rows}
