@@ -22,6 +22,9 @@ from splatseg.errors import InputError
 
 Image = UInt8[Tensor, "height width 3"]
 
+CANONICAL_PHRASES = ("object", "things", "stuff", "texture")
+"""What a word is compared with to say how relevant it is (LERF, Kerr et al. 2023, section 3.3)."""
+
 
 @runtime_checkable
 class Model(Protocol):

@@ -5,12 +5,9 @@ from collections.abc import Sequence
 import torch
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.core.models import TextFeaturesWithWords
+from splatseg.core.models import CANONICAL_PHRASES, TextFeaturesWithWords
 from splatseg.errors import InputError
 from splatseg.io.evidence import TextEmbeddings
-
-CANONICAL_PHRASES = ("object", "things", "stuff", "texture")
-"""What a word is compared with to say how relevant it is (LERF, Kerr et al. 2023, section 3.3)."""
 
 _PLACE = "{}"
 

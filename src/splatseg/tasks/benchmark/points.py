@@ -30,7 +30,7 @@ from splatseg.lift import GaussianField
 from splatseg.lift.heads import ClassifierHead, has_classifier
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
-from splatseg.tasks.benchmark.spoken import vocabulary_of
+from splatseg.tasks.benchmark.spoken import words_of
 
 _LAYER = "layer"
 _MOVED = 1e-4
@@ -133,11 +133,11 @@ def read_by_words(
     """
     if table is None:
         raise InputError(f"scene {job.bench.name}: expected names of its classes, got none.")
-    vocabulary = vocabulary_of(job.scene, seen)
+    vocabulary = words_of(job.scene, seen)
     ids = [id for id in wanted if vocabulary.known(table.name_of(id))]
     if not ids:
         raise InputError("words: expected vectors of names of classes, none has one.")
-    weight, bias = vocabulary.space.linear(vocabulary.encode([table.name_of(id) for id in ids]))
+    weight, bias = vocabulary.space.linear(vocabulary.vectors([table.name_of(id) for id in ids]))
     head = ClassifierHead(ids=torch.tensor(ids), weight=weight, bias=bias, blend="probabilities")
     return replace(layer, info=replace(layer.info, head=head.to_json()))
 

@@ -32,6 +32,7 @@ from splatseg.io.images import save_png
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.heads import has_classifier
+from splatseg.lift.vocabulary import Vocabulary
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks.benchmark.chosen import (
     Answer,
@@ -54,7 +55,7 @@ from splatseg.tasks.benchmark.prompts import (
 )
 from splatseg.tasks.benchmark.selecting import LayerSelector, is_affinity
 from splatseg.tasks.benchmark.sight import Seen
-from splatseg.tasks.benchmark.spoken import Vocabulary, vocabulary_of
+from splatseg.tasks.benchmark.spoken import words_of
 
 _LAYER = "layer"
 _THING, _REST = 1, 2
@@ -289,8 +290,8 @@ class TargetRun:
         found = self._by_features(
             layer,
             vocabulary.space,
-            vocabulary.encode([words]),
-            vocabulary.encode(self._switches.negatives),
+            vocabulary.vectors([words]),
+            vocabulary.vectors(self._switches.negatives),
         )
         return self._with_cut(task, found, None)
 
@@ -310,7 +311,7 @@ class TargetRun:
 
     @cached_property
     def _vocabulary(self) -> Vocabulary:
-        return vocabulary_of(self._job.scene, self._words_seen)
+        return words_of(self._job.scene, self._words_seen)
 
     def _by_features(
         self, layer: Features, space: TextSpace, thing: Tensor, others: Tensor
