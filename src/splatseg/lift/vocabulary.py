@@ -142,8 +142,8 @@ def vocabulary_of(
         width = int(encoder.encode_text(["object"]).shape[1])
         if recorded is not None and recorded.vectors.shape[1] != width:
             recorded = None
-    elif recorded is not None:
-        width = int(recorded.vectors.shape[1])
+    else:
+        width = 0 if recorded is None else int(recorded.vectors.shape[1])
     if mean is not None and len(mean) != width:
         raise InputError(
             f"{evidence.folder}: expected words of width {len(mean)}, as the features, got {width}."
