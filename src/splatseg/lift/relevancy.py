@@ -42,6 +42,22 @@ class TextSpace:
             check_shape("mean", self.mean, (self.width,))
 
     @boundary
+    def expand(self, values: Float[Tensor, "*batch channels"]) -> Float[Tensor, "*batch width"]:
+        """Full vectors, of the length that values give them.
+
+        Args:
+            values: Vectors, or components of them.
+
+        Raises:
+            ShapeError: If widths do not fit.
+        """
+        if self.basis is None or self.mean is None:
+            check_shape("values", values, (*values.shape[:-1], self.width))
+            return values
+        check_shape("values", values, (*values.shape[:-1], len(self.basis)))
+        return values @ self.basis.to(values) + self.mean.to(values)
+
+    @boundary
     def cosines(
         self, values: Float[Tensor, "*batch channels"], words: Float[Tensor, "k width"]
     ) -> Float[Tensor, "*batch k"]:

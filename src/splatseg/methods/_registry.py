@@ -14,7 +14,7 @@ from splatseg.methods._method import Method
 ENTRY_POINT_GROUP = "splatseg.methods"
 
 _OWN = (
-    "uplift", "features", "vote", "associate", "identity", "saga", "cosseg", "logits",
+    "uplift", "features", "objects", "vote", "associate", "identity", "saga", "cosseg", "logits",
     "probabilities",
 )  # fmt: skip
 _REGISTERED: dict[str, Method] = {}

@@ -138,7 +138,7 @@ def _weighted_sums(
     weights = torch.zeros(count)
     values: Tensor | None = None
     for done, view in enumerate(ordered):
-        grid = _checked(view, evidence.features(view.name))
+        grid = checked_grid(view, evidence.features(view.name))
         if values is None:
             values = torch.zeros(count, grid.channels)
         if grid.channels != values.shape[1]:
@@ -162,7 +162,7 @@ def _add_view(
     values: Tensor,
 ) -> Tensor:
     """Add a view's weighted features to `values`, some channels at a time; gives its weights."""
-    covered, camera = _camera_of_grid(view, grid)
+    covered, camera = camera_of_grid(view, grid)
     if options.longest_side is not None:
         longest = max(camera.width, camera.height)
         if longest > options.longest_side:
@@ -236,7 +236,7 @@ def read_features_at(
         InputError: If a feature is not finite.
         ShapeError: If the grid does not fit its photograph.
     """
-    covered, _ = _camera_of_grid(view, _checked(view, grid))
+    covered, _ = camera_of_grid(view, checked_grid(view, grid))
     cells = (covered[0] / grid.stride, covered[1] / grid.stride)
     features = grid.features.float().cpu()
     first_row, second_row, down = (
@@ -276,7 +276,7 @@ def _blend(image: Tensor, taps: _Taps, *, dim: int) -> Tensor:
     )
 
 
-def _camera_of_grid(view: View, grid: FeatureMap) -> tuple[tuple[int, int], Camera]:
+def camera_of_grid(view: View, grid: FeatureMap) -> tuple[tuple[int, int], Camera]:
     """Rows and columns of pixels that the grid counts its cells in, and their camera."""
     rows, columns = view.camera.height, view.camera.width
     # Whole cells over a photograph that they do not divide: a part of a cell more or less.
@@ -286,7 +286,13 @@ def _camera_of_grid(view: View, grid: FeatureMap) -> tuple[tuple[int, int], Came
     return (grid.height, grid.width), camera_of_map(view, grid.height, grid.width)
 
 
-def _checked(view: View, grid: FeatureMap) -> FeatureMap:
+def checked_grid(view: View, grid: FeatureMap) -> FeatureMap:
+    """The features of a view, if they are finite and cover its photograph.
+
+    Raises:
+        InputError: If a feature is not finite.
+        ShapeError: If the grid does not fit its photograph.
+    """
     bad = ~torch.isfinite(grid.features)
     if bool(bad.any()):
         raise InputError(
