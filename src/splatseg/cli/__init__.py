@@ -73,6 +73,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.select",
         summary="clicks, boxes, strokes, masks, places -> a selection of Gaussians",
     ),
+    "query": CommandEntry(
+        module="splatseg.cli.query",
+        summary="words -> the things that they mean, and how surely",
+    ),
     "render": CommandEntry(
         module="splatseg.cli.render",
         summary="pictures, depth and label maps of a scene's views",

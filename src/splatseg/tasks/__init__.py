@@ -35,6 +35,13 @@ from splatseg.tasks.make_scene import fit_capture as fit_capture
 from splatseg.tasks.outputs import check_layer_exports as check_layer_exports
 from splatseg.tasks.outputs import export_layer as export_layer
 from splatseg.tasks.outputs import report_layer as report_layer
+from splatseg.tasks.query import Answers as Answers
+from splatseg.tasks.query import Found as Found
+from splatseg.tasks.query import QuerySession as QuerySession
+from splatseg.tasks.query import query as query
+from splatseg.tasks.query_options import QueryOptions as QueryOptions
+from splatseg.tasks.query_outputs import draw_answers as draw_answers
+from splatseg.tasks.query_outputs import draw_heat as draw_heat
 from splatseg.tasks.render import Rendering as Rendering
 from splatseg.tasks.render import RenderingOptions as RenderingOptions
 from splatseg.tasks.render import render_views as render_views

@@ -134,7 +134,6 @@ def test_what_does_not_fit_is_refused(scene, views) -> None:
     none = replace(objects, ids=torch.full((7,), -1).int())
     with pytest.raises(InputError, match="at least one object"):
         object_features(gaussians, views, evidence, none)
-    one = Labels(ids=torch.ones(1).int(), confidence=torch.ones(1))
     with pytest.raises(ShapeError, match="objects: expected 7 rows, got 1"):
         object_features(
             gaussians, views, evidence, Labels(ids=torch.ones(1).int(), confidence=torch.ones(1))

@@ -5,6 +5,7 @@ from splatseg.lift.words.answers import WordAnswers as WordAnswers
 from splatseg.lift.words.answers import answer_words as answer_words
 from splatseg.lift.words.answers import context_of as context_of
 from splatseg.lift.words.context import CONTEXT_WORDS as CONTEXT_WORDS
+from splatseg.lift.words.index import WordIndex as WordIndex
 from splatseg.lift.words.object_features import ObjectFeatures as ObjectFeatures
 from splatseg.lift.words.object_features import UnmixOptions as UnmixOptions
 from splatseg.lift.words.object_features import object_features as object_features

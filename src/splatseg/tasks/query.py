@@ -1,0 +1,304 @@
+"""Words asked of a scene: which things answer to them, and how surely."""
+
+import importlib.metadata
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from splatseg.core import UNLABELLED, Labels, Layer, LayerInfo, Scene, Selection
+from splatseg.core.boundary import boundary
+from splatseg.core.models import TextFeatures
+from splatseg.errors import InputError
+from splatseg.lift.words import WordAnswers, WordIndex
+from splatseg.render import BackendName
+from splatseg.selection import components
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks._query_sources import word_source
+from splatseg.tasks.query_options import QueryOptions
+
+_THINGS = 20_000
+"""Distinct vectors up to which each is a thing; with more, things are connected pieces."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """A thing that answers to a word."""
+
+    thing: int
+    """Its number, for `Answers.of_thing`; the same in all answers of one session where objects
+    answer."""
+
+    probability: float
+    """That the word means it, rather than another word of the context."""
+
+    cosine: float
+    """In the span of the scene's features."""
+
+    gaussians: int
+    """How many it has."""
+
+    centre: tuple[float, float, float]
+    """Median of their centres, world, scene units."""
+
+    size: tuple[float, float, float]
+    """Extent along x, y and z, between the 2nd and the 98th percentile of centres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answers:
+    """What a scene answers to words."""
+
+    words: tuple[str, ...]
+
+    found: Mapping[str, tuple[Found, ...]]
+    """Things by word, the surest first; none where the word is unknown here."""
+
+    probabilities: Float[Tensor, "n words"]
+    """Of each Gaussian."""
+
+    cosines: Float[Tensor, "n words"]
+    """Of each Gaussian, in the span of the scene's features; 0 where it has no feature."""
+
+    things: Int64[Tensor, "n words"]
+    """The thing that each Gaussian is of, by word; -1 where it does not answer."""
+
+    layer: str
+    """Name of the layer that answered."""
+
+    options: QueryOptions
+
+    made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
+    """Layers that were made to answer, by the names to keep them under: with them the next query
+    answers at once."""
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Words that nothing answers to."""
+        return tuple(word for word in self.words if not self.found[word])
+
+    @boundary
+    def of_thing(self, word: str, thing: int) -> Selection:
+        """The Gaussians of a thing.
+
+        Raises:
+            InputError: If it does not answer to the word.
+        """
+        if word not in self.words or thing not in {one.thing for one in self.found[word]}:
+            raise InputError(f"thing: expected one that answers to {word!r}, got {thing}.")
+        return Selection(mask=self.things[:, self.words.index(word)] == thing)
+
+    def selection(self) -> Selection:
+        """Everything that answers to the words, with the probability of the likeliest.
+
+        Raises:
+            InputError: If nothing does.
+        """
+        inside = (self.things >= 0).any(dim=1)
+        if not bool(inside.any()):
+            raise InputError(f"words: nothing in the scene answers to {', '.join(self.words)}.")
+        sure = self.probabilities.amax(dim=1).clamp(0, 1)
+        confidence = torch.where(inside, sure.clamp_min(0.5), sure.clamp_max(0.5))
+        return Selection(mask=inside, confidence=confidence, info=self._info())
+
+    def labels(self) -> Labels:
+        """The likeliest word of each Gaussian: ids 1, 2, ... in the order of the words.
+
+        Where nothing answers it is -1, unless `QueryOptions.every` asks for one everywhere.
+        """
+        if self.options.every:
+            best = self.cosines.argmax(dim=1)
+            known = self.cosines.abs().amax(dim=1) > 0
+        else:
+            answering = torch.where(self.things >= 0, self.probabilities, -1.0)
+            best, known = answering.argmax(dim=1), answering.amax(dim=1) >= 0
+        sure = self.probabilities.gather(1, best[:, None]).squeeze(1)
+        return Labels(
+            ids=torch.where(known, best + 1, UNLABELLED).int(),
+            confidence=torch.where(known, sure, 0.0).clamp(0, 1),
+            info=self._info(),
+        )
+
+    def _info(self) -> LayerInfo:
+        return LayerInfo(
+            method="query",
+            options={**asdict(self.options), "from_layer": self.layer},
+            names=dict(enumerate(self.words, start=1)),
+            versions={"splatseg": importlib.metadata.version("splatseg")},
+            details={
+                "words": list(self.words),
+                "found": {word: [asdict(one) for one in self.found[word]] for word in self.words},
+            },
+        )
+
+
+class QuerySession:
+    """Asks a scene for words again and again, each time in milliseconds.
+
+    Args:
+        scene: The scene; it must stay as it is.
+        options: Who answers, and how sure is sure.
+        encoder: The model that features were made with, for any words; None takes words that were
+            recorded with them.
+        words: What will be asked for: nothing that takes long is done if one has no vector.
+        layers: Layers at hand; others are read from the scene's folder.
+        backend: Who renders.
+        observer: Is told of what is opened.
+
+    Raises:
+        InputError: If the scene has nothing that answers, or not what the options ask for.
+    """
+
+    @boundary
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        options: QueryOptions | None = None,
+        encoder: TextFeatures | None = None,
+        words: Sequence[str] = (),
+        layers: Mapping[str, Layer] | None = None,
+        backend: BackendName = "auto",
+        observer: Observer = SILENT,
+    ) -> None:
+        self._scene = scene
+        self._options = options or QueryOptions()
+        self._source = word_source(
+            scene,
+            self._options,
+            encoder=encoder,
+            words=words,
+            layers=layers,
+            backend=backend,
+            observer=observer,
+        )
+        if len(self._source.features) != len(scene.gaussians):
+            raise InputError(
+                f"from_layer: expected {len(scene.gaussians)} Gaussians, those of the scene, "
+                f"{self._source.layer!r} has {len(self._source.features)}."
+            )
+        self._index = WordIndex(
+            self._source.features,
+            self._source.vocabulary,
+            components=self._options.components,
+        )
+
+    @property
+    def index(self) -> WordIndex:
+        """The vectors that answer."""
+        return self._index
+
+    @property
+    def made_layers(self) -> Mapping[str, Layer]:
+        """Layers that opening it made, by the names to keep them under."""
+        return self._source.made_layers
+
+    @boundary
+    def ask(self, words: Sequence[str]) -> Answers:
+        """Which things answer to words, and how surely.
+
+        Args:
+            words: Words or phrases; each is asked for by itself.
+
+        Raises:
+            InputError: If there are none, one is there twice, or nothing is known of one.
+        """
+        asked = self._index.ask(words, options=self._options.answers)
+        for word in asked.words:
+            if asked.words.count(word) > 1:
+                raise InputError(f"words: expected distinct words, got {word!r} more than once.")
+        things = self._things(asked)
+        probabilities = self._index.of_gaussians(asked.probabilities)
+        cosines = self._index.of_gaussians(asked.cosines)
+        found = {
+            word: self._found(things[:, column], probabilities[:, column], cosines[:, column])
+            for column, word in enumerate(asked.words)
+        }
+        return Answers(
+            words=asked.words,
+            found=found,
+            probabilities=probabilities,
+            cosines=cosines,
+            things=things,
+            layer=self._source.layer,
+            options=self._options,
+            made_layers=self._source.made_layers,
+        )
+
+    def _things(self, asked: WordAnswers) -> Int64[Tensor, "n words"]:
+        answering = asked.probabilities >= self._options.min_probability
+        rows = self._index.rows
+        inside = (rows >= 0)[:, None] & answering[rows.clamp_min(0)]
+        if len(self._index) <= _THINGS:
+            return torch.where(inside, rows[:, None], UNLABELLED)
+        columns = [
+            components(self._scene.gaussians, Selection(mask=inside[:, column]))
+            for column in range(inside.shape[1])
+        ]
+        return torch.stack(columns, dim=1)
+
+    def _found(self, things: Tensor, probabilities: Tensor, cosines: Tensor) -> tuple[Found, ...]:
+        """The things that answer to one word, the surest first, of equals the larger."""
+        inside = torch.nonzero(things >= 0).squeeze(1)
+        inside = inside[torch.argsort(things[inside], stable=True)]
+        ids, counts = torch.unique_consecutive(things[inside], return_counts=True)
+        means = self._scene.gaussians.means.detach().cpu()
+        found: list[Found] = []
+        for thing, rows in zip(ids.tolist(), inside.split(counts.tolist()), strict=True):
+            at = means[rows].double()
+            span = at.quantile(torch.tensor([0.02, 0.98]).double(), dim=0)
+            found.append(
+                Found(
+                    thing=int(thing),
+                    probability=round(float(probabilities[rows].double().mean()), 6),
+                    cosine=round(float(cosines[rows].double().mean()), 6),
+                    gaussians=len(rows),
+                    centre=_triple(at.median(dim=0).values),
+                    size=_triple(span[1] - span[0]),
+                )
+            )
+        return tuple(sorted(found, key=lambda one: (-one.probability, -one.gaussians, one.thing)))
+
+
+def _triple(values: Tensor) -> tuple[float, float, float]:
+    x, y, z = (round(float(value), 6) for value in values)
+    return x, y, z
+
+
+@boundary
+def query(
+    scene: Scene,
+    words: Sequence[str],
+    *,
+    options: QueryOptions | None = None,
+    encoder: TextFeatures | None = None,
+    layers: Mapping[str, Layer] | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> Answers:
+    """Ask a scene for words once, see `QuerySession`.
+
+    Args:
+        scene: The scene.
+        words: Words or phrases.
+        options: Who answers, and how sure is sure.
+        encoder: The model that features were made with; None takes recorded words.
+        layers: Layers at hand; others are read from the scene's folder.
+        backend: Who renders.
+        observer: Is told of what is opened.
+
+    Raises:
+        InputError: If the scene has nothing that answers, or nothing is known of a word.
+    """
+    session = QuerySession(
+        scene,
+        options=options,
+        encoder=encoder,
+        words=words,
+        layers=layers,
+        backend=backend,
+        observer=observer,
+    )
+    return session.ask(words)
