@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 
 import torch
 
-from splatseg.core import Features, InstanceTree, Labels, LayerInfo
+from splatseg.core import Features, InstanceTree, LayerInfo
 from splatseg.errors import InputError
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.lift.words import UnmixOptions, object_features
@@ -29,7 +29,12 @@ class ObjectFeaturesOptions:
 
 
 def run(inputs: MethodInputs, options: ObjectFeaturesOptions) -> Features:
-    """Associate masks, and solve for the features of the objects."""
+    """Associate masks, and solve for the features of the objects.
+
+    Returns:
+        The vector of its object for each Gaussian, zeros where it has none or no view shows it.
+        Weights of the Gaussians of an object add up to the cells that show it.
+    """
     masks = inputs.companions.get("masks")
     if masks is None:
         raise InputError(
@@ -39,27 +44,12 @@ def run(inputs: MethodInputs, options: ObjectFeaturesOptions) -> Features:
         inputs.gaussians, inputs.views, EvidenceSegments(evidence=masks), backend=inputs.backend
     )
     objects = found.cut("object") if isinstance(found, InstanceTree) else found
-    return features_of_objects(inputs, objects, options.unmixing)
-
-
-def features_of_objects(inputs: MethodInputs, objects: Labels, options: UnmixOptions) -> Features:
-    """Features of objects that are known, on their Gaussians.
-
-    Args:
-        inputs: The Gaussians, the views and their feature maps.
-        objects: Which object each Gaussian is of.
-        options: How features that share cells are told apart.
-
-    Returns:
-        The vector of its object for each Gaussian, zeros where it has none or no view shows it.
-        Weights of the Gaussians of an object add up to the cells that show it.
-    """
     solved = object_features(
         inputs.gaussians,
         inputs.views,
         inputs.evidence,
         objects,
-        options=options,
+        options=options.unmixing,
         backend=inputs.backend,
         progress=inputs.progress,
     )

@@ -115,9 +115,13 @@ def _layer_at_hand(
 
 def _masks(scene: Scene, options: QueryOptions) -> str | None:
     """Masks to find objects by: those asked for, or the only ones."""
-    if options.masks is not None:
-        return options.masks
     folders = _folders(scene)
+    if options.masks is not None:
+        if options.masks not in (known := evidence_names(folders)):
+            raise InputError(
+                f"masks: expected one of those at hand ({', '.join(known)}), got {options.masks!r}."
+            )
+        return options.masks
     names = [
         name
         for name in evidence_names(folders)

@@ -37,7 +37,7 @@ def asked(words, **options):
 
 
 def test_by_hand() -> None:
-    found = asked([" mug", "lamp"], temperature=2.0, same_meaning=0.7)
+    found = asked([" mug", "lamp"], temperature=2.0, same_meaning=0.7, least_energy=0.0)
     assert found.words == ("mug", "lamp")
     torch.testing.assert_close(found.cosines, torch.tensor([[1.0, 0], [0, 0], [0, 0]]))
     # Against desk, lamp and object (0.577); mug itself means the same.
@@ -52,6 +52,17 @@ def test_words_of_one_meaning_are_not_held_against_each_other() -> None:
     same, apart = asked(["cup"], same_meaning=0.9), asked(["cup"], same_meaning=0.999)
     assert float(same.probabilities[0, 0]) > 0.99
     assert float(apart.probabilities[0, 0]) < 0.6
+
+
+def test_words_that_the_scene_can_hardly_show_count_less() -> None:
+    span = word_span(torch.eye(4)[:3], torch.ones(3), SPACE)
+    faint = torch.tensor([[0.3, 0, 0, 0.91**0.5]])
+    torch.testing.assert_close(span.cosines(VALUES[:1], faint), torch.ones(1, 1))
+    less = span.cosines(VALUES[:1], faint, least_energy=0.4)
+    torch.testing.assert_close(less, torch.tensor([[0.6]]))
+    usual, never = asked(["mug"], least_energy=0.0), asked(["mug"], least_energy=1.0)
+    assert float(never.probabilities[0, 0]) < float(usual.probabilities[0, 0])
+    assert torch.equal(never.cosines, usual.cosines)
 
 
 def test_a_word_that_nothing_answers_to_is_unknown() -> None:
@@ -88,6 +99,6 @@ def test_what_is_wrong_is_refused() -> None:
         asked([])
     with pytest.raises(InputError, match="got 'cap'; near are 'cup'"):
         asked(["cap"])
-    for change in ({"temperature": 0.0}, {"same_meaning": 2.0}):
+    for change in ({"temperature": 0.0}, {"same_meaning": 2.0}, {"least_energy": -1.0}):
         with pytest.raises(RangeError, match=next(iter(change))):
             AnswerOptions(**change)

@@ -6,7 +6,8 @@ against what else a thing could be, the words of a context that do not mean the 
 .. math:: p_{kw} = \frac{e^{\tau s_{kw}}}{e^{\tau s_{kw}} +
           \sum_{c:\, \cos(t_c, t_w) < \gamma} e^{\tau s_{kc}}}
 
-with s the cosines in the span of the scene's features (`lift.words.span`). A word that no object
+with s the cosines in the span of the scene's features (`lift.words.span`), less those of words
+that the scene can hardly show. A word that no object
 answers to with at least a half is unknown: the context explains every object better.
 """
 
@@ -40,8 +41,12 @@ class AnswerOptions:
     """Gamma: words of the context whose cosine with a word is larger mean the same, and are not
     held against it."""
 
+    least_energy: float = 0.2
+    """Length of a word in the span, in [0, 1], at which its s is 0.7 of its cosine."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
+        check_range("least_energy", self.least_energy, 0.0, 1.0)
         if not 0 < self.temperature < float("inf"):
             raise RangeError(f"temperature: expected above 0, got {self.temperature}.")
         check_range("same_meaning", self.same_meaning, -1.0, 1.0)
@@ -124,13 +129,14 @@ def _answered(
 ) -> tuple[Tensor, Tensor]:
     """Cosines of some features with the words, and p."""
     cosines = span.cosines(values, asked)
-    against = options.temperature * span.cosines(values, rivals)
+    least, tau = options.least_energy, options.temperature
+    own = tau * span.cosines(values, asked, least_energy=least)
+    against = tau * span.cosines(values, rivals, least_energy=least)
     found = torch.empty_like(cosines)
     for column in range(cosines.shape[1]):
-        own = options.temperature * cosines[:, column]
         total = torch.logsumexp(
-            torch.cat((own[:, None], against[:, held[:, column]]), dim=1), dim=1
+            torch.cat((own[:, column, None], against[:, held[:, column]]), dim=1), dim=1
         )
-        found[:, column] = torch.exp(own - total)
+        found[:, column] = torch.exp(own[:, column] - total)
     found[values.abs().amax(dim=1) <= 0] = 0
     return cosines, found

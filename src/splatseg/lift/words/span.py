@@ -57,13 +57,19 @@ class WordSpan:
 
     @boundary
     def cosines(
-        self, values: Float[Tensor, "n channels"], words: Float[Tensor, "k width"]
+        self,
+        values: Float[Tensor, "n channels"],
+        words: Float[Tensor, "k width"],
+        *,
+        least_energy: float = 0.0,
     ) -> Float[Tensor, "n k"]:
-        """Cosine of each value with each word in the span; 0 where one has no length there.
+        r"""Cosine of each value with each word in the span; 0 where one has no length there.
 
         Args:
             values: Features, in the channels of the feature maps.
             words: Vectors of words.
+            least_energy: A: cosines are times :math:`e / \sqrt{e^2 + a^2}` with e the energy of the
+                word, so that what the scene can hardly show is no match for anything.
 
         Raises:
             ShapeError: If widths do not fit.
@@ -71,7 +77,10 @@ class WordSpan:
         check_shape("words", words, (None, self.space.width))
         with one_torch_thread():
             features = _unit(self.space.expand(values.float()) @ self.directions.T)
-            return features @ _unit(words.float() @ self.directions.T).T
+            inside = _unit(words.float()) @ self.directions.T
+            energy = inside.norm(dim=1)
+            kept = energy / (energy.square() + least_energy**2).sqrt().clamp_min(_TINY)
+            return features @ (_unit(inside) * kept[:, None]).T
 
 
 def _unit(vectors: Tensor) -> Tensor:

@@ -1,0 +1,230 @@
+"""Words asked of a scene, from Python and from the command line."""
+
+import importlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+
+from splatseg.cli import main
+from splatseg.core import Features, Labels, LayerInfo, Selection
+from splatseg.errors import InputError, RangeError
+from splatseg.io.evidence import FeatureEvidence, open_evidence
+from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
+from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
+from splatseg.tasks import QueryOptions, QuerySession, draw_answers, draw_heat, query
+
+
+@pytest.fixture(scope="module")
+def folder(fitted_room, tmp_path_factory) -> Path:
+    return Path(shutil.copytree(fitted_room, tmp_path_factory.mktemp("query") / "scene"))
+
+
+@pytest.fixture(scope="module")
+def scene(folder):
+    return load_scene(folder)
+
+
+@pytest.fixture(scope="module")
+def vocabulary(scene) -> Vocabulary:
+    evidence = open_evidence(scene.source / "features_text")
+    assert isinstance(evidence, FeatureEvidence)
+    return vocabulary_of(evidence)
+
+
+@pytest.fixture(scope="module")
+def words(vocabulary) -> tuple[str, str, str]:
+    """Three classes that the features can tell apart."""
+    labels, kinds = vocabulary.recorded.labels, vocabulary.recorded.kinds
+    names = [label for label, kind in zip(labels, kinds, strict=True) if kind == "class"]
+    vectors = vocabulary.vectors(names)
+    shown = vectors @ torch.linalg.qr(vocabulary.space.basis.T).Q
+    # The two that features show best, and the one that is least like both.
+    first = int(shown.norm(dim=1).argmax())
+    second = int((shown.norm(dim=1) - 2 * (vectors @ vectors[first]).clamp_min(0)).argmax())
+    third = int((vectors[[first, second]] @ vectors.T).abs().sum(dim=0).argmin())
+    return names[first], names[second], names[third]
+
+
+def layer_of(scene, vocabulary, words) -> Features:
+    """The left third of the Gaussians is the first word, the middle the second."""
+    space = vocabulary.space
+    vectors = vocabulary.vectors(words)
+    values = (vectors - space.mean) @ space.basis.T if space.basis is not None else vectors
+    place = scene.gaussians.means[:, 0].argsort().argsort() * 3 // len(scene.gaussians)
+    kept = torch.cat((values[:2], torch.zeros(1, values.shape[1])))[place]
+    return Features(
+        values=kept,
+        weights=(place < 2).float(),
+        info=LayerInfo(method="objects", evidence="features_text"),
+    )
+
+
+@pytest.fixture(scope="module")
+def layers(scene, vocabulary, words):
+    return {"objects": layer_of(scene, vocabulary, words)}
+
+
+LOW = QueryOptions(min_probability=0.3)
+
+
+def test_things_that_a_word_means(scene, layers, words) -> None:
+    found = query(scene, words, options=LOW, layers=layers)
+    assert found.layer == "objects"
+    assert [len(found.found[word]) for word in words] == [1, 1, 0]
+    assert found.unknown == (words[2],)
+    first = found.found[words[0]][0]
+    third = -(-len(scene.gaussians) // 3)
+    assert abs(first.gaussians - third) <= 1
+    assert first.probability > 0.3
+    chosen = found.of_thing(words[0], first.thing)
+    assert chosen.count == first.gaussians
+    inside = scene.gaussians.means[chosen.mask].double()
+    assert first.centre == pytest.approx(inside.median(dim=0).values.tolist(), abs=1e-5)
+    assert first.size[0] < float(inside[:, 0].max() - inside[:, 0].min()) + 1e-5
+    with pytest.raises(InputError, match="thing: expected one that answers"):
+        found.of_thing(words[1], first.thing)
+
+
+def test_layers_of_answers(scene, layers, words) -> None:
+    found = query(scene, words, options=LOW, layers=layers)
+    selection = query(scene, words[:1], options=LOW, layers=layers).selection()
+    assert isinstance(selection, Selection)
+    assert selection.count == found.found[words[0]][0].gaussians
+    assert selection.info.method == "query"
+    labels = found.labels()
+    assert labels.present.tolist() == [1, 2]
+    assert labels.info.names == dict(enumerate(words, start=1))
+    every = query(
+        scene, words, options=replace(LOW, every=True, min_probability=1.0), layers=layers
+    )
+    assert every.labels().ids.tolist() == labels.ids.tolist()
+    with pytest.raises(InputError, match=f"answers to {words[2]}"):
+        query(scene, words[2:], options=LOW, layers=layers).selection()
+
+
+def test_a_higher_probability_is_asked_for(scene, layers, words) -> None:
+    sure = query(scene, words[:1], options=LOW, layers=layers).found[words[0]][0].probability
+    above = QueryOptions(min_probability=min(1.0, sure + 1e-3))
+    assert query(scene, words[:1], options=above, layers=layers).unknown == (words[0],)
+
+
+def test_components_and_answers_count(scene, layers, words) -> None:
+    base = query(scene, words, layers=layers)
+    one = query(scene, words, options=QueryOptions(components=1), layers=layers)
+    assert not torch.equal(one.cosines, base.cosines)
+    from splatseg.lift.words import AnswerOptions
+
+    warm = QueryOptions(answers=AnswerOptions(temperature=3.0))
+    assert not torch.equal(
+        query(scene, words, options=warm, layers=layers).probabilities, base.probabilities
+    )
+
+
+def test_features_of_each_gaussian_answer_in_connected_pieces(scene, vocabulary, words) -> None:
+    layer = layer_of(scene, vocabulary, words)
+    generator = torch.Generator().manual_seed(5)
+    noise = 1e-4 * torch.randn(layer.values.shape, generator=generator)
+    own = replace(
+        layer,
+        values=torch.where(
+            layer.values.abs().amax(dim=1, keepdim=True) > 0, layer.values + noise, 0
+        ),
+        info=replace(layer.info, method="features"),
+    )
+    module: Any = importlib.import_module("splatseg.tasks.query")
+    session = QuerySession(scene, options=replace(LOW, from_layer="own"), layers={"own": own})
+    assert len(session.index) > 1000
+    before = module._THINGS
+    try:
+        module._THINGS = 100
+        found = session.ask(words)
+    finally:
+        module._THINGS = before
+    pieces = found.found[words[0]]
+    assert 1 <= len(pieces) < 1000
+    assert sum(one.gaussians for one in pieces) == int((found.things[:, 0] >= 0).sum())
+
+
+def test_a_layer_of_objects_is_made_once_and_kept(folder, words, capsys) -> None:
+    call = ["query", str(folder), *words, "--masks", "masks_sam", "--features", "features_text"]
+    assert main([*call, "--json", "--layer", "answers", "--every"]) == 0
+    captured = capsys.readouterr()
+    facts = json.loads(captured.out)
+    assert "finding objects by masks_sam" in captured.err
+    assert facts["source"] == "objects"
+    assert set(facts["words"]) == set(words)
+    made = load_scene_layer(folder, "objects")
+    assert isinstance(made, Features)
+    assert made.info.method == "objects"
+    assert isinstance(load_scene_layer(folder, "answers"), Labels)
+    assert main([*call, "--json"]) == 0
+    captured = capsys.readouterr()
+    assert "finding objects" not in captured.err
+    assert json.loads(captured.out)["words"] == facts["words"]
+
+
+def test_what_the_command_prints_and_writes(folder, scene, layers, words, capsys, tmp_path) -> None:
+    save_scene_layer(layers["objects"], folder, "drawn")
+    name = scene.train_views[0].name
+    call = ["query", str(folder), *words, "--from-layer", "drawn", "--min-probability", "0.3"]
+    call += ["--picture", str(tmp_path / "p"), "--heat", str(tmp_path / "h"), "--views", name]
+    assert main(call) == 0
+    out = capsys.readouterr().out
+    assert f"{words[0]}: 1 thing" in out
+    assert f"{words[2]}: unknown here" in out
+    pictures = sorted(path.name for path in (tmp_path / "p").iterdir())
+    assert len(pictures) == 2
+    assert all(picture.endswith("_1.png") for picture in pictures)
+    heat = sorted(path for path in (tmp_path / "h").rglob("*.png"))
+    assert len(heat) == 3
+    camera = scene.train_views[0].camera
+    with Image.open(heat[0]) as picture:
+        assert picture.size == (camera.width, camera.height)
+    # One word becomes a selection.
+    call = ["query", str(folder), words[0], "--from-layer", "drawn", "--min-probability", "0.3"]
+    assert main([*call, "--layer", "one", "--quiet"]) == 0
+    assert isinstance(load_scene_layer(folder, "one"), Selection)
+
+
+def test_pictures_from_python(scene, layers, words, tmp_path) -> None:
+    found = query(scene, words, options=LOW, layers=layers)
+    assert len(draw_answers(found, scene, tmp_path / "a", top=1)) == 2
+    assert len(draw_heat(found, scene, scene.train_views[:2], tmp_path / "b")) == 6
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (["zzz"], "recorded words, got 'zzz'"),
+        ([""], "expected words or phrases"),
+        (["A", "--top", "0"], "top: expected at least 1"),
+        (["A", "--from-layer", "nothing"], "from-layer: expected one of"),
+        (
+            ["A", "--features", "masks_sam", "--masks", "masks_sam"],
+            "expected features, 'masks_sam' has masks",
+        ),
+        (["A", "--masks", "nothing", "--features", "features_text"], "nothing"),
+        (["A", "--model", "classical"], "expected one that encodes words"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(folder, words, call, said, capsys) -> None:
+    asked = [words[0] if word == "A" else word for word in call]
+    assert main(["query", str(folder), *asked]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_twice_the_same_word_is_refused(scene, layers, words) -> None:
+    with pytest.raises(InputError, match="distinct words"):
+        query(scene, [words[0], f" {words[0]}"], layers=layers)
+    with pytest.raises(RangeError, match="min_probability"):
+        QueryOptions(min_probability=1.5)
+    with pytest.raises(RangeError, match="components"):
+        QueryOptions(components=0)
