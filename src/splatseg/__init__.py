@@ -86,6 +86,7 @@ if TYPE_CHECKING:
     from splatseg.tasks import ExportOptions as ExportOptions
     from splatseg.tasks import ImportOptions as ImportOptions
     from splatseg.tasks import MakeSceneOptions as MakeSceneOptions
+    from splatseg.tasks import QueryOptions as QueryOptions
     from splatseg.tasks import RenderingOptions as RenderingOptions
     from splatseg.tasks import SeeOptions as SeeOptions
     from splatseg.tasks import SegmentOptions as SegmentOptions
@@ -102,6 +103,7 @@ if TYPE_CHECKING:
     from splatseg.tasks import import_scene as import_scene
     from splatseg.tasks import make_demo as make_demo
     from splatseg.tasks import open_selector as open_selector
+    from splatseg.tasks import query as query
     from splatseg.tasks import render_truth as render_truth
     from splatseg.tasks import render_views as render_views
     from splatseg.tasks import save_segmentation as save_segmentation
@@ -128,11 +130,11 @@ _HOMES = {
     "splatseg.synthetic": "write_capture",
     "splatseg.tasks": (
         "AttachLayersOptions BenchOptions CheckpointOptions DemoOptions EditOptions "
-        "EvaluationOptions ExportOptions ImportOptions MakeSceneOptions RenderingOptions "
-        "SeeOptions SegmentOptions SelectOptions SharpenSceneOptions attach_layers bench "
-        "describe edit_scene "
+        "EvaluationOptions ExportOptions ImportOptions MakeSceneOptions QueryOptions "
+        "RenderingOptions SeeOptions SegmentOptions SelectOptions SharpenSceneOptions "
+        "attach_layers bench describe edit_scene "
         "evaluate_scene examine_capture export_scene fit_capture import_scene make_demo "
-        "open_selector render_truth render_views save_segmentation see segment select "
+        "open_selector query render_truth render_views save_segmentation see segment select "
         "sharpen_scene"
     ),
 }

@@ -16,8 +16,8 @@ from splatseg.io.scene import load_scene_layer
 
 CLI = Path(cli.__file__).parent
 MAKE = {
-    "attach", "bench", "demo", "edit", "evaluate", "export", "fit", "import", "render", "see",
-    "segment", "select", "sharpen",
+    "attach", "bench", "demo", "edit", "evaluate", "export", "fit", "import", "query", "render",
+    "see", "segment", "select", "sharpen",
 }  # fmt: skip
 TELL = {"doctor", "info"}
 SHARED = {

@@ -267,6 +267,16 @@ def valid(world: World) -> dict[str, Any]:
     return {"by_type": by_type, "by_name": by_name, "special": special(world, by_type)}
 
 
+def answers() -> Any:
+    from splatseg.tasks import Answers, QueryOptions
+
+    none = torch.zeros(COUNT, 1)
+    return Answers(
+        words=("cup",), found={"cup": ()}, probabilities=none, cosines=none,
+        things=torch.full((COUNT, 1), -1), layer="objects", options=QueryOptions(),
+    )  # fmt: skip
+
+
 def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
     ids = Maps().label_map("a").ids
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
@@ -275,6 +285,8 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         **inner(world, by_type),
         **of_points(world.folder),
         "tasks.select.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
+        "tasks.draw_answers.answers": answers(),
+        "tasks.draw_heat.answers": answers(),
         "tasks.draw_selection.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
         "core.apply_rows.layer": world.labels,
         "evaluate.learned_bytes.layer": world.labels,
