@@ -40,7 +40,7 @@ def test_it_is_what_the_network_gives(checkpoints, rng, family: str, kind: str) 
         logits = model._network(((picture.permute(2, 0, 1) / 255 - mean) / std)[None]).logits
     best = F.interpolate(logits, (64, 64), mode="bilinear")[0].softmax(0).max(0)
     assert float((found.ids == best.indices + 1).float().mean()) > 0.99
-    torch.testing.assert_close(found.confidence, best.values, rtol=0, atol=2e-2)
+    torch.testing.assert_close(found.confidence, best.values, rtol=0, atol=1e-4)
     assert len(found.ids.unique()) > 1
     assert [row.id for row in model.classes.rows] == [1, 2, 3, 4, 5, 6]
 
