@@ -2,11 +2,13 @@
 
 import importlib
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import pytest
 import torch
 from PIL import Image
@@ -18,6 +20,7 @@ from splatseg.io.evidence import FeatureEvidence, open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
 from splatseg.tasks import QueryOptions, QuerySession, draw_answers, draw_heat, query
+from splatseg.tasks.query_report import write_query_report
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +81,8 @@ def test_things_that_a_word_means(scene, layers, words) -> None:
     assert found.layer == "objects"
     assert [len(found.found[word]) for word in words] == [1, 1, 0]
     assert found.unknown == (words[2],)
+    assert 0 <= found.surest[words[2]] < 0.3
+    assert found.surest[words[0]] == pytest.approx(float(found.probabilities[:, 0].max()))
     first = found.found[words[0]][0]
     third = -(-len(scene.gaussians) // 3)
     assert abs(first.gaussians - third) <= 1
@@ -177,7 +182,7 @@ def test_what_the_command_prints_and_writes(folder, scene, layers, words, capsys
     assert main(call) == 0
     out = capsys.readouterr().out
     assert f"{words[0]}: 1 thing" in out
-    assert f"{words[2]}: unknown here" in out
+    assert re.search(rf"{words[2]}: unknown here \([\d.]+% at most\)", out)
     pictures = sorted(path.name for path in (tmp_path / "p").iterdir())
     assert len(pictures) == 2
     assert all(picture.endswith("_1.png") for picture in pictures)
@@ -190,6 +195,55 @@ def test_what_the_command_prints_and_writes(folder, scene, layers, words, capsys
     call = ["query", str(folder), words[0], "--from-layer", "drawn", "--min-probability", "0.3"]
     assert main([*call, "--layer", "one", "--quiet"]) == 0
     assert isinstance(load_scene_layer(folder, "one"), Selection)
+
+
+def test_a_report_shows_what_answers(folder, scene, layers, words, capsys) -> None:
+    save_scene_layer(layers["objects"], folder, "drawn")
+    call = ["query", str(folder), *words, "--from-layer", "drawn", "--min-probability", "0.3"]
+    assert main([*call, "--report", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    page = Path(facts["report"]).read_text()
+    assert Path(facts["report"]) == folder / "reports" / "query.html"
+    assert "2 of 3" in page
+    assert f"Unknown: {words[2]}." in page
+    assert f"{facts['surest'][words[2]]:.1%}" in page
+    # A cut-out of each thing, and for each of two words its view and the heat there.
+    assert page.count("<img") == 2 + 2 * 2
+    assert f"<h2>{words[0]}</h2>" in page
+    record = json.loads((folder / "reports" / "query.json").read_text())
+    assert record["found"][words[0]] == facts["words"][words[0]]
+    assert record["surest"] == facts["surest"]
+
+
+def test_no_more_things_are_reported_than_asked_for(scene, vocabulary, words, tmp_path) -> None:
+    layer = layer_of(scene, vocabulary, words)
+    # Another third that means the first word, less surely.
+    mixed = torch.where(layer.values == 0, 0.9 * layer.values[:1] + 0.1, layer.values)
+    left = scene.gaussians.means[:, 0].argmin()
+    values = torch.where(layer.values.abs().sum(1, keepdim=True) > 0, layer.values, mixed[left])
+    two = replace(layer, values=values, weights=torch.ones(len(values)))
+    found = query(scene, words[:1], options=QueryOptions(min_probability=0.0), layers={"o": two})
+    assert len(found.found[words[0]]) > 1
+    (tmp_path / "reports").mkdir()
+    all_of_them = write_query_report(found, scene, tmp_path).read_text()
+    first = write_query_report(found, scene, tmp_path, top=1).read_text()
+    assert all_of_them.count("<img") == 2 + len(found.found[words[0]])
+    assert first.count("<img") == 2 + 1
+    assert "The surest 1 of them." in first
+
+
+def test_a_film_of_heat_along_a_path(folder, layers, words, capsys, tmp_path) -> None:
+    save_scene_layer(layers["objects"], folder, "drawn")
+    call = ["query", str(folder), words[0], "--from-layer", "drawn", "--heat", str(tmp_path)]
+    assert main([*call, "--views", "path", "--frames", "6", "--video", "--fps", "3"]) == 0
+    capsys.readouterr()
+    assert len(list(tmp_path.rglob("path_*.png"))) == 6
+    (film,) = tmp_path.glob("*.mp4")
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
+    assert frames == 6
+    assert seconds == pytest.approx(2.0, abs=0.1)
+    assert main(["query", str(folder), words[0], "--video"]) == 2
+    assert "video: expected --heat" in capsys.readouterr().err
 
 
 def test_pictures_from_python(scene, layers, words, tmp_path) -> None:

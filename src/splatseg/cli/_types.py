@@ -94,7 +94,7 @@ SelectLevel: TypeAlias = Annotated[
     ),
 ]
 
-Frames: TypeAlias = Annotated[int, _named("N", "Views of --split path.")]
+Frames: TypeAlias = Annotated[int, _named("N", "Views of a path.")]
 
 Json: TypeAlias = Annotated[
     bool,

@@ -1,5 +1,6 @@
 """``splatseg query``: words become the things that they mean, and how surely."""
 
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -8,14 +9,21 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder
-from splatseg.cli._work import ConsoleObserver, open_scene, print_result
+from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import Scene, View
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.io.scene_folder import work_on_scene
-from splatseg.tasks import Answers, QueryOptions, QuerySession, draw_answers, draw_heat
+from splatseg.tasks import (
+    Answers,
+    QueryOptions,
+    QuerySession,
+    draw_answers,
+    draw_heat,
+    write_query_report,
+)
 from splatseg.tasks.named_models import model_of
 from splatseg.tasks.scene_parts import views_asked
 
@@ -42,7 +50,7 @@ class Command:
 
     splatseg query room wall floor ceiling chair --every --layer classes
 
-    splatseg query room sofa --model clip --features clip --heat maps --views view_01,view_07
+    splatseg query room sofa --model clip --features clip --report --heat maps --views path --video
     """
 
     scene: SceneFolder
@@ -61,7 +69,19 @@ class Command:
     """Also write DIR/WORD/VIEW.png: the probability of each word over the views."""
 
     views: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VIEWS")] = ("train",)
-    """Views of the heat maps: train, all, or names by comma or by space."""
+    """Views of the heat maps: train, all, path (a smooth path near the cameras), or names by comma
+    or by space."""
+
+    frames: Frames = 360
+
+    video: bool = False
+    """Also write a film of each word's heat maps, DIR/WORD.mp4. Needs splatseg[video]."""
+
+    fps: float = 24.0
+    """Frames a second of --video."""
+
+    report: bool = False
+    """Also write SCENE/reports/query.html and query.json: what answers, with pictures."""
 
     top: int = _LISTED
     """Things of a word that are listed and drawn, at most."""
@@ -97,9 +117,10 @@ def run(command: Command) -> None:
     if command.layer is not None:
         check_name("layer", command.layer)
     scene = open_scene(command.scene, command.data)
-    views = views_asked(scene, _names(command.views)) if command.heat is not None else ()
+    views = _views(command, scene)
     encoder = None if command.model is None else _encoder(command, observer)
-    with work_on_scene(command.scene, "query", writes=["layers"]):
+    writes = ["layers", *(["reports"] if command.report else [])]
+    with work_on_scene(command.scene, "query", writes=writes):
         session = QuerySession(
             scene,
             options=command.options,
@@ -117,6 +138,12 @@ def run(command: Command) -> None:
             made = answers.labels() if _several(command, answers) else answers.selection()
             facts["layer"] = save_scene_layer(made, command.scene, command.layer)
             lines.append(str(facts["layer"]))
+        if command.report:
+            facts["report"] = write_query_report(
+                answers, scene, command.scene,
+                top=command.top, command=typed(sys.argv), backend=command.backend,
+            )  # fmt: skip
+            lines.append(f"report: {facts['report']}")
     for key, folder, files in _drawn(command, scene, answers, views):
         facts[key] = list(files)
         lines.append(f"{len(files)} {key.replace('_', ' ')} in {folder}")
@@ -127,6 +154,15 @@ def run(command: Command) -> None:
 
 def _several(command: Command, answers: Answers) -> bool:
     return len(answers.words) > 1 or command.options.every
+
+
+def _views(command: Command, scene: Scene) -> tuple[View, ...]:
+    """Those of the heat maps."""
+    if command.heat is None:
+        if command.video:
+            raise InputError("video: expected --heat, whose maps the film is of, with it.")
+        return ()
+    return views_asked(scene, _names(command.views), frames=command.frames)
 
 
 def _names(views: tuple[str, ...]) -> tuple[str, ...]:
@@ -145,13 +181,18 @@ def _encoder(command: Command, observer: ConsoleObserver) -> TextFeatures:
 
 
 def _answered(answers: Answers, top: int) -> tuple[dict[str, Any], list[str]]:
-    facts: dict[str, Any] = {"source": answers.layer, "words": {}, "unknown": answers.unknown}
+    facts: dict[str, Any] = {
+        "source": answers.layer,
+        "words": {},
+        "unknown": answers.unknown,
+        "surest": dict(answers.surest),
+    }
     lines: list[str] = []
     for word in answers.words:
         found = answers.found[word]
         facts["words"][word] = [asdict(one) for one in found[:top]]
         if not found:
-            lines.append(f"{word}: unknown here")
+            lines.append(f"{word}: unknown here ({answers.surest[word]:.1%} at most)")
             continue
         more = f", the surest {top} of them" if len(found) > top else ""
         count = "1 thing" if len(found) == 1 else f"{len(found)} things"
@@ -175,5 +216,8 @@ def _drawn(
         )
         yield "pictures", command.picture, files
     if command.heat is not None:
-        files = draw_heat(answers, scene, views, command.heat, backend=command.backend)
+        files = draw_heat(
+            answers, scene, views, command.heat,
+            video=command.video, fps=command.fps, backend=command.backend,
+        )  # fmt: skip
         yield "heat_maps", command.heat, files

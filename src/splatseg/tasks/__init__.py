@@ -42,6 +42,7 @@ from splatseg.tasks.query import query as query
 from splatseg.tasks.query_options import QueryOptions as QueryOptions
 from splatseg.tasks.query_outputs import draw_answers as draw_answers
 from splatseg.tasks.query_outputs import draw_heat as draw_heat
+from splatseg.tasks.query_report import write_query_report as write_query_report
 from splatseg.tasks.render import Rendering as Rendering
 from splatseg.tasks.render import RenderingOptions as RenderingOptions
 from splatseg.tasks.render import render_views as render_views

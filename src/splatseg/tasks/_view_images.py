@@ -1,10 +1,10 @@
-"""What a 2D model is shown of a view: its photograph, or a render where it has none."""
+"""What a 2D model or a person is shown of a view: its photograph, or a render if there is none."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from splatseg.core import Renderable, Scene, View
@@ -13,7 +13,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import save_render
 from splatseg.io.images import image_camera, load_image
 from splatseg.lift import GaussianField
-from splatseg.render import BackendName
+from splatseg.render import BackendName, PreparedView
 
 _GREYS = (0.0, 1.0, 0.5)
 # A scene that fills its views has no background to speak of, and it stays black.
@@ -64,6 +64,15 @@ class ViewImages:
         save_render(image, folder, view.name)
         self.drawn += 1
         return image
+
+
+def shown_image(view: View, prepared: PreparedView) -> UInt8[Tensor, "height width 3"]:
+    """The photograph of a view, or the render of it."""
+    if view.image is not None:
+        return load_image(view)
+    with torch.no_grad():
+        colour = prepared.render().image
+    return (colour.cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
 
 
 def background_of(field: Renderable, views: Sequence[View]) -> float:

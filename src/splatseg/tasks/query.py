@@ -3,6 +3,7 @@
 import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
@@ -55,6 +56,9 @@ class Answers:
 
     found: Mapping[str, tuple[Found, ...]]
     """Things by word, the surest first; none where the word is unknown here."""
+
+    surest: Mapping[str, float]
+    """The largest probability of anything by word, also where that is not enough to answer."""
 
     probabilities: Float[Tensor, "n words"]
     """Of each Gaussian."""
@@ -127,11 +131,17 @@ class Answers:
             options={**asdict(self.options), "from_layer": self.layer},
             names=dict(enumerate(self.words, start=1)),
             versions={"splatseg": importlib.metadata.version("splatseg")},
-            details={
-                "words": list(self.words),
-                "found": {word: [asdict(one) for one in self.found[word]] for word in self.words},
-            },
+            details=answers_record(self),
         )
+
+
+def answers_record(answers: Answers) -> dict[str, Any]:
+    """What was found, as values that JSON holds."""
+    return {
+        "words": list(answers.words),
+        "found": {word: [asdict(one) for one in answers.found[word]] for word in answers.words},
+        "surest": dict(answers.surest),
+    }
 
 
 class QuerySession:
@@ -219,6 +229,10 @@ class QuerySession:
         return Answers(
             words=asked.words,
             found=found,
+            surest={
+                word: round(float(probabilities[:, column].max()), 6)
+                for column, word in enumerate(asked.words)
+            },
             probabilities=probabilities,
             cosines=cosines,
             things=things,

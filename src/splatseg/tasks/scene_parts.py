@@ -9,6 +9,7 @@ from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene_layer, scene_layer_names
 from splatseg.lift import GaussianField, PointLabelOptions
 from splatseg.render import BackendName
+from splatseg.tasks._film import path_views
 
 
 def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
@@ -24,14 +25,20 @@ def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
     raise InputError(f"split: expected all or a split of the scene ({known}), got {split!r}.")
 
 
-def views_asked(scene: Scene, asked: Sequence[str]) -> tuple[View, ...]:
+def views_asked(
+    scene: Scene, asked: Sequence[str], *, frames: int | None = None
+) -> tuple[View, ...]:
     """The views that are asked for: ``train``, ``all``, or views by their names.
+
+    With `frames` also ``path``: so many along a smooth path near them.
 
     Raises:
         InputError: If there is none, or none of a name.
     """
     if not asked:
         raise InputError("views: expected train, all or names of views, got none.")
+    if frames is not None and tuple(asked) == ("path",):
+        return path_views(scene, GaussianField(scene.gaussians), frames=frames)
     if len(asked) > 1 or asked[0] not in ("train", "all"):
         return tuple(scene.view(name) for name in asked)
     views = scene.views if asked[0] == "all" else scene.train_views

@@ -7,17 +7,18 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from splatseg.core import Scene, Selection, View
+from splatseg.core import Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.images import load_image, save_png
+from splatseg.io.images import save_png
 from splatseg.io.paths import path_inside
 from splatseg.io.splats import write_splats
 from splatseg.lift.field_layers import selection_labels
 from splatseg.lift.label_maps import view_label_map
 from splatseg.prompting.prompts import Lasso, SelectionPrompt, ViewPrompt
-from splatseg.render import BackendName, PreparedView, prepare
+from splatseg.render import BackendName, prepare
 from splatseg.report.selection_picture import selection_picture
+from splatseg.tasks._view_images import shown_image
 
 _SELECTED = 1
 
@@ -89,21 +90,12 @@ def draw_selection(
     for name, view in views.items():
         with prepare(scene.gaussians, view.camera, backend=backend) as prepared:
             mask = view_label_map(prepared, selection_labels(selection)).ids.cpu() == _SELECTED
-            image = _image(view, prepared)
+            image = shown_image(view, prepared)
         picture = _picture(image, mask, [p for p in shown if p.view.name == name])
         path = path_inside(folder, f"{name}.png")
         save_png(picture, path)
         files.append(path)
     return tuple(files)
-
-
-def _image(view: View, prepared: PreparedView) -> UInt8[Tensor, "height width 3"]:
-    """The photograph, or the render."""
-    if view.image is not None:
-        return load_image(view)
-    with torch.no_grad():
-        colour = prepared.render().image
-    return (colour.cpu().clamp(0, 1) * 255 + 0.5).to(torch.uint8)
 
 
 def _picture(
