@@ -321,3 +321,31 @@ def match_features(
     negative_scores: Tensor | None,
     member: Tensor | None,
 ) -> None: ...
+
+class VoxelGrid:
+    nbytes: int
+    def __init__(self, cells: Tensor, /) -> None: ...
+    def find(self, cells: Tensor, rows: Tensor, /) -> None: ...
+    def trace(
+        self,
+        origin: Tensor,
+        directions: Tensor,
+        near: float,
+        far: float,
+        depths: Tensor | None,
+        hits: Tensor,
+        weights: Tensor | None,
+    ) -> None: ...
+
+def add_hit_features(
+    rows: Tensor,
+    row_weight: Tensor,
+    columns: Tensor,
+    column_weight: Tensor,
+    hits: Tensor,
+    weights: Tensor | None,
+    features: Tensor,
+    view_means: bool,
+    sums: Tensor,
+    totals: Tensor,
+) -> None: ...

@@ -209,8 +209,8 @@ def read_grid(
         resampling: ``bilinear`` between centres, or the ``nearest`` centre.
     """
     rows, columns = features.shape[:2]
-    row_taps = _taps(rows, cells[0], size[0], resampling)
-    column_taps = _taps(columns, cells[1], size[1], resampling)
+    row_taps = grid_taps(rows, cells[0], size[0], resampling)
+    column_taps = grid_taps(columns, cells[1], size[1], resampling)
     # First along the columns of the small grid, then down: the large image is written once.
     resampled = _blend(features, column_taps, dim=1)
     return _blend(resampled, row_taps, dim=0)
@@ -240,21 +240,29 @@ def read_features_at(
     cells = (covered[0] / grid.stride, covered[1] / grid.stride)
     features = grid.features.float().cpu()
     first_row, second_row, down = (
-        taps[pixels // size[1]] for taps in _taps(features.shape[0], cells[0], size[0], "bilinear")
+        taps[pixels // size[1]] for taps in grid_taps(features.shape[0], cells[0], size[0])
     )
     first, second, right = (
-        taps[pixels % size[1]] for taps in _taps(features.shape[1], cells[1], size[1], "bilinear")
+        taps[pixels % size[1]] for taps in grid_taps(features.shape[1], cells[1], size[1])
     )
     upper = torch.lerp(features[first_row, first], features[first_row, second], right[:, None])
     lower = torch.lerp(features[second_row, first], features[second_row, second], right[:, None])
     return torch.lerp(upper, lower, down[:, None])
 
 
-_Taps = tuple[Tensor, Tensor, Tensor]
+Taps = tuple[Tensor, Tensor, Tensor]
+"""Of each pixel along an axis the two cells that it reads, and the second one's weight."""
 
 
-def _taps(count: int, cells: float, pixels: int, resampling: Resampling) -> _Taps:
-    """The two cells each pixel reads along an axis, and the second one's weight."""
+def grid_taps(count: int, cells: float, pixels: int, resampling: Resampling = "bilinear") -> Taps:
+    """The cells that pixels read along an axis, see `read_grid`.
+
+    Args:
+        count: Cells that there are.
+        cells: Cells that the pixels cover; need not be whole, nor `count`.
+        pixels: How many pixels there are.
+        resampling: ``bilinear`` between centres of cells, or the ``nearest`` centre.
+    """
     position = (torch.arange(pixels, dtype=torch.float64) + 0.5) * (cells / pixels) - 0.5
     position = position.clamp(0, count - 1)
     if resampling == "nearest":
@@ -265,7 +273,7 @@ def _taps(count: int, cells: float, pixels: int, resampling: Resampling) -> _Tap
     return first, (first + 1).clamp_max(count - 1), (position - first).float()
 
 
-def _blend(image: Tensor, taps: _Taps, *, dim: int) -> Tensor:
+def _blend(image: Tensor, taps: Taps, *, dim: int) -> Tensor:
     first, second, second_weight = taps
     if not bool(second_weight.any()):
         return image.index_select(dim, first)
