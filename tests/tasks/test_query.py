@@ -19,7 +19,7 @@ from splatseg.errors import InputError, RangeError
 from splatseg.io.evidence import FeatureEvidence, open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
-from splatseg.tasks import QueryOptions, QuerySession, draw_answers, draw_heat, query
+from splatseg.tasks import Found, QueryOptions, QuerySession, draw_answers, draw_heat, query
 from splatseg.tasks.query_report import write_query_report
 
 
@@ -113,6 +113,16 @@ def test_layers_of_answers(scene, layers, words) -> None:
         query(scene, words[2:], options=LOW, layers=layers).selection()
 
 
+def test_of_equally_sure_things_the_larger_comes_first() -> None:
+    at = (0.0, 0.0, 0.0)
+    small, large, other = (
+        Found(thing=thing, probability=p, cosine=0.5, gaussians=count, centre=at, size=at)
+        for thing, p, count in ((1, 0.9999, 10), (2, 0.9996, 500), (3, 0.93, 900))
+    )
+    module: Any = importlib.import_module("splatseg.tasks.query")
+    assert sorted((other, small, large), key=module._rank) == [large, small, other]
+
+
 def test_a_higher_probability_is_asked_for(scene, layers, words) -> None:
     sure = query(scene, words[:1], options=LOW, layers=layers).found[words[0]][0].probability
     above = QueryOptions(min_probability=min(1.0, sure + 1e-3))
@@ -131,7 +141,9 @@ def test_components_and_answers_count(scene, layers, words) -> None:
     )
 
 
-def test_features_of_each_gaussian_answer_in_connected_pieces(scene, vocabulary, words) -> None:
+def test_features_of_each_gaussian_answer_in_connected_pieces(
+    scene, vocabulary, words, monkeypatch
+) -> None:
     layer = layer_of(scene, vocabulary, words)
     generator = torch.Generator().manual_seed(5)
     noise = 1e-4 * torch.randn(layer.values.shape, generator=generator)
@@ -143,14 +155,10 @@ def test_features_of_each_gaussian_answer_in_connected_pieces(scene, vocabulary,
         info=replace(layer.info, method="features"),
     )
     module: Any = importlib.import_module("splatseg.tasks.query")
+    monkeypatch.setattr(module, "_THINGS", 100)
     session = QuerySession(scene, options=replace(LOW, from_layer="own"), layers={"own": own})
     assert len(session.index) > 1000
-    before = module._THINGS
-    try:
-        module._THINGS = 100
-        found = session.ask(words)
-    finally:
-        module._THINGS = before
+    found = session.ask(words)
     pieces = found.found[words[0]]
     assert 1 <= len(pieces) < 1000
     assert sum(one.gaussians for one in pieces) == int((found.things[:, 0] >= 0).sum())

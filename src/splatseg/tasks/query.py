@@ -3,6 +3,7 @@
 import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -48,26 +49,24 @@ class Found:
     """Extent along x, y and z, between the 2nd and the 98th percentile of centres."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Answers:
-    """What a scene answers to words."""
+    """What a scene answers to words; of Gaussians it is worked out when it is asked for."""
 
     words: tuple[str, ...]
 
     found: Mapping[str, tuple[Found, ...]]
-    """Things by word, the surest first; none where the word is unknown here."""
+    """Things by word, the surest first, of those that are equal to a percent the larger; none where
+    the word is unknown here."""
 
     surest: Mapping[str, float]
     """The largest probability of anything by word, also where that is not enough to answer."""
 
-    probabilities: Float[Tensor, "n words"]
-    """Of each Gaussian."""
+    vectors: WordAnswers
+    """What the distinct vectors of the layer answer."""
 
-    cosines: Float[Tensor, "n words"]
-    """Of each Gaussian, in the span of the scene's features; 0 where it has no feature."""
-
-    things: Int64[Tensor, "n words"]
-    """The thing that each Gaussian is of, by word; -1 where it does not answer."""
+    index: WordIndex
+    """Whose vectors these are."""
 
     layer: str
     """Name of the layer that answered."""
@@ -77,6 +76,29 @@ class Answers:
     made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
     """Layers that were made to answer, by the names to keep them under: with them the next query
     answers at once."""
+
+    pieces: Int64[Tensor, "n words"] | None = None
+    """Connected pieces of Gaussians by word, -1 outside, where these are the things; None where
+    each vector is one."""
+
+    @cached_property
+    def probabilities(self) -> Float[Tensor, "n words"]:
+        """Of each Gaussian."""
+        return self.index.of_gaussians(self.vectors.probabilities)
+
+    @cached_property
+    def cosines(self) -> Float[Tensor, "n words"]:
+        """Of each Gaussian, in the span of the scene's features; 0 where it has no feature."""
+        return self.index.of_gaussians(self.vectors.cosines)
+
+    @cached_property
+    def things(self) -> Int64[Tensor, "n words"]:
+        """The thing that each Gaussian is of, by word; -1 where it does not answer."""
+        if self.pieces is not None:
+            return self.pieces
+        inside = self.probabilities >= self.options.min_probability
+        rows = self.index.rows[:, None]
+        return torch.where(inside & (rows >= 0), rows, UNLABELLED)
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -194,6 +216,9 @@ class QuerySession:
             self._source.vocabulary,
             components=self._options.components,
         )
+        # Of few vectors each is a thing, whose place does not depend on what is asked.
+        few = len(self._index) <= _THINGS
+        self._places = _places(scene, self._index.rows) if few else None
 
     @property
     def index(self) -> WordIndex:
@@ -219,61 +244,88 @@ class QuerySession:
         for word in asked.words:
             if asked.words.count(word) > 1:
                 raise InputError(f"words: expected distinct words, got {word!r} more than once.")
-        things = self._things(asked)
-        probabilities = self._index.of_gaussians(asked.probabilities)
-        cosines = self._index.of_gaussians(asked.cosines)
-        found = {
-            word: self._found(things[:, column], probabilities[:, column], cosines[:, column])
-            for column, word in enumerate(asked.words)
-        }
+        pieces = None if self._places is not None else self._pieces(asked)
         return Answers(
             words=asked.words,
-            found=found,
+            found={
+                word: self._found(asked, column, pieces) for column, word in enumerate(asked.words)
+            },
             surest={
-                word: round(float(probabilities[:, column].max()), 6)
+                word: round(float(asked.probabilities[:, column].max()), 6)
                 for column, word in enumerate(asked.words)
             },
-            probabilities=probabilities,
-            cosines=cosines,
-            things=things,
+            vectors=asked,
+            index=self._index,
             layer=self._source.layer,
             options=self._options,
             made_layers=self._source.made_layers,
+            pieces=pieces,
         )
 
-    def _things(self, asked: WordAnswers) -> Int64[Tensor, "n words"]:
+    def _pieces(self, asked: WordAnswers) -> Int64[Tensor, "n words"]:
+        """Connected pieces of the Gaussians that answer."""
         answering = asked.probabilities >= self._options.min_probability
-        rows = self._index.rows
-        inside = (rows >= 0)[:, None] & answering[rows.clamp_min(0)]
-        if len(self._index) <= _THINGS:
-            return torch.where(inside, rows[:, None], UNLABELLED)
+        inside = self._index.of_gaussians(answering)
         columns = [
             components(self._scene.gaussians, Selection(mask=inside[:, column]))
             for column in range(inside.shape[1])
         ]
         return torch.stack(columns, dim=1)
 
-    def _found(self, things: Tensor, probabilities: Tensor, cosines: Tensor) -> tuple[Found, ...]:
-        """The things that answer to one word, the surest first, of equals the larger."""
-        inside = torch.nonzero(things >= 0).squeeze(1)
-        inside = inside[torch.argsort(things[inside], stable=True)]
-        ids, counts = torch.unique_consecutive(things[inside], return_counts=True)
-        means = self._scene.gaussians.means.detach().cpu()
-        found: list[Found] = []
-        for thing, rows in zip(ids.tolist(), inside.split(counts.tolist()), strict=True):
-            at = means[rows].double()
-            span = at.quantile(torch.tensor([0.02, 0.98]).double(), dim=0)
-            found.append(
-                Found(
-                    thing=int(thing),
-                    probability=round(float(probabilities[rows].double().mean()), 6),
-                    cosine=round(float(cosines[rows].double().mean()), 6),
-                    gaussians=len(rows),
-                    centre=_triple(at.median(dim=0).values),
-                    size=_triple(span[1] - span[0]),
-                )
+    def _found(self, asked: WordAnswers, column: int, pieces: Tensor | None) -> tuple[Found, ...]:
+        """The things that answer to one word, in the order of `Answers.found`."""
+        probabilities, cosines = asked.probabilities[:, column], asked.cosines[:, column]
+        if pieces is None:
+            places = self._places or {}
+            answering = torch.nonzero(probabilities >= self._options.min_probability).flatten()
+            rows = {row: torch.tensor([row]) for row in answering.tolist()}
+        else:
+            places = _places(self._scene, pieces[:, column])
+            rows = {thing: self._index.rows[pieces[:, column] == thing] for thing in places}
+        found = [
+            Found(
+                thing=thing,
+                probability=round(float(probabilities[vectors].double().mean()), 6),
+                cosine=round(float(cosines[vectors].double().mean()), 6),
+                gaussians=places[thing].gaussians,
+                centre=places[thing].centre,
+                size=places[thing].size,
             )
-        return tuple(sorted(found, key=lambda one: (-one.probability, -one.gaussians, one.thing)))
+            for thing, vectors in rows.items()
+        ]
+        return tuple(sorted(found, key=_rank))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Place:
+    """Where a thing is, see `Found`."""
+
+    gaussians: int
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
+
+
+def _places(scene: Scene, things: Int64[Tensor, "n"]) -> dict[int, _Place]:
+    """Of each thing, by its number; -1 is none."""
+    inside = torch.nonzero(things >= 0).squeeze(1)
+    inside = inside[torch.argsort(things[inside], stable=True)]
+    ids, counts = torch.unique_consecutive(things[inside], return_counts=True)
+    means = scene.gaussians.means.detach().cpu()
+    found: dict[int, _Place] = {}
+    for thing, rows in zip(ids.tolist(), inside.split(counts.tolist()), strict=True):
+        at = means[rows].double()
+        span = at.quantile(torch.tensor([0.02, 0.98]).double(), dim=0)
+        found[int(thing)] = _Place(
+            gaussians=len(rows),
+            centre=_triple(at.median(dim=0).values),
+            size=_triple(span[1] - span[0]),
+        )
+    return found
+
+
+def _rank(found: Found) -> tuple[float, int, int]:
+    """Least for what comes first."""
+    return -round(found.probability, 2), -found.gaussians, found.thing
 
 
 def _triple(values: Tensor) -> tuple[float, float, float]:

@@ -101,10 +101,10 @@ def answer_words(
         ShapeError: If widths do not fit.
     """
     options = options or AnswerOptions()
-    asked = vocabulary.vectors(words)
     others = context_of(vocabulary) if context is None else tuple(context)
-    rivals = vocabulary.vectors(others) if others else asked[:0]
     with one_torch_thread():
+        asked = vocabulary.vectors(words)
+        rivals = vocabulary.vectors(others) if others else asked[:0]
         held = (rivals @ asked.T) < options.same_meaning
         parts = [
             _answered(part, asked=asked, rivals=rivals, held=held, span=span, options=options)

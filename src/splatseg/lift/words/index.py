@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, Features
@@ -38,6 +38,8 @@ class WordIndex:
             raise InputError("features: expected a feature of at least one Gaussian, got none.")
         rows, self._rows = _distinct(values, known)
         self._values = values[rows]
+        # A row of zeros after the last stands for Gaussians without a vector: one gather is enough.
+        self._padded = torch.where(self._rows < 0, len(rows), self._rows)
         counted = torch.ones(len(values)) if weights is None else weights.cpu().float()
         self._weights = torch.zeros(len(rows), dtype=torch.float64)
         self._weights.index_add_(0, self._rows[known], counted[known].double())
@@ -87,15 +89,14 @@ class WordIndex:
         )
 
     @boundary
-    def of_gaussians(self, found: Float[Tensor, "k words"]) -> Float[Tensor, "n words"]:
+    def of_gaussians(self, found: Shaped[Tensor, "k words"]) -> Shaped[Tensor, "n words"]:
         """Numbers of vectors on their Gaussians, 0 where one has none.
 
         Args:
             found: One row a vector, such as the probabilities of `ask`.
         """
-        there = self._rows != UNLABELLED
-        spread = found[self._rows.clamp_min(0)]
-        return torch.where(there[:, None], spread, torch.zeros_like(spread))
+        padded = torch.cat((found, found.new_zeros(1, found.shape[1])))
+        return padded.index_select(0, self._padded)
 
 
 def _distinct(
