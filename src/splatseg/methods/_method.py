@@ -144,6 +144,10 @@ class Method:
     """Name of the option that names the folder of a new scene, whose Gaussians learn along with
     the layer; None where Gaussians always stay as they are."""
 
+    words: Literal["cosines", "span"] = "cosines"
+    """How words are asked of its features: by cosines; or in the span of all features, held against
+    what else a thing could be, as `query` asks (`lift.words`)."""
+
     readouts: Mapping[str, Returns] = field(default_factory=dict[str, Returns])
     """What it gives by its option ``readout``, where that is not `returns`."""
 

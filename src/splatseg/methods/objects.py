@@ -83,4 +83,5 @@ METHOD = Method(
     returns="features",
     companions={"masks": ("masks", "panoptic", "tracked")},
     complete=False,
+    words="span",
 )

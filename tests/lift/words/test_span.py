@@ -69,3 +69,20 @@ def test_what_is_wrong_is_refused() -> None:
         word_span(values * torch.nan, torch.ones(2), SPACE)
     with pytest.raises(ShapeError, match="words"):
         word_span(values, torch.ones(2), SPACE).cosines(values, torch.ones(1, 3))
+
+
+def test_dot_products_with_what_is_inside_order_words_as_cosines_do(rng) -> None:
+    values = torch.from_numpy(rng.normal(size=(6, 3))).float()
+    basis = torch.linalg.qr(torch.from_numpy(rng.normal(size=(8, 3))).float()).Q.T
+    mean = torch.from_numpy(rng.normal(size=8)).float()
+    space = TextSpace(width=8, basis=basis, mean=mean)
+    span = word_span(values, torch.ones(6), space)
+    words = torch.from_numpy(rng.normal(size=(5, 8))).float()
+    inside = span.inside(words)
+    torch.testing.assert_close(inside.norm(dim=1), torch.ones(5))
+    lengths = (space.expand(values) @ span.directions.T).norm(dim=1, keepdim=True)
+    torch.testing.assert_close(
+        space.expand(values) @ inside.T, lengths * span.cosines(values, words)
+    )
+    axes = word_span(torch.eye(4)[:2], torch.ones(2), SPACE)
+    assert axes.inside(torch.eye(4)[2:]).abs().max() == 0, "a word with nothing in the span"

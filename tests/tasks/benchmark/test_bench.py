@@ -20,6 +20,7 @@ from splatseg.tasks.benchmark import load_result
 
 DataSet = Callable[[str], Path]
 EVIDENCE = ("masks_sam", "labels_semantic", "labels_panoptic", "features_text", "features_dino")
+BESIDE = ("--companion", "masks_sam")
 STEPS = ("--steps", "60", "--max-gaussians", "4000", "--quiet")
 
 
@@ -80,6 +81,8 @@ def save_maps(maps: TrueMaps, views: list[str], folder: Path) -> None:
         ("nvos", "nvos", ("--method", "uplift")),
         ("lerf-ovs-2d", "lerf-ovs", ("--method", "features", "--model", "features_text")),
         ("lerf-ovs-3d", "lerf-ovs", ("--method", "features", "--model", "features_text")),
+        ("lerf-ovs-2d", "lerf-ovs", ("--method", "objects", "--model", "features_text", *BESIDE)),
+        ("lerf-ovs-3d", "lerf-ovs", ("--method", "objects", "--model", "features_text", *BESIDE)),
         ("lerf-mask", "lerf-mask", ("--method", "features", "--model", "features_text")),
         ("3d-ovs", "3d-ovs", ("--method", "features", "--model", "features_text")),
     ],
@@ -168,11 +171,12 @@ def test_classes_of_views_whose_truth_is_a_labelled_scan(bench, data_set, tmp_pa
     assert len(result.rows) == len(scene.capture.test_views)
 
 
-@pytest.mark.parametrize("method", ["uplift", "features"])
+@pytest.mark.parametrize("method", ["uplift", "features", "objects"])
 def test_classes_of_points(method: str, bench, data_set, tmp_path, score) -> None:
     data = data_set("scannet")
-    name = {"uplift": "labels_semantic", "features": "features_text"}[method]
+    name = "labels_semantic" if method == "uplift" else "features_text"
     words = ("--method", method, "--model", name, "--switch", "frame_step=1")
+    words += BESIDE if method == "objects" else ()
     out = bench("scannet-19", "scannet", *words)
     scene = scene_of("scannet", data)
     ours = load_result(out / f"results/scannet-19/{method}/{scene.name}.json").scores

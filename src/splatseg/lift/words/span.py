@@ -56,6 +56,19 @@ class WordSpan:
         return (words.float() @ self.directions.T).norm(dim=1) / lengths
 
     @boundary
+    def inside(self, words: Float[Tensor, "k width"]) -> Float[Tensor, "k width"]:
+        r"""Unit vectors of what of words lies in the span, zeros where nothing does.
+
+        Dot products with any vector in the space of words, :math:`f \cdot V^T V t / \|V t\|`, order
+        words as cosines in the span do.
+
+        Raises:
+            ShapeError: If widths do not fit.
+        """
+        check_shape("words", words, (None, self.space.width))
+        return _unit(words.float() @ self.directions.T) @ self.directions
+
+    @boundary
     def cosines(
         self,
         values: Float[Tensor, "n channels"],

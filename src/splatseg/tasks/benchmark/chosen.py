@@ -102,10 +102,13 @@ class BySelection:
 
     def answer(self, camera: Camera) -> Answer:
         """Pixels that are likely, or the silhouette of the Gaussians that are."""
+        found = self.score_map(camera)
         if self.switches.decided == "gaussians":
             chosen = self.gaussians[self._probabilities > self.cut]
-            return Answer(mask=silhouette(chosen, camera, self.switches))
-        return Answer(mask=self.mask_at(self.score_map(camera), self.cut))
+            mask = silhouette(chosen, camera, self.switches)
+        else:
+            mask = self.mask_at(found, self.cut)
+        return Answer(mask=mask, relevancy=found)
 
     def score_map(self, camera: Camera) -> Float[Tensor, "height width"]:
         """Probability of each pixel."""

@@ -28,6 +28,7 @@ from splatseg.io.npz_writing import save_arrays
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.lift.heads import ClassifierHead, has_classifier
+from splatseg.lift.words import WordIndex
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
 from splatseg.tasks.benchmark.spoken import words_of
@@ -122,7 +123,7 @@ def _check_places(job: Job, truth: TruePoints) -> None:
 def read_by_words(
     job: Job, seen: Seen, layer: Features, table: ClassTable | None, wanted: Sequence[int]
 ) -> Features:
-    """Features with a classifier: the class whose name they are nearest to.
+    """Features with a classifier: the class whose name is nearest, as the method asks words.
 
     Args:
         job: The method and the scene.
@@ -137,7 +138,10 @@ def read_by_words(
     ids = [id for id in wanted if vocabulary.known(table.name_of(id))]
     if not ids:
         raise InputError("words: expected vectors of names of classes, none has one.")
-    weight, bias = vocabulary.space.linear(vocabulary.vectors([table.name_of(id) for id in ids]))
+    vectors = vocabulary.vectors([table.name_of(id) for id in ids])
+    if job.method.words == "span":
+        vectors = WordIndex(layer, vocabulary).span.inside(vectors)
+    weight, bias = vocabulary.space.linear(vectors)
     head = ClassifierHead(ids=torch.tensor(ids), weight=weight, bias=bias, blend="probabilities")
     return replace(layer, info=replace(layer.info, head=head.to_json()))
 

@@ -17,6 +17,7 @@ from splatseg.core import (
     InstanceTree,
     LabelMap,
     Layer,
+    Selection,
 )
 from splatseg.core.benchmark import TargetTask, TrueMask
 from splatseg.errors import InputError
@@ -33,6 +34,7 @@ from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.heads import has_classifier
 from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.words import WordIndex
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks.benchmark.chosen import (
     Answer,
@@ -272,17 +274,17 @@ class TargetRun:
             prompt,
         )
 
-    def _by_words(self, task: TargetTask) -> ByFeatures | None:
-        """What is more relevant to the words than to canonical ones."""
+    def _by_words(self, task: TargetTask) -> ByFeatures | BySelection | None:
+        """What answers to the words more than to canonical ones, or as the method asks words."""
         words = task.words or task.name
-        layer = self._word_layer
         vocabulary = self._vocabulary
-        unknown = [
-            word for word in (words, *self._switches.negatives) if not vocabulary.known(word)
-        ]
-        if words in unknown:
+        if not vocabulary.known(words):
             self.notes.append(f"{task.name}: no vector of its words was recorded.")
             return None
+        if self._job.method.words == "span":
+            return self._by_span(task, words)
+        layer = self._word_layer
+        unknown = [word for word in self._switches.negatives if not vocabulary.known(word)]
         if unknown:
             raise InputError(
                 f"words: expected vectors of the canonical words, {', '.join(unknown)} have none."
@@ -294,6 +296,22 @@ class TargetRun:
             vocabulary.vectors(self._switches.negatives),
         )
         return self._with_cut(task, found, None)
+
+    def _by_span(self, task: TargetTask, words: str) -> BySelection:
+        """What likelier is the thing than anything else, as `query` answers."""
+        index = self._word_index
+        sure = index.of_gaussians(index.ask([words]).probabilities)[:, 0].clamp(0, 1)
+        found = BySelection(
+            gaussians=self._job.scene.gaussians,
+            selection=Selection(mask=sure >= 0.5, confidence=sure),
+            switches=self._switches,
+            backend=self._job.backend,
+        )
+        return self._with_cut(task, found, None)
+
+    @cached_property
+    def _word_index(self) -> WordIndex:
+        return WordIndex(self._word_layer, self._vocabulary)
 
     @cached_property
     def _word_layer(self) -> Features:
