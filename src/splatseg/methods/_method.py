@@ -10,9 +10,10 @@ from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, EvidenceKind, FeatureEvidence, TrackedEvidence
 
-Returns = Literal["labels", "features", "tree", "field"]
+Returns = Literal["labels", "features", "tree", "selection", "field"]
 """labels: one id a Gaussian. features: one vector a Gaussian, with the head that reads it. tree:
-instances with groups above and parts below them. field: something that is no Gaussian's."""
+instances with groups above and parts below them. selection: the Gaussians of what was asked for.
+field: something that is no Gaussian's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,6 +29,9 @@ class MethodInputs:
 
     companions: Mapping[str, Evidence] = field(default_factory=dict[str, Evidence])
     """Further evidence of the same views, by the options that name it, see `Method.companions`."""
+
+    models: Mapping[str, object] = field(default_factory=dict[str, object])
+    """Models, by the options that name them, see `Method.models`."""
 
     trained: Features | None = None
     """What the method made before, where its options name such a layer, see `Method.trained`."""
@@ -136,6 +140,10 @@ class Method:
     """Options that name evidence which the method takes besides, and the kinds that each may be
     of. An option that is None names none."""
 
+    models: Mapping[str, type[Any]] = field(default_factory=dict[str, type[Any]])
+    """Options that name models, as ``NAME[=WEIGHTS][,OPTION=VALUE...]``, and the protocol of
+    `core.models` that each must fulfil. An option that is None names none."""
+
     trained: str | None = None
     """Name of the option that names a layer of features which the method made before, to be read
     in another way without training again; None where it takes none."""
@@ -165,7 +173,13 @@ class Method:
             raise InputError(
                 f"method {self.name!r}: expected a default for every option ({error})."
             ) from error
-        named = (*self.companions, self.trained, self.refines, "readout" if self.readouts else None)
+        named = (
+            *self.companions,
+            *self.models,
+            self.trained,
+            self.refines,
+            "readout" if self.readouts else None,
+        )
         for option in named:
             if option is not None and option not in self.option_names():
                 raise InputError(f"method {self.name!r}: expected an option {option!r}.")

@@ -15,7 +15,7 @@ ENTRY_POINT_GROUP = "splatseg.methods"
 
 _OWN = (
     "uplift", "features", "objects", "vote", "associate", "identity", "saga", "cosseg", "logits",
-    "probabilities",
+    "probabilities", "prompt",
 )  # fmt: skip
 _REGISTERED: dict[str, Method] = {}
 

@@ -1,6 +1,6 @@
 """What the options of a method name besides its evidence."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_evidence
 from splatseg.methods import Method
+from splatseg.tasks.named_models import model_of
 from splatseg.tasks.scene_parts import layer_of
 
 
@@ -25,6 +26,28 @@ def trained_features(
             f"{method.trained}: expected a layer of features, got {name!r} of {layer_kind(layer)}."
         )
     return layer
+
+
+def named_models(
+    method: Method, options: Any, *, report: Callable[[str], None]
+) -> dict[str, object]:
+    """The models that the method's options name, by option.
+
+    Raises:
+        InputError: If there is no such model, or it answers something else.
+    """
+    found: dict[str, object] = {}
+    for option, protocol in method.models.items():
+        named = getattr(options, option)
+        if named is None:
+            continue
+        model = model_of(named, report=report)
+        if not isinstance(model, protocol):
+            raise InputError(
+                f"{option}: expected a model that is a {protocol.__name__}, got {model.name}."
+            )
+        found[option] = model
+    return found
 
 
 def named_companions(scene: Scene, method: Method, options: Any) -> dict[str, Evidence]:

@@ -38,7 +38,7 @@ from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._refined_scene import refined_folder, save_refined
-from splatseg.tasks._segment_inputs import named_companions, trained_features
+from splatseg.tasks._segment_inputs import named_companions, named_models, trained_features
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.fit_quality import fit_quality
 from splatseg.tasks.scene_parts import layer_of, views_asked, views_recorded
@@ -174,6 +174,7 @@ def segment(
         views=_views(scene, evidence, options.views, observer),
         evidence=evidence,
         companions=named_companions(scene, method, chosen),
+        models=named_models(method, chosen, report=observer.note),
         trained=trained,
         classes=scene.classes,
         metres_per_unit=scene.metres_per_unit,

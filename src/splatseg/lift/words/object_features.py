@@ -19,32 +19,25 @@ References:
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import scipy.sparse as sparse
 import torch
 from jaxtyping import Float, Int64
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from splatseg._check import check_shape
 from splatseg.core import UNLABELLED, FeatureMap, FeatureSource, Gaussians, Labels, View
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.label_maps import label_map
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.mass.features import camera_of_grid, checked_grid
+from splatseg.lift.words.unmixing import NormalEquations, blurred
 from splatseg.render import RenderOptions
 
 BLURS = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0)
 """Standard deviations, in cells, of which the one with the least residual is taken."""
-
-_LEAST_SHARE = 1e-3
-"""Share of a cell below which an object counts as not in it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,13 +138,13 @@ def object_features(
         raise InputError("objects: expected a layer with at least one object, got one without.")
     ordered = voting_views(views, evidence, "features")
     blurs = BLURS if options.blur is None else (options.blur,)
-    systems: list[_Normal] = []
+    systems: list[NormalEquations] = []
     hard = Labels(ids=objects.ids, confidence=objects.confidence, background=UNLABELLED)
     for done, view in enumerate(ordered):
         grid = checked_grid(view, evidence.features(view.name))
         features = grid.features.double().cpu().flatten(0, 1).numpy()
         if not systems:
-            systems = [_Normal(len(ids) + 1, grid.channels) for _ in blurs]
+            systems = [NormalEquations(len(ids) + 1, grid.channels) for _ in blurs]
         if grid.channels != systems[0].channels:
             raise ShapeError(
                 f"evidence: expected {systems[0].channels} channels of view {view.name}, as of "
@@ -161,7 +154,7 @@ def object_features(
         found = label_map(gaussians, camera, hard, options=render_options, backend=backend).ids
         columns, shares = cell_shares(_rows_of(found, ids).numpy(), grid)
         for blur, system in zip(blurs, systems, strict=True):
-            system.add(columns, _blurred(shares, blur), features)
+            system.add(columns, blurred(shares, blur), features)
         if progress is not None:
             progress(done + 1, len(ordered))
     solved = [system.solved(options.ridge) for system in systems]
@@ -207,55 +200,3 @@ def cell_shares(
     counts = counts.reshape(down, right, len(there))
     total = counts.sum(axis=2, keepdims=True)
     return there, counts / np.where(total > 0, total, 1.0)
-
-
-def _blurred(shares: NDArray[np.float64], blur: float) -> NDArray[np.float64]:
-    if blur <= 0:
-        return shares
-    once = gaussian_filter1d(shares, blur, axis=0, mode="nearest")
-    return gaussian_filter1d(once, blur, axis=1, mode="nearest")
-
-
-class _Normal:
-    """The normal equations, summed over views; float64, sparse, in one thread."""
-
-    def __init__(self, count: int, channels: int) -> None:
-        self.channels = channels
-        self._matrix: Any = sparse.csr_matrix((count, count), dtype=np.float64)
-        self._right = np.zeros((count, channels))
-        self._squares = 0.0
-        self._features, self._cells = np.zeros(channels), 0
-
-    def add(
-        self,
-        columns: NDArray[np.int64],
-        shares: NDArray[np.float64],
-        features: NDArray[np.float64],
-    ) -> None:
-        """Take in the cells of a view."""
-        dense = shares.reshape(-1, len(columns))
-        local = sparse.csr_matrix(np.where(dense >= _LEAST_SHARE, dense, 0.0))
-        product = (local.T @ local).tocoo()
-        self._matrix = self._matrix + sparse.csr_matrix(
-            (product.data, (columns[product.row], columns[product.col])), self._matrix.shape
-        )
-        self._right[columns] += local.T @ features
-        self._squares += float(np.square(features).sum())
-        self._features += features.sum(axis=0)
-        self._cells += len(features)
-
-    def cells(self) -> NDArray[np.float64]:
-        """The diagonal."""
-        return np.asarray(self._matrix.diagonal(), dtype=np.float64)
-
-    def solved(self, ridge: float) -> tuple[NDArray[np.float64], float]:
-        """X, and the share of squares that is left over."""
-        mean = self._features / max(self._cells, 1)
-        count = len(self._right)
-        with one_torch_thread():
-            factors = splu((self._matrix + ridge * sparse.identity(count)).tocsc())
-            found = factors.solve(self._right + ridge * mean)
-        product = self._matrix @ found
-        left = self._squares - 2 * float((found * self._right).sum())
-        left += float((found * product).sum())
-        return found, max(0.0, left) / self._squares if self._squares > 0 else 0.0

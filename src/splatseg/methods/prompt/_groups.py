@@ -1,0 +1,141 @@
+"""Objects of the initial views: a mask, and the masks of other views that are of the same thing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from splatseg.core import Rle, View
+from splatseg.methods.prompt._table import MaskTable
+
+_SAME = 0.3
+"""IoU from which on masks of two views are of one thing."""
+
+_FULL_CELLS = 50.0
+"""Cells from which on a mask counts fully in the mean over views."""
+
+_INSIDE = 0.5
+"""Share of a mask in another from which on it is not another object."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FoundObject:
+    """What answers to a word: masks in some of the initial views."""
+
+    word: str
+    probability: float
+    """That the word means it, in [0, 1]."""
+
+    masks: tuple[tuple[View, Rle], ...]
+    """At least one; at most one of each view."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MaskGroups:
+    """One group a mask: it, and its match in every other view that has one."""
+
+    members: Int64[Tensor, "m views"]
+    """Rows of the table, -1 where a view has no match."""
+
+    values: Float[Tensor, "m channels"]
+    """Mean feature of the members."""
+
+    weights: Float[Tensor, "m"]
+    """Cells of the members, each counted to a limit."""
+
+
+def mask_groups(table: MaskTable) -> MaskGroups:
+    """The groups of all masks."""
+    count = len(table)
+    members = torch.full((count, len(table.views)), -1, dtype=torch.int64)
+    for at in range(len(table.views)):
+        of_view = torch.nonzero(table.view == at).squeeze(1)
+        if not len(of_view):
+            continue
+        best, column = table.iou[:, of_view].max(dim=1)
+        members[:, at] = torch.where(best >= _SAME, of_view[column], -1)
+    members[torch.arange(count), table.view] = torch.arange(count)
+    counted = table.cells.clamp_max(_FULL_CELLS).double()
+    weights = torch.where(members >= 0, counted[members.clamp_min(0)], 0.0)
+    values = (weights[:, :, None] * table.values.double()[members.clamp_min(0)]).sum(dim=1)
+    total = weights.sum(dim=1)
+    return MaskGroups(
+        members=members, values=(values / total[:, None]).float(), weights=total.float()
+    )
+
+
+def answering(
+    table: MaskTable,
+    groups: MaskGroups,
+    probabilities: Float[Tensor, "m"],
+    word: str,
+    *,
+    several: bool,
+    least: float,
+) -> list[FoundObject]:
+    """The groups that answer to a word, the surest first, none inside another.
+
+    Args:
+        table: The masks.
+        groups: One a mask.
+        probabilities: That the word means each.
+        word: The word.
+        several: Whether all that answer are wanted; else the surest alone.
+        least: Probability from which on one answers.
+    """
+    order = torch.argsort(probabilities, descending=True, stable=True)
+    found: list[FoundObject] = []
+    taken = torch.zeros(len(table), dtype=torch.bool)
+    for row in order.tolist():
+        if float(probabilities[row]) < least or (found and not several):
+            break
+        if bool(taken[row]):
+            continue
+        members = [int(one) for one in groups.members[row].tolist() if one >= 0]
+        taken |= _of_same(table, members)
+        found.append(
+            FoundObject(
+                word=word,
+                probability=float(probabilities[row]),
+                masks=tuple((table.views[int(table.view[one])], table.rle(one)) for one in members),
+            )
+        )
+    return found
+
+
+def _of_same(table: MaskTable, members: Sequence[int]) -> Bool[Tensor, "m"]:
+    """Masks that lie in one of some masks, or around it, or are members."""
+    rows = torch.tensor(members)
+    inside = (table.contained[:, rows] >= _INSIDE).any(dim=1)
+    around = (table.contained[rows] >= _INSIDE).any(dim=0)
+    inside[rows] = True
+    return inside | around
+
+
+def linked(
+    views: Sequence[int], iou: Float[Tensor, "m m"], scores: Sequence[float]
+) -> list[list[int]]:
+    """Masks joined to objects: those of two views that are of one thing, of each view one.
+
+    Args:
+        views: The view of each mask.
+        iou: Of all pairs.
+        scores: How sure each is; objects come in the order of their surest mask.
+    """
+    free = set(range(len(views)))
+    objects: list[list[int]] = []
+    for seed in sorted(range(len(views)), key=lambda one: (-scores[one], one)):
+        if seed not in free:
+            continue
+        free.discard(seed)
+        members = [seed]
+        for view in sorted(set(views) - {views[seed]}):
+            rivals = [one for one in sorted(free) if views[one] == view]
+            best = max(rivals, key=lambda one: (float(iou[seed, one]), -one), default=None)
+            if best is not None and float(iou[seed, best]) >= _SAME:
+                members.append(best)
+                free.discard(best)
+        objects.append(sorted(members, key=lambda one: views[one]))
+    return objects

@@ -1,0 +1,282 @@
+"""Objects found in some views become shares of Gaussians: points, masks of views, votes.
+
+Views are gone through once for all objects, each prepared once.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatseg.core import Gaussians, Prompt, Rle, View
+from splatseg.methods.prompt._groups import FoundObject
+from splatseg.methods.prompt._masks import PromptedMasks
+from splatseg.methods.prompt._options import PromptOptions
+from splatseg.methods.prompt._points import lifted, points_around, points_inside
+from splatseg.methods.prompt._views import projected_views, seed_of
+from splatseg.methods.prompt._vote import MaskVotes
+from splatseg.render import PreparedView, options_for, prepare
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WorldPrompt:
+    """What is shown of an object, as points of the world."""
+
+    key: str
+    """Word and rank, or the points by hand: what random choices are seeded by."""
+
+    points: Float[Tensor, "k 3"]
+    """float64."""
+
+    positive: Bool[Tensor, "k"]
+    """Whether each is on the object."""
+
+    size: float | None = None
+    """Area that it would cover at a depth of 1, in squares of the focal length; None where nobody
+    knows."""
+
+    def area_in(self, view: View) -> float | None:
+        """Pixels that it covers in a view, as far as its distance tells."""
+        if self.size is None:
+            return None
+        camera = view.camera
+        _, depth = camera.project(self.points[self.positive])
+        before = depth[depth > 0]
+        if not len(before):
+            return None
+        return self.size * camera.fx * camera.fy / float(before.mean()) ** 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PromptShares:
+    """What views say of some objects."""
+
+    shares: Float[Tensor, "objects n"]
+    """Share of each Gaussian, in [0, 1], see `_vote`."""
+
+    projected: tuple[int, ...]
+    """How many views the points of each object were projected into."""
+
+    masked: tuple[int, ...]
+    """How many of these had a mask of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewPoints:
+    """Points of an object in one view."""
+
+    view: View
+    pixels: Float[Tensor, "p 2"]
+    """x and y."""
+
+    positive: Bool[Tensor, "p"]
+    """Whether each is on the object."""
+
+    area: int | None = None
+    """Pixels of the object in the view; None where nobody knows."""
+
+
+def sampled_points(
+    found: FoundObject, key: str, options: PromptOptions, *, seed: int
+) -> list[ViewPoints]:
+    """Points inside and around the masks of an object."""
+    points: list[ViewPoints] = []
+    for view, rle in found.masks:
+        generator = torch.Generator().manual_seed(seed_of(seed, f"{key}:{view.name}"))
+        mask = rle.decode()
+        inside = points_inside(mask, options.points, how=options.sampling, generator=generator)
+        around = points_around(mask, options.negatives, how=options.sampling, generator=generator)
+        signs = torch.arange(len(inside) + len(around)) < len(inside)
+        pixels = torch.cat((inside, around))
+        points.append(ViewPoints(view=view, pixels=pixels, positive=signs, area=rle.area))
+    return points
+
+
+def world_prompts(
+    gaussians: Gaussians,
+    given: Sequence[tuple[str, Sequence[ViewPoints]]],
+    options: PromptOptions,
+    *,
+    backend: str,
+) -> list[WorldPrompt]:
+    """Points of views as points of the world, each view prepared once.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        given: Objects by key, with their points.
+        options: How points are lifted.
+        backend: Name of the rendering backend.
+    """
+    views = {one.view.name: one.view for _, points in given for one in points}
+    parts: list[list[tuple[Tensor, Tensor]]] = [[] for _ in given]
+    sizes: list[list[float]] = [[] for _ in given]
+    for name in sorted(views):
+        here = [
+            (at, one)
+            for at, (_, points) in enumerate(given)
+            for one in points
+            if one.view.name == name and len(one.pixels)
+        ]
+        if not here:
+            continue
+        with prepare(gaussians, views[name].camera, backend=backend) as prepared:
+            world, gaussian = lifted(
+                views[name],
+                prepared,
+                gaussians,
+                torch.cat([one.pixels for _, one in here]),
+                how=options.lifting,
+                tolerance=options.tolerance,
+            )
+        start = 0
+        for at, one in here:
+            part = slice(start, start + len(one.pixels))
+            known = gaussian[part] >= 0
+            parts[at].append((world[part][known], one.positive[known]))
+            sizes[at] += _size(one, world[part][known & one.positive])
+            start += len(one.pixels)
+    nothing = (torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.bool))
+    return [
+        WorldPrompt(
+            key=key,
+            points=torch.cat([nothing[0], *(points for points, _ in parts[at])]),
+            positive=torch.cat([nothing[1], *(signs for _, signs in parts[at])]),
+            size=float(torch.tensor(sizes[at]).median()) if sizes[at] else None,
+        )
+        for at, (key, _) in enumerate(given)
+    ]
+
+
+def _size(points: ViewPoints, world: Tensor) -> list[float]:
+    """Area at a depth of 1, where the area in the view and a depth are known."""
+    if points.area is None or not len(world):
+        return []
+    camera = points.view.camera
+    _, depth = camera.project(world)
+    return [points.area * float(depth.mean()) ** 2 / (camera.fx * camera.fy)]
+
+
+def vote_for(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    prompts: Sequence[WorldPrompt],
+    makers: PromptedMasks,
+    options: PromptOptions,
+    *,
+    seed: int,
+    backend: str,
+    progress: Callable[[int, int], None] | None = None,
+) -> PromptShares:
+    """Project points into views, have masks made of them, and let these vote.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        views: All views that may be used.
+        prompts: The objects.
+        makers: Makes masks of points.
+        options: How.
+        seed: Of random choices.
+        backend: Name of the rendering backend.
+        progress: Called with the views done and all there are.
+    """
+    chosen: list[set[str]] = []
+    for prompt in prompts:
+        of_object: tuple[View, ...] = ()
+        if bool(prompt.positive.any()):
+            of_object = projected_views(
+                views,
+                prompt.points[prompt.positive],
+                share=options.view_share,
+                how=options.view_choice,
+                seed=seed_of(seed, prompt.key),
+            )
+        chosen.append({view.name for view in of_object})
+    render_options = options_for(gaussians, backend)
+    votes = MaskVotes(
+        gaussians,
+        len(prompts),
+        rule=options.vote,
+        render_options=render_options,
+        depth_tolerance=options.depth_tolerance,
+    )
+    votes.add_views([len(one) for one in chosen])
+    masked = [0] * len(prompts)
+    ordered = sorted(views, key=lambda view: view.name)
+    for done, view in enumerate(ordered):
+        objects = [at for at, names in enumerate(chosen) if view.name in names]
+        falling = {at: _in_picture(view, prompts[at]) for at in objects}
+        objects = [at for at in objects if falling[at][0].any()]
+        if objects:
+            with prepare(
+                gaussians, view.camera, options=render_options, backend=backend
+            ) as prepared:
+                shown = _shown(view, prepared, gaussians, prompts, falling, options=options)
+                made = _made(view, shown, prompts, makers)
+                votes.add(view, prepared, made)
+            for at, _ in made:
+                masked[at] += 1
+        if progress is not None:
+            progress(done + 1, len(ordered))
+    return PromptShares(
+        shares=votes.shares(),
+        projected=tuple(len(one) for one in chosen),
+        masked=tuple(masked),
+    )
+
+
+def _in_picture(view: View, prompt: WorldPrompt) -> tuple[Tensor, Tensor, Tensor]:
+    """Which points are positive and in the picture, pixels (k, 2), and depths, 0 outside."""
+    pixels, depth = view.camera.project(prompt.points)
+    size = pixels.new_tensor([view.camera.width, view.camera.height])
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    depth = torch.where(inside, depth, 0.0)
+    return inside & prompt.positive, pixels, depth
+
+
+def _shown(
+    view: View,
+    prepared: PreparedView,
+    gaussians: Gaussians,
+    prompts: Sequence[WorldPrompt],
+    falling: dict[int, tuple[Tensor, Tensor, Tensor]],
+    *,
+    options: PromptOptions,
+) -> dict[int, Prompt]:
+    """The points of each object that a view shows, of those with a positive one."""
+    found: dict[int, Prompt] = {}
+    for at, (_, pixels, depth) in falling.items():
+        kept = depth > 0
+        if options.occlusion == "depth" and bool(kept.any()):
+            rows = torch.nonzero(kept).squeeze(1)
+            surface = _median_depth(view, prepared, gaussians, pixels[rows])
+            hidden = (surface > 0) & (depth[rows] > surface * (1 + options.depth_tolerance))
+            kept[rows[hidden]] = False
+        positive = prompts[at].positive[kept]
+        if bool(positive.any()):
+            found[at] = Prompt(points=pixels[kept].float(), positive=positive)
+    return found
+
+
+def _median_depth(
+    view: View, prepared: PreparedView, gaussians: Gaussians, pixels: Tensor
+) -> Float[Tensor, "p"]:
+    """Depth of the Gaussian at which half of the light is stopped; 0 where it never is."""
+    median = prepared.contributors(pixels.floor().long(), 1).median.cpu().long()
+    centres = gaussians.means.detach().cpu().double()[median.clamp_min(0)]
+    _, depth = view.camera.project(centres)
+    return torch.where(median >= 0, depth, 0.0)
+
+
+def _made(
+    view: View,
+    shown: dict[int, Prompt],
+    prompts: Sequence[WorldPrompt],
+    makers: PromptedMasks,
+) -> list[tuple[int, Rle]]:
+    """The masks that were made in a view, by object."""
+    objects = sorted(shown)
+    areas = [prompts[at].area_in(view) for at in objects]
+    masks = makers.masks(view, [shown[at] for at in objects], areas)
+    return [(at, mask) for at, mask in zip(objects, masks, strict=True) if mask is not None]

@@ -1,0 +1,112 @@
+r"""Votes of views for Gaussians, by the masks of the views.
+
+With :math:`L_{ij} = [P_j \mu_i \in m_j]` (Prompt SA-GS, eq. 7) the share of a Gaussian is
+
+.. math:: s_i = \frac{1}{N} \sum_j L_{ij} \quad \text{(published, eq. 8)}, \qquad
+          s_i = \frac{\sum_j v_{ij} L_{ij}}{\sum_j v_{ij}} \quad \text{(visible)}, \qquad
+          s_i = \frac{\sum_j (W_j^\top m_j)_i}{\sum_j (W_j^\top 1)_i} \quad \text{(transposed)}
+
+with :math:`v_{ij} = 1` where view j has the centre of Gaussian i in its picture, and nothing that
+is rendered hides it. Published, a view that does not see a Gaussian votes against it, and one that
+sees the object through it votes for it. Views without a mask of the object vote when published
+only: against.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import Gaussians, Rle, View
+from splatseg.lift.mass.centres import centres_in, unoccluded
+from splatseg.methods.prompt._options import VoteRule
+from splatseg.render import PreparedView, RenderOptions, SparseImage
+
+
+class MaskVotes:
+    """Sums the votes for some objects, view after view.
+
+    Args:
+        gaussians: The Gaussians of the scene.
+        objects: How many objects there are.
+        rule: How views vote.
+        render_options: Switches of the blending model.
+        depth_tolerance: How far behind the median depth a centre is not hidden yet.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        objects: int,
+        *,
+        rule: VoteRule,
+        render_options: RenderOptions,
+        depth_tolerance: float,
+    ) -> None:
+        self._gaussians, self._rule = gaussians, rule
+        self._options, self._tolerance = render_options, depth_tolerance
+        self._inside = torch.zeros(objects, len(gaussians))
+        self._total = torch.zeros(objects, 1 if rule == "published" else len(gaussians))
+
+    def add_views(self, counts: Sequence[int]) -> None:
+        """How many views there are for each object, which the published rule divides by."""
+        if self._rule == "published":
+            self._total += torch.tensor(counts, dtype=torch.float32)[:, None]
+
+    def add(self, view: View, prepared: PreparedView, masks: Sequence[tuple[int, Rle]]) -> None:
+        """Add what the masks of a view say.
+
+        Args:
+            view: The view.
+            prepared: The same, prepared.
+            masks: Object and mask.
+        """
+        if not masks:
+            return
+        if self._rule == "transposed":
+            self._add_transposed(prepared, masks)
+            return
+        centres = centres_in(self._gaussians.means, view.camera, near=self._options.near)
+        if self._rule == "visible":
+            seen = unoccluded(centres, self._gaussians, prepared, tolerance=self._tolerance)
+            centres = centres[seen]
+        column, row = centres.pixels.unbind(dim=1)
+        for at, mask in masks:
+            self._inside[at, centres.gaussians] += mask.decode()[row, column].float()
+            if self._rule == "visible":
+                self._total[at, centres.gaussians] += 1
+
+    def _add_transposed(self, prepared: PreparedView, masks: Sequence[tuple[int, Rle]]) -> None:
+        pixels = torch.stack([mask.decode().reshape(-1) for _, mask in masks], dim=1)
+        channel = torch.nonzero(pixels)[:, 1].to(torch.int32)
+        starts = torch.cat((torch.zeros(1, dtype=torch.int64), pixels.sum(dim=1).cumsum(0)))
+        image = SparseImage(
+            indptr=starts, channels=channel, values=torch.ones(len(channel)), count=len(masks)
+        )
+        with torch.no_grad():
+            found = prepared.back_project_sparse(image)
+        objects = torch.tensor([at for at, _ in masks])
+        # A Gaussian has each channel at most once.
+        self._inside[objects[found.channels.long()], found.gaussians] += found.sums
+        self._total[objects] += found.weights
+
+    def shares(self) -> Float[Tensor, "objects n"]:
+        """Of each object and Gaussian, in [0, 1]; 0 where no view votes."""
+        # Sums of half precision weights may leave a share a hair above 1.
+        return (self._inside / self._total.clamp_min(1e-12)).clamp(0, 1)
+
+
+def confidence_of(shares: Float[Tensor, "*batch"], tau: float) -> Float[Tensor, "*batch"]:
+    """Probabilities that are above 0.5 where a share is above tau: linear on both sides.
+
+    Args:
+        shares: In [0, 1].
+        tau: In [0, 1].
+    """
+    below = 0.5 * shares / max(tau, 1e-6)
+    above = 0.5 + 0.5 * (shares - tau) / max(1 - tau, 1e-6)
+    inside = shares > tau
+    # The least float above one half: what is above tau by a rounding is inside.
+    least = 0.5 + torch.finfo(torch.float32).eps
+    return torch.where(inside, above.clamp(least, 1.0), below.clamp(0.0, 0.5))
