@@ -17,6 +17,7 @@ import docstring_parser
 import tyro
 
 from splatseg.cli._words import names_as_flags, option_names
+from splatseg.core.typed_text import REPEATED
 
 _LISTS: dict[Any, type[str] | type[int]] = {tuple[str, ...]: str, tuple[int, ...]: int}
 _PLACEHOLDERS: dict[Any, str] = {str: "NAME", int: "N", float: "X", Path: "PATH"}
@@ -72,6 +73,7 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
         configured = [note for note in notes if _is_argument(note)]
         help = next((note.help for note in configured if note.help), None) or texts.get(field.name)
         metavar = next((note.metavar for note in configured if note.metavar), None)
+        metavar = metavar or field.metadata.get(REPEATED)
         if metavar is None and not dataclasses.is_dataclass(kind):
             metavar = _placeholder(kind)
         argument = tyro.conf.arg(
@@ -83,6 +85,8 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
         others = [note for note in notes if not _is_argument(note)]
         if kind is bool and field.default is False:
             others.append(tyro.conf.FlagCreatePairsOff)  # --no-x would say what is so anyway
+        if field.metadata.get(REPEATED):
+            others.append(tyro.conf.UseAppendAction)
         # A flag that is given again and again has one item each time, commas and all.
         if kind in _LISTS and tyro.conf.UseAppendAction not in others:
             others.append(_list_of(_LISTS[kind]))

@@ -13,7 +13,7 @@ import tyro
 from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder, Seed
 from splatseg.cli._words import option_value
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
-from splatseg.core import UNLABELLED, Features, Labels, Scene
+from splatseg.core import UNLABELLED, Features, Labels, Scene, Selection
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
@@ -241,7 +241,12 @@ def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
         "warnings": list(result.warnings),
         "stage_seconds": {name: round(value, 3) for name, value in result.timings.items()},
     }
-    if not isinstance(result.layer, Features):
+    if isinstance(result.layer, Selection):
+        mean = result.layer.mean_confidence
+        facts["gaussians"] = len(result.layer)
+        facts["selected"] = result.layer.count
+        facts["confidence"] = None if mean is None else round(mean, 4)
+    elif not isinstance(result.layer, Features):
         labels = result.labels
         facts["gaussians"] = len(labels)
         facts["labelled"] = int((labels.ids != UNLABELLED).sum())
@@ -270,6 +275,13 @@ def _summary(result: Segmentation, seconds: float) -> str:
         count, channels = result.layer.values.shape
         return (
             f"features of {channels} channels on {count} Gaussians, "
+            f"from {counted(views, 'view')} in {seconds:.1f} s"
+        )
+    if isinstance(result.layer, Selection):
+        mean = result.layer.mean_confidence
+        sure = "" if mean is None else f", confidence {mean:.2f}"
+        return (
+            f"{result.layer.count} of {len(result.layer)} Gaussians{sure}, "
             f"from {counted(views, 'view')} in {seconds:.1f} s"
         )
     labels = result.labels

@@ -5,6 +5,10 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from splatseg.errors import InputError
 
 _WORDS = {int: "a whole number", float: "a number", str: "text"}
+REPEATED = "repeated"
+"""Key of the metadata of a dataclass's field whose flag has one item each time that it is given,
+commas and all; its value is the placeholder."""
+
 _YES, _NO = ("yes", "true"), ("no", "false")
 
 

@@ -1,4 +1,4 @@
-"""Two balls before a wall, seen by nine cameras; masks and features of words drawn from the truth."""
+"""Two balls before a wall, seen by nine cameras; masks and features drawn from the truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -8,10 +8,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg.core import Rle, View
+from splatseg.lift.words import WordAnswers
+from splatseg.methods.prompt._linked import SAME
 from splatseg.methods.prompt._table import MaskTable
-
-_SAME = 0.3
-"""IoU from which on masks of two views are of one thing."""
 
 _FULL_CELLS = 50.0
 """Cells from which on a mask counts fully in the mean over views."""
@@ -55,7 +54,7 @@ def mask_groups(table: MaskTable) -> MaskGroups:
         if not len(of_view):
             continue
         best, column = table.iou[:, of_view].max(dim=1)
-        members[:, at] = torch.where(best >= _SAME, of_view[column], -1)
+        members[:, at] = torch.where(best >= SAME, of_view[column], -1)
     members[torch.arange(count), table.view] = torch.arange(count)
     counted = table.cells.clamp_max(_FULL_CELLS).double()
     weights = torch.where(members >= 0, counted[members.clamp_min(0)], 0.0)
@@ -69,23 +68,27 @@ def mask_groups(table: MaskTable) -> MaskGroups:
 def answering(
     table: MaskTable,
     groups: MaskGroups,
-    probabilities: Float[Tensor, "m"],
-    word: str,
+    answers: WordAnswers,
     *,
     several: bool,
     least: float,
 ) -> list[FoundObject]:
     """The groups that answer to a word, the surest first, none inside another.
 
+    One object is the group of the largest cosine: a phrase says which of several alike things is
+    meant, and the names of their class, which probabilities hold against it, say nothing of that.
+
     Args:
         table: The masks.
         groups: One a mask.
-        probabilities: That the word means each.
-        word: The word.
-        several: Whether all that answer are wanted; else the surest alone.
+        answers: What each answers to one word.
+        several: Whether all that answer are wanted; else the one of the largest cosine.
         least: Probability from which on one answers.
     """
-    order = torch.argsort(probabilities, descending=True, stable=True)
+    probabilities, word = answers.probabilities[:, 0], answers.words[0]
+    order = torch.argsort(
+        probabilities if several else answers.cosines[:, 0], descending=True, stable=True
+    )
     found: list[FoundObject] = []
     taken = torch.zeros(len(table), dtype=torch.bool)
     for row in order.tolist():
@@ -112,30 +115,3 @@ def _of_same(table: MaskTable, members: Sequence[int]) -> Bool[Tensor, "m"]:
     around = (table.contained[rows] >= _INSIDE).any(dim=0)
     inside[rows] = True
     return inside | around
-
-
-def linked(
-    views: Sequence[int], iou: Float[Tensor, "m m"], scores: Sequence[float]
-) -> list[list[int]]:
-    """Masks joined to objects: those of two views that are of one thing, of each view one.
-
-    Args:
-        views: The view of each mask.
-        iou: Of all pairs.
-        scores: How sure each is; objects come in the order of their surest mask.
-    """
-    free = set(range(len(views)))
-    objects: list[list[int]] = []
-    for seed in sorted(range(len(views)), key=lambda one: (-scores[one], one)):
-        if seed not in free:
-            continue
-        free.discard(seed)
-        members = [seed]
-        for view in sorted(set(views) - {views[seed]}):
-            rivals = [one for one in sorted(free) if views[one] == view]
-            best = max(rivals, key=lambda one: (float(iou[seed, one]), -one), default=None)
-            if best is not None and float(iou[seed, best]) >= _SAME:
-                members.append(best)
-                free.discard(best)
-        objects.append(sorted(members, key=lambda one: views[one]))
-    return objects

@@ -38,7 +38,7 @@ class PromptedMasks(Protocol):
 
         Args:
             view: The view.
-            prompts: Points in it.
+            prompts: Points in it, or what is selected so far as a mask.
             areas: Pixels that each object covers there, about; None where nobody knows.
         """
         ...
@@ -71,6 +71,8 @@ class RecordedMasks:
                 f"{view.name} has, got {found.width}x{found.height}."
             )
         self.calls += len(prompts)
+        if any(prompt.mask is not None for prompt in prompts):
+            return _overlapping(found, prompts)
         return [
             self._chosen(found, prompt, area) for prompt, area in zip(prompts, areas, strict=True)
         ]
@@ -123,6 +125,22 @@ class ModelMasks:
                 )
             chosen.append(found.masks[0] if len(found) else None)
         return chosen
+
+
+def _overlapping(masks: MaskSet, prompts: Sequence[Prompt]) -> list[Rle | None]:
+    """The mask with the best IoU with that of each prompt, at least one half."""
+    shown = torch.stack([one.mask.reshape(-1) for one in prompts if one.mask is not None]).float()
+    best = torch.zeros(len(shown))
+    chosen: list[Rle | None] = [None] * len(shown)
+    sizes = shown.sum(dim=1)
+    for mask in masks.masks:
+        inside = mask.decode().reshape(-1)
+        both = shown[:, inside].sum(dim=1)
+        iou = both / (sizes + mask.area - both).clamp_min(1)
+        for at in torch.nonzero((iou > best) & (iou >= _MOST)).squeeze(1).tolist():
+            chosen[at] = mask
+        best = torch.maximum(best, iou)
+    return chosen
 
 
 def _unlike(area: int, wanted: float | None) -> float:

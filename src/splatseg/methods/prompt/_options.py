@@ -6,6 +6,7 @@ from typing import Literal
 
 from splatseg._check import check_choice, check_range
 from splatseg.core.boundary import convert_fields
+from splatseg.core.typed_text import REPEATED
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.words import AnswerOptions
 
@@ -21,6 +22,8 @@ VoteRule = Literal["transposed", "visible", "published"]
 _PUBLISHED_WORDS, _PUBLISHED_POINTS = 0.6, 0.7
 """Tau of Prompt SA-GS and of SA-GS."""
 
+_LEAST = {"one": 0.05, "all": 0.3}
+
 _THRESHOLDS = {"transposed": 0.5, "visible": 0.5}
 
 
@@ -31,8 +34,9 @@ class PromptOptions:
     words: tuple[str, ...] = ()
     """Words or phrases. What each of them means is selected."""
 
-    point: tuple[str, ...] = ()
-    """Points by hand instead of words, as SA-GS has them: VIEW:X,Y, a pixel on the thing."""
+    point: tuple[str, ...] = field(default=(), metadata={REPEATED: "VIEW:X,Y"})
+    """Points by hand instead of words, as SA-GS has them: a pixel on the thing. May be given again
+    and again."""
 
     objects: Objects = "one"
     """one: of the objects that answer to a word, the surest. all: all of them."""
@@ -56,15 +60,16 @@ class PromptOptions:
     its neighbours', compared in the span of the scene's features, and averaged over the initial
     views. cells: the connected cells more relevant than the negatives, in each view alone."""
 
-    min_probability: float = 0.05
-    """Probability in [0, 1] from which on an object answers to a word; with cells relevancy."""
+    min_probability: float | None = None
+    """Probability in [0, 1] from which on an object answers to a word; with cells relevancy, with
+    a grounder its score. None is 0.05 for one object and 0.3 for all."""
 
     initial: InitialViews = "kmeans"
     """In which views words are looked for. kmeans: the views nearest to the centres of k-means
     over position and rotation. random: any. single: the one nearest to the mean of all."""
 
-    initial_views: int = 4
-    """How many of them; single is one."""
+    initial_views: int = 12
+    """How many of them, published 4; single is one."""
 
     points: int = 2
     """Points taken in each initial mask."""
@@ -101,6 +106,10 @@ class PromptOptions:
     weight. visible: the share of the views with its centre unhidden that have it in the mask.
     published: that of all views, whether they see it or not (eq. 8)."""
 
+    rounds: int = 2
+    """Rounds of masks and votes. In the first, masks are chosen by points; in further ones by what
+    is selected so far, rendered into each view. Published 1."""
+
     threshold: float | None = None
     """Tau: the share in [0, 1] that a Gaussian must exceed. None is 0.5; published 0.6 with words
     and 0.7 with points by hand."""
@@ -118,8 +127,9 @@ class PromptOptions:
         check_choice("view_choice", self.view_choice, ("coverage", "random"))
         check_choice("occlusion", self.occlusion, ("depth", "none"))
         check_choice("vote", self.vote, ("transposed", "visible", "published"))
-        check_range("min_probability", self.min_probability, 0.0, 1.0)
-        for name, low in (("initial_views", 1), ("points", 1), ("negatives", 0)):
+        if self.min_probability is not None:
+            check_range("min_probability", self.min_probability, 0.0, 1.0)
+        for name, low in (("initial_views", 1), ("points", 1), ("negatives", 0), ("rounds", 1)):
             if getattr(self, name) < low:
                 raise RangeError(f"{name}: expected at least {low}, got {getattr(self, name)}.")
         for name in ("tolerance", "depth_tolerance"):
@@ -134,6 +144,13 @@ class PromptOptions:
             raise InputError("words, point: expected one of them, got both.")
 
     @property
+    def least_probability(self) -> float:
+        """`min_probability`, or what None stands for."""
+        if self.min_probability is not None:
+            return self.min_probability
+        return _LEAST[self.objects]
+
+    @property
     def tau(self) -> float:
         """`threshold`, or what None stands for."""
         if self.threshold is not None:
@@ -145,6 +162,8 @@ class PromptOptions:
 
 PUBLISHED = PromptOptions(
     region="cells",
+    initial_views=4,
+    rounds=1,
     negatives=0,
     sampling="random",
     lifting="centre",

@@ -25,6 +25,8 @@ from splatseg.render import PreparedView
 _AROUND = (0.5, 2.0)
 """Distance of points around a mask from it, in radii of its largest circle."""
 
+_TIE = 1e-3
+
 _MIN_AROUND = 3.0
 """The same in pixels, at least: recorded masks are ragged."""
 
@@ -111,7 +113,9 @@ def _spread(room: Tensor, mask: Tensor, count: int) -> Tensor:
     chosen: list[int] = []
     nearest = torch.full_like(score, float("inf"))
     for _ in range(min(count, len(rows))):
-        at = int((score if not chosen else torch.minimum(limit, nearest / 2)).argmax())
+        # Of equal places the one farthest from all before.
+        further = torch.minimum(limit, nearest / 2) + _TIE * nearest
+        at = int((further if chosen else score).argmax())
         if chosen and nearest[at] <= 0:
             break
         chosen.append(at)

@@ -19,6 +19,11 @@ from splatseg.methods.prompt._views import projected_views, seed_of
 from splatseg.methods.prompt._vote import MaskVotes
 from splatseg.render import PreparedView, options_for, prepare
 
+_LIGHT = 0.5
+"""Share of the light of a pixel that is of an object from which on it shows the object."""
+
+_MIN_PIXELS = 4
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WorldPrompt:
@@ -181,6 +186,47 @@ def vote_for(
         backend: Name of the rendering backend.
         progress: Called with the views done and all there are.
     """
+    chosen = _views_of(views, prompts, options, seed)
+    shares: Tensor | None = None
+    masked = [0] * len(prompts)
+    ordered = [view for view in views if any(view.name in names for names in chosen)]
+    ordered.sort(key=lambda view: view.name)
+    for turn in range(options.rounds):
+        votes = MaskVotes(
+            gaussians,
+            len(prompts),
+            rule=options.vote,
+            render_options=options_for(gaussians, backend),
+            depth_tolerance=options.depth_tolerance,
+        )
+        votes.add_views([len(one) for one in chosen])
+        masked = [0] * len(prompts)
+        inside = None if shares is None else (shares > options.tau).float().T.contiguous()
+        for done, view in enumerate(ordered):
+            objects = [at for at, names in enumerate(chosen) if view.name in names]
+            with prepare(gaussians, view.camera, backend=backend) as prepared:
+                if inside is None:
+                    shown = _shown(view, prepared, gaussians, prompts, objects, options=options)
+                else:
+                    shown = _rendered(prepared, inside, objects)
+                made = _made(view, shown, prompts, makers)
+                votes.add(view, prepared, made)
+            for at, _ in made:
+                masked[at] += 1
+            if progress is not None:
+                progress(turn * len(ordered) + done + 1, options.rounds * len(ordered))
+        shares = votes.shares()
+    return PromptShares(
+        shares=torch.zeros(len(prompts), len(gaussians)) if shares is None else shares,
+        projected=tuple(len(one) for one in chosen),
+        masked=tuple(masked),
+    )
+
+
+def _views_of(
+    views: Sequence[View], prompts: Sequence[WorldPrompt], options: PromptOptions, seed: int
+) -> list[set[str]]:
+    """Names of the views that each object is projected into."""
     chosen: list[set[str]] = []
     for prompt in prompts:
         of_object: tuple[View, ...] = ()
@@ -193,46 +239,7 @@ def vote_for(
                 seed=seed_of(seed, prompt.key),
             )
         chosen.append({view.name for view in of_object})
-    render_options = options_for(gaussians, backend)
-    votes = MaskVotes(
-        gaussians,
-        len(prompts),
-        rule=options.vote,
-        render_options=render_options,
-        depth_tolerance=options.depth_tolerance,
-    )
-    votes.add_views([len(one) for one in chosen])
-    masked = [0] * len(prompts)
-    ordered = sorted(views, key=lambda view: view.name)
-    for done, view in enumerate(ordered):
-        objects = [at for at, names in enumerate(chosen) if view.name in names]
-        falling = {at: _in_picture(view, prompts[at]) for at in objects}
-        objects = [at for at in objects if falling[at][0].any()]
-        if objects:
-            with prepare(
-                gaussians, view.camera, options=render_options, backend=backend
-            ) as prepared:
-                shown = _shown(view, prepared, gaussians, prompts, falling, options=options)
-                made = _made(view, shown, prompts, makers)
-                votes.add(view, prepared, made)
-            for at, _ in made:
-                masked[at] += 1
-        if progress is not None:
-            progress(done + 1, len(ordered))
-    return PromptShares(
-        shares=votes.shares(),
-        projected=tuple(len(one) for one in chosen),
-        masked=tuple(masked),
-    )
-
-
-def _in_picture(view: View, prompt: WorldPrompt) -> tuple[Tensor, Tensor, Tensor]:
-    """Which points are positive and in the picture, pixels (k, 2), and depths, 0 outside."""
-    pixels, depth = view.camera.project(prompt.points)
-    size = pixels.new_tensor([view.camera.width, view.camera.height])
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
-    depth = torch.where(inside, depth, 0.0)
-    return inside & prompt.positive, pixels, depth
+    return chosen
 
 
 def _shown(
@@ -240,14 +247,16 @@ def _shown(
     prepared: PreparedView,
     gaussians: Gaussians,
     prompts: Sequence[WorldPrompt],
-    falling: dict[int, tuple[Tensor, Tensor, Tensor]],
+    objects: Sequence[int],
     *,
     options: PromptOptions,
 ) -> dict[int, Prompt]:
     """The points of each object that a view shows, of those with a positive one."""
     found: dict[int, Prompt] = {}
-    for at, (_, pixels, depth) in falling.items():
-        kept = depth > 0
+    size = torch.tensor([view.camera.width, view.camera.height])
+    for at in objects:
+        pixels, depth = view.camera.project(prompts[at].points)
+        kept = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
         if options.occlusion == "depth" and bool(kept.any()):
             rows = torch.nonzero(kept).squeeze(1)
             surface = _median_depth(view, prepared, gaussians, pixels[rows])
@@ -257,6 +266,19 @@ def _shown(
         if bool(positive.any()):
             found[at] = Prompt(points=pixels[kept].float(), positive=positive)
     return found
+
+
+def _rendered(
+    prepared: PreparedView, inside: Float[Tensor, "n objects"], objects: Sequence[int]
+) -> dict[int, Prompt]:
+    """What is selected of each object so far, as a mask of the view: most of the light."""
+    with torch.no_grad():
+        drawn = prepared.render(inside[:, list(objects)], warp="nearest").image.cpu() > _LIGHT
+    return {
+        at: Prompt(mask=drawn[..., place])
+        for place, at in enumerate(objects)
+        if int(drawn[..., place].sum()) >= _MIN_PIXELS
+    }
 
 
 def _median_depth(

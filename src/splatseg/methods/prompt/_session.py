@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -218,32 +218,35 @@ class PromptSession:
         if self._sources.grounder is None:
             # A word without a vector is told before anything is read.
             self.vocabulary.vectors(words)
-        began = time.perf_counter()
+        began, before = time.perf_counter(), self._answering.calls
         found: list[FoundObject] = []
         for word in words:
             objects = self.find(word)
             if not objects:
                 raise InputError(
                     f"words: nothing in the {len(self.initial)} initial views answers to "
-                    f"{word!r}; expected at least {self._options.min_probability:g} of a mask."
+                    f"{word!r}; expected at least {self._options.least_probability:g} of a mask."
                 )
             found += objects
         seconds = {"find": time.perf_counter() - began}
-        return self.select(found, seconds=seconds, progress=progress)
+        made = self.select(found, progress=progress)
+        return replace(
+            made,
+            mask_calls=made.mask_calls + self._answering.calls - before,
+            seconds=seconds | made.seconds,
+        )
 
     @boundary
     def select(
         self,
         found: Sequence[FoundObject],
         *,
-        seconds: dict[str, float] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Prompted:
         """Select what was found.
 
         Args:
             found: Objects that `find` gave, or others.
-            seconds: Of what was done before.
             progress: Called with the views done and all there are.
 
         Raises:
@@ -257,7 +260,7 @@ class PromptSession:
             key = f"{one.word}/{rank}"
             given.append((key, sampled_points(one, key, self._options, seed=self._seed)))
         about = [(one.word, one.probability) for one in found]
-        return self._voted(given, about, dict(seconds or {}), progress)
+        return self._voted(given, about, progress)
 
     @boundary
     def ask_points(
@@ -298,7 +301,7 @@ class PromptSession:
             )
             for name, pixels in given.items()
         ]
-        return self._voted([("points", shown)], [("", 1.0)], {}, progress)
+        return self._voted([("points", shown)], [("", 1.0)], progress)
 
     def _mask_maker(self) -> PromptedMasks:
         if self._sources.prompter is not None:
@@ -321,7 +324,6 @@ class PromptSession:
         self,
         given: Sequence[tuple[str, Sequence[ViewPoints]]],
         about: Sequence[tuple[str, float]],
-        seconds: dict[str, float],
         progress: Callable[[int, int], None] | None,
     ) -> Prompted:
         began = time.perf_counter()
@@ -346,13 +348,11 @@ class PromptSession:
                 f"masks: expected a mask at the points in at least one of "
                 f"{max((one.projected for one in objects), default=0)} views, found none."
             )
-        seconds["select"] = time.perf_counter() - began
-        asked = self._sources.grounder is not None and "find" in seconds
         return Prompted(
             objects=tuple(objects),
             confidence=torch.stack([one.confidence for one in objects]).amax(dim=0),
-            mask_calls=self._makers.calls - before + (self._answering.calls if asked else 0),
-            seconds=seconds,
+            mask_calls=self._makers.calls - before,
+            seconds={"select": time.perf_counter() - began},
         )
 
 

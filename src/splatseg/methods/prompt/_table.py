@@ -1,11 +1,14 @@
 r"""The masks of the initial views: what each shows, and which are masks of one thing.
 
-Masks of two views are of one thing if they hold the same Gaussians. With :math:`s_{ik}` the share
-of what view u sees of Gaussian i that lies in mask k, and :math:`c_i` the lesser visibility of both
-views,
+Masks of two views are of one thing if they hold the same Gaussians. With :math:`m_{ki}` the
+blending weight of Gaussian i summed over the pixels of mask k of view u, and :math:`v_{ui}` that
+over all of its pixels,
 
-.. math:: \mathrm{IoU}(k, l) = \frac{\sum_i c_i s_{ik} s_{il}}
-          {\sum_i c_i (s_{ik} + s_{il} - s_{ik} s_{il})}
+.. math:: I_{kl} = \sum_i \sqrt{m_{ki} m_{li}}, \qquad
+          S_{k|v} = \sum_i \sqrt{m_{ki} v_{vi}}, \qquad
+          \mathrm{IoU}(k, l) = \frac{I_{kl}}{S_{k|v} + S_{l|u} - I_{kl}}
+
+for mask l of view v: what only one of the views sees counts for neither.
 
 Features of masks are solved for together over the cells of all initial views, with the masks
 painted over each other, the smallest last (`lift.words.unmixing`).
@@ -184,35 +187,25 @@ def mask_overlaps(
 
     Args:
         held: The masses of the masks of each view.
-        rows: View and mask of each row, by their indices.
+        rows: View and mask of each row, by their indices; views ascend.
         gaussians: How many Gaussians there are.
     """
     import scipy.sparse
 
-    shares: list[Any] = []
-    visible: list[NDArray[np.float64]] = []
-    places: list[NDArray[np.int64]] = []
+    roots: list[Any] = []
+    sights: list[Any] = []
     for at, found in enumerate(held):
         own = np.array([index for view, index in rows if view == at], dtype=np.int64)
-        seen = found.visible.double().numpy()
-        gaussian = found.gaussian.numpy()
-        share = found.weight.double().numpy() / np.maximum(seen[gaussian], 1e-12)
-        entries = (share, (found.segment.numpy(), gaussian))
-        count = int(own.max(initial=-1)) + 1
-        shape = (max(count, int(found.segment.max()) + 1 if len(found.segment) else 0), gaussians)
-        shares.append(scipy.sparse.csr_matrix(entries, shape=shape)[own])
-        visible.append(seen)
-        places.append(np.array([row for row, (view, _) in enumerate(rows) if view == at], np.int64))
-    total = len(rows)
-    iou, contained = np.zeros((total, total), np.float32), np.zeros((total, total), np.float32)
-    for first, one in enumerate(shares):
-        for second, other in enumerate(shares):
-            both = np.minimum(visible[first], visible[second])
-            shared = (one.multiply(both[None])).tocsr() @ other.T
-            inner = np.asarray(shared.todense())
-            sizes = np.asarray(one @ both), np.asarray(other @ both)
-            union = sizes[0][:, None] + sizes[1][None] - inner
-            block = np.ix_(places[first], places[second])
-            iou[block] = inner / np.maximum(union, 1e-9)
-            contained[block] = inner / np.maximum(sizes[0][:, None], 1e-9)
-    return torch.from_numpy(iou), torch.from_numpy(contained)
+        segment, gaussian = found.segment.numpy(), found.gaussian.numpy()
+        count = max(int(own.max(initial=-1)), int(segment.max(initial=-1))) + 1
+        entries = (found.weight.double().sqrt().numpy(), (segment, gaussian))
+        roots.append(scipy.sparse.csr_matrix(entries, shape=(count, gaussians))[own])
+        sights.append(scipy.sparse.csr_matrix(found.visible.double().sqrt().numpy()[None]))
+    masks: Any = scipy.sparse.vstack(roots, format="csr")
+    shared = np.asarray((masks @ masks.T).todense())
+    seen = np.asarray((masks @ scipy.sparse.vstack(sights, format="csr").T).todense())
+    # Of each mask, what the view of each other mask sees.
+    size = seen[:, [view for view, _ in rows]]
+    iou = shared / np.maximum(size + size.T - shared, 1e-9)
+    contained = shared / np.maximum(size, 1e-9)
+    return torch.from_numpy(iou).float(), torch.from_numpy(contained).float()

@@ -33,9 +33,9 @@ from splatseg.methods.prompt._groups import (
     FoundObject,
     MaskGroups,
     answering,
-    linked,
     mask_groups,
 )
+from splatseg.methods.prompt._linked import linked
 from splatseg.methods.prompt._options import PromptOptions
 from splatseg.methods.prompt._table import MaskTable, mask_overlaps
 from splatseg.render import prepare
@@ -85,10 +85,9 @@ class MaskAnswers:
         return answering(
             self._table,
             self._groups,
-            answers.probabilities[:, 0],
-            word,
+            answers,
             several=self._options.objects == "all",
-            least=self._options.min_probability,
+            least=self._options.least_probability,
         )
 
 
@@ -157,7 +156,7 @@ class CellAnswers:
             space.cosines(values, self._negatives),
         )[..., 0]
         limit = max(float((found.max() + found.median()) / 2), _BETTER)
-        least = max(self._options.min_probability, _BETTER)
+        least = max(self._options.least_probability, _BETTER)
         count, pieces = cv2.connectedComponents((found >= limit).numpy().astype(np.uint8))
         peaks = [
             (float(found[torch.from_numpy(pieces == one)].max()), one) for one in range(1, count)
@@ -249,7 +248,8 @@ class GroundedAnswers:
                 f"grounder: expected masks of {view.camera.width}x{view.camera.height} pixels, "
                 f"got {found.width}x{found.height}."
             )
-        sure = [i for i in range(len(found)) if float(found.scores[i]) >= self._least]
+        least = self._options.least_probability
+        sure = [i for i in range(len(found)) if float(found.scores[i]) >= least]
         sure.sort(key=lambda i: (-float(found.scores[i]), i))
         if self._options.objects == "one":
             sure = sure[:1]
@@ -260,10 +260,6 @@ class GroundedAnswers:
             scores=found.scores[sure],
             levels=found.levels[sure],
         )
-
-    @property
-    def _least(self) -> float:
-        return self._options.min_probability
 
 
 def image_of(gaussians: Gaussians, view: View, backend: str) -> Image:

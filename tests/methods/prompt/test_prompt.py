@@ -1,0 +1,226 @@
+"""From words, or points by hand, to a selection."""
+
+import pytest
+import torch
+
+from methods.prompt.conftest import APPLE, PEAR, agreement
+from splatseg.core import Selection
+from splatseg.errors import InputError, RangeError
+from splatseg.methods import MethodInputs, find_method
+from splatseg.methods.prompt import (
+    PUBLISHED,
+    PromptOptions,
+    PromptSession,
+    PromptSources,
+    parsed_points,
+)
+
+
+def test_words_select_their_thing(fruit) -> None:
+    for word, id in (("apple", APPLE), ("pear", PEAR)):
+        made = fruit.session().ask([word])
+        assert agreement(made.confidence, fruit.ids == id) > 0.95
+        (one,) = made.objects
+        assert one.word == word
+        assert one.projected == one.masked == 9
+    both = fruit.session().ask(["apple", "pear"])
+    assert agreement(both.confidence, fruit.ids < 3) > 0.95
+    assert [one.word for one in both.objects] == ["apple", "pear"]
+
+
+def test_the_same_whatever_the_order_of_views(fruit) -> None:
+    def asked(views, **options):
+        sources = PromptSources(features=fruit.features, masks=fruit.masks)
+        session = PromptSession(
+            fruit.gaussians, views, sources, options=PromptOptions(**options), seed=3
+        )
+        return session.ask(["apple"]).confidence
+
+    for options in ({}, {"sampling": "random", "initial": "random", "view_choice": "random"}):
+        assert torch.equal(asked(fruit.views, **options), asked(fruit.views[::-1], **options))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"vote": "visible"},
+        {"vote": "published"},
+        {"threshold": 0.9},
+        {"points": 1, "rounds": 1},
+        {"view_share": 0.3},
+        {"view_share": 0.3, "view_choice": "random"},
+    ],
+)
+def test_options_change_the_answer(fruit, change) -> None:
+    base = {"view_share": 0.3, "view_choice": "coverage"} if "view_choice" in change else {}
+    usual = fruit.session(**base).ask(["wall"])
+    other = fruit.session(**change).ask(["wall"])
+    assert not torch.equal(usual.confidence, other.confidence) or change == {
+        "points": 1,
+        "rounds": 1,
+    }
+    assert usual.mask_calls != other.mask_calls or "rounds" not in change
+
+
+def test_points_are_recorded(fruit) -> None:
+    def records(**options):
+        (one,) = fruit.session(**options).ask(["apple"]).objects
+        return one.record()["prompts"]
+
+    usual = records()
+    assert [place["view"] for place in usual] == [f"v{i}" for i in range(9)]
+    assert all(len(place["points"]) == 2 for place in usual)
+    assert all(len(place["negative_points"]) == 4 for place in usual)
+    assert all(len(place["points"]) == 3 for place in records(points=3))
+    assert all(not place["negative_points"] for place in records(negatives=0))
+    assert records(sampling="random") != usual
+    assert len(records(initial="single")) == 1
+    assert len(records(initial_views=2)) == 2
+    assert len(records(initial="random", initial_views=3)) == 3
+
+
+def test_hidden_points_are_not_given(fruit) -> None:
+    """Points on the wall that the apple hides from the left would rule out the apple's mask."""
+    shown = fruit.session(rounds=1, occlusion="none", negatives=8)
+    kept = fruit.session(rounds=1, occlusion="depth", negatives=8)
+    strict = fruit.session(rounds=1, occlusion="depth", depth_tolerance=0.0, negatives=8)
+    counts = [_points_given(session) for session in (shown, kept, strict)]
+    assert counts[0] > counts[1] > counts[2]
+
+
+def _points_given(session: PromptSession) -> int:
+    """How many points all views get."""
+    given: list[int] = []
+    maker = session._makers
+    usual = maker.masks
+
+    def counting(view, prompts, areas):
+        given.extend(len(prompt.points) for prompt in prompts)
+        return usual(view, prompts, areas)
+
+    maker.masks = counting
+    session.ask(["apple"])
+    return sum(given)
+
+
+def test_lifting_and_tolerance_matter(fruit) -> None:
+    def points(**options):
+        from splatseg.methods.prompt._select import sampled_points, world_prompts
+
+        chosen = PromptOptions(negatives=0, **options)
+        found = fruit.session(negatives=0).find("apple")[0]
+        given = [("apple", sampled_points(found, "apple", chosen, seed=0))]
+        return world_prompts(fruit.gaussians, given, chosen, backend="auto")[0].points
+
+    weight, centre = points(), points(lifting="centre")
+    assert not torch.equal(weight, centre)
+    assert not torch.equal(points(lifting="centre", tolerance=2.0), centre)
+    assert not len(points(lifting="centre", tolerance=0.0))
+    # Both lie on the apple: it has a radius of 0.12 around (-0.5, 0, 2.5).
+    for found in (weight, centre):
+        away = (found - torch.tensor([-0.5, 0.0, 2.5], dtype=torch.float64)).norm(dim=1)
+        assert float(away.max()) < 0.25
+
+
+def test_points_by_hand_are_one_object(fruit) -> None:
+    view = fruit.views[4]
+    inside = torch.nonzero(fruit.truth(view) == PEAR).double().mean(dim=0)
+    text = f"v4:{float(inside[1]):.2f},{float(inside[0]):.2f}"
+    points = parsed_points((text,))
+    made = fruit.session().ask_points(points)
+    assert agreement(made.confidence, fruit.ids == PEAR) > 0.95
+    assert made.objects[0].word == ""
+    with pytest.raises(InputError, match="point: expected a view that may be used, got 'x'"):
+        fruit.session().ask_points([("x", 1, 1)])
+    with pytest.raises(RangeError, match="pixels of view v4, 64x48, got \\(64, 2\\)"):
+        fruit.session().ask_points([("v4", 64, 2)])
+    with pytest.raises(InputError, match="point: expected at least one"):
+        fruit.session().ask_points([])
+    with pytest.raises(InputError, match="expected VIEW:X,Y, such as front:200,150, got 'v4,3'"):
+        parsed_points(("v4,3",))
+
+
+def test_no_mask_at_the_points(fruit) -> None:
+    sky = fruit.session(lifting="centre", tolerance=0.0)
+    with pytest.raises(InputError, match="masks: expected a mask at the points in at least one"):
+        sky.ask_points([("v4", 30.0, 20.0)])
+
+
+def test_published_is_the_setting_of_the_paper() -> None:
+    assert PUBLISHED.tau == 0.6
+    assert PUBLISHED.initial_views == 4
+    assert PUBLISHED.points == 2
+    assert PUBLISHED.tolerance == 10.0
+    assert PUBLISHED.view_share == 0.5
+    assert PromptOptions(vote="published", point=("v:1,1",)).tau == 0.7
+    assert PromptOptions(threshold=0.3).tau == 0.3
+    assert PromptOptions(objects="all").least_probability == 0.3
+    assert find_method("prompt").published_options == PUBLISHED
+
+
+def test_published_finds_the_apple(fruit) -> None:
+    sources = PromptSources(features=fruit.features, masks=fruit.masks)
+    session = PromptSession(fruit.gaussians, fruit.views, sources, options=PUBLISHED)
+    made = session.ask(["apple"])
+    assert len(session.initial) == 4
+    assert made.objects[0].projected == 5
+    assert agreement(made.confidence, fruit.ids == APPLE) > 0.5
+
+
+def test_the_method_gives_a_selection_with_a_record(fruit) -> None:
+    method = find_method("prompt")
+    options = PromptOptions(words=("apple",))
+    made = method.run(
+        MethodInputs(
+            gaussians=fruit.gaussians,
+            views=fruit.views,
+            evidence=fruit.features,
+            companions={"masks": fruit.masks},
+        ),
+        options,
+    )
+    assert isinstance(made, Selection)
+    assert made.info.method == "prompt"
+    assert made.info.options["words"] == ["apple"]
+    assert made.info.details["initial_views"] == [f"v{i}" for i in range(9)]
+    assert made.info.details["mask_calls"] == 18
+    assert made.info.details["prompts"][0]["word"] == "apple"
+    assert method.gives(options) == "selection"
+
+
+def test_masks_alone_will_do_for_points(fruit) -> None:
+    pixel = torch.nonzero(fruit.truth(fruit.views[4]) == APPLE).double().mean(dim=0)
+    options = PromptOptions(point=(f"v4:{float(pixel[1])},{float(pixel[0])}",))
+    inputs = MethodInputs(gaussians=fruit.gaussians, views=fruit.views, evidence=fruit.masks)
+    made = find_method("prompt").run(inputs, options)
+    assert agreement(made.confidence, fruit.ids == APPLE) > 0.95
+    with pytest.raises(InputError, match="words: expected words or phrases, or points by hand"):
+        find_method("prompt").run(inputs, PromptOptions())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"words": ("a",), "point": ("v:1,1",)}, "words, point: expected one of them"),
+        ({"initial": "some"}, "initial: expected"),
+        ({"region": "boxes"}, "region: expected"),
+        ({"objects": "two"}, "objects: expected"),
+        ({"sampling": "rim"}, "sampling: expected"),
+        ({"lifting": "nearest"}, "lifting: expected"),
+        ({"view_choice": "first"}, "view_choice: expected"),
+        ({"occlusion": "some"}, "occlusion: expected"),
+        ({"vote": "all"}, "vote: expected"),
+        ({"initial_views": 0}, "initial_views: expected at least 1"),
+        ({"points": 0}, "points: expected at least 1"),
+        ({"negatives": -1}, "negatives: expected at least 0"),
+        ({"rounds": 0}, "rounds: expected at least 1"),
+        ({"tolerance": float("nan")}, "tolerance: expected 0 or more"),
+        ({"depth_tolerance": -1.0}, "depth_tolerance: expected 0 or more"),
+        ({"view_share": 0.0}, "view_share: expected above 0"),
+        ({"threshold": 1.5}, "threshold: expected"),
+        ({"min_probability": -0.1}, "min_probability: expected"),
+    ],
+)
+def test_bad_options(options, message) -> None:
+    with pytest.raises(InputError, match=message):
+        PromptOptions(**options)
