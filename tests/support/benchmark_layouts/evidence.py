@@ -1,7 +1,8 @@
 """Recorded evidence of a scene under the names that its photographs have in a layout.
 
 Photographs are told by their pixels, so a layout may call them what it likes, and store them as
-PNG. Those that it does not have, such as held-out ones, lose their evidence.
+PNG. Those that it does not have, such as held-out ones, lose their evidence. Where they were taken
+again through a fisheye lens they are told by their order, and evidence is taken through it too.
 """
 
 import hashlib
@@ -14,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from splatseg.core import Capture
+from support.benchmark_layouts.fisheye import fisheye_names, through_fisheye
 from support.benchmark_layouts.source import Source, link
 
 SHARED_FILES = ("quant.npz", "basis.npz", "text_embeddings.npz")
@@ -33,14 +35,19 @@ def write_evidence(source: Source, capture: Capture, name: str, folder: Path) ->
         FileNotFoundError: If the scene has no such evidence, or none of these photographs.
     """
     there = source.folder / name
-    names = renamed_views(source, capture)
+    bent = any(view.camera.model == "fisheye" for view in capture.views)
+    names = fisheye_names(source) if bent else renamed_views(source, capture)
+    lens = capture.views[0].camera if bent else None
     files = {path.stem: path for path in sorted(there.iterdir()) if path.stem in names}
     if not files:
         raise FileNotFoundError(f"{there}: expected evidence of the photographs of {capture.path}")
     target = folder / name
     target.mkdir(parents=True)
     for view, path in files.items():
-        link(path, target / f"{names[view]}{path.suffix}")
+        if lens is None:
+            link(path, target / f"{names[view]}{path.suffix}")
+        else:
+            through_fisheye(path, target / f"{names[view]}{path.suffix}", source, lens)
     for shared in SHARED_FILES:
         if (there / shared).is_file():
             link(there / shared, target / shared)

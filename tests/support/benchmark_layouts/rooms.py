@@ -1,7 +1,6 @@
 """Layouts of scanned rooms: Replica in its two forms, ScanNet and ScanNet++."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatseg.core import Camera, View
+from support.benchmark_layouts.fisheye import (
+    FISHEYE,
+    fisheye_inside,
+    fisheye_maps,
+    fisheye_names,
+)
 from support.benchmark_layouts.source import Source, link
 from support.benchmark_layouts.sparse import rotation_and_translation, write_sparse
 
 POINTS = 220_000
 FRAME_STEP = 20
-FISHEYE = (0.02, -0.004, 0.0, 0.0)
-"""k1 to k4 of the lens that photographs are taken through again for ScanNet++."""
 
 _ROW = {0: "train", 2: "test"}
 _STEP = 5
@@ -122,8 +125,8 @@ def write_scannetpp(source: Source, folder: Path) -> None:
     images = scene / "dslr/resized_images"
     images.mkdir(parents=True)
     lens = fisheye_inside(source.views[0].camera)
-    maps = _fisheye_maps(source.views[0].camera, lens)
-    names = {view.name: f"DSC{i:05d}.JPG" for i, view in enumerate(source.views, start=1)}
+    maps = fisheye_maps(source.views[0].camera, lens)
+    names = {name: f"{photograph}.JPG" for name, photograph in fisheye_names(source).items()}
     for view in source.views:
         with Image.open(view.image) as image:
             pixels = cv2.remap(np.asarray(image), *maps, cv2.INTER_LINEAR)
@@ -169,42 +172,6 @@ def write_ply(
     head += ["element face 0", "property list uchar int vertex_indices", "end_header"]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(("\n".join(head) + "\n").encode() + rows.tobytes())
-
-
-def fisheye_inside(camera: Camera) -> Camera:
-    """A fisheye lens with the same pixels that sees nothing which a pinhole camera does not.
-
-    Its corner sees what the corner of the pinhole camera sees, and all its other pixels less.
-    """
-    half = np.array([camera.width / 2, camera.height / 2])
-    angle = math.atan(float(np.hypot(*half)) / camera.fx)
-    t2 = angle * angle
-    k1, k2, k3, k4 = FISHEYE
-    stretched = angle * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    focal = 1.01 * float(np.hypot(*half)) / stretched
-    return Camera(
-        width=camera.width,
-        height=camera.height,
-        fx=focal,
-        fy=focal,
-        cx=float(half[0]),
-        cy=float(half[1]),
-        cam_from_world=camera.cam_from_world,
-        model="fisheye",
-        distortion=FISHEYE,
-    )
-
-
-def _fisheye_maps(pinhole: Camera, lens: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where each pixel of the fisheye image lies in the photograph, by OpenCV's own model."""
-    v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(np.float64) + 0.5
-    pixels = np.stack((u, v), -1).reshape(-1, 1, 2)
-    plane = cv2.fisheye.undistortPoints(pixels, lens.K.numpy(), np.array(FISHEYE))
-    plane = plane.reshape(lens.height, lens.width, 2)
-    # OpenCV counts pixels from the centre of the first.
-    across = plane[..., 0] * pinhole.fx + pinhole.cx - 0.5
-    down = plane[..., 1] * pinhole.fy + pinhole.cy - 0.5
-    return across.astype(np.float32), down.astype(np.float32)
 
 
 def _replica_frame(

@@ -40,8 +40,7 @@ def data_set(
             write_layout(layout, generated_room, path)
             (scene,) = read_benchmark(layout, path)
             source = read_source(generated_room)
-            # Photographs of ScanNet++ are resampled, so there is no evidence of them.
-            for name in () if layout == "scannetpp" else EVIDENCE:
+            for name in EVIDENCE:
                 write_evidence(source, scene.capture, name, path / "evidence" / scene.name)
             made[layout] = path
         return made[layout]

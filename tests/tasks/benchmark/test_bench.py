@@ -169,6 +169,12 @@ def test_classes_of_views_whose_truth_is_a_labelled_scan(bench, data_set, tmp_pa
     result = load_result(out / f"results/scannetpp/uplift/{scene.name}.json")
     assert result.scores["miou"] > 0.3
     assert len(result.rows) == len(scene.capture.test_views)
+    # Recorded evidence, seen through the lens as the photographs are: of classes, and of words.
+    bench("scannetpp", "scannetpp", "--method", "vote", "--model", "labels_semantic")
+    result = load_result(out / f"results/scannetpp/vote/{scene.name}.json")
+    assert result.scores["miou"] > 0.25
+    bench("scannetpp", "scannetpp", "--method", "objects", "--model", "features_text", *BESIDE)
+    assert (out / f"results/scannetpp/objects/{scene.name}.json").is_file()
 
 
 @pytest.mark.parametrize("method", ["uplift", "features", "objects"])
