@@ -3,14 +3,15 @@
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from splatseg.cli._prompt_words import PromptWords
+from splatseg.cli._select_text import selected_by_text, word_facts, word_lines
 from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Seed, SelectLevel
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
-from splatseg.core import Scene, Selection
+from splatseg.core import PromptableMasks, Scene, Selection
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.scene import save_scene_layer
@@ -24,6 +25,7 @@ from splatseg.tasks import (
     check_selection_file,
     draw_selection,
     save_selected_splats,
+    text_prompts,
 )
 from splatseg.tasks.named_models import prompter_of
 from splatseg.tasks.scene_parts import whole_layer
@@ -66,6 +68,8 @@ class Command:
     splatseg select room --view front --box 120,80,260,210 --save mug.ply --picture clicks
 
     splatseg select room --sphere 0.4 0 1.2 0.3 --add-to mug --layer mug
+
+    splatseg select room --text "red mug" --layer mug --picture found
     """
 
     scene: SceneFolder
@@ -104,6 +108,22 @@ class Command:
 
     sphere: tuple[float, float, float, float] | None = None
     """Centre x, y, z and radius, world, scene units."""
+
+    text: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="WORDS")] = ()
+    """Words or a phrase that the thing answers to, instead of clicks: found by recorded features
+    and masks of the views, or by models. `splatseg segment --method prompt` has more options."""
+
+    objects: Literal["one", "all"] = "one"
+    """With --text: the surest object, or all that answer."""
+
+    features: str | None = None
+    """With --text: evidence of features in the space of words. None takes the only one."""
+
+    grounder: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    """With --text: a model that finds words in photographs, such as langsam."""
+
+    encoder: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
+    """With --text: the model that made the features, for words that were not recorded."""
 
     like: Annotated[tuple[str, ...], _Repeated, tyro.conf.arg(metavar="LAYER")] = ()
     """A layer that is a selection: all things like it."""
@@ -148,6 +168,7 @@ def run(command: Command) -> None:
     started = time.monotonic()
     observer = ConsoleObserver(quiet=command.quiet, json=command.json)
     scene = open_scene(command.scene, command.data)
+    _check_text(command)
     prompts = _prompts(command, scene)
     base, mode = _base(command, scene)
     prompter = None
@@ -161,20 +182,23 @@ def run(command: Command) -> None:
         )
     saved = None if command.save is None else check_selection_file(command.save, command.layer)
     with work_on_scene(command.scene, "select", writes=["layers"]):
-        session = SelectionSession(
-            scene,
-            options=replace(command.options, mode=mode),
-            prompter=prompter,
-            backend=command.backend,
-            observer=observer,
-        )
-        try:
-            with session:
-                made = session.select(prompts, base=base)
-        finally:
-            # Masks take a while to associate: their tree is kept, even where it has no answer.
-            for name, layer in session.made_layers.items():
-                save_scene_layer(layer, command.scene, name)
+        options = replace(command.options, mode=mode)
+        if command.text:
+            made = selected_by_text(
+                command,
+                scene,
+                prompts,
+                options,
+                prompter=prompter,
+                base=base,
+                observer=observer,
+                report=observer.note,
+            )
+            prompts += text_prompts(made.selection, scene)
+        else:
+            made = _clicked(
+                command, scene, prompts, options, prompter=prompter, base=base, observer=observer
+            )
         path = save_scene_layer(made.selection, command.scene, command.layer)
     facts = _facts(made, command.layer, path)
     lines = [*_lines(made), str(path)]
@@ -192,6 +216,39 @@ def run(command: Command) -> None:
     print_result(facts, lines, json=command.json)
 
 
+def _check_text(command: Command) -> None:
+    """Refuse flags that go with words where there are none."""
+    if command.text:
+        return
+    for name in ("features", "grounder", "encoder"):
+        if getattr(command, name) is not None:
+            raise InputError(f"{name}: goes with --text, got none.")
+    if command.objects != "one":
+        raise InputError("objects: goes with --text, got none.")
+
+
+def _clicked(
+    command: Command,
+    scene: Scene,
+    prompts: list[SelectionPrompt],
+    options: SelectOptions,
+    *,
+    prompter: PromptableMasks | None,
+    base: Selection | None,
+    observer: ConsoleObserver,
+) -> Selected:
+    session = SelectionSession(
+        scene, options=options, prompter=prompter, backend=command.backend, observer=observer
+    )
+    try:
+        with session:
+            return session.select(prompts, base=base)
+    finally:
+        # Masks take a while to associate: their tree is kept, even where it has no answer.
+        for name, layer in session.made_layers.items():
+            save_scene_layer(layer, command.scene, name)
+
+
 def _prompts(command: Command, scene: Scene) -> list[SelectionPrompt]:
     """All prompts of the command line."""
     words = PromptWords(scene, command.view)
@@ -207,10 +264,10 @@ def _prompts(command: Command, scene: Scene) -> list[SelectionPrompt]:
         x, y, z, radius = command.sphere
         prompts.append(Ball(centre=(x, y, z), radius=radius))
     prompts += [Similar(selection=_selection("--like", scene, name)) for name in command.like]
-    if not prompts:
+    if not prompts and not command.text:
         raise InputError(
-            "prompts: expected --point, --box, --mask, --scribble, --lasso, --box-3d, --sphere or "
-            "--like, got none."
+            "prompts: expected --point, --box, --mask, --scribble, --lasso, --box-3d, --sphere, "
+            "--like or --text, got none."
         )
     return prompts
 
@@ -247,6 +304,7 @@ def _facts(made: Selected, name: str, path: Path) -> dict[str, Any]:
         "selected": made.selection.count,
         "confidence": None if mean is None else round(mean, 4),
         "source": made.source,
+        "words": word_facts(made),
         "next_click": None
         if hint is None
         else {
@@ -268,6 +326,7 @@ def _lines(made: Selected) -> list[str]:
         f"{made.selection.count} of {len(made.selection)} Gaussians{by}{sure}; "
         f"{sum(made.seconds.values()):.2f} s"
     ]
+    lines += word_lines(made)
     lines += [f"note: {warning}" for warning in made.warnings]
     if (hint := made.next_click) is not None:
         x, y = (float(v) for v in hint.point)

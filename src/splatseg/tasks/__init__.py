@@ -62,6 +62,10 @@ from splatseg.tasks.select_outputs import draw_selection as draw_selection
 from splatseg.tasks.select_outputs import save_selected_splats as save_selected_splats
 from splatseg.tasks.select_session import Selected as Selected
 from splatseg.tasks.select_session import SelectionSession as SelectionSession
+from splatseg.tasks.select_text import TextModels as TextModels
+from splatseg.tasks.select_text import TextOptions as TextOptions
+from splatseg.tasks.select_text import select_text as select_text
+from splatseg.tasks.select_text import text_prompts as text_prompts
 from splatseg.tasks.sharpen import SharpenedScene as SharpenedScene
 from splatseg.tasks.sharpen import SharpenSceneOptions as SharpenSceneOptions
 from splatseg.tasks.sharpen import sharpen_scene as sharpen_scene

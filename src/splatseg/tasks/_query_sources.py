@@ -57,8 +57,8 @@ def word_source(
     if name is None:
         name = _layer_at_hand(scene, options, layers, ("objects",))
     made: dict[str, Layer] = {}
-    if name is None and (masks := _masks(scene, options)) is not None:
-        evidence = _feature_evidence(scene, options.features, encoder)
+    if name is None and (masks := mask_name(scene, options.masks)) is not None:
+        evidence = feature_evidence(scene, options.features, encoder)
         if words:
             vocabulary_of(evidence, encoder).vectors(words)
         observer.note(f"finding objects by {masks} and their features by {evidence.folder.name}")
@@ -74,7 +74,7 @@ def word_source(
     layer = made.get(name) or whole_layer(scene, name, layers, option="from_layer")
     if not isinstance(layer, Features):
         raise InputError(f"from_layer: expected features, {name!r} has none.")
-    evidence = _feature_evidence(scene, options.features or layer.info.evidence, encoder)
+    evidence = feature_evidence(scene, options.features or layer.info.evidence, encoder)
     return WordSource(
         features=layer,
         layer=name,
@@ -113,15 +113,15 @@ def _layer_at_hand(
     return next((found[method] for method in methods if method in found), None)
 
 
-def _masks(scene: Scene, options: QueryOptions) -> str | None:
+def mask_name(scene: Scene, asked: str | None) -> str | None:
     """Masks to find objects by: those asked for, or the only ones."""
     folders = _folders(scene)
-    if options.masks is not None:
-        if options.masks not in (known := evidence_names(folders)):
+    if asked is not None:
+        if asked not in (known := evidence_names(folders)):
             raise InputError(
-                f"masks: expected one of those at hand ({', '.join(known)}), got {options.masks!r}."
+                f"masks: expected one of those at hand ({', '.join(known)}), got {asked!r}."
             )
-        return options.masks
+        return asked
     names = [
         name
         for name in evidence_names(folders)
@@ -151,7 +151,7 @@ def _made(
     return name, found.layer
 
 
-def _feature_evidence(
+def feature_evidence(
     scene: Scene, name: str | None, encoder: TextFeatures | None
 ) -> FeatureEvidence:
     """The evidence of features in the space of words: of this name, or the only one."""

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import JSON, Layer, LayerInfo, PromptableMasks, Scene, Selection
+from splatseg.core import JSON, Gaussians, Layer, LayerInfo, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
 from splatseg.prompting.context import SceneIndex
@@ -38,7 +38,7 @@ from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._select_prompter import segmented_prompts
 from splatseg.tasks._select_record import prompt_record
 from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
-from splatseg.tasks.select_options import SelectOptions
+from splatseg.tasks.select_options import SelectMode, SelectOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -155,7 +155,7 @@ class SelectionSession:
         options = options or self._options
         self._check_source(options)
         asked = given = _as_prompts(prompts)
-        _check_base(self._scene, base, options)
+        check_base(self._scene, base, options)
         seconds: dict[str, float] = {}
         if self._prompter is not None:
             began = time.perf_counter()
@@ -173,7 +173,7 @@ class SelectionSession:
         if shown or similar:
             confidence, steps = postprocess(confidence, context, enabled=options.steps)
             seconds |= steps
-        confidence = _within(confidence, solids, context)
+        confidence = within(confidence, solids, self._scene.gaussians)
         selection = self._described(confidence, asked, base, options)
         hint = None
         if advise and shown and selection.confidence is not None:
@@ -268,17 +268,7 @@ class SelectionSession:
         options: SelectOptions,
     ) -> Selection:
         """The selection with what it adds to, and the record of both."""
-        selection = Selection.of_confidence(confidence)
-        if base is not None:
-            match options.mode:
-                case "add":
-                    selection = base | selection
-                case "subtract":
-                    selection = base - selection
-                case "intersect":
-                    selection = base & selection
-                case "new":
-                    pass
+        selection = combined(Selection.of_confidence(confidence), base, options.mode)
         opened = self._opened
         details: dict[str, JSON] = {"prompts": [prompt_record(prompt) for prompt in prompts]}
         if base is not None:
@@ -319,7 +309,29 @@ def _as_prompts(
     return given
 
 
-def _check_base(scene: Scene, base: Selection | None, options: SelectOptions) -> None:
+def combined(selection: Selection, base: Selection | None, mode: SelectMode) -> Selection:
+    """A selection added to, subtracted from or intersected with an earlier one.
+
+    Args:
+        selection: The new one.
+        base: The earlier one; None where there is none.
+        mode: How.
+    """
+    if base is None:
+        return selection
+    match mode:
+        case "add":
+            return base | selection
+        case "subtract":
+            return base - selection
+        case "intersect":
+            return base & selection
+        case "new":
+            return selection
+
+
+def check_base(scene: Scene, base: Selection | None, options: SelectOptions) -> None:
+    """Raise `InputError` unless there is a base where the mode wants one, of the same scene."""
     if (base is None) != (options.mode == "new"):
         raise InputError(
             "base: expected a selection with mode add, subtract or intersect and none with new, "
@@ -332,11 +344,9 @@ def _check_base(scene: Scene, base: Selection | None, options: SelectOptions) ->
         )
 
 
-def _within(
-    confidence: Tensor, solids: Sequence[Solid], context: SelectionContext
-) -> Float[Tensor, "n"]:
+def within(confidence: Tensor, solids: Sequence[Solid], gaussians: Gaussians) -> Float[Tensor, "n"]:
     """Confidences inside all places, 0 outside."""
     for solid in solids:
-        inside = solid.contains(context.gaussians).to(confidence.device)
+        inside = solid.contains(gaussians).to(confidence.device)
         confidence = torch.where(inside, confidence, 0.0)
     return confidence

@@ -16,6 +16,9 @@ from splatseg.methods.prompt._words import image_of
 
 _MOST = 0.5
 
+_AT_ONCE = 32
+"""Masks that are drawn at a time."""
+
 _PER_FOLD = 0.1
 """What an area that is e times another counts, in shares of points."""
 
@@ -133,13 +136,16 @@ def _overlapping(masks: MaskSet, prompts: Sequence[Prompt]) -> list[Rle | None]:
     best = torch.zeros(len(shown))
     chosen: list[Rle | None] = [None] * len(shown)
     sizes = shown.sum(dim=1)
-    for mask in masks.masks:
-        inside = mask.decode().reshape(-1)
-        both = shown[:, inside].sum(dim=1)
-        iou = both / (sizes + mask.area - both).clamp_min(1)
-        for at in torch.nonzero((iou > best) & (iou >= _MOST)).squeeze(1).tolist():
-            chosen[at] = mask
-        best = torch.maximum(best, iou)
+    for start in range(0, len(masks), _AT_ONCE):
+        part = masks.masks[start : start + _AT_ONCE]
+        inside = torch.stack([mask.decode().reshape(-1) for mask in part]).float()
+        # Counts of pixels, which float32 adds up exactly.
+        both = shown @ inside.T
+        iou = both / (sizes[:, None] + inside.sum(dim=1) - both).clamp_min(1)
+        value, index = iou.max(dim=1)
+        for at in torch.nonzero((value > best) & (value >= _MOST)).squeeze(1).tolist():
+            chosen[at] = part[int(index[at])]
+        best = torch.maximum(best, value)
     return chosen
 
 
