@@ -12,7 +12,9 @@ instance that is meant. IoU is the mean over views (a view in which neither is a
 `oracle` is the ceiling: mean features of the true instances in train views, and the share of the
 phrases whose own instance has the largest plain cosine. `classes` asks for names of classes, all
 objects of each. `true` gives true masks of the initial views instead of words: what is lost after
-words are found. Rows `seen` are phrases whose instance more than 60 % of the train views show.
+words are found. `seen_often` are phrases whose instance more than 60 % of the train views show.
+`boundaries` are phrases that were found, by pooled IoU: as selected (`usual`), without confidence
+(`hard`), decomposed at the masks of five views as SA-GS does it, and split by `cut_masks`.
 """
 
 import argparse
@@ -32,9 +34,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from selected_views import TestViews
 
-from splatseg.core import Rle, Scene, Selection, View
+from splatseg.core import LabelMap, Rle, Scene, Selection, View
 from splatseg.io.evidence import FeatureEvidence, load_text_embeddings, open_evidence
 from splatseg.io.scene import load_scene
+from splatseg.lift.boundaries.cut import cut_masks
+from splatseg.lift.boundaries.decompose_masks import decompose_at_masks
 from splatseg.lift.vocabulary import vocabulary_of
 from splatseg.methods.prompt import (
     PUBLISHED,
@@ -281,12 +285,70 @@ def classes(bench: Bench) -> None:
         print(f"classes {many}", {k: round(v, 4) for k, v in said.items()}, flush=True)
 
 
+@dataclass(frozen=True)
+class _ObjectMaps:
+    """Masks of an object as label maps: 1 inside, 2 outside."""
+
+    masks: dict[str, torch.Tensor]
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        return tuple(self.masks)
+
+    def label_map(self, name: str) -> LabelMap:
+        return LabelMap(ids=torch.where(self.masks[name], 1, 2).int())
+
+
+DECOMPOSED_VIEWS = 5
+
+
+def boundaries(bench: Bench) -> None:
+    """Decomposition at masks (SA-GS), and our own splitting, of phrases that were found."""
+    session = bench.session(PromptOptions())
+    rows: list[list[float]] = []
+    for one in bench.phrases:
+        found = session.find(one.words)[:1]
+        if not found or not bench.right(found[0], one.id):
+            continue
+        (made,) = session.select(found).objects
+        masks = [(view, rle.decode()) for view, rle in made.masks]
+        usual = Selection.of_confidence(made.confidence)
+        hard = Selection(mask=usual.mask)
+        step = max(1, len(masks) // DECOMPOSED_VIEWS)
+        edited, inside = decompose_at_masks(
+            bench.scene.gaussians, hard, masks[::step][:DECOMPOSED_VIEWS]
+        )
+        cut = cut_masks(
+            bench.scene.gaussians,
+            [view for view, _ in masks],
+            _ObjectMaps({view.name: mask for view, mask in masks}),
+            [1],
+        )
+        scenes = (
+            (bench.scene.gaussians, usual),
+            (bench.scene.gaussians, hard),
+            (edited.gaussians, inside),
+            (cut.edited.gaussians, cut.inside),
+        )
+        rows.append([])
+        for gaussians, selection in scenes:
+            views = TestViews(replace(bench.scene, gaussians=gaussians), bench.data)
+            rows[-1].append(float(views.scores([selection], [one.id]).pooled[0]))
+        print(one.words, [round(value, 4) for value in rows[-1]], flush=True)
+    names = ("usual", "hard", "decomposed", "cut")
+    said = {name: float(value) for name, value in zip(names, np.mean(rows, axis=0), strict=True)}
+    bench.results["boundaries"] = said | {"phrases": len(rows)}
+    print("boundaries", len(rows), {k: round(v, 4) for k, v in said.items()}, flush=True)
+
+
 DEFAULT = PromptOptions()
 OPTIONS: dict[str, PromptOptions] = {
     "default": DEFAULT,
     "single": replace(DEFAULT, initial="single"),
-    "random": replace(DEFAULT, initial="random"),
-    "kmeans8": replace(DEFAULT, initial_views=8),
+    "kmeans4": replace(DEFAULT, initial_views=4),
+    "random4": replace(DEFAULT, initial="random", initial_views=4),
+    "random24": replace(DEFAULT, initial="random"),
+    "rounds1": replace(DEFAULT, rounds=1),
     "cells": replace(DEFAULT, region="cells"),
     "views10": replace(DEFAULT, view_share=0.1),
     "views50": replace(DEFAULT, view_share=0.5),
@@ -320,6 +382,7 @@ ROWS: dict[str, Callable[[Bench], None]] = {
     **{name: _row_of(name) for name in OPTIONS},
     "true": true_masks,
     "classes": classes,
+    "boundaries": boundaries,
 }
 
 

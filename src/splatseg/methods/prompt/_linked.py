@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-SAME = 0.3
+SAME = 0.2
 """IoU from which on masks of two views are of one thing."""
 
 

@@ -68,7 +68,7 @@ class PromptOptions:
     """In which views words are looked for. kmeans: the views nearest to the centres of k-means
     over position and rotation. random: any. single: the one nearest to the mean of all."""
 
-    initial_views: int = 12
+    initial_views: int = 24
     """How many of them, published 4; single is one."""
 
     points: int = 2

@@ -64,8 +64,8 @@ class PromptShares:
     projected: tuple[int, ...]
     """How many views the points of each object were projected into."""
 
-    masked: tuple[int, ...]
-    """How many of these had a mask of it."""
+    masks: tuple[tuple[tuple[View, Rle], ...], ...]
+    """Of each object, the views that had a mask of it, with the mask of the last round."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,7 +188,7 @@ def vote_for(
     """
     chosen = _views_of(views, prompts, options, seed)
     shares: Tensor | None = None
-    masked = [0] * len(prompts)
+    masks: list[list[tuple[View, Rle]]] = [[] for _ in prompts]
     ordered = [view for view in views if any(view.name in names for names in chosen)]
     ordered.sort(key=lambda view: view.name)
     for turn in range(options.rounds):
@@ -200,7 +200,7 @@ def vote_for(
             depth_tolerance=options.depth_tolerance,
         )
         votes.add_views([len(one) for one in chosen])
-        masked = [0] * len(prompts)
+        masks = [[] for _ in prompts]
         inside = None if shares is None else (shares > options.tau).float().T.contiguous()
         for done, view in enumerate(ordered):
             objects = [at for at, names in enumerate(chosen) if view.name in names]
@@ -211,15 +211,15 @@ def vote_for(
                     shown = _rendered(prepared, inside, objects)
                 made = _made(view, shown, prompts, makers)
                 votes.add(view, prepared, made)
-            for at, _ in made:
-                masked[at] += 1
+            for at, mask in made:
+                masks[at].append((view, mask))
             if progress is not None:
                 progress(turn * len(ordered) + done + 1, options.rounds * len(ordered))
         shares = votes.shares()
     return PromptShares(
         shares=torch.zeros(len(prompts), len(gaussians)) if shares is None else shares,
         projected=tuple(len(one) for one in chosen),
-        masked=tuple(masked),
+        masks=tuple(tuple(one) for one in masks),
     )
 
 

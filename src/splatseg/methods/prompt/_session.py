@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import JSON, Gaussians, PromptableMasks, View
+from splatseg.core import JSON, Gaussians, PromptableMasks, Rle, View
 from splatseg.core.boundary import boundary
 from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.errors import InputError, RangeError
@@ -78,8 +78,13 @@ class PromptedObject:
     projected: int
     """How many views its points were projected into."""
 
-    masked: int
-    """How many of these had a mask of it."""
+    masks: tuple[tuple[View, Rle], ...]
+    """The views that had a mask of it, with the mask of the last round."""
+
+    @property
+    def masked(self) -> int:
+        """How many views had a mask of it."""
+        return len(self.masks)
 
     def record(self) -> dict[str, JSON]:
         """What a layer keeps of it."""
@@ -369,7 +374,7 @@ def _objects(
             points=given[at][1],
             confidence=confidence_of(votes.shares[at], options.tau),
             projected=votes.projected[at],
-            masked=votes.masked[at],
+            masks=votes.masks[at],
         )
         for at in range(len(given))
     ]
