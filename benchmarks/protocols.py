@@ -50,6 +50,7 @@ _TEXT, _CLASSES, _PANOPTIC, _TRACKED, _MASKS = (
 )  # fmt: skip
 _ANY = ("scene_list=all",)
 _BESIDES = (_MASKS, "features_dino")
+_WORDS = ("features", "objects")
 RUNS = (
     Run(protocol="nvos", layout="nvos", scene="frontal",
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
@@ -57,14 +58,14 @@ RUNS = (
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
     Run(protocol="spin-nerf-ludvig", layout="spin-nerf", scene="frontal",
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
-    Run(protocol="lerf-mask", layout="lerf-mask", scene="toys", methods=("features",),
-        evidence=(_TEXT,)),
-    Run(protocol="lerf-ovs-2d", layout="lerf-ovs", scene="toys", methods=("features",),
-        evidence=(_TEXT,)),
-    Run(protocol="lerf-ovs-3d", layout="lerf-ovs", scene="toys", methods=("features",),
-        evidence=(_TEXT,)),
-    Run(protocol="3d-ovs", layout="3d-ovs", scene="toys", methods=("features",),
-        evidence=(_TEXT,)),
+    Run(protocol="lerf-mask", layout="lerf-mask", scene="toys", methods=_WORDS,
+        companions=(_MASKS,), evidence=(_TEXT,)),
+    Run(protocol="lerf-ovs-2d", layout="lerf-ovs", scene="toys", methods=_WORDS,
+        companions=(_MASKS,), evidence=(_TEXT,)),
+    Run(protocol="lerf-ovs-3d", layout="lerf-ovs", scene="toys", methods=_WORDS,
+        companions=(_MASKS,), evidence=(_TEXT,)),
+    Run(protocol="3d-ovs", layout="3d-ovs", scene="toys", methods=_WORDS,
+        companions=(_MASKS,), evidence=(_TEXT,)),
     Run(protocol="replica", layout="replica", scene="office", methods=("uplift", "associate"),
         evidence=(_CLASSES, _PANOPTIC)),
     Run(protocol="replica-gaga", layout="replica", scene="office", methods=("associate",),
@@ -79,6 +80,8 @@ RUNS = (
         evidence=(_PANOPTIC,)),
     Run(protocol="scannet-10", layout="scannet", scene="office", methods=("uplift", "features"),
         evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
+    Run(protocol="scannetpp", layout="scannetpp", scene="office", methods=_WORDS,
+        companions=(_MASKS,), evidence=(_TEXT,)),
     Run(protocol="cosseg-replica-semantic", layout="replica", scene="office",
         methods=("uplift", "associate", "cosseg"), companions=_BESIDES,
         evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
