@@ -32,7 +32,7 @@ def scene(folder):
 
 def options(**prompt) -> TextOptions:
     chosen = {"initial_views": 4, "min_probability": 0.0, "rounds": 1} | prompt
-    return TextOptions(masks="masks_sam", prompt=PromptOptions(**chosen))
+    return TextOptions(evidence="masks_sam", prompt=PromptOptions(**chosen))
 
 
 @pytest.fixture(scope="module")
@@ -95,14 +95,14 @@ def test_steps_and_seed_count(scene, table) -> None:
 
 
 def test_what_is_asked_for_is_there(scene) -> None:
-    with pytest.raises(InputError, match="masks: expected one of those at hand"):
-        select_text(scene, [WORD], options=TextOptions(masks="nothing"))
-    with pytest.raises(InputError, match="masks: expected the name of one of"):
+    with pytest.raises(InputError, match="evidence: expected one of those at hand"):
+        select_text(scene, [WORD], options=TextOptions(evidence="nothing"))
+    with pytest.raises(InputError, match="evidence: expected the name of one of"):
         select_text(scene, [WORD], options=TextOptions(features="features_text"))
     with pytest.raises(InputError, match="features: expected features"):
-        select_text(scene, [WORD], options=TextOptions(features="masks_sam", masks="masks_sam"))
-    with pytest.raises(InputError, match="masks: expected masks or segments"):
-        select_text(scene, [WORD], options=TextOptions(masks="features_dino"))
+        select_text(scene, [WORD], options=TextOptions(features="masks_sam", evidence="masks_sam"))
+    with pytest.raises(InputError, match="evidence: expected masks or segments"):
+        select_text(scene, [WORD], options=TextOptions(evidence="features_dino"))
     with pytest.raises(InputError, match="recorded words, got 'tabel'; near are 'table'"):
         select_text(scene, ["tabel"], options=options())
     with pytest.raises(InputError, match="words: expected words or phrases, got none"):
@@ -193,3 +193,14 @@ def test_text_from_the_command_line(folder, tmp_path, capsys) -> None:
 def test_bad_command_lines(folder, capsys, flags, message) -> None:
     assert main(["select", str(folder), "--evidence", "masks_sam", *flags]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_masks_are_asked_for_by_the_option_that_select_has(folder, tmp_path, capsys) -> None:
+    other = Path(shutil.copytree(folder, tmp_path / "scene"))
+    capture = load_scene(folder).source
+    assert capture is not None
+    shutil.copytree(capture / "masks_sam", other / "evidence" / "more_masks")
+    assert main(["select", str(other), "--text", WORD]) == 2
+    said = capsys.readouterr().err
+    assert "evidence: expected the name of one of masks_sam, more_masks" in said
+    assert "(see --evidence)" in said

@@ -66,7 +66,7 @@ def selected_by_text(
         command.text,
         options=TextOptions(
             features=command.features,
-            masks=options.evidence,
+            evidence=options.evidence,
             prompt=PromptOptions(objects=objects),
         ),
         select_options=options,

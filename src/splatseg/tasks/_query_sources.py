@@ -113,13 +113,13 @@ def _layer_at_hand(
     return next((found[method] for method in methods if method in found), None)
 
 
-def mask_name(scene: Scene, asked: str | None) -> str | None:
-    """Masks to find objects by: those asked for, or the only ones."""
+def mask_name(scene: Scene, asked: str | None, *, option: str = "masks") -> str | None:
+    """Masks to find objects by: those asked for, or the only ones; `option` is who asks."""
     folders = _folders(scene)
     if asked is not None:
         if asked not in (known := evidence_names(folders)):
             raise InputError(
-                f"masks: expected one of those at hand ({', '.join(known)}), got {asked!r}."
+                f"{option}: expected one of those at hand ({', '.join(known)}), got {asked!r}."
             )
         return asked
     names = [
@@ -129,7 +129,7 @@ def mask_name(scene: Scene, asked: str | None) -> str | None:
     ]
     if len(names) > 1:
         raise InputError(
-            f"masks: expected the name of one of {', '.join(names)}, got none (see --masks)."
+            f"{option}: expected the name of one of {', '.join(names)}, got none (see --{option})."
         )
     return names[0] if names else None
 

@@ -43,7 +43,7 @@ class TextOptions:
     """Evidence of features in the space of words, such as features_text. None takes the only one
     that there are words for."""
 
-    masks: str | None = None
+    evidence: str | None = None
     """Evidence of masks. None takes the only one."""
 
     prompt: PromptOptions = field(default_factory=PromptOptions)
@@ -153,15 +153,15 @@ def _evidence(
     features = None
     if models.grounder is None:
         features = feature_evidence(scene, options.features, models.encoder)
-    if models.grounder is not None and models.prompter is not None and options.masks is None:
+    if models.grounder is not None and models.prompter is not None and options.evidence is None:
         return features, None
-    name = mask_name(scene, options.masks)
+    name = mask_name(scene, options.evidence, option="evidence")
     if name is None:
         return features, None
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
     masks = open_evidence(find_evidence(folders, name))
     if masks.kind not in _KINDS:
-        raise InputError(f"masks: expected masks or segments, {name!r} has {masks.kind}.")
+        raise InputError(f"evidence: expected masks or segments, {name!r} has {masks.kind}.")
     return features, masks
 
 
