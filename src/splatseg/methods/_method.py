@@ -27,6 +27,10 @@ class MethodInputs:
     evidence: Evidence
     """Of one of the kinds that the method takes."""
 
+    prompt_views: tuple[View, ...] = ()
+    """All views of the scene: points by hand may lie in any, whose photograph and evidence stay
+    unused."""
+
     companions: Mapping[str, Evidence] = field(default_factory=dict[str, Evidence])
     """Further evidence of the same views, by the options that name it, see `Method.companions`."""
 

@@ -173,6 +173,7 @@ def segment(
         gaussians=scene.gaussians,
         views=_views(scene, evidence, options.views, observer),
         evidence=evidence,
+        prompt_views=scene.views,
         companions=named_companions(scene, method, chosen),
         models=named_models(method, chosen, report=observer.note),
         trained=trained,

@@ -103,6 +103,33 @@ def _points_given(session: PromptSession) -> int:
     return sum(given)
 
 
+def test_what_fits_no_mask_keeps_the_first_round(fruit) -> None:
+    session = fruit.session(rounds=2)
+    maker = session._makers
+    usual = maker.masks
+
+    def points_alone(view, prompts, areas):
+        if any(prompt.mask is not None for prompt in prompts):
+            return [None] * len(prompts)
+        return usual(view, prompts, areas)
+
+    maker.masks = points_alone
+    found, once = session.ask(["apple"]), fruit.session(rounds=1).ask(["apple"])
+    assert torch.equal(found.confidence, once.confidence)
+    assert found.objects[0].masked == once.objects[0].masked == 9
+
+
+def test_points_may_lie_in_views_that_are_not_used(fruit) -> None:
+    sources = PromptSources(features=fruit.features, masks=fruit.masks)
+    session = PromptSession(fruit.gaussians, fruit.views[:4], sources)
+    pixel = torch.nonzero(fruit.truth(fruit.views[8]) == APPLE).double().mean(dim=0)
+    point = ("v8", float(pixel[1]), float(pixel[0]))
+    made = session.ask_points([point], views=fruit.views)
+    assert agreement(made.confidence, fruit.ids == APPLE) > 0.9
+    with pytest.raises(InputError, match="point: expected a view of the scene, got 'v8'"):
+        session.ask_points([point])
+
+
 def test_lifting_and_tolerance_matter(fruit) -> None:
     def points(**options):
         from splatseg.methods.prompt._select import sampled_points, world_prompts
@@ -130,7 +157,7 @@ def test_points_by_hand_are_one_object(fruit) -> None:
     made = fruit.session().ask_points(points)
     assert agreement(made.confidence, fruit.ids == PEAR) > 0.95
     assert made.objects[0].word == ""
-    with pytest.raises(InputError, match="point: expected a view that may be used, got 'x'"):
+    with pytest.raises(InputError, match="point: expected a view of the scene, got 'x'"):
         fruit.session().ask_points([("x", 1, 1)])
     with pytest.raises(RangeError, match="pixels of view v4, 64x48, got \\(64, 2\\)"):
         fruit.session().ask_points([("v4", 64, 2)])

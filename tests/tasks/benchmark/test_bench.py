@@ -122,6 +122,35 @@ def test_masks(protocol: str, layout: str, words, bench, data_set, tmp_path, sco
     assert scores["iou"] > 0.1
 
 
+@pytest.mark.parametrize(
+    ("protocol", "layout", "words"),
+    [
+        ("spin-nerf", "spin-nerf", ("--model", "masks_sam")),
+        ("spin-nerf", "spin-nerf", ("--model", "masks_sam", "--published")),
+        ("lerf-ovs-2d", "lerf-ovs", ("--model", "features_text", *BESIDE)),
+    ],
+)
+def test_a_method_that_is_asked_for_each_thing(
+    protocol: str, layout: str, words, data_set, tmp_path
+) -> None:
+    """Prompts of a protocol become points by hand, or words, of the method."""
+    data, out = data_set(layout), tmp_path / "out"
+    named = [evidence(data, word) if word in EVIDENCE else word for word in words]
+    command = ("bench", protocol, "--data", data, "-o", out, *STEPS, "--method", "prompt", *named)
+    assert main([str(word) for word in command]) == 0
+    found = content(out, protocol)["methods"]
+    (method,) = found
+    (scene,) = read_benchmark(layout, data)
+    result = load_result(out / "results" / protocol / method / f"{scene.name}.json")
+    masks = out / "predictions" / protocol / method / scene.name
+    drawn = [path for task in scene.tasks for path in (masks / task.name).glob("*.png")]
+    told = [note for note in result.notes if "nothing was selected" in note]
+    assert len(drawn) + len(told) > 0
+    if "--published" not in words:
+        assert drawn
+        assert found[method]["scores"]["iou"] > 0.1
+
+
 def test_classes_and_instances_of_views(bench, data_set, tmp_path, score) -> None:
     data, models = data_set("replica"), ("labels_semantic", "labels_panoptic")
     out = bench("replica", "replica", "--method", "uplift,associate", "--model", *models)

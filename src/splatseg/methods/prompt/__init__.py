@@ -12,6 +12,9 @@ References:
 from dataclasses import asdict
 from typing import cast
 
+from jaxtyping import Bool
+from torch import Tensor
+
 from splatseg.core import JSON, PromptableMasks, Selection
 from splatseg.core.layer_info import LayerInfo
 from splatseg.core.models import GroundedMasks, TextFeatures
@@ -21,6 +24,7 @@ from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods.prompt._groups import FoundObject as FoundObject
 from splatseg.methods.prompt._options import PUBLISHED as PUBLISHED
 from splatseg.methods.prompt._options import PromptOptions as PromptOptions
+from splatseg.methods.prompt._points import points_inside
 from splatseg.methods.prompt._session import Prompted as Prompted
 from splatseg.methods.prompt._session import PromptedObject as PromptedObject
 from splatseg.methods.prompt._session import PromptSession as PromptSession
@@ -46,6 +50,18 @@ def parsed_points(texts: tuple[str, ...]) -> list[tuple[str, float, float]]:
         if not name:
             raise InputError(f"point: expected VIEW:X,Y, such as front:200,150, got {text!r}.")
     return found
+
+
+def mask_points(view: str, mask: Bool[Tensor, "height width"], count: int = 8) -> tuple[str, ...]:
+    """Points of a mask, as the option ``point`` takes them.
+
+    Args:
+        view: Name of its view.
+        mask: The mask.
+        count: How many, far from its rim and from each other.
+    """
+    points = points_inside(mask, count).tolist()
+    return tuple(f"{view}:{x:g},{y:g}" for x, y in points)
 
 
 def selection_of(prompted: Prompted, session: PromptSession, options: PromptOptions) -> Selection:
@@ -84,7 +100,9 @@ def run(inputs: MethodInputs, options: PromptOptions) -> Selection:
     )
     points = parsed_points(options.point)
     prompted = (
-        session.ask_points(points, progress=inputs.progress)
+        session.ask_points(
+            points, views=inputs.prompt_views or inputs.views, progress=inputs.progress
+        )
         if points
         else session.ask(options.words, progress=inputs.progress)
     )

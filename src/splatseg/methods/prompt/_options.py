@@ -108,7 +108,8 @@ class PromptOptions:
 
     rounds: int = 2
     """Rounds of masks and votes. In the first, masks are chosen by points; in further ones by what
-    is selected so far, rendered into each view. Published 1."""
+    is selected so far, rendered into each view. An object that fits no mask then keeps what the
+    round before gave. Published 1."""
 
     threshold: float | None = None
     """Tau: the share in [0, 1] that a Gaussian must exceed. None is 0.5; published 0.6 with words

@@ -200,7 +200,7 @@ def vote_for(
             depth_tolerance=options.depth_tolerance,
         )
         votes.add_views([len(one) for one in chosen])
-        masks = [[] for _ in prompts]
+        before, masks = masks, [[] for _ in prompts]
         inside = None if shares is None else (shares > options.tau).float().T.contiguous()
         for done, view in enumerate(ordered):
             objects = [at for at, names in enumerate(chosen) if view.name in names]
@@ -215,7 +215,11 @@ def vote_for(
                 masks[at].append((view, mask))
             if progress is not None:
                 progress(turn * len(ordered) + done + 1, options.rounds * len(ordered))
-        shares = votes.shares()
+        found = votes.shares()
+        # What no mask overlaps by half keeps what the round before gave.
+        lost = torch.tensor([not one for one in masks])
+        masks = [one or old for one, old in zip(masks, before, strict=True)]
+        shares = found if shares is None else torch.where(lost[:, None], shares, found)
     return PromptShares(
         shares=torch.zeros(len(prompts), len(gaussians)) if shares is None else shares,
         projected=tuple(len(one) for one in chosen),

@@ -272,12 +272,14 @@ class PromptSession:
         self,
         points: Sequence[tuple[str, float, float]],
         *,
+        views: Sequence[View] = (),
         progress: Callable[[int, int], None] | None = None,
     ) -> Prompted:
         """Select what points by hand show, all together one object, as SA-GS does.
 
         Args:
             points: Name of a view, x and y.
+            views: Those that points may lie in, if not only those that may be used.
             progress: Called with the views done and all there are.
 
         Raises:
@@ -286,11 +288,11 @@ class PromptSession:
         """
         if not points:
             raise InputError("point: expected at least one, got none.")
-        by_name = {view.name: view for view in self._views}
+        by_name = {view.name: view for view in (*self._views, *views)}
         given: dict[str, list[list[float]]] = {}
         for name, x, y in points:
             if name not in by_name:
-                raise InputError(f"point: expected a view that may be used, got {name!r}.")
+                raise InputError(f"point: expected a view of the scene, got {name!r}.")
             camera = by_name[name].camera
             if not (0 <= x < camera.width and 0 <= y < camera.height):
                 raise RangeError(

@@ -1,5 +1,6 @@
 """One method in one scene under a protocol: what the parts of a run share."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,12 @@ class Job:
         )
 
     def layer(
-        self, evidence: str, *, views: tuple[str, ...] = ("train",), source: Path | None = None
+        self,
+        evidence: str,
+        *,
+        views: tuple[str, ...] = ("train",),
+        source: Path | None = None,
+        asked: Mapping[str, object] | None = None,
     ) -> Layer:
         """The method's layer of evidence.
 
@@ -58,12 +64,18 @@ class Job:
             evidence: Its name, in the scene's folder, or in `source`.
             views: Which views it may learn from.
             source: A folder of evidence besides the scene's.
+            asked: Options of the method that say what is asked for, such as words.
         """
         scene = self.scene if source is None else replace(self.scene, source=source)
+        beside = self._options_beside()
+        if asked:
+            method = self.method
+            usual = method.published_options if self.options.published else method.options()
+            beside = replace(beside or usual, **asked)
         made = segment(
             scene,
             self.method,
-            method_options=self._options_beside(),
+            method_options=beside,
             options=SegmentOptions(
                 evidence=evidence,
                 views=views,

@@ -35,6 +35,7 @@ from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.heads import has_classifier
 from splatseg.lift.vocabulary import Vocabulary
 from splatseg.lift.words import WordIndex
+from splatseg.methods.prompt import mask_points
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks.benchmark.chosen import (
     Answer,
@@ -140,6 +141,8 @@ class TargetRun:
 
     def _answers(self, task: TargetTask) -> Answering | None:
         """Who answers a task; nobody where it cannot be asked."""
+        if self._job.method.returns == "selection":
+            return self._by_method(task)
         if self._switches.prompt == "words" and self._job.grounder is None:
             return self._by_words(task)
         if self._selects:
@@ -153,6 +156,37 @@ class TargetRun:
         if isinstance(self._layer, Features) and not has_classifier(self._layer):
             return self._by_prototype(task, prompt, self._layer)
         return self._by_segments(task, prompt)
+
+    def _by_method(self, task: TargetTask) -> BySelection | None:
+        """What a method selects that is asked for one thing at a time.
+
+        It is asked by words where these are given, or a grounder was named to find them; else by
+        points of the mask, or of the mask that the prompter makes of strokes.
+        """
+        words = self._switches.prompt == "words" or self._job.options.grounder is not None
+        given: PromptedMask | None = None
+        asked: dict[str, object] = {"words": (task.words or task.name,)}
+        if self._job.options.grounder is not None:
+            asked["grounder"] = self._job.options.grounder
+        if not words:
+            given = self._prompt(task)
+            if given is None:
+                return None
+            asked = {"point": mask_points(given.view, given.mask)}
+        try:
+            layer = self._job.layer(self._job.seen(words=words).name, asked=asked)
+        except InputError as error:
+            self.notes.append(f"{task.name}: nothing was selected ({error})")
+            return None
+        if not isinstance(layer, Selection):
+            raise InputError(f"method {self._job.method.name}: expected it to give a selection.")
+        found = BySelection(
+            gaussians=self._job.scene.gaussians,
+            selection=layer,
+            switches=self._switches,
+            backend=self._job.backend,
+        )
+        return self._with_cut(task, found, given)
 
     @property
     def _selects(self) -> bool:
