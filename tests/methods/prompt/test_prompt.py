@@ -251,3 +251,9 @@ def test_masks_alone_will_do_for_points(fruit) -> None:
 def test_bad_options(options, message) -> None:
     with pytest.raises(InputError, match=message):
         PromptOptions(**options)
+
+
+def test_published_votes_are_shares_of_all_views(fruit) -> None:
+    """The wall behind the apple is in its mask in a few views of nine."""
+    made = fruit.session(vote="published", rounds=1).ask(["apple"])
+    assert agreement(made.confidence, fruit.ids == APPLE) > 0.9
