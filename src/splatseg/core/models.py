@@ -311,14 +311,15 @@ class Pointmap:
     network's own, and one for both maps of a pair."""
 
     confidence: Float[Tensor, "rows columns"]
-    """How sure each is, from 0 on; numbers of one network compare with each other."""
+    """How sure each is, from 1 on, where it is not at all. Numbers of one network compare with each
+    other."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("points", self.points, (None, None, 3))
         check_shape("confidence", self.confidence, tuple(self.points.shape[:2]))
         check_finite("points", self.points)
-        check_values("confidence", self.confidence, 0.0, math.inf)
+        check_values("confidence", self.confidence, 1.0, math.inf)
 
 
 @runtime_checkable

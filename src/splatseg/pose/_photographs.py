@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import UInt8
 from PIL import Image
+from torch import Tensor
 
 from splatseg.core import Camera, View
 from splatseg.core.boundary import boundary
@@ -215,9 +217,12 @@ def _lenses(kept: Sequence[tuple[Photograph, str]], options: PoseOptions) -> lis
     return lenses
 
 
-def _copy(photograph: Photograph, target: Path, *, longest: int) -> None:
-    if target.is_file():
-        return
+def read_reduced(photograph: Photograph, *, longest: int) -> UInt8[Tensor, "height width 3"]:
+    """A photograph upright and, where it is larger, reduced to a longest side.
+
+    Raises:
+        FileFormatError: If it cannot be decoded.
+    """
     camera = Camera(
         width=photograph.width,
         height=photograph.height,
@@ -227,8 +232,14 @@ def _copy(photograph: Photograph, target: Path, *, longest: int) -> None:
         cy=0.0,
         cam_from_world=torch.eye(4, dtype=torch.float64),
     )
-    view = View(name=target.stem, camera=camera, image=photograph.path)
-    pixels = load_image(view, longest=longest).numpy()
+    view = View(name="photograph", camera=camera, image=photograph.path)
+    return load_image(view, longest=longest)
+
+
+def _copy(photograph: Photograph, target: Path, *, longest: int) -> None:
+    if target.is_file():
+        return
+    pixels = read_reduced(photograph, longest=longest).numpy()
     temporary = target.with_suffix(".tmp")
     # Little compression: it is read twice and thrown away.
     Image.fromarray(pixels).save(temporary, format="PNG", compress_level=1)

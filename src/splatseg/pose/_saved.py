@@ -12,7 +12,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
@@ -39,7 +39,11 @@ _ENDS = 65536
 
 def fingerprint(files: Sequence[Path], options: PoseOptions) -> str:
     """What poses depend on: names, sizes and ends of the photographs, and the options."""
-    asked = {key: value for key, value in asdict(options).items() if key != "threads"}
+    return content_digest(files, {k: v for k, v in asdict(options).items() if k != "threads"})
+
+
+def content_digest(files: Sequence[Path], asked: Mapping[str, Any]) -> str:
+    """A digest of names, sizes and ends of photographs, and of what was asked of them."""
     digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode())
     for path in files:
         size = path.stat().st_size

@@ -7,6 +7,9 @@ from splatseg.synthetic._classes import STREET_CLASSES as STREET_CLASSES
 from splatseg.synthetic._drive import drive_cameras as drive_cameras
 from splatseg.synthetic._labels import machine_labels as machine_labels
 from splatseg.synthetic._mesh import scene_mesh as scene_mesh
+from splatseg.synthetic._pointmaps import PointmapErrors as PointmapErrors
+from splatseg.synthetic._pointmaps import SyntheticPointmaps as SyntheticPointmaps
+from splatseg.synthetic._pointmaps import synthetic_pointmaps as synthetic_pointmaps
 from splatseg.synthetic._raycast import Truth as Truth
 from splatseg.synthetic._raycast import cast as cast
 from splatseg.synthetic._raycast import render_truth as render_truth
