@@ -8,8 +8,7 @@ from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.errors import InputError
 from splatseg.methods.prompt import PromptOptions
 from splatseg.prompting.prompts import SelectionPrompt, Similar, Solid, ViewPrompt
-from splatseg.tasks import Selected, SelectOptions, TextModels, TextOptions, select_text
-from splatseg.tasks._observer import Observer
+from splatseg.tasks import Observer, Selected, SelectOptions, TextModels, TextOptions, select_text
 from splatseg.tasks.named_models import model_of
 
 

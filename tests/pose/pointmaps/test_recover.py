@@ -122,6 +122,25 @@ def test_pairs_are_chosen_as_asked(tmp_path, photographed) -> None:
         assert found.report.pairs == wanted
 
 
+def test_a_network_is_asked_about_all_pairs_or_about_those_that_look_alike(
+    tmp_path, photographed
+) -> None:
+    photographs = photographed.write(tmp_path / "photos")
+    for complete_up_to, neighbours, pairs in ((8, 1, 56), (7, 1, 14)):
+        network = Network(photographed, photographed.answers(complete(8)))
+        options = PointmapOptions(
+            samples=100, iterations=2, max_points=100,
+            complete_up_to=complete_up_to, neighbours=neighbours,
+        )  # fmt: skip
+        found = recover_from_pointmaps(photographs, network, options=options)
+        # Shades without a feature look like nothing: each with the next by name is left.
+        assert found.report.pairs == len(network.asked) == pairs
+    one_way = PointmapOptions(
+        samples=100, iterations=2, max_points=100, pairs="complete", symmetric=False
+    )
+    assert recover_from_pointmaps(photographs, network, options=one_way).report.pairs == 28
+
+
 def test_pairs_that_are_missing_are_named(tmp_path, photographed) -> None:
     photographs = photographed.write(tmp_path / "photos")
     apart = photographed.record(tmp_path / "apart", [(0, 1), (1, 2), (3, 4), (5, 6), (6, 7)])
