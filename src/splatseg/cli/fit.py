@@ -126,9 +126,15 @@ class Command:
     format: Format = "auto"
     strict: Strict = False
 
-    poses: Literal["auto", "given", "sfm"] = _SCENE.poses
+    poses: Literal["auto", "given", "sfm", "pointmaps"] = _SCENE.poses
     """Where cameras come from. given: DATA. sfm: they are found from the photographs alone, by
-    structure from motion, and kept in SCENE/capture. auto: sfm where DATA has none."""
+    structure from motion, and kept in SCENE/capture. pointmaps: from what a network such as DUSt3R
+    says of pairs of photographs, with a dense cloud to start from; for few photographs. auto: sfm
+    where DATA has none."""
+
+    pointmaps: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_MODEL")] = None
+    """Whose, with --poses pointmaps: a folder of recorded pointmaps, or a model of another package,
+    MODEL[=WEIGHTS][,OPTION=VALUE...]. None is DATA/pointmaps."""
 
     frames: int = _SCENE.frames
     """Frames to take from DATA where it is a video."""
@@ -146,6 +152,7 @@ def run(command: Command) -> None:
             format=command.format,
             strict=command.strict,
             poses=command.poses,
+            pointmaps=command.pointmaps,
             frames=command.frames,
             resume=command.resume,
             overwrite=command.overwrite,

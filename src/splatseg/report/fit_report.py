@@ -43,7 +43,7 @@ class FitReportData:
     """The words that started it."""
 
     poses: Mapping[str, Any] | None = None
-    """What structure from motion said, where it found the poses."""
+    """What was said by what found the poses, where they did not come with the capture."""
 
     timings: Mapping[str, float] = field(default_factory=dict[str, float])
     """Seconds of the command by part: poses, optimisation, what follows it."""
@@ -270,7 +270,7 @@ def _sizes(views: Sequence[View]) -> str:
 
 
 def _pose_rows(poses: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What structure from motion says of itself, as far as it fits into a cell."""
+    """What is said of how poses were found, as far as it fits into a cell."""
     rows: list[tuple[str, str]] = []
     for name, value in poses.items():
         words = f"{value:.3f}" if isinstance(value, float) else str(value)

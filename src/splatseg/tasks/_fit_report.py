@@ -51,6 +51,7 @@ def score_and_report(
     scoring: bool,
     command: str = "",
     timings: Mapping[str, float] | None = None,
+    poses: Mapping[str, Any] | None = None,
 ) -> FittedScene:
     """Score the held-out views, write SCENE/reports/fit.html and fit.json.
 
@@ -66,6 +67,7 @@ def score_and_report(
         scoring: Whether held-out views are scored.
         command: The words that started it; may be empty.
         timings: Seconds by part of the command until now.
+        poses: How cameras were found; None takes what is kept with the scene.
     """
     began = time.monotonic()
     views = [view for view in capture.test_views if view.image is not None]
@@ -85,7 +87,7 @@ def score_and_report(
         held_out=len(views),
         file_bytes=(root / GAUSSIANS_FILE).stat().st_size,
         command=command,
-        poses=_poses(root),
+        poses=_poses(root) if poses is None else poses,
         facts={"backend": backend},
     )
     pairs = None

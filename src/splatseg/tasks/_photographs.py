@@ -16,9 +16,11 @@ from splatseg.pose import (
     is_video,
     recover_poses,
 )
+from splatseg.pose.pointmaps import PointmapReport
 from splatseg.tasks._observer import Observer
+from splatseg.tasks._pointmaps import capture_of_pointmaps
 
-Poses = Literal["auto", "given", "sfm"]
+Poses = Literal["auto", "given", "sfm", "pointmaps"]
 """Where cameras come from."""
 
 # So many photographs without a pose are named; poses.json names all.
@@ -32,10 +34,12 @@ def capture_of(
     format: str,
     strict: bool,
     poses: Poses,
+    pointmaps: str | None,
+    max_points: int | None,
     frames: int,
     seed: int,
     observer: Observer,
-) -> tuple[Capture, PoseReport | None]:
+) -> tuple[Capture, PoseReport | PointmapReport | None]:
     """Read a capture, or find the poses of photographs or a video and say how that went.
 
     Args:
@@ -45,6 +49,8 @@ def capture_of(
         format: How a capture is read; see `read_capture`.
         strict: Whether a capture may list photographs that are not there; see `read_capture`.
         poses: Where cameras come from.
+        pointmaps: Whose pointmaps, with `poses` pointmaps; see `capture_of_pointmaps`.
+        max_points: Most points of a cloud from pointmaps; None leaves it to them.
         frames: Frames taken from a video.
         seed: Of everything that is drawn at random.
         observer: Is told of the progress and of what was found.
@@ -52,8 +58,14 @@ def capture_of(
     Returns:
         The capture, and how its poses were found; None where they came with it.
     """
+    if pointmaps is not None and poses != "pointmaps":
+        raise InputError(f"pointmaps: expected none with `poses` {poses}, got {pointmaps!r}.")
     if not _without_poses(data, format, poses):
         return read_capture(data, format=format, strict=strict), None
+    if poses == "pointmaps":
+        return capture_of_pointmaps(
+            data, pointmaps, scene=scene, max_points=max_points, seed=seed, observer=observer
+        )
     check_utf8(data)
     options = PoseOptions(seed=seed, frames=frames)
     with observer.pose_stage() as step:
@@ -64,9 +76,9 @@ def capture_of(
 
 
 def _without_poses(data: Path, format: str, poses: Poses) -> bool:
-    if poses == "sfm":
+    if poses in ("sfm", "pointmaps"):
         if format != "auto":
-            raise InputError(f"format: expected none with `poses` sfm, got {format!r}.")
+            raise InputError(f"format: expected none with `poses` {poses}, got {format!r}.")
         return True
     if poses == "given" or format != "auto":
         return False

@@ -26,6 +26,7 @@ from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scene import save_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.pose import PoseReport
+from splatseg.pose.pointmaps import PointmapReport
 from splatseg.render import BackendName
 from splatseg.report.fit_verdict import FitVerdict
 from splatseg.tasks._depth_evidence import with_depth_evidence
@@ -47,8 +48,12 @@ class MakeSceneOptions(CheckpointOptions):
     """Refuse a capture that lists a photograph which is not there."""
 
     poses: Poses = "auto"
-    """Where cameras come from: given, the capture; sfm, from the photographs alone; auto, sfm
-    where the capture has none."""
+    """Where cameras come from: given, the capture; sfm, from the photographs alone; pointmaps,
+    from pointmaps of pairs of them; auto, sfm where the capture has none."""
+
+    pointmaps: str | None = None
+    """Whose pointmaps, with poses pointmaps: a folder of recorded ones, or the name of a model;
+    None is the folder ``pointmaps`` in that of the photographs."""
 
     frames: int = 120
     """Frames to take from a video."""
@@ -91,7 +96,7 @@ class MadeScene:
     report: Path
     """The page on the fit."""
 
-    poses: PoseReport | None
+    poses: PoseReport | PointmapReport | None
     """How poses were found; None where they came with the capture."""
 
     verdict: FitVerdict
@@ -166,6 +171,7 @@ def fit_capture(
             scoring=not stopped,
             command=command,
             timings=timings,
+            poses=None if poses is None else poses.as_json(),
         )
         # Not before the report: who is stopped there can resume, and gets it.
         if not (stopped or options.keep_checkpoint):
@@ -192,7 +198,7 @@ def _capture(
     options: MakeSceneOptions,
     fit_options: FitOptions,
     observer: Observer,
-) -> tuple[Capture, PoseReport | None]:
+) -> tuple[Capture, PoseReport | PointmapReport | None]:
     """The capture with its poses; the observer is told what it is."""
     if isinstance(data, Capture):
         capture, poses = data, None
@@ -203,6 +209,9 @@ def _capture(
             format=options.format,
             strict=options.strict,
             poses=options.poses,
+            pointmaps=options.pointmaps,
+            # A fixed fit keeps every point; other strategies thin the cloud themselves.
+            max_points=fit_options.max_gaussians if fit_options.strategy == "fixed" else None,
             frames=options.frames,
             seed=fit_options.seed,
             observer=observer,
