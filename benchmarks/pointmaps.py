@@ -2,6 +2,7 @@
 
     python benchmarks/pointmaps.py ../shared/data/office --views 24 --seeds 3
     python benchmarks/pointmaps.py ../shared/data/office --views 6 --sfm
+    python benchmarks/pointmaps.py ../shared/data/office --views 24 --window 4 --fit 500
     python benchmarks/pointmaps.py ../shared/data/office --views 24 --record ROOM
 
 Photographs are taken evenly from the train views. Pointmaps of pairs of them are made from true
@@ -19,20 +20,23 @@ import shutil
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from poses import compare
 
-from splatseg.core import Camera, View
+from splatseg.core import Camera, Capture, View
 from splatseg.errors import SplatsegError
+from splatseg.fit import FitOptions
 from splatseg.io.captures import read_capture
 from splatseg.io.depths import read_depth_map
-from splatseg.io.pointmaps import RecordedPointmaps, create_pointmaps
+from splatseg.io.pointmaps import RecordedPointmaps, create_pointmaps, open_pointmaps
 from splatseg.pose import recover_poses
 from splatseg.pose.pointmaps import PointmapOptions, recover_from_pointmaps
 from splatseg.synthetic import PointmapErrors, SyntheticPointmaps, synthetic_pointmaps
+from splatseg.tasks import fit_capture
 
 GOALS = {"rotation median deg": 0.5, "centre median % of extent": 1.0, "focal off": 0.01}
 
@@ -108,6 +112,32 @@ def measured(folder: Path, source: RecordedPointmaps, given: dict[str, Camera], 
     }
 
 
+def fitted(capture: Capture, *, steps: int) -> dict[str, Any]:
+    """A fit of so many steps, scored on the photographs it holds out."""
+    options = FitOptions.preset("quick").with_length(minutes=None, steps=steps)
+    options = replace(options, max_gaussians=60_000)
+    with tempfile.TemporaryDirectory() as temporary:
+        made = fit_capture(capture, Path(temporary) / "scene", fit_options=options, backend="cpu")
+    return {
+        "steps": made.result.steps,
+        "gaussians": len(made.result.gaussians),
+        "psnr": None if made.scores is None else round(made.scores.psnr, 2),
+    }
+
+
+def fits(capture: Path, views: list[View], folder: Path, steps: int) -> None:
+    """Fits from recorded pointmaps and from the given cameras and points, same views held out."""
+    source = open_pointmaps(folder / "photos" / "pointmaps")
+    found = recover_from_pointmaps(folder / "photos", source).capture
+    print(json.dumps({"poses": "pointmaps", **fitted(found, steps=steps)}), flush=True)
+    held_out = {file_name(view) for view in found.test_views}
+    given = [
+        replace(view, split="test" if file_name(view) in held_out else "train") for view in views
+    ]
+    same = replace(read_capture(capture), views=tuple(given))
+    print(json.dumps({"poses": "given", **fitted(same, steps=steps)}), flush=True)
+
+
 def main() -> int:
     """Measure and print a line of JSON a run."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -119,6 +149,7 @@ def main() -> int:
     parser.add_argument("--published", action="store_true", help="DUSt3R's alignment as well")
     parser.add_argument("--sfm", action="store_true")
     parser.add_argument("--record", type=Path)
+    parser.add_argument("--fit", type=int, help="steps of fits from pointmaps and given poses")
     arguments = parser.parse_args()
     views = chosen(arguments.capture, arguments.views)
     given = {file_name(view): view.camera for view in views}
@@ -143,6 +174,8 @@ def main() -> int:
                 print(json.dumps(row), flush=True)
                 off = {**row, "focal off": abs(row["focal ratio"] - 1)}
                 missed |= kind == "robust" and any(off[k] > v for k, v in GOALS.items())
+            if arguments.fit is not None:
+                fits(arguments.capture, views, folder, arguments.fit)
         if arguments.record is not None:
             break
     return int(missed)
