@@ -106,6 +106,7 @@ struct SubsetTree;  // subset.h
 struct SubsetScratch;
 struct Matching;    // retrieve.h
 struct Matched;
+struct RowProducts;
 struct Bundle;
 struct Candidates;
 
@@ -227,6 +228,9 @@ struct Kernels {
 
   // Scores of the rows of panels [begin, end) against queries, see retrieve.h.
   void (*match_panels)(const Matching&, int64_t begin, int64_t end, const Matched&);
+
+  // Products of rows [begin, end) with vectors, see row_products.h.
+  void (*row_products)(const RowProducts&, int64_t begin, int64_t end);
 };
 
 // The kernels chosen for this machine, or by set_isa.

@@ -25,6 +25,7 @@ void register_csr(nb::module_& m);
 void register_memberships(nb::module_& m);
 void register_neighbours(nb::module_& m);
 void register_retrieve(nb::module_& m);
+void register_row_products(nb::module_& m);
 void register_voxels(nb::module_& m);
 }  // namespace splatseg
 
@@ -400,5 +401,6 @@ NB_MODULE(_native, m) {
   register_memberships(m);
   register_neighbours(m);
   register_retrieve(m);
+  register_row_products(m);
   register_voxels(m);
 }

@@ -35,6 +35,7 @@ SPLATSEG_KERNEL(points_within)
 SPLATSEG_KERNEL(mean_distances)
 SPLATSEG_KERNEL(points_near)
 SPLATSEG_KERNEL(match_panels)
+SPLATSEG_KERNEL(row_products)
 
 const Kernels& table() {
   static const Kernels kernels = {SPLATSEG_TEXT(SPLATSEG_ISA), project, recolour, find_tiles, forward_colour,
@@ -42,7 +43,8 @@ const Kernels& table() {
                                   chain, block_weights, block_sums, blocks_forward, blocks_adjoint,
                                   tile_weights, gather_rows, scatter_rows, ids_below,
                                   sparse_adjoint, argmax, nearest_points, count_points,
-                                  points_within, mean_distances, points_near, match_panels};
+                                  points_within, mean_distances, points_near, match_panels,
+                                  row_products};
   return kernels;
 }
 

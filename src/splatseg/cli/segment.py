@@ -13,7 +13,7 @@ import tyro
 from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, SceneFolder, Seed
 from splatseg.cli._words import option_value
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
-from splatseg.core import UNLABELLED, Features, Labels, Scene, Selection
+from splatseg.core import UNLABELLED, Features, Labels, Scene, Selection, VoxelFeatures
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
@@ -246,7 +246,7 @@ def _facts(result: Segmentation, path: Path) -> dict[str, Any]:
         facts["gaussians"] = len(result.layer)
         facts["selected"] = result.layer.count
         facts["confidence"] = None if mean is None else round(mean, 4)
-    elif not isinstance(result.layer, Features):
+    elif not isinstance(result.layer, Features | VoxelFeatures):
         labels = result.labels
         facts["gaussians"] = len(labels)
         facts["labelled"] = int((labels.ids != UNLABELLED).sum())
@@ -271,6 +271,8 @@ def _check_outputs(command: Command, method: Method) -> None:
 def _summary(result: Segmentation, seconds: float) -> str:
     """One line on the layer."""
     views = len(result.views)
+    if isinstance(result.layer, VoxelFeatures):
+        return f"{result.layer!r}, from {counted(views, 'view')} in {seconds:.1f} s"
     if isinstance(result.layer, Features):
         count, channels = result.layer.values.shape
         return (

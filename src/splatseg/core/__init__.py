@@ -85,3 +85,8 @@ from splatseg.core.surfaces import LabelledMesh as LabelledMesh
 from splatseg.core.surfaces import LabelledPoints as LabelledPoints
 from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
 from splatseg.core.tree_levels import TreeLevel as TreeLevel
+from splatseg.core.voxel_features import StoredPrecision as StoredPrecision
+from splatseg.core.voxel_features import StoredTable as StoredTable
+from splatseg.core.voxel_features import VoxelFeatures as VoxelFeatures
+from splatseg.core.voxel_features import plain_features as plain_features
+from splatseg.core.voxels import VoxelGrid as VoxelGrid

@@ -13,6 +13,7 @@ from splatseg.core.evidence import UNLABELLED
 from splatseg.core.gaussians import Gaussians
 from splatseg.core.instance_tree import InstanceTree, Layer
 from splatseg.core.layers import Features, Labels, Selection
+from splatseg.core.voxel_features import VoxelFeatures
 from splatseg.errors import InputError, RangeError, ShapeError
 
 NEW = -1
@@ -148,6 +149,12 @@ def apply_rows(layer: Layer, edited: Edited) -> Layer:
                 taken,
                 values=_filled(taken.values, new, 0),
                 weights=_shared(_filled_or_none(taken.weights, new, 0), fractions),
+            )
+        case VoxelFeatures():
+            return replace(
+                taken,
+                rows=_filled(taken.rows, new, UNLABELLED),
+                shares=_filled_or_none(taken.shares, new, 0),
             )
         case Selection():
             return replace(

@@ -17,6 +17,7 @@ from splatseg.core.soft_labels import merged_candidates
 from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
 from splatseg.core.tree_levels import TreeLevel as TreeLevel
 from splatseg.core.tree_levels import tree_level as tree_level
+from splatseg.core.voxel_features import VoxelFeatures
 from splatseg.errors import InputError, RangeError
 
 _FOLLOWS: dict[TreeLevel, tuple[TreeLevel | None, ...]] = {
@@ -285,7 +286,7 @@ class InstanceTree:
         )
 
 
-FlatLayer = Labels | Features | Selection
+FlatLayer = Labels | Features | VoxelFeatures | Selection
 """Layers without levels."""
 
 Layer = FlatLayer | InstanceTree
@@ -309,7 +310,9 @@ def layer_address(text: str) -> tuple[str, TreeLevel | float | None]:
 
 @boundary
 def layer_kind(layer: Layer) -> str:
-    """What a layer is called in a sentence: labels, features, selection or tree."""
+    """What a layer is called in a sentence: labels, features, voxels, selection or tree."""
+    if isinstance(layer, VoxelFeatures):
+        return "voxels"
     return "tree" if isinstance(layer, InstanceTree) else type(layer).__name__.lower()
 
 

@@ -19,6 +19,7 @@ from splatseg.core import (
     Layer,
     LayerInfo,
     Selection,
+    VoxelFeatures,
 )
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.lift.affinity import KIND, AffinityHead
@@ -83,6 +84,9 @@ def _kept(layer: Layer) -> tuple[Tensor | None, ...]:
     """The arrays of a layer that label maps and answers come from."""
     if isinstance(layer, Features):
         return (layer.values, *_head(layer))
+    if isinstance(layer, VoxelFeatures):
+        table = layer.table
+        return (table.codes, table.scales, table.codebooks, layer.rows, layer.shares)
     if isinstance(layer, Selection):
         return (layer.mask, layer.confidence)
     labels = layer.labels if isinstance(layer, InstanceTree) else layer

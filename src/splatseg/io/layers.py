@@ -22,6 +22,7 @@ from splatseg.core import (
     LayerInfo,
     Selection,
     TreeNode,
+    VoxelFeatures,
     layer_info_from_json,
     layer_info_from_metadata,
     layer_info_to_json,
@@ -33,16 +34,20 @@ from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import parse_object
+from splatseg.io.layer_arrays import checked_array
 from splatseg.io.npz import open_npz
 from splatseg.io.npz_writing import save_arrays
+from splatseg.io.voxel_arrays import VOXEL_ARRAYS, voxel_arrays, voxels_of
 
 FORMAT = "splatseg-layer"
-VERSION = 4
+VERSION = 5
 """Versions up to it are read. Trees came with version 2, `LayerInfo` with version 3, the confidence
-of selections and the shares of trees with version 4. A file is of the first version that has all
-it holds, so that older programs refuse no layer that they can read whole."""
+of selections and the shares of trees with version 4, voxels with version 5. A file is of the first
+version that has all it holds, so that older programs refuse no layer that they can read whole."""
 
 _WITHOUT_CONFIDENCE = 3
+_WITH_CONFIDENCE = 4
+_WITH_VOXELS = 5
 
 _INFO_VERSION = 3
 """Files before it have a flat object of any keys instead, under ``metadata``."""
@@ -50,7 +55,7 @@ _INFO_VERSION = 3
 _HEADER = "header"
 _ARRAYS = (
     _HEADER, "ids", "confidence", "candidates", "shares", "evidence", "effective_views",
-    "inferred", "values", "weights", "mask",
+    "inferred", "values", "weights", "mask", *VOXEL_ARRAYS,
 )  # fmt: skip
 """All that some kind of layer has; nothing else of a file is unpacked."""
 
@@ -90,14 +95,17 @@ def save_layer(layer: Layer, path: Path) -> None:
                 "nodes": [node_row(node) for node in layer.nodes],
             }
             if labels.candidates is not None:
-                header |= {"version": VERSION}
+                header |= {"version": _WITH_CONFIDENCE}
             arrays = _label_arrays(labels)
         case Selection():
             header |= {"kind": "selection"}
             arrays = {"mask": layer.mask.cpu().numpy()}
             if layer.confidence is not None:
-                header |= {"version": VERSION}
+                header |= {"version": _WITH_CONFIDENCE}
                 arrays |= {"confidence": _floats(layer.confidence.float())}
+        case VoxelFeatures():
+            fields, arrays = voxel_arrays(layer)
+            header |= {"kind": "voxels", "version": _WITH_VOXELS, **fields}
     header["info"] = layer_info_to_json(layer.info)
     with atomic_file(path, durable=True) as temporary:
         save_arrays(header, arrays, temporary, name=path)
@@ -141,8 +149,8 @@ def _layer(
             return _labels(path, header, arrays, info)
         case "features":
             return Features(
-                values=torch.from_numpy(_array(path, arrays, "values", "f", (count, None))),
-                weights=torch.from_numpy(_array(path, arrays, "weights", "f", (count,)))
+                values=torch.from_numpy(checked_array(path, arrays, "values", "f", (count, None))),
+                weights=torch.from_numpy(checked_array(path, arrays, "weights", "f", (count,)))
                 if "weights" in arrays
                 else None,
                 info=info,
@@ -150,16 +158,18 @@ def _layer(
         case "tree":
             return _tree(path, header, arrays, info)
         case "selection":
-            mask = torch.from_numpy(_array(path, arrays, "mask", "?", (count,)))
+            mask = torch.from_numpy(checked_array(path, arrays, "mask", "?", (count,)))
             confidence = (
-                torch.from_numpy(_array(path, arrays, "confidence", "f4", (count,)))
+                torch.from_numpy(checked_array(path, arrays, "confidence", "f4", (count,)))
                 if int(header["version"]) > _WITHOUT_CONFIDENCE and "confidence" in arrays
                 else None
             )
             return Selection(mask=mask, confidence=confidence, info=info)
+        case "voxels":
+            return voxels_of(path, header, arrays, info)
         case kind:
             raise FileFormatError(
-                f"{path}: expected a layer of labels, features, a tree or a selection, "
+                f"{path}: expected a layer of labels, features, voxels, a tree or a selection, "
                 f"got {quoted(kind)}."
             )
 
@@ -174,16 +184,18 @@ def _labels(
 
     def optional(name: str, kind: str) -> Tensor | None:
         found = name in arrays
-        return torch.from_numpy(_array(path, arrays, name, kind, (count,))) if found else None
+        return (
+            torch.from_numpy(checked_array(path, arrays, name, kind, (count,))) if found else None
+        )
 
     return Labels(
-        ids=_from_file(_array(path, arrays, "ids", "i4", (count,))),
-        confidence=torch.from_numpy(_array(path, arrays, "confidence", "f4", (count,))),
+        ids=_from_file(checked_array(path, arrays, "ids", "i4", (count,))),
+        confidence=torch.from_numpy(checked_array(path, arrays, "confidence", "f4", (count,))),
         background=_background(path, header),
-        candidates=_from_file(_array(path, arrays, "candidates", "i4", (count, None)))
+        candidates=_from_file(checked_array(path, arrays, "candidates", "i4", (count, None)))
         if pair
         else None,
-        shares=torch.from_numpy(_array(path, arrays, "shares", "f4", (count, None)))
+        shares=torch.from_numpy(checked_array(path, arrays, "shares", "f4", (count, None)))
         if pair
         else None,
         evidence=optional("evidence", "f4"),
@@ -286,37 +298,3 @@ def _info(path: Path, header: Mapping[str, Any]) -> LayerInfo:
 def _background(path: Path, header: Mapping[str, Any]) -> int:
     value = json_integer(header.get("background"), where=f"{path}: background", high=_MAX_ID)
     return UNLABELLED if value == _VOID else value
-
-
-def _array(
-    path: Path,
-    arrays: Mapping[str, NDArray[Any]],
-    name: str,
-    kind: str,
-    shape: tuple[int | None, ...],
-) -> NDArray[Any]:
-    """An array of a layer after checking its type (exact, or its kind letter), shape, values."""
-    array = arrays.get(name)
-    if array is None:
-        raise FileFormatError(f"{path}: expected an array {name!r}, which is not there.")
-    fits = array.dtype.kind == kind if kind == "f" else array.dtype == np.dtype(kind)
-    if (
-        not fits
-        or array.ndim != len(shape)
-        or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True))
-    ):
-        wanted = ", ".join("any" if want is None else str(want) for want in shape)
-        raise FileFormatError(
-            f"{path}: expected {name!r} of type {kind} and shape ({wanted}), "
-            f"got {array.dtype} of {array.shape}."
-        )
-    if kind.startswith("f"):
-        bad = int(array.size - np.isfinite(array).sum())
-        if bad:
-            raise FileFormatError(
-                f"{path}: expected finite {name!r}, got {bad} of {array.size} values that are NaN "
-                "or infinite."
-            )
-    elif kind.startswith("i") and array.size and array.min() < 0:
-        raise FileFormatError(f"{path}: expected {name!r} of 0 (none) or more, got {array.min()}.")
-    return array

@@ -21,7 +21,9 @@ from splatseg.core import (
     PointLabels,
     RenderableLayer,
     Selection,
+    VoxelFeatures,
     flat_layer,
+    plain_features,
     tree_level,
 )
 from splatseg.errors import InputError
@@ -89,9 +91,13 @@ def field_layer(layers: Mapping[str, Layer], address: str) -> FieldLayer:
         raise InputError(f"layer: expected one of the field ({known}), got {name!r}.")
     if isinstance(layer, Features):
         return _of_features(name, layer, part if at else "rendered")
+    if isinstance(layer, VoxelFeatures):
+        return _PlainFeatures(name, layer)
     flat = flat_layer(layer, tree_level(part) if at else None, name=name)
     if isinstance(flat, Features):
         return _of_features(name, flat, "rendered")
+    if isinstance(flat, VoxelFeatures):
+        return _PlainFeatures(name, flat)
     return _LabelLayer(name, flat)
 
 
@@ -218,7 +224,7 @@ class _TrainedLayer(FieldLayer):
 class _PlainFeatures(FieldLayer):
     """Features that nobody knows how to read."""
 
-    def __init__(self, name: str, features: Features) -> None:
+    def __init__(self, name: str, features: Features | VoxelFeatures) -> None:
         self._name = name
         self._features = features
 
@@ -234,7 +240,7 @@ class _PlainFeatures(FieldLayer):
 
     @override
     def features(self, view: ViewRenderer) -> Tensor:
-        return view.scores(self._features.values)[0]
+        return view.scores(plain_features(self._features).values)[0]
 
     @override
     def label_map(self, view: ViewRenderer) -> LabelMap:

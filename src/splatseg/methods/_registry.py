@@ -14,8 +14,8 @@ from splatseg.methods._method import Method
 ENTRY_POINT_GROUP = "splatseg.methods"
 
 _OWN = (
-    "uplift", "features", "objects", "vote", "associate", "identity", "saga", "cosseg", "logits",
-    "probabilities", "prompt",
+    "uplift", "features", "objects", "voxels", "vote", "associate", "identity", "saga", "cosseg",
+    "logits", "probabilities", "prompt",
 )  # fmt: skip
 _REGISTERED: dict[str, Method] = {}
 

@@ -3,7 +3,16 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from splatseg.core import FeatureMap, Features, InstanceTree, Labels, Layer, Scene, View
+from splatseg.core import (
+    FeatureMap,
+    Features,
+    InstanceTree,
+    Labels,
+    Layer,
+    Scene,
+    View,
+    VoxelFeatures,
+)
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import evidence_names, find_evidence, open_evidence
@@ -169,6 +178,8 @@ def _open_features(offer: Offer) -> OpenedSource | None:
     if name is None:
         return None
     layer = whole_layer(offer.scene, name, offer.layers, option="from_layer")
+    if isinstance(layer, VoxelFeatures):
+        layer = layer.features()
     if not isinstance(layer, Features):
         if offer.options.source == "auto":
             return None

@@ -16,6 +16,7 @@ from splatseg.core import (
     Scene,
     Similarity,
     View,
+    VoxelFeatures,
     with_info,
 )
 from splatseg.core.boundary import boundary, convert_fields
@@ -190,7 +191,7 @@ def _layers_to_file(work: _Work, output: Path) -> AttachedLayers:
     scene = load_scene(work.source)
     classes = None if options.layer is None else layer_of(scene, options.layer)
     instances = None if options.instances is None else layer_of(scene, options.instances)
-    if isinstance(classes, Features) or not isinstance(instances, Labels | None):
+    if isinstance(classes, Features | VoxelFeatures) or not isinstance(instances, Labels | None):
         raise InputError("layer, instances: expected layers of labels.")
     if classes is None and instances is None:
         known = ", ".join(scene_layer_names(work.source)) or "it has none"

@@ -17,6 +17,7 @@ from splatseg.core import (
     Layer,
     Scene,
     View,
+    VoxelFeatures,
 )
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError
@@ -217,6 +218,9 @@ def _layer_kind(layer: Layer) -> str:
         return f"labels of {len(layer.present)} ids"
     if isinstance(layer, Features):
         return f"features of {layer.values.shape[1]} channels"
+    if isinstance(layer, VoxelFeatures):
+        table = layer.table
+        return f"{len(table)} voxels of {table.channels} channels in {table.precision}"
     if isinstance(layer, InstanceTree):
         levels = Counter(node.level for node in layer.nodes)
         counts = ", ".join(f"{levels[level]} {level}s" for level in TREE_LEVELS)

@@ -351,8 +351,7 @@ def _classes_to_merge(
         raise InputError(f"classes: goes with evidence of instances, not of {evidence.kind}.")
     layer = layer_of(scene, options.classes, layers)
     if not isinstance(layer, Labels):
-        kind = "features" if isinstance(layer, Features) else "a selection"
-        raise InputError(f"classes: expected a layer of labels, got {kind}.")
+        raise InputError(f"classes: expected a layer of labels, got {layer_kind(layer)}.")
     table = evidence.classes or scene.classes
     if isinstance(evidence, TrackedEvidence):
         table = evidence.maps.table or scene.classes

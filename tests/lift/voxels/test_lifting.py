@@ -131,7 +131,7 @@ def test_one_feature_everywhere_is_what_every_voxel_gets(scene, rule: str, avera
         grid,
         views,
         constant_grids(views, [[2.0, -1.0]] * 3),
-        options=HitOptions(rule=rule, average=average),
+        options=HitOptions(hits=rule, average=average),
         depths=optical_depths(grid, gaussians, rows),
         gaussians=gaussians,
         rows=rows,
@@ -167,7 +167,7 @@ def test_weights_of_w_are_uplift_where_each_gaussian_has_its_voxel(rng) -> None:
     grid = voxelise(gaussians.means, 0.5)
     rows = assign_voxels(grid, gaussians.means).rows[:, 0].long()
     lifted = lift_to_voxels(
-        grid, views, features, options=HitOptions(rule="weights"),
+        grid, views, features, options=HitOptions(hits="weights"),
         gaussians=gaussians, rows=rows, backend=BACKEND,
     )  # fmt: skip
     own = uplift_features(gaussians, views, features, backend=BACKEND)
@@ -208,7 +208,7 @@ def test_several_hits_reach_what_is_behind(scene) -> None:
     depths = optical_depths(grid, gaussians, rows)
 
     def lifted(hits: int):
-        options = HitOptions(rule="several", hits=hits)
+        options = HitOptions(hits="several", max_hits=hits)
         return lift_to_voxels(grid, views, features, options=options, depths=depths)
 
     assert bool(((lifted(1).totals == 0) & (lifted(4).totals > 0)).any())
@@ -224,7 +224,7 @@ def test_nearest_and_trilinear_by_hand() -> None:
     far = assign_voxels(grid, points, options=AssignmentOptions(max_distance=None))
     assert far.rows[:, 0].tolist() == [0, 1, 0, 1, 1]
     mixed = assign_voxels(
-        grid, points, options=AssignmentOptions(rule="trilinear", max_distance=3.0)
+        grid, points, options=AssignmentOptions(interpolation="trilinear", max_distance=3.0)
     )
     table = torch.tensor([10.0, 20.0, 0.0])  # the last row stands for -1
     value = (mixed.shares * table[mixed.rows.long()]).sum(dim=1)
@@ -268,9 +268,9 @@ def test_what_is_no_surface_is_left_out() -> None:
 def test_bad_input_is_refused(scene) -> None:
     gaussians, grid, views, features = scene
     with pytest.raises(InputError, match="depths: expected the optical depth"):
-        lift_to_voxels(grid, views, features, options=HitOptions(rule="several"))
+        lift_to_voxels(grid, views, features, options=HitOptions(hits="several"))
     with pytest.raises(InputError, match="gaussians, rows: expected"):
-        lift_to_voxels(grid, views, features, options=HitOptions(rule="weights"))
+        lift_to_voxels(grid, views, features, options=HitOptions(hits="weights"))
     with pytest.raises(InputError, match="features of every view"):
         lift_to_voxels(grid, [*views, View(name="w", camera=views[0].camera)], features)
     broken = random_grids(np.random.default_rng(1), views)
@@ -287,7 +287,7 @@ def test_bad_input_is_refused(scene) -> None:
         surface_gaussians(gaussians, options=FilterOptions(min_neighbours=60))
     wrong = (
         (HitOptions, {"near": 2, "far": 1}),
-        (HitOptions, {"hits": 0}),
+        (HitOptions, {"max_hits": 0}),
         (AssignmentOptions, {"max_distance": 0}),
         (FilterOptions, {"radius": 0}),
         (FilterOptions, {"opaque_share": 0}),
@@ -297,5 +297,5 @@ def test_bad_input_is_refused(scene) -> None:
     for options, value in wrong:
         with pytest.raises(RangeError, match=next(iter(value))):
             options(**value)
-    with pytest.raises(InputError, match="rule"):
-        HitOptions(rule="last")
+    with pytest.raises(InputError, match="hits"):
+        HitOptions(hits="last")

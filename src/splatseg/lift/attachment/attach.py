@@ -24,6 +24,7 @@ from splatseg.core import (
     Layer,
     Selection,
     Similarity,
+    VoxelFeatures,
 )
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import RangeError, ShapeError
@@ -352,6 +353,12 @@ def _carried(layer: Layer, rows: Tensor) -> Layer:
                 layer,
                 values=_gathered(layer.values, rows, 0.0),
                 weights=_gathered_if(layer.weights, rows, 0.0),
+            )
+        case VoxelFeatures():
+            return replace(
+                layer,
+                rows=_gathered(layer.rows, rows, UNLABELLED),
+                shares=_gathered_if(layer.shares, rows, 0.0),
             )
         case Selection():
             return replace(

@@ -12,3 +12,6 @@ from splatseg.lift.voxels.lifting import HitOptions as HitOptions
 from splatseg.lift.voxels.lifting import LiftedVoxels as LiftedVoxels
 from splatseg.lift.voxels.lifting import lift_to_voxels as lift_to_voxels
 from splatseg.lift.voxels.lifting import optical_depths as optical_depths
+from splatseg.lift.voxels.storage import products as products
+from splatseg.lift.voxels.storage import store as store
+from splatseg.lift.voxels.words import VoxelWords as VoxelWords

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int32
@@ -20,7 +21,7 @@ from splatseg.neighbours import NeighbourIndex
 class AssignmentOptions:
     """Which voxels a Gaussian reads."""
 
-    rule: str = "nearest"
+    interpolation: Literal["nearest", "trilinear"] = "nearest"
     """nearest: the voxel whose centre is nearest to that of the Gaussian. trilinear: the voxels
     whose eight centres are around it, those that are there; the nearest where none is."""
 
@@ -30,7 +31,7 @@ class AssignmentOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("rule", self.rule, ("nearest", "trilinear"))
+        check_choice("interpolation", self.interpolation, ("nearest", "trilinear"))
         if self.max_distance is not None and not self.max_distance > 0:
             raise RangeError(f"max_distance: expected above 0, got {self.max_distance}.")
 
@@ -65,7 +66,7 @@ def assign_voxels(
     check_shape("points", points, (None, 3))
     check_finite("points", points)
     points = points.detach().cpu().double()
-    if options.rule == "nearest":
+    if options.interpolation == "nearest":
         rows = _nearest(grid, points, options)[:, None]
         return VoxelRows(rows=rows, shares=(rows != UNLABELLED).float())
     rows, shares = _around(grid, points)

@@ -14,6 +14,7 @@ References:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64, Int32, Int64
@@ -30,7 +31,7 @@ from splatseg.lift.mass.features import Taps, camera_of_grid, checked_grid, grid
 from splatseg.lift.voxels.grid import MAX_HITS, GridIndex
 from splatseg.render import options_for
 
-HIT_RULES = ("first", "several", "weights")
+HitRule = Literal["first", "several", "weights"]
 _CHANNELS = 64
 """Channels whose sums onto Gaussians are held at a time, with the weights of W."""
 
@@ -39,15 +40,15 @@ _CHANNELS = 64
 class HitOptions:
     """Which voxels a pixel's feature goes to, and how they are averaged."""
 
-    rule: str = "first"
+    hits: HitRule = "first"
     """first: the first voxel that the ray hits. several: the first ones, each by the light that
     reaches and stops in it. weights: by the weights with which Gaussians make the pixel, to the
     voxels that they lie nearest to."""
 
-    hits: int = 4
+    max_hits: int = 4
     """With several: voxels of a ray, at most."""
 
-    average: str = "hits"
+    average: Literal["hits", "views"] = "hits"
     """hits: every pixel counts. views: every view counts once for a voxel."""
 
     near: float = 0.01
@@ -58,10 +59,10 @@ class HitOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("rule", self.rule, HIT_RULES)
+        check_choice("hits", self.hits, ("first", "several", "weights"))
         check_choice("average", self.average, ("hits", "views"))
-        if not 1 <= self.hits <= MAX_HITS:
-            raise RangeError(f"hits: expected 1 to {MAX_HITS}, got {self.hits}.")
+        if not 1 <= self.max_hits <= MAX_HITS:
+            raise RangeError(f"max_hits: expected 1 to {MAX_HITS}, got {self.max_hits}.")
         far = float("inf") if self.far is None else self.far
         if not 0 <= self.near < far:
             raise RangeError(f"near, far: expected 0 <= near < far, got {self.near} and {far}.")
@@ -118,9 +119,9 @@ def lift_to_voxels(
         ShapeError: If a grid of features does not fit its photograph, or widths differ.
     """
     options = options or HitOptions()
-    if options.rule == "several" and depths is None:
+    if options.hits == "several" and depths is None:
         raise InputError("depths: expected the optical depth of each voxel, got none.")
-    if options.rule == "weights" and (gaussians is None or rows is None):
+    if options.hits == "weights" and (gaussians is None or rows is None):
         raise InputError("gaussians, rows: expected Gaussians and their voxels, got none.")
     ordered = voting_views(views, evidence, "features")
     index = GridIndex(grid)
@@ -134,7 +135,7 @@ def lift_to_voxels(
                 f"evidence: expected {sums.values.shape[1]} channels of view {view.name}, as of "
                 f"view {ordered[0].name}, got {features.channels}."
             )
-        if gaussians is not None and rows is not None and options.rule == "weights":
+        if gaussians is not None and rows is not None and options.hits == "weights":
             sums.add_weights(view, features, gaussians, rows, backend)
         else:
             sums.add_rays(view, features, index, depths)
@@ -166,11 +167,11 @@ class _Sums:
         options = self._options
         covered, camera = camera_of_grid(view, grid)
         origin, directions = camera.rays()
-        several = options.rule == "several"
+        several = options.hits == "several"
         hits, weights = index.trace(
             origin,
             directions.reshape(-1, 3),
-            hits=options.hits if several else 1,
+            hits=options.max_hits if several else 1,
             depths=depths if several else None,
             near=options.near,
             far=_FAR if options.far is None else options.far,

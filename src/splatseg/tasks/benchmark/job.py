@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Layer, Model, Scene
+from splatseg.core import Layer, Model, Scene, VoxelFeatures
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.models import GroundedMasks
 from splatseg.errors import InputError
@@ -85,7 +85,9 @@ class Job:
             backend=self.backend,
             observer=self.observer,
         )
-        return made.layer
+        # Words are asked of Gaussians, each with what it reads of its voxels.
+        layer = made.layer
+        return layer.features() if isinstance(layer, VoxelFeatures) else layer
 
     def _options_beside(self) -> Any:
         """Options that name what the method takes besides, where some is given; else None."""
