@@ -8,6 +8,9 @@ row `gaussians`, one of `segment --method features --evidence features_text` cal
 
 - `objects`: the likeliest of the classes that are there, by `query --every`.
 - `means`: plain cosines of means over the same objects; `gaussians`: of each Gaussian's own.
+- `voxels`: by voxels, the layer `voxels` (`segment --method voxels --evidence features_text --layer
+  voxels`), in the span as `query --every --from-layer voxels` asks, and by plain cosines, as the
+  paper asks; `published` the same of the layer `voxels_published`, made with `--published`.
 - `unknown`: how well the probabilities tell which of all classes are there: the area under the
   ROC, and the shares found at 0.5 of those that are there and of those that are not.
 - `speed`: milliseconds of a query of one word, and of ten: of the vectors, of the things, and of
@@ -18,15 +21,17 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from scored import ScoredScene, run_rows
 
-from splatseg.core import UNLABELLED, Features, Labels
+from splatseg.core import UNLABELLED, Features, Labels, VoxelFeatures
 from splatseg.io.scene import load_scene_layer
 from splatseg.lift import complete
+from splatseg.lift.voxels import VoxelWords
 from splatseg.tasks import QueryOptions, QuerySession
 
 
@@ -41,7 +46,7 @@ def _classes(bench: ScoredScene) -> list[dict[str, Any]]:
     return json.loads((bench.data / "metadata.json").read_text())["classes"]
 
 
-def _session(bench: ScoredScene, layer: Features) -> QuerySession:
+def _session(bench: ScoredScene, layer: Features | VoxelFeatures) -> QuerySession:
     options = QueryOptions(from_layer="asked", every=True, features="features_text")
     return QuerySession(bench.scene, options=options, layers={"asked": layer})
 
@@ -92,6 +97,28 @@ def means(bench: ScoredScene) -> None:
     _scored(bench, "means", _plain(bench, replace(own, values=index.of_gaussians(mean))))
 
 
+def _voxels(bench: ScoredScene, name: str) -> None:
+    layer = load_scene_layer(bench.scene.root or Path(), name)
+    if not isinstance(layer, VoxelFeatures):
+        raise TypeError(f"{name}: expected voxels.")
+    session = _session(bench, layer)
+    _scored(bench, f"{name}, span", session.ask(_names(bench)).labels())
+    asked = VoxelWords(layer, session.index.vocabulary, components=None)
+    cosines = asked.of_gaussians(asked.cosines(asked.vocabulary.vectors(_names(bench))))
+    known = cosines.abs().amax(dim=1) > 0
+    best = torch.where(known, cosines.argmax(dim=1) + 1, UNLABELLED)
+    plain = Labels(ids=best.int(), confidence=known.float())
+    _scored(bench, f"{name}, cosines", plain)
+
+
+def voxels(bench: ScoredScene) -> None:
+    _voxels(bench, "voxels")
+
+
+def published(bench: ScoredScene) -> None:
+    _voxels(bench, "voxels_published")
+
+
 def unknown(bench: ScoredScene) -> None:
     session = _session(bench, _features(bench, "objects"))
     found = session.index.ask([row["name"] for row in _classes(bench)]).probabilities
@@ -132,6 +159,8 @@ if __name__ == "__main__":
             "objects": objects,
             "means": means,
             "gaussians": gaussians,
+            "voxels": voxels,
+            "published": published,
             "unknown": unknown,
             "speed": speed,
         },

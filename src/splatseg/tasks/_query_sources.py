@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatseg.core import Features, Layer, Scene
+from splatseg.core import Features, Layer, Scene, VoxelFeatures
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -31,7 +31,7 @@ _ANSWERING = ("objects", "voxels", "features")
 class WordSource:
     """Features that answer, and the words for them."""
 
-    features: Features
+    features: Features | VoxelFeatures
     layer: str
     vocabulary: Vocabulary
     made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
@@ -72,7 +72,7 @@ def word_source(
             "`splatseg see`, or a layer with `splatseg segment --method features`."
         )
     layer = made.get(name) or whole_layer(scene, name, layers, option="from_layer")
-    if not isinstance(layer, Features):
+    if not isinstance(layer, Features | VoxelFeatures):
         raise InputError(f"from_layer: expected features, {name!r} has none.")
     evidence = feature_evidence(scene, options.features or layer.info.evidence, encoder)
     return WordSource(
@@ -100,7 +100,7 @@ def _layer_at_hand(
     found: dict[str, str] = {}
     for name in sorted(names):
         layer = whole_layer(scene, name, layers)
-        if not isinstance(layer, Features) or layer.info.method not in (
+        if not isinstance(layer, Features | VoxelFeatures) or layer.info.method not in (
             *methods,
             "uplift_features",
         ):

@@ -10,10 +10,19 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from splatseg.core import UNLABELLED, Labels, Layer, LayerInfo, Scene, Selection
+from splatseg.core import (
+    UNLABELLED,
+    Labels,
+    Layer,
+    LayerInfo,
+    Scene,
+    Selection,
+    VoxelFeatures,
+)
 from splatseg.core.boundary import boundary
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
+from splatseg.lift.voxels import VoxelWords
 from splatseg.lift.words import WordAnswers, WordIndex
 from splatseg.render import BackendName
 from splatseg.selection import components
@@ -65,7 +74,7 @@ class Answers:
     vectors: WordAnswers
     """What the distinct vectors of the layer answer."""
 
-    index: WordIndex
+    index: WordIndex | VoxelWords
     """Whose vectors these are."""
 
     layer: str
@@ -79,7 +88,7 @@ class Answers:
 
     pieces: Int64[Tensor, "n words"] | None = None
     """Connected pieces of Gaussians by word, -1 outside, where these are the things; None where
-    each vector is one."""
+    each vector of a `WordIndex` is one."""
 
     @cached_property
     def probabilities(self) -> Float[Tensor, "n words"]:
@@ -96,6 +105,8 @@ class Answers:
         """The thing that each Gaussian is of, by word; -1 where it does not answer."""
         if self.pieces is not None:
             return self.pieces
+        if isinstance(self.index, VoxelWords):
+            raise InputError("pieces: expected those of Gaussians that read voxels, got none.")
         inside = self.probabilities >= self.options.min_probability
         rows = self.index.rows[:, None]
         return torch.where(inside & (rows >= 0), rows, UNLABELLED)
@@ -211,17 +222,20 @@ class QuerySession:
                 f"from_layer: expected {len(scene.gaussians)} Gaussians, those of the scene, "
                 f"{self._source.layer!r} has {len(self._source.features)}."
             )
-        self._index = WordIndex(
-            self._source.features,
-            self._source.vocabulary,
-            components=self._options.components,
-        )
-        # Of few vectors each is a thing, whose place does not depend on what is asked.
-        few = len(self._index) <= _THINGS
-        self._places = _places(scene, self._index.rows) if few else None
+        features, vocabulary = self._source.features, self._source.vocabulary
+        components = self._options.components
+        self._places: Mapping[int, _Place] | None = None
+        self._index: WordIndex | VoxelWords
+        if isinstance(features, VoxelFeatures):
+            self._index = VoxelWords(features, vocabulary, components=components)
+        else:
+            self._index = WordIndex(features, vocabulary, components=components)
+            # Of few vectors each is a thing, whose place does not depend on what is asked.
+            if len(self._index) <= _THINGS:
+                self._places = _places(scene, self._index.rows)
 
     @property
-    def index(self) -> WordIndex:
+    def index(self) -> WordIndex | VoxelWords:
         """The vectors that answer."""
         return self._index
 
@@ -264,8 +278,7 @@ class QuerySession:
 
     def _pieces(self, asked: WordAnswers) -> Int64[Tensor, "n words"]:
         """Connected pieces of the Gaussians that answer."""
-        answering = asked.probabilities >= self._options.min_probability
-        inside = self._index.of_gaussians(answering)
+        inside = self._index.of_gaussians(asked.probabilities) >= self._options.min_probability
         columns = [
             components(self._scene.gaussians, Selection(mask=inside[:, column]))
             for column in range(inside.shape[1])
@@ -280,18 +293,21 @@ class QuerySession:
             answering = torch.nonzero(probabilities >= self._options.min_probability).flatten()
             rows = {row: torch.tensor([row]) for row in answering.tolist()}
         else:
+            probabilities, cosines = (
+                self._index.of_gaussians(found[:, None])[:, 0] for found in (probabilities, cosines)
+            )
             places = _places(self._scene, pieces[:, column])
-            rows = {thing: self._index.rows[pieces[:, column] == thing] for thing in places}
+            rows = {thing: torch.nonzero(pieces[:, column] == thing).flatten() for thing in places}
         found = [
             Found(
                 thing=thing,
-                probability=round(float(probabilities[vectors].double().mean()), 6),
-                cosine=round(float(cosines[vectors].double().mean()), 6),
+                probability=round(float(probabilities[which].double().mean()), 6),
+                cosine=round(float(cosines[which].double().mean()), 6),
                 gaussians=places[thing].gaussians,
                 centre=places[thing].centre,
                 size=places[thing].size,
             )
-            for thing, vectors in rows.items()
+            for thing, which in rows.items()
         ]
         return tuple(sorted(found, key=_rank))
 

@@ -35,8 +35,8 @@ class FilterOptions:
     """Least number of other centres that must lie near."""
 
     radius: float | None = None
-    """How near, scene units. None takes ten times the median distance from a centre to the nearest
-    other."""
+    """How near, scene units. None takes ten times the median distance from a centre to the last of
+    so many nearest others: fits put many centres onto one another."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
@@ -105,8 +105,10 @@ def _dense(means: Tensor, options: FilterOptions) -> Bool[Tensor, "n"]:
     index = NeighbourIndex(means)
     radius = options.radius
     if radius is None:
-        if len(means) < 2:
+        wanted = options.min_neighbours or 1
+        if len(means) <= wanted:
             return torch.zeros(len(means), dtype=torch.bool)
-        radius = _NEAREST_FACTOR * float(index.nearest_others(1).distances.median())
+        last = index.nearest_others(wanted).distances[:, -1]
+        radius = _NEAREST_FACTOR * float(last.median())
     # A centre finds itself too.
     return index.count_within(means, radius) > (options.min_neighbours or 0)
