@@ -28,13 +28,16 @@ from splatseg.lift.voxels import (
 )
 from splatseg.methods._method import Method, MethodInputs
 
+_CELLS_A_HIT = 3
+"""Cells that depth lies in for one that is kept and that a ray hits first, about."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VoxelOptions:
     """How features become voxels."""
 
     voxels: int = 80_000
-    """Occupied cells, at most; their size follows."""
+    """Cells, about, which is what their size is found for; of centres at most."""
 
     cell: float | None = None
     """Side of a cell, scene units; the number of cells follows. None takes `voxels`."""
@@ -42,6 +45,10 @@ class VoxelOptions:
     cells: Literal["depth", "centres"] = "depth"
     """Of what cells are made. depth: of the points where the light of pixels is half stopped, so
     that no ray passes between them. centres: of the centres of Gaussians, as published."""
+
+    min_points: int = 6
+    """Pixels of all views, every second along both axes, that must end in a cell of depth: those of
+    few lie between things, where depth jumps, and hide what is behind them."""
 
     filtering: FilterOptions = field(default_factory=FilterOptions)
     """Which Gaussians make cells, where their centres do."""
@@ -61,6 +68,8 @@ class VoxelOptions:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_choice("cells", self.cells, ("depth", "centres"))
+        if self.min_points < 1:
+            raise RangeError(f"min_points: expected at least 1, got {self.min_points}.")
         if self.voxels < 1:
             raise RangeError(f"voxels: expected at least 1, got {self.voxels}.")
         if self.cell is not None and not 0 < self.cell < float("inf"):
@@ -149,14 +158,17 @@ def run(inputs: MethodInputs, options: VoxelOptions) -> VoxelFeatures:
 def _grid(inputs: MethodInputs, options: VoxelOptions) -> VoxelGrid:
     """Cells of the size, or as many as are asked for."""
     gaussians = inputs.gaussians
-    if options.cells == "depth":
-        points = surface_points(gaussians, inputs.views, backend=inputs.backend)
-    else:
+    if options.cells == "centres":
         kept = surface_gaussians(gaussians, options=options.filtering)
         points = gaussians.means.detach().cpu()[kept]
-    if options.cell is None:
-        return voxelise_to_count(points, options.voxels)
-    return voxelise(points, options.cell)
+        if options.cell is None:
+            return voxelise_to_count(points, options.voxels)
+        return voxelise(points, options.cell)
+    points = surface_points(gaussians, inputs.views, backend=inputs.backend)
+    size = options.cell
+    if size is None:
+        size = voxelise_to_count(points, _CELLS_A_HIT * options.voxels).size
+    return voxelise(points, size, min_points=options.min_points)
 
 
 METHOD = Method(

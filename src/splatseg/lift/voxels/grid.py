@@ -117,15 +117,16 @@ class GridIndex:
 
 
 @boundary
-def voxelise(points: Float[Tensor, "n 3"], size: float) -> VoxelGrid:
-    """The cells of a size that have a point in them.
+def voxelise(points: Float[Tensor, "n 3"], size: float, *, min_points: int = 1) -> VoxelGrid:
+    """The cells of a size that have points in them.
 
     Args:
         points: World, scene units.
         size: Side of a cell, scene units.
+        min_points: How many, at least.
 
     Raises:
-        InputError: If there is no point.
+        InputError: If there is no point, or no cell has enough.
         RangeError: If a coordinate is not finite, the size not above 0, or so small that cells
             cannot be counted.
     """
@@ -134,7 +135,10 @@ def voxelise(points: Float[Tensor, "n 3"], size: float) -> VoxelGrid:
         raise RangeError(f"size: expected above 0, got {size}.")
     origin = points.amin(dim=0)
     cells = _cells(points, origin, size)
-    return VoxelGrid(cells=cells[_first_of_each(cells)], size=size, origin=origin)
+    occupied = _first_of_each(cells, min_points)
+    if not len(occupied):
+        raise InputError(f"min_points: expected a cell of {min_points} points, there is none.")
+    return VoxelGrid(cells=cells[occupied], size=size, origin=origin)
 
 
 @boundary
@@ -188,9 +192,13 @@ def _cells(points: Tensor, origin: Tensor, size: float) -> Int64[Tensor, "n 3"]:
     return torch.floor((points - origin) / size).long()
 
 
-def _first_of_each(cells: Tensor) -> Int64[Tensor, "m"]:
-    """A row of each distinct cell, in the order of cells."""
+def _first_of_each(cells: Tensor, least: int = 1) -> Int64[Tensor, "m"]:
+    """A row of each distinct cell that is there often enough, in the order of cells."""
     key, order = torch.sort(cell_order(cells), stable=True)
     first = torch.ones(len(key), dtype=torch.bool)
     first[1:] = key[1:] != key[:-1]
-    return order[first]
+    if least <= 1:
+        return order[first]
+    starts = torch.nonzero(first).squeeze(1)
+    counts = torch.diff(starts, append=torch.tensor([len(key)]))
+    return order[starts[counts >= least]]
