@@ -4,6 +4,7 @@ import ast
 import importlib
 import json
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ def test_each_command_shows_three_examples_that_parse(name, monkeypatch) -> None
     ran = []
     monkeypatch.setattr(module, "run", ran.append)
     for line in examples:
-        words = line.partition(" > ")[0].split()[1:]
+        words = shlex.split(line.partition(" > ")[0])[1:]
         assert words[0] == name
         assert cli.main(words) == 0, line
     assert len(ran) == len(examples)

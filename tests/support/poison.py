@@ -268,13 +268,26 @@ def valid(world: World) -> dict[str, Any]:
 
 
 def answers() -> Any:
+    from splatseg.core import Features
+    from splatseg.lift import TextSpace
+    from splatseg.lift.vocabulary import Vocabulary
+    from splatseg.lift.words import WordAnswers, WordIndex
     from splatseg.tasks import Answers, QueryOptions
 
     none = torch.zeros(COUNT, 1)
+    values = torch.rand(COUNT, 4, generator=torch.Generator().manual_seed(0))
+    vocabulary = Vocabulary(space=TextSpace(width=4))
     return Answers(
-        words=("cup",), found={"cup": ()}, probabilities=none, cosines=none,
-        things=torch.full((COUNT, 1), -1), layer="objects", options=QueryOptions(),
+        words=("cup",), found={"cup": ()}, surest={"cup": 0.0},
+        vectors=WordAnswers(words=("cup",), cosines=none, probabilities=none),
+        index=WordIndex(Features(values=values), vocabulary), layer="objects",
+        options=QueryOptions(),
     )  # fmt: skip
+
+
+def voxels() -> core.VoxelGrid:
+    cells = torch.tensor([[0, 0, 0], [1, 0, 0]])
+    return core.VoxelGrid(cells=cells, size=1.0, origin=torch.zeros(3))
 
 
 def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
@@ -287,8 +300,18 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "tasks.select.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
         "tasks.draw_answers.answers": answers(),
         "tasks.draw_heat.answers": answers(),
+        "tasks.write_query_report.answers": answers(),
         "tasks.draw_selection.prompts": [AxisBox(low=(-9, -9, -9), high=(9, 9, 9))],
         "core.apply_rows.layer": world.labels,
+        "core.StoredTable.codes": torch.ones(2, 4),
+        "core.VoxelFeatures.grid": voxels(),
+        "core.VoxelFeatures.table": core.StoredTable(codes=torch.ones(2, 4)),
+        "core.VoxelFeatures.weights": torch.ones(2),
+        "core.VoxelFeatures.rows": torch.zeros(COUNT, 1, dtype=torch.int32),
+        "core.VoxelFeatures.shares": None,
+        "synthetic.synthetic_pointmaps.cameras": dict.fromkeys("ab", world.views[0].camera),
+        "synthetic.synthetic_pointmaps.depths": dict.fromkeys("ab", torch.ones(HEIGHT, WIDTH)),
+        "synthetic.synthetic_pointmaps.pairs": [("a", "b")],
         "evaluate.learned_bytes.layer": world.labels,
         "evaluate.LearnedBytes.layer": 4,
         "core.map_ids.ids": ids,

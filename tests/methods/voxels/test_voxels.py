@@ -102,7 +102,7 @@ def test_parts_are_bytes_of_a_voxel(scene) -> None:
 
 def test_filtering_counts_where_centres_make_cells(scene) -> None:
     options = replace(OPTIONS, cells="centres")
-    strict = replace(options, filtering=replace(options.filtering, min_opacity=0.9))
+    strict = replace(options, filtering=replace(options.filtering, scale_share=0.4))
     assert made(scene, strict).grid.size != made(scene, options).grid.size
 
 
