@@ -33,7 +33,7 @@ def test_bash(script) -> None:
     assert completed(script, "splatseg", "se") == {"see", "segment", "select"}
     assert {"--method", "--evidence"} <= completed(script, "splatseg", "segment", "--")
     assert completed(script, "splatseg", "segment", "S", "--evi") == {"--evidence"}
-    assert completed(script, "splatseg", "segment", "--method", "vo") == {"vote"}
+    assert completed(script, "splatseg", "segment", "--method", "vo") == {"vote", "voxels"}
     assert completed(script, "splatseg", "help", "ren") == {"render"}
     assert completed(script, "splatseg", "fit", "--max-g") == {"--max-gaussians"}
 
