@@ -175,8 +175,8 @@ def test_a_record_of_version_0_is_that_of_a_file_without_its_version(tmp_path) -
 
 
 def test_layers_of_a_later_version_are_refused(tmp_path) -> None:
-    path = changed(tmp_path, lambda h, a: h.update(version=5), layer="tree")
-    with pytest.raises(FileFormatError, match="version 4 or less, got version 5"):
+    path = changed(tmp_path, lambda h, a: h.update(version=6), layer="tree")
+    with pytest.raises(FileFormatError, match="version 5 or less, got version 6"):
         load_layer(path)
 
 
@@ -243,10 +243,10 @@ def changed(tmp_path, change, layer="soft"):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h, a: h.update(version=5), "version 4 or less, got version 5; a later splatseg"),
+        (lambda h, a: h.update(version=6), "version 5 or less, got version 6; a later splatseg"),
         (lambda h, a: h.update(version=0), "got version 0"),
         (lambda h, a: h.update(format="other"), "expected a layer, got 'other'"),
-        (lambda h, a: h.update(kind="voxels"), "got 'voxels'"),
+        (lambda h, a: h.update(kind="clouds"), "got 'clouds'"),
         (lambda h, a: h.update(count=4), r"'ids' of type i4 and shape \(4\), got int32 of \(5,\)"),
         (lambda h, a: h.update(count=-1), "count: expected a whole number of at least 0"),
         (lambda h, a: h.update(background=-1), "background: expected a whole number"),
