@@ -122,7 +122,7 @@ def test_flags_of_another_method_are_refused(small, splatseg) -> None:
     [
         ("uplit", "did you mean uplift"),
         ("asociate", "did you mean associate"),
-        ("xyzzy", "known: uplift, features, objects, voxels, vote, associate, identity, saga, cosseg"),
+        ("xyzzy", "known: uplift, features, objects, voxels, vote, associate, identity, saga"),
     ],
 )
 def test_an_unknown_method_gets_the_nearest_names(small, splatseg, name, said) -> None:
