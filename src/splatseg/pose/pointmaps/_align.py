@@ -126,7 +126,7 @@ def align(
                 state = place_pairs(
                     samples, _place_views(samples, state, views, touching), touching
                 )
-                state = _normalised(state)
+                state = normalised(state)
                 depth = float(state.depth.median())
                 step = float((state.centre - before).norm(dim=1).max()) / depth
                 moved = max(moved, step)
@@ -136,7 +136,7 @@ def align(
                     break
         if moved < _STILL:
             break
-    return _normalised(place_pairs(samples, state, every))
+    return normalised(place_pairs(samples, state, every))
 
 
 def place_pairs(samples: PairSamples, state: Aligned, pairs: Int64[Tensor, "n"]) -> Aligned:
@@ -276,7 +276,7 @@ def _jacobian(local: Tensor, rays: Tensor, depth: Tensor) -> Tensor:
     return full - unit.unsqueeze(-1) * along
 
 
-def _normalised(state: Aligned) -> Aligned:
+def normalised(state: Aligned) -> Aligned:
     """The same world in the unit in which the product of the pairs' scales is one."""
     unit = state.scale.log().mean().exp()
     return replace(

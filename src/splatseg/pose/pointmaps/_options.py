@@ -57,6 +57,10 @@ class PointmapOptions:
     solved by turns in closed form. published: DUSt3R's, all pairs, by Adam from the spanning tree
     of the surest pairs."""
 
+    refine: bool = True
+    """Of robust: end with all cameras, depths and scales together, where the points of a pair are in
+    its first camera's frame and errors along rays count less than those across, as measured."""
+
     shared_focal: bool = True
     """Photographs of one size share a focal length; else each has its own."""
 

@@ -8,6 +8,7 @@ from splatseg.pose.pointmaps._focal import lens_focals
 from splatseg.pose.pointmaps._geometry import pair_geometry
 from splatseg.pose.pointmaps._gradient import align_by_gradients
 from splatseg.pose.pointmaps._options import PointmapOptions
+from splatseg.pose.pointmaps._refine import refine
 from splatseg.pose.pointmaps._samples import PairSamples
 from splatseg.pose.pointmaps._start import agreement, confidence_score, spanning_tree, tree_world
 
@@ -33,10 +34,14 @@ def solve(
             progress=progress,
         )
     start = initial(samples, geometry, average(samples, geometry, world), focal)
-    return align(
+    parts = 2 if options.refine else 1
+    aligned = align(
         samples,
         start,
         iterations=options.iterations or _ROBUST_ITERATIONS,
         block=options.block,
-        progress=progress,
+        progress=lambda done, total: progress(done, parts * total),
     )
+    if not options.refine:
+        return aligned
+    return refine(samples, aligned, progress=lambda done, total: progress(total + done, 2 * total))
