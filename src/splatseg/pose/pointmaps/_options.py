@@ -58,8 +58,9 @@ class PointmapOptions:
     of the surest pairs."""
 
     refine: bool = True
-    """Of robust: end with all cameras, depths and scales together, where the points of a pair are in
-    its first camera's frame and errors along rays count less than those across, as measured."""
+    """Of robust: end with all cameras, focal lengths, depths and scales at once, with the points of
+    each pair in its first camera's frame, and with errors along rays and across them divided by how
+    large they are."""
 
     shared_focal: bool = True
     """Photographs of one size share a focal length; else each has its own."""

@@ -34,14 +34,18 @@ def solve(
             progress=progress,
         )
     start = initial(samples, geometry, average(samples, geometry, world), focal)
-    parts = 2 if options.refine else 1
+    stages = 2 if options.refine else 1
+
+    def percent(stage: int) -> Callable[[int, int], None]:
+        return lambda done, total: progress(100 * stage + 100 * done // total, 100 * stages)
+
     aligned = align(
         samples,
         start,
         iterations=options.iterations or _ROBUST_ITERATIONS,
         block=options.block,
-        progress=lambda done, total: progress(done, parts * total),
+        progress=percent(0),
     )
     if not options.refine:
         return aligned
-    return refine(samples, aligned, progress=lambda done, total: progress(total + done, 2 * total))
+    return refine(samples, aligned, progress=percent(1))
