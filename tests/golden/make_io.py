@@ -3,7 +3,8 @@
 Run from the project's root: ``python tests/golden/make_io.py``. It makes what is not there:
 scene-v1, a scene folder with one view of each lens and evidence of each kind that is written; and
 layers-v3, a layer of each kind, with a record that says something in every field; layers-v4, a
-selection with confidence, which alone is of that version; and
+selection with confidence, and layers-v5, voxels in each precision, which alone are of these
+versions; and
 evidence-v2, features of three blocks with a class token. A version's
 files are made once and then kept: later versions of splatseg must read them. The layers in
 scene-v1 are of version 1 and the one in layers-v2 of version 2, as the scripts of then made them;
@@ -35,20 +36,23 @@ from splatseg.core import (
     MaskSet,
     Scene,
     Selection,
+    StoredTable,
     TreeNode,
     View,
+    VoxelFeatures,
+    VoxelGrid,
     with_info,
 )
 from splatseg.io.evidence import create_evidence, save_features, save_label_map, save_masks
 from splatseg.io.evidence._open import VERSION as EVIDENCE_VERSION
-from splatseg.io.layers import VERSION as LAYER_VERSION
 from splatseg.io.layers import save_layer
 from splatseg.io.scene import VERSION, save_scene, save_scene_layer
 from splatseg.io.scene_folder import CAMERAS_FILE, SCENE_FILE
 
 ROOT = Path(__file__).parent / f"scene-v{VERSION}"
 LAYERS_3 = Path(__file__).parent / "layers-v3"
-LAYERS = Path(__file__).parent / f"layers-v{LAYER_VERSION}"
+LAYERS_4 = Path(__file__).parent / "layers-v4"
+LAYERS_5 = Path(__file__).parent / "layers-v5"
 EVIDENCE = Path(__file__).parent / f"evidence-v{EVIDENCE_VERSION}"
 CLASSES = ClassTable(
     rows=(
@@ -194,6 +198,44 @@ def golden_soft_selection() -> Selection:
     )
 
 
+def golden_voxels() -> dict[str, VoxelFeatures]:
+    """Three voxels of four channels in each precision, read by five Gaussians one at a time, and
+    by two at a time."""
+    values = torch.tensor([[0.5, -1.0, 0.0, 2.0], [0.25, 3.0, -0.125, 1.0], [-4.0, 0.0, 0.75, 8.0]])
+    steps = torch.arange(256, dtype=torch.float32)[None, :, None]
+    tables = {
+        "float32": StoredTable(codes=values),
+        "float16": StoredTable(codes=values.half()),
+        "int8": StoredTable(
+            codes=torch.tensor([[127, -127, 0, 1], [-1, 127, 64, 2], [3, 0, 0, 127]]).to(
+                torch.int8
+            ),
+            scales=torch.tensor([0.5, 0.25, 0.125]),
+        ),
+        "product": StoredTable(
+            codes=torch.tensor([[0, 255], [7, 1], [128, 64]], dtype=torch.uint8),
+            codebooks=torch.cat([steps / 8 - 16, steps / -4], dim=0).expand(2, 256, 2).clone(),
+        ),
+    }
+    grid = VoxelGrid(
+        cells=torch.tensor([[-9, -1, 0], [1, 0, 2], [0, 1, 2]], dtype=torch.int32),
+        size=0.1,
+        origin=torch.tensor([1 / 3, -2.0, 0.25], dtype=torch.float64),
+    )
+    weights = torch.tensor([1.5, 8.0, 0.25])
+    rows = torch.tensor([[2], [-1], [0], [1], [1]], dtype=torch.int32)
+    made = {
+        name: VoxelFeatures(grid=grid, table=table, weights=weights, rows=rows, info=full_info())
+        for name, table in tables.items()
+    }
+    made["shares"] = replace(
+        made["float16"],
+        rows=torch.tensor([[2, 0], [-1, -1], [0, -1], [1, 2], [1, 0]], dtype=torch.int32),
+        shares=torch.tensor([[0.75, 0.25], [0, 0], [1, 0], [0.5, 0.5], [0.125, 0.875]]),
+    )
+    return made
+
+
 def golden_evidence() -> tuple[LabelMap, MaskSet, FeatureMap]:
     """A label map, masks and features of the view left/1."""
     ids = torch.full((6, 8), -1, dtype=torch.int32)
@@ -238,9 +280,13 @@ def main() -> None:
         LAYERS_3.mkdir()
         for name, layer in golden_layers_of_version_3().items():
             save_layer(layer, LAYERS_3 / f"{name}.npz")
-    if not LAYERS.exists():
-        LAYERS.mkdir()
-        save_layer(golden_soft_selection(), LAYERS / "chosen.npz")
+    if not LAYERS_4.exists():
+        LAYERS_4.mkdir()
+        save_layer(golden_soft_selection(), LAYERS_4 / "chosen.npz")
+    if not LAYERS_5.exists():
+        LAYERS_5.mkdir()
+        for name, layer in golden_voxels().items():
+            save_layer(layer, LAYERS_5 / f"{name}.npz")
 
 
 def make_scene() -> None:

@@ -55,7 +55,7 @@ def voxels_of(
         FileFormatError: If an array is missing, or not of the type and shape that it must be.
     """
     precision = header.get("precision")
-    if precision not in _TYPES:
+    if not isinstance(precision, str) or precision not in _TYPES:
         raise FileFormatError(
             f"{path}: expected a precision ({', '.join(_TYPES)}), got {quoted(precision)}."
         )

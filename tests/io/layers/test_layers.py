@@ -17,7 +17,10 @@ from splatseg.core import (
     Labels,
     LayerInfo,
     Selection,
+    StoredTable,
     TreeNode,
+    VoxelFeatures,
+    VoxelGrid,
 )
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.layers import load_layer, save_layer
@@ -39,7 +42,7 @@ def same(a, b) -> None:
         if isinstance(one, torch.Tensor):
             assert one.dtype == other.dtype
             assert torch.equal(one, other), name
-        elif isinstance(one, Labels):
+        elif isinstance(one, Labels | VoxelGrid | StoredTable):
             same(one, other)
         else:
             assert one == other
@@ -72,6 +75,21 @@ LAYERS = {
     ),
     "selection": Selection(mask=torch.tensor([True, False, True]), info=INFO),
     "soft selection": Selection.of_confidence(torch.tensor([0.75, 0.5, 1.0, 1 / 3]), info=INFO),
+    "voxels": VoxelFeatures(
+        grid=VoxelGrid(
+            cells=torch.tensor([[-9, 4, 0], [1, 0, 2]]),
+            size=1 / 3,
+            origin=torch.tensor([0.1, 2, 3]),
+        ),
+        table=StoredTable(
+            codes=torch.tensor([[127, -3, 5], [0, -127, 1]], dtype=torch.int8),
+            scales=torch.tensor([0.25, 1 / 3]),
+        ),
+        weights=torch.tensor([2.5, 1.0]),
+        rows=torch.tensor([[1, 0], [-1, -1], [0, -1]]),
+        shares=torch.tensor([[0.25, 0.75], [0.0, 0.0], [1.0, 0.0]]),
+        info=INFO,
+    ),
     "empty": Labels(ids=torch.zeros(0, dtype=torch.int32), confidence=torch.zeros(0)),
     "none": Selection(mask=torch.zeros(0, dtype=torch.bool)),
 }
@@ -130,6 +148,18 @@ def test_selections_with_confidence_of_version_4_are_read_and_written_as_they_we
     path = project_root / "tests/golden/layers-v4/chosen.npz"
     layer = load_layer(path)
     same(golden.golden_soft_selection(), layer)
+    save_layer(layer, tmp_path / "again.npz")
+    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["float32", "float16", "int8", "product", "shares"])
+def test_voxels_of_version_5_are_read_and_written_as_they_were(
+    golden, project_root, tmp_path, name
+) -> None:
+    path = project_root / f"tests/golden/layers-v5/{name}.npz"
+    layer = load_layer(path)
+    same(golden.golden_voxels()[name], layer)
+    assert layer.table.precision == ("float16" if name == "shares" else name)
     save_layer(layer, tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
 
@@ -263,6 +293,31 @@ def changed(tmp_path, change, layer="soft"):
 )
 def test_files_that_contradict_themselves(tmp_path, change, message) -> None:
     path = changed(tmp_path, change)
+    with pytest.raises(FileFormatError, match=f"^{path}: .*{message}"):
+        load_layer(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda h, a: h.update(precision="int4"), "a precision .float32, .*, got 'int4'"),
+        (lambda h, a: h.update(precision=["int8"]), "a precision .*, got"),
+        (lambda h, a: h.update(precision="float32"), "'codes' of type f4 .*, got int8 of"),
+        (lambda h, a: h.update(voxels=3), r"'codes' of type i1 and shape \(3, any\)"),
+        (lambda h, a: h.update(size=0), "size: expected above 0"),
+        (lambda h, a: h.update(origin=[0, 0]), "'origin' of three numbers"),
+        (lambda h, a: a.pop("codes"), "'codes' of type i1 .*, got none"),
+        (lambda h, a: a.pop("scales"), "an array 'scales', which is not there"),
+        (lambda h, a: a.pop("shares"), "shares: expected those of 2 voxels a Gaussian, got none"),
+        (lambda h, a: a.update(cells=a["cells"][::-1]), "cells in their order, each once"),
+        (lambda h, a: a.update(cells=a["cells"][:, :2]), r"'cells' of type i4 and shape \(2, 3\)"),
+        (lambda h, a: a["rows"].__setitem__((0, 0), 3), "rows of 2 voxels"),
+        (lambda h, a: a["shares"].__setitem__((0, 0), -1), "shares: expected at least 0"),
+        (lambda h, a: a["voxel_weights"].__setitem__(0, np.nan), "finite 'voxel_weights'"),
+    ],
+)
+def test_files_that_hold_no_voxels(tmp_path, change, message) -> None:
+    path = changed(tmp_path, change, layer="voxels")
     with pytest.raises(FileFormatError, match=f"^{path}: .*{message}"):
         load_layer(path)
 

@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatseg.core import Features, InstanceTree, Labels, LayerInfo, Scene, Selection, TreeNode
+from splatseg.core import (
+    Features,
+    InstanceTree,
+    Labels,
+    LayerInfo,
+    Scene,
+    Selection,
+    StoredTable,
+    TreeNode,
+    VoxelFeatures,
+    VoxelGrid,
+)
 from splatseg.fit._checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from splatseg.fit._state import FitState
 from splatseg.io.export import column_table_of, write_column_table
@@ -66,6 +77,35 @@ def _tree() -> InstanceTree:
     return InstanceTree(nodes=nodes, labels=_labels())
 
 
+def _voxels(table: StoredTable) -> VoxelFeatures:
+    return VoxelFeatures(
+        grid=VoxelGrid(
+            cells=torch.tensor([[-1, 0, 0], [0, 0, 0], [2, 0, 0]], dtype=torch.int32),
+            size=0.5,
+            origin=torch.zeros(3),
+        ),
+        table=table,
+        weights=torch.tensor([1.0, 2.0, 3.0]),
+        rows=torch.tensor([[0, 1], [1, -1], [-1, -1], [2, 0]], dtype=torch.int32),
+        shares=torch.tensor([[0.5, 0.5], [1, 0], [0, 0], [0.25, 0.75]]),
+        info=LayerInfo(method="voxels", views=("a",), seed=1),
+    )
+
+
+def _voxels_of_bytes() -> VoxelFeatures:
+    codes = torch.tensor([[1, -2], [127, 0], [-127, 3]]).to(torch.int8)
+    return _voxels(StoredTable(codes=codes, scales=torch.tensor([0.5, 0.25, 1.0])))
+
+
+def _voxels_of_products() -> VoxelFeatures:
+    codes = torch.tensor([[0, 255], [3, 4], [5, 6]], dtype=torch.uint8)
+    codebooks = torch.arange(512, dtype=torch.float32).reshape(2, 256, 1) / 512
+    return _voxels(StoredTable(codes=codes, codebooks=codebooks))
+
+
+_layer("layer-voxels", lambda: _voxels(StoredTable(codes=torch.arange(12).reshape(3, 4).half())))
+_layer("layer-voxels-int8", _voxels_of_bytes)
+_layer("layer-voxels-product", _voxels_of_products)
 _layer("layer-labels", _labels)
 _layer("layer-tree", _tree)
 _layer("layer-features", lambda: Features(values=torch.rand(4, 3), weights=torch.ones(4)))
