@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from splatseg import BenchOptions, bench  # noqa: E402
 from splatseg.core import BenchmarkScene  # noqa: E402
 from splatseg.io.benchmarks import read_benchmark  # noqa: E402
+from splatseg.methods import find_method  # noqa: E402
 from splatseg.tasks.benchmark import load_result, write_tables  # noqa: E402
 from support.benchmark_layouts import read_source, write_layout  # noqa: E402
 from support.benchmark_layouts.evidence import write_evidence  # noqa: E402
@@ -43,6 +44,13 @@ class Run:
     evidence: tuple[str, ...] = ()
     companions: tuple[str, ...] = ()
     switches: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
+    published: bool = False
+
+    @property
+    def setting(self) -> str:
+        """What tells the results of other settings of methods apart; empty for their own."""
+        return "-".join((*(("published",) if self.published else ()), *self.options))
 
 
 _TEXT, _CLASSES, _PANOPTIC, _TRACKED, _MASKS = (
@@ -50,7 +58,33 @@ _TEXT, _CLASSES, _PANOPTIC, _TRACKED, _MASKS = (
 )  # fmt: skip
 _ANY = ("scene_list=all",)
 _BESIDES = (_MASKS, "features_dino")
-_WORDS = ("features", "objects")
+_WORDS = ("features", "objects", "voxels")
+_ALL_VIEWS = ("view_share=1.0",)
+
+
+def _spoken(scene: str) -> tuple[Run, ...]:
+    """SPIn-NeRF by words, as Table 4 of Prompt SA-GS has it, and by other methods of words."""
+
+    def run(*methods: str, **more: Any) -> Run:
+        return Run(
+            protocol="spin-nerf-words", layout="spin-nerf", scene=scene, methods=methods,
+            companions=(_MASKS,), evidence=(_TEXT,), **more,
+        )  # fmt: skip
+
+    by_points = {"protocol": "spin-nerf", "layout": "spin-nerf", "scene": scene}
+    return (
+        run("prompt", *_WORDS),
+        run("prompt", options=("view_share=0.5",)),
+        run("prompt", published=True),
+        run("prompt", published=True, options=_ALL_VIEWS),
+        run("voxels", published=True),
+        # SA-GS: points by hand in one view, masks of all views.
+        Run(**by_points, methods=("prompt",), evidence=(_MASKS,)),
+        Run(**by_points, methods=("prompt",), evidence=(_MASKS,), published=True,
+            options=_ALL_VIEWS),
+    )  # fmt: skip
+
+
 RUNS = (
     Run(protocol="nvos", layout="nvos", scene="frontal",
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
@@ -58,6 +92,8 @@ RUNS = (
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
     Run(protocol="spin-nerf-ludvig", layout="spin-nerf", scene="frontal",
         methods=("uplift", "associate", "saga"), evidence=(_MASKS,)),
+    *_spoken("frontal"),
+    *_spoken("toys"),
     Run(protocol="lerf-mask", layout="lerf-mask", scene="toys", methods=_WORDS,
         companions=(_MASKS,), evidence=(_TEXT,)),
     Run(protocol="lerf-ovs-2d", layout="lerf-ovs", scene="toys", methods=_WORDS,
@@ -105,19 +141,25 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--max-gaussians", type=int, default=100_000)
     parser.add_argument("--protocols", nargs="*", help="names; all without it")
+    parser.add_argument("--methods", nargs="*", help="of these only; all without it")
     asked = parser.parse_args()
     for run in RUNS:
-        if not asked.protocols or run.protocol in asked.protocols:
-            _do(run, asked)
+        methods = tuple(one for one in run.methods if not asked.methods or one in asked.methods)
+        if methods and (not asked.protocols or run.protocol in asked.protocols):
+            takes = any(find_method(one).companions for one in methods)
+            companions = run.companions if takes else ()
+            _do(replace(run, methods=methods, companions=companions), asked)
 
 
 def _do(run: Run, asked: Any) -> None:
     data, scene = _written(run, asked)
     began = time.monotonic()
+    root = _root(run, asked)
+    fits = asked.out / "runs" / "scenes" / run.layout / "{scene}"
     done = bench(
         run.protocol,
         data,
-        asked.out / "runs",
+        root,
         options=BenchOptions(
             methods=run.methods,
             models=tuple(str(data / "evidence" / "{scene}" / name) for name in run.evidence),
@@ -125,21 +167,33 @@ def _do(run: Run, asked: Any) -> None:
             steps=asked.steps,
             max_gaussians=asked.max_gaussians,
             switches=run.switches,
+            method_options=run.options,
+            published=run.published,
+            fitted=str(fits) if run.setting else None,
         ),
         command=" ".join(sys.argv),
     )
-    write_tables(done, asked.out / "runs")
+    write_tables(done, root)
     for method in done.methods:
         figures = ", ".join(f"{name} {value:.4f}" for name, value in method.scores.items())
         checks = dict(_checked(run, scene, method.method, asked))
         held = ", ".join(f"{name} {value:.1e}" for name, value in checks.items()) or "none"
-        print(f"{run.protocol} | {method.method} | {figures} | off score.py by: {held}", flush=True)
+        name = f"{method.method} {run.setting}".strip()
+        print(
+            f"{run.protocol} | {run.scene} | {name} | {figures} | off score.py by: {held}",
+            flush=True,
+        )
     print(f"{run.protocol}: {time.monotonic() - began:.0f} s", flush=True)
+
+
+def _root(run: Run, asked: Any) -> Path:
+    """The folder of results; other settings of methods have one of their own."""
+    return asked.out / f"runs-{run.setting}" if run.setting else asked.out / "runs"
 
 
 def _written(run: Run, asked: Any) -> tuple[Path, BenchmarkScene]:
     """The scene in the layout, with all evidence that its runs take."""
-    data = asked.out / "data" / run.layout
+    data = asked.out / "data" / f"{run.layout}-{run.scene}"
     source = asked.shared / "data" / run.scene
     if not data.is_dir():
         write_layout(run.layout, source, data)
@@ -154,11 +208,11 @@ def _checked(
     run: Run, scene: BenchmarkScene, method: str, asked: Any
 ) -> Iterator[tuple[str, float]]:
     """By how much figures differ from the independent scorer's."""
-    root = asked.out / "runs"
+    root = _root(run, asked)
     result = load_result(root / "results" / run.protocol / method / f"{scene.name}.json")
     predicted = root / "predictions" / run.protocol / method / scene.name
     scorer = asked.shared / "score" / "score.py"
-    truth = asked.out / "truth" / run.protocol / method
+    truth = asked.out / "truth" / run.protocol / run.scene / (method + run.setting)
     if scene.tasks and "averaging" in result.switches and predicted.is_dir():
         worst = 0.0
         for task in scene.tasks:

@@ -34,6 +34,9 @@ class Command:
 
     splatseg bench lerf-ovs-2d --data lerf_ovs --method features --model clip=weights -o bench
 
+    splatseg bench spin-nerf-words --data spin-nerf --method prompt --model sam2 --grounder langsam
+    --option view_share=0.5 -o bench
+
     splatseg bench lerf-mask --data lerf_mask --method associate --model sam2 --steps 9000 -o bench
     """
 
@@ -53,6 +56,10 @@ class Command:
     """Who sees for the methods, each NAME[=WEIGHTS][,OPTION=VALUE...], or a folder of recorded
     evidence in which {scene} stands for the scene's name. A method takes the first that gives what
     it needs."""
+
+    option: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ..")] = ()
+    """Options of methods other than their own, named as in `splatseg segment --method METHOD
+    --help` with _ for -, such as view_share=0.5; results record them."""
 
     companion: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL ..")] = ()
     """Who sees what methods take besides their evidence, such as features and masks, named in the
@@ -121,6 +128,7 @@ def run(command: Command) -> None:
         options=BenchOptions(
             methods=listed("--method", command.method),
             models=command.model,
+            method_options=command.option,
             companions=command.companion,
             prompter=command.prompter,
             grounder=command.grounder,

@@ -160,6 +160,9 @@ class Method:
     """How words are asked of its features: by cosines; or in the span of all features, held against
     what else a thing could be, as `query` asks (`lift.words`)."""
 
+    published_words: Literal["cosines", "span"] | None = None
+    """The same in the setting of the publication, where that is not `words`."""
+
     readouts: Mapping[str, Returns] = field(default_factory=dict[str, Returns])
     """What it gives by its option ``readout``, where that is not `returns`."""
 

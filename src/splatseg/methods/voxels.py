@@ -181,5 +181,7 @@ METHOD = Method(
     returns="features",
     seeded=True,
     published=PUBLISHED,
+    words="span",
+    published_words="cosines",
     complete=False,
 )

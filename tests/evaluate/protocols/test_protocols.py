@@ -11,6 +11,7 @@ from splatseg.evaluate.protocols import (
     MapSwitches,
     PointSwitches,
     RoomSwitches,
+    SpokenSwitches,
     TargetSwitches,
     differences,
     find_protocol,
@@ -168,3 +169,35 @@ def test_switches_of_rooms_are_typed() -> None:
 def test_switches_of_rooms_that_cannot_be(changes, error, message) -> None:
     with pytest.raises(error, match=message):
         find_protocol("cosseg-replica-semantic").with_switches(changes)
+
+
+def test_words_of_scenes_are_a_recorded_choice() -> None:
+    """Table 3 of Prompt SA-GS; another choice is another experiment."""
+    words = find_protocol("spin-nerf-words")
+    assert isinstance(words.switches, SpokenSwitches)
+    assert words.switches.words_of_scenes == {
+        "truck": "truck",
+        "orchids": "all of the flowers",
+        "fortress": "fortress",
+        "pinecone": "pine cone",
+    }
+    assert tuple(words.switches.words_of_scenes) == words.scenes
+    own = words.with_switches(
+        dict([switch_value(words, "scene_words=fork: the fork ,lego:digger: yellow")])
+    )
+    assert own.switches.words_of_scenes == {"fork": "the fork", "lego": "digger: yellow"}
+    assert len(differences(words.switches, own.switches)) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("truck",), "expected pairs SCENE:WORDS, got 'truck'"),
+        (("truck:",), "expected pairs SCENE:WORDS, got 'truck:'"),
+        ((":truck",), "expected pairs SCENE:WORDS"),
+        (("truck:a", "truck:b"), "expected each scene once"),
+    ],
+)
+def test_words_of_scenes_that_say_nothing(given, message) -> None:
+    with pytest.raises(InputError, match=f"^scene_words: {message}"):
+        SpokenSwitches(prompt="words", scene_words=given)

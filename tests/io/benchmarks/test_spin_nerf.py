@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatseg.errors import InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.benchmarks import read_benchmark
 
 NAMES = ("b.jpg", "a.jpg", "c d.jpg")
@@ -30,7 +30,23 @@ def test_a_generated_scene(converted, source) -> None:
             for mask in task.truth
         )
     ]
-    assert len(things) == 1
+    (thing,) = things
+    assert task.words == thing.name
+
+
+def test_words_of_a_scene(tmp_path, tiny_capture, left_half) -> None:
+    tiny_capture(tmp_path, NAMES)
+    left_half(tmp_path / "masks" / "a.png", value=1)
+    assert read_benchmark("spin-nerf", tmp_path)[0].tasks[0].words is None
+    file = tmp_path / "words.txt"
+    file.write_text("\n  the red cup\n\n")
+    assert read_benchmark("spin-nerf", tmp_path)[0].tasks[0].words == "the red cup"
+    for text, lines in (("", 0), ("cup\nfork\n", 2)):
+        file.write_text(text)
+        with pytest.raises(
+            FileFormatError, match=rf"words\.txt: expected one line, .* got {lines}"
+        ):
+            read_benchmark("spin-nerf", tmp_path)
 
 
 @pytest.mark.parametrize("place", ["masks", "label", "images/label"])

@@ -7,6 +7,7 @@ from PIL import Image
 from scipy import ndimage
 
 from splatseg.core import View
+from splatseg.io.benchmarks.spin_nerf import WORDS_FILE
 from support.benchmark_layouts.source import Mask, Source, Thing, link, save_mask
 from support.benchmark_layouts.sparse import write_sparse
 
@@ -39,11 +40,15 @@ def write_nvos(source: Source, folder: Path) -> None:
 
 
 def write_spin_nerf(source: Source, folder: Path) -> None:
-    """The clearest thing in all views that show it; values 0 and 1, as its labels have."""
+    """The clearest thing in all views that show it; values 0 and 1, as its labels have.
+
+    Its name is what asks for it in words.
+    """
     scene = folder / source.name
     names = _photographs(source, scene, "images")
     thing = _whole_things(source)[0]
     (scene / "masks").mkdir()
+    (scene / WORDS_FILE).write_text(f"{thing.name}\n", encoding="utf-8")
     for view in source.views:
         mask = source.mask(thing, view)
         if mask.any():

@@ -21,6 +21,7 @@ from splatseg.tasks.benchmark import load_result
 DataSet = Callable[[str], Path]
 EVIDENCE = ("masks_sam", "labels_semantic", "labels_panoptic", "features_text", "features_dino")
 BESIDE = ("--companion", "masks_sam")
+HALF = ("--option", "view_share=0.5")
 STEPS = ("--steps", "60", "--max-gaussians", "4000", "--quiet")
 
 
@@ -83,6 +84,8 @@ def save_maps(maps: TrueMaps, views: list[str], folder: Path) -> None:
         ("lerf-ovs-3d", "lerf-ovs", ("--method", "features", "--model", "features_text")),
         ("lerf-ovs-2d", "lerf-ovs", ("--method", "objects", "--model", "features_text", *BESIDE)),
         ("lerf-ovs-3d", "lerf-ovs", ("--method", "objects", "--model", "features_text", *BESIDE)),
+        ("lerf-ovs-2d", "lerf-ovs", ("--method", "voxels", "--model", "features_text")),
+        ("spin-nerf-words", "spin-nerf", ("--method", "features", "--model", "features_text")),
         ("lerf-mask", "lerf-mask", ("--method", "features", "--model", "features_text")),
         ("3d-ovs", "3d-ovs", ("--method", "features", "--model", "features_text")),
     ],
@@ -127,6 +130,7 @@ def test_masks(protocol: str, layout: str, words, bench, data_set, tmp_path, sco
     [
         ("spin-nerf", "spin-nerf", ("--model", "masks_sam")),
         ("spin-nerf", "spin-nerf", ("--model", "masks_sam", "--published")),
+        ("spin-nerf-words", "spin-nerf", ("--model", "features_text", *BESIDE, *HALF)),
         ("lerf-ovs-2d", "lerf-ovs", ("--model", "features_text", *BESIDE)),
     ],
 )
@@ -146,6 +150,9 @@ def test_a_method_that_is_asked_for_each_thing(
     drawn = [path for task in scene.tasks for path in (masks / task.name).glob("*.png")]
     told = [note for note in result.notes if "nothing was selected" in note]
     assert len(drawn) + len(told) > 0
+    assert result.made["options"]["view_share"] == (
+        0.5 if "--published" in words or "--option" in words else 1.0
+    )
     if "--published" not in words:
         assert drawn
         assert found[method]["scores"]["iou"] > 0.1
@@ -202,11 +209,13 @@ def test_classes_of_views_whose_truth_is_a_labelled_scan(bench, data_set, tmp_pa
     bench("scannetpp", "scannetpp", "--method", "vote", "--model", "labels_semantic")
     result = load_result(out / f"results/scannetpp/vote/{scene.name}.json")
     assert result.scores["miou"] > 0.25
-    bench("scannetpp", "scannetpp", "--method", "objects", "--model", "features_text", *BESIDE)
-    assert (out / f"results/scannetpp/objects/{scene.name}.json").is_file()
+    for method, beside in (("objects", BESIDE), ("voxels", ()), ("voxels", ("--published",))):
+        bench("scannetpp", "scannetpp", "--method", method, "--model", "features_text", *beside)
+        result = load_result(out / f"results/scannetpp/{method}/{scene.name}.json")
+        assert result.scores["miou"] > 0.02
 
 
-@pytest.mark.parametrize("method", ["uplift", "features", "objects"])
+@pytest.mark.parametrize("method", ["uplift", "features", "objects", "voxels"])
 def test_classes_of_points(method: str, bench, data_set, tmp_path, score) -> None:
     data = data_set("scannet")
     name = "labels_semantic" if method == "uplift" else "features_text"

@@ -3,8 +3,10 @@
 import shutil
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
 
 import pytest
 import torch
@@ -15,19 +17,22 @@ from splatseg.core import (
     Labels,
     MaskSet,
     Prompt,
+    Selection,
 )
 from splatseg.core.models import TextMasks
 from splatseg.errors import InputError, MissingFileError, RangeError
 from splatseg.evaluate.protocols import find_protocol
 from splatseg.io.benchmarks import read_benchmark
+from splatseg.io.evidence import create_evidence, save_masks
 from splatseg.io.scene import load_scene, save_scene
 from splatseg.methods import Method, MethodInputs, _registry, find_method, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import SILENT, Observer
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
 from splatseg.tasks.benchmark.fits import held_out_views
+from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import bench_model, companion_for, seen_for
-from support.red_square import save_strokes
+from support.red_square import NAMES, SIZE, save_strokes
 
 
 @pytest.fixture
@@ -327,6 +332,89 @@ def test_words_found_in_the_drawn_first_view(tiny, tmp_path, monkeypatch) -> Non
     assert not rows["green cube", "b"]["found"]
     assert done.methods[0].scores["iou"] < 0.55
     assert "green cube" in done.methods[0].scenes[0].notes[0]
+
+
+@dataclass(frozen=True)
+class Asked:
+    words: tuple[str, ...] = ()
+    objects: Literal["one", "all"] = "one"
+    grounder: str | None = None
+
+
+def test_words_of_scenes_come_from_a_file_or_a_switch(run, tiny, tmp_path, monkeypatch) -> None:
+    """What a method is asked: the words of words.txt, or those of the experiment."""
+    data, _ = tiny
+    with pytest.raises(InputError, match=r"scene wall: expected the words .*words\.txt, or set"):
+        run("spin-nerf-words")
+    asked: list[Asked] = []
+
+    def answered(inputs: MethodInputs, options: Asked) -> Selection:
+        asked.append(options)
+        return Selection(mask=torch.ones(len(inputs.gaussians), dtype=torch.bool))
+
+    method = Method(
+        name="asked", summary="what was asked", reference="test", evidence=("masks",),
+        options=Asked, run=answered, returns="selection",
+    )  # fmt: skip
+    monkeypatch.setattr("splatseg.tasks.benchmark.run.find_method", lambda name: method)
+    masks = tmp_path / "masks"
+    create_evidence(masks, kind="masks")
+    for name in NAMES:
+        whole = MaskSet.from_dense(torch.ones(1, SIZE, SIZE, dtype=torch.bool))
+        save_masks(whole, masks, name)
+    shutil.copytree(data, tmp_path / "data")
+    (tmp_path / "data/wall/words.txt").write_text("red square\n")
+
+    def go(out: str, *switches: str) -> BenchRun:
+        options = BenchOptions(
+            methods=("asked",), models=(str(masks),), grounder="redness", switches=switches,
+            fitted=str(tiny[1] / "{scene}"),
+        )  # fmt: skip
+        return bench("spin-nerf-words", tmp_path / "data", tmp_path / out, options=options)
+
+    monkeypatch.setattr("splatseg.tasks.benchmark.run.bench_model", lambda *_: Redness())
+    done = go("file")
+    go("switch", "scene_words=wall:All of the squares")
+    assert [(one.words, one.objects) for one in asked] == [
+        (("red square",), "one"),
+        (("All of the squares",), "all"),
+    ]
+    # All annotated views count, the first one as well.
+    rows = done.methods[0].scenes[0].rows
+    assert {row["view"] for row in rows} == set(NAMES)
+    # No mean is published: figures of scenes stand beside, each named.
+    columns, table = bench_table(done)
+    assert columns[:3] == ("method", "iou", "accuracy")
+    figures = {(row[0], str(row[-1]).split(";")[0]): row[1:3] for row in table}
+    assert figures["Prompt SA-GS", "Prompt SA-GS, Table 4, orchids"] == (0.76, 0.957)
+    assert figures["SA-GS", "Prompt SA-GS, Table 4, truck"] == (0.934, 0.978)
+
+
+def test_words_are_asked_of_published_voxels_by_cosines() -> None:
+    """As their paper asks, and not in the span of the features."""
+    asked = [
+        Job.words.fget(
+            SimpleNamespace(method=find_method(name), options=BenchOptions(published=published))
+        )
+        for name in ("voxels", "objects", "features")
+        for published in (False, True)
+    ]
+    assert asked == ["span", "cosines", "span", "span", "cosines", "cosines"]
+
+
+def test_options_of_methods_are_another_experiment(run) -> None:
+    """Also those that their options hold in an object of their own."""
+    assert run().kept == 0
+    done = run(method_options=("correct_confusion=no", "correlated_views=7"))
+    assert done.kept == 0
+    made = done.methods[0].scenes[0].made["options"]
+    assert made["correct_confusion"] is False
+    assert made["confusion"]["correlated_views"] == 7
+    for wrong in ("view_share=0.5", "correct_confusion", "=1"):
+        with pytest.raises(InputError, match="^option: expected NAME=VALUE with an option of up"):
+            run(method_options=(wrong,))
+    with pytest.raises(InputError, match="option: correlated_views: expected a number, got 'much'"):
+        run(method_options=("correlated_views=much",))
 
 
 def test_from_the_command(tiny, tmp_path, capsys) -> None:

@@ -15,6 +15,7 @@ from splatseg.evaluate.protocols._scene_lists import SceneList as SceneList
 from splatseg.evaluate.protocols._switches import MapSwitches as MapSwitches
 from splatseg.evaluate.protocols._switches import PointSwitches as PointSwitches
 from splatseg.evaluate.protocols._switches import RoomSwitches as RoomSwitches
+from splatseg.evaluate.protocols._switches import SpokenSwitches as SpokenSwitches
 from splatseg.evaluate.protocols._switches import Switches as Switches
 from splatseg.evaluate.protocols._switches import TargetSwitches as TargetSwitches
 from splatseg.evaluate.protocols._switches import differences as differences

@@ -9,7 +9,12 @@ from splatseg.errors import InputError
 from splatseg.evaluate.protocols._protocol import Protocol
 from splatseg.evaluate.protocols._rooms import ROOMS
 from splatseg.evaluate.protocols._scene_lists import SCENE_LISTS
-from splatseg.evaluate.protocols._switches import MapSwitches, PointSwitches, TargetSwitches
+from splatseg.evaluate.protocols._switches import (
+    MapSwitches,
+    PointSwitches,
+    SpokenSwitches,
+    TargetSwitches,
+)
 
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 """Words that LERF holds every query against."""
@@ -55,6 +60,29 @@ _SPIN_NERF = Protocol(
     measure="iou",
     scenes=_SPIN_SCENES,
 )  # fmt: skip
+_SPIN_NERF_WORDS = Protocol(
+    name="spin-nerf-words",
+    summary="the object of SPIn-NeRF's masks asked for by words, in all annotated views",
+    layouts=("spin-nerf",),
+    reference="Prompt SA-GS (2024), Table 3",
+    switches=SpokenSwitches(
+        averaging="scenes",
+        prompt="words",
+        scored_in_training=True,
+        boundary_ratio=0.02,
+        negatives=CANONICAL_NEGATIVES,
+        scene_words=(
+            "truck:truck",
+            "orchids:all of the flowers",
+            "fortress:fortress",
+            "pinecone:pine cone",
+        ),
+    ),
+    measure="iou",
+    scenes=("truck", "orchids", "fortress", "pinecone"),
+    note="words of other scenes stand in their words.txt; those that begin with all mean "
+    "everything that answers, others one thing",
+)
 _LERF_MASK = Protocol(
     name="lerf-mask",
     summary="objects by words in held-out views",
@@ -165,6 +193,7 @@ PROTOCOLS: tuple[Protocol, ...] = (
         scenes=_SPIN_SCENES,
         note="LUDVIG leaves out view 14 of orchids as well, which is not done here",
     ),
+    _SPIN_NERF_WORDS,
     _LERF_MASK,
     _LERF_OVS_2D,
     _LERF_OVS_3D,

@@ -123,6 +123,30 @@ class TargetSwitches(Switches):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SpokenSwitches(TargetSwitches):
+    """Choices where the words of a scene are a choice of the experiment, not of the data set."""
+
+    scene_words: tuple[str, ...] = ()
+    """What is asked for in scenes, each ``SCENE:WORDS``. Scenes that are not among them are asked
+    for what their data set says."""
+
+    def __post_init__(self) -> None:
+        TargetSwitches.__post_init__(self)
+        for pair in self.scene_words:
+            scene, _, words = pair.partition(":")
+            if not (scene.strip() and words.strip()):
+                raise InputError(f"scene_words: expected pairs SCENE:WORDS, got {pair!r}.")
+        if len(self.words_of_scenes) < len(self.scene_words):
+            raise InputError(f"scene_words: expected each scene once, got {self.scene_words}.")
+
+    @property
+    def words_of_scenes(self) -> dict[str, str]:
+        """Words by scene."""
+        pairs = (pair.partition(":") for pair in self.scene_words)
+        return {scene.strip(): words.strip() for scene, _, words in pairs}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapSwitches(Switches):
     """Choices where every pixel of views has a true class or instance."""
 

@@ -7,16 +7,21 @@ Fields, CVPR 2023.
 from pathlib import Path
 
 from splatseg.core import BenchmarkScene, TargetTask
-from splatseg.errors import InputError, MissingFileError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.benchmarks._masks import true_mask
 from splatseg.io.benchmarks._views import ViewsByFile, read_views, scene_folders, trained_on_all
 from splatseg.io.captures import find_formats
+from splatseg.io.foreign import read_lines
 from splatseg.io.images import find_images
 
 LAYOUT = "spin-nerf"
 
 _FOLDERS = ("masks", "label", "labels", "images_4/label", "images/label", "images_2/label")
 _MASK = "_mask"
+
+WORDS_FILE = "words.txt"
+"""What asks for a scene's object in words, one line. The data set has no such file: it is for
+scenes of one's own."""
 
 
 def find_spin_nerf(folder: Path) -> tuple[Path, ...]:
@@ -30,7 +35,8 @@ def read_spin_nerf(folder: Path) -> tuple[BenchmarkScene, ...]:
     A scene is a capture with a folder of masks, one a view that is annotated, called as its
     photograph or ``VIEW_mask``: ``masks``, ``label``, ``labels`` or ``label`` in the folder of
     photographs. Views are sorted by name; the mask of the first is the prompt, and it is among
-    those that are scored: a protocol that leaves it out says so.
+    those that are scored: a protocol that leaves it out says so. ``words.txt`` in the scene's
+    folder, one line, has the words that ask for the object; it may lack.
 
     Args:
         folder: A scene, or the folder of several.
@@ -38,6 +44,7 @@ def read_spin_nerf(folder: Path) -> tuple[BenchmarkScene, ...]:
     Raises:
         MissingFileError: If there is no scene, or it has no masks.
         InputError: If a mask is of a view that the scene does not have.
+        FileFormatError: If ``words.txt`` has not one line.
     """
     scenes = find_spin_nerf(folder)
     if not scenes:
@@ -62,9 +69,21 @@ def _scene(path: Path) -> BenchmarkScene:
         name=path.name,
         layout=LAYOUT,
         capture=capture,
-        tasks=(TargetTask(name=path.name, truth=truth, reference=truth[0]),),
+        tasks=(TargetTask(name=path.name, truth=truth, reference=truth[0], words=_words(path)),),
         notes=capture.notes,
     )
+
+
+def _words(path: Path) -> str | None:
+    file = path / WORDS_FILE
+    if not file.is_file():
+        return None
+    lines = read_lines(file, "words")
+    if len(lines) != 1:
+        raise FileFormatError(
+            f"{file}: expected one line, the words that ask for the object, got {len(lines)}."
+        )
+    return lines[0]
 
 
 def _masks(path: Path) -> tuple[Path, ...]:

@@ -249,3 +249,9 @@ def best_cut(
         if overlap > best + 1e-12:
             best, chosen = overlap, cut
     return chosen
+
+
+def mask_overlap(one: Bool[Tensor, "height width"], other: Bool[Tensor, "height width"]) -> float:
+    """Intersection over union; 1 of two empty masks."""
+    either = int((one | other).sum())
+    return int((one & other).sum()) / either if either else 1.0

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from splatseg.core import Layer, Model, Scene, VoxelFeatures
 from splatseg.core.benchmark import BenchmarkScene
@@ -58,7 +58,7 @@ class Job:
         source: Path | None = None,
         asked: Mapping[str, object] | None = None,
     ) -> Layer:
-        """The method's layer of evidence.
+        """The method's layer of evidence, with what each Gaussian reads of its voxels.
 
         Args:
             evidence: Its name, in the scene's folder, or in `source`.
@@ -66,16 +66,24 @@ class Job:
             source: A folder of evidence besides the scene's.
             asked: Options of the method that say what is asked for, such as words.
         """
+        layer = self.whole_layer(evidence, views=views, source=source, asked=asked)
+        return layer.features() if isinstance(layer, VoxelFeatures) else layer
+
+    def whole_layer(
+        self,
+        evidence: str,
+        *,
+        views: tuple[str, ...] = ("train",),
+        source: Path | None = None,
+        asked: Mapping[str, object] | None = None,
+    ) -> Layer:
+        """The same with voxels as they are, to be asked for words."""
         scene = self.scene if source is None else replace(self.scene, source=source)
-        beside = self._options_beside()
-        if asked:
-            method = self.method
-            usual = method.published_options if self.options.published else method.options()
-            beside = replace(beside or usual, **asked)
+        given = replace(self.options.options_of(self.method), **self._beside(), **(asked or {}))
         made = segment(
             scene,
             self.method,
-            method_options=beside,
+            method_options=given,
             options=SegmentOptions(
                 evidence=evidence,
                 views=views,
@@ -85,15 +93,19 @@ class Job:
             backend=self.backend,
             observer=self.observer,
         )
-        # Words are asked of Gaussians, each with what it reads of its voxels.
-        layer = made.layer
-        return layer.features() if isinstance(layer, VoxelFeatures) else layer
+        return made.layer
 
-    def _options_beside(self) -> Any:
-        """Options that name what the method takes besides, where some is given; else None."""
+    @property
+    def words(self) -> Literal["cosines", "span"]:
+        """How the method's features are asked for words."""
+        published = self.method.published_words if self.options.published else None
+        return published or self.method.words
+
+    def _beside(self) -> dict[str, str]:
+        """Names of what the method takes besides, by its options."""
         method = self.method
         if not (method.companions and self.options.companions):
-            return None
+            return {}
         named: dict[str, str] = {}
         for option, kinds in method.companions.items():
             seen = companion_for(
@@ -113,5 +125,4 @@ class Job:
                 f"companions: expected a model that gives {' or '.join(wanted)}, got "
                 f"{', '.join(self.options.companions)}."
             )
-        chosen = method.published_options if self.options.published else method.options()
-        return replace(chosen, **named)
+        return named

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from splatseg.core import (
     UNLABELLED,
-    Features,
     InstanceTree,
     LabelMap,
     Layer,
@@ -37,10 +36,9 @@ from splatseg.evaluate.protocols import MapSwitches
 from splatseg.io.evidence import save_label_map
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
-from splatseg.lift.heads import has_classifier
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.job import Job
-from splatseg.tasks.benchmark.points import read_by_words, true_ids_of
+from splatseg.tasks.benchmark.points import read_by_words, read_in_words, true_ids_of
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
 
 _LAYER = "layer"
@@ -75,8 +73,8 @@ def map_scores(job: Job) -> Scores:
         InputError: If the scene has no truth of what the method gives.
     """
     seen = job.seen(words=evidence_wanted(job.protocol, job.method, job.options) == "words")
-    layer = job.layer(seen.name)
-    if isinstance(layer, Features) and not has_classifier(layer):
+    layer = job.whole_layer(seen.name)
+    if read_in_words(layer):
         truth = _truth(job, true_classes(job), "classes")
         if truth.table is None:
             raise InputError(f"scene {job.bench.name}: expected names of its classes, got none.")

@@ -1,11 +1,15 @@
 """What a run of a protocol is told: methods, models, fits, other choices than its own."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from splatseg.core.boundary import convert_fields
+from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Preset
+from splatseg.methods import Method
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,6 +23,10 @@ class BenchOptions:
     """Who sees for the methods, each NAME[=WEIGHTS][,OPTION=VALUE...], or a folder of recorded
     evidence in which {scene} stands for the scene's name. A method takes the first that gives what
     it needs."""
+
+    method_options: tuple[str, ...] = ()
+    """Options of methods other than their own, each NAME=VALUE; all methods that have an option of
+    the name take it, and results record it."""
 
     companions: tuple[str, ...] = ()
     """Who sees what methods take besides their evidence, such as features and masks, named in the
@@ -75,6 +83,31 @@ class BenchOptions:
         if len(set(self.methods)) != len(self.methods):
             raise InputError(f"methods: expected each once, got {', '.join(self.methods)}.")
 
+    def options_of(self, method: Method) -> Any:
+        """Options of a method: its own or those of its publication, changed by `method_options`.
+
+        Raises:
+            InputError: If a value does not fit.
+        """
+        chosen = method.published_options if self.published else method.options()
+        for text in self.method_options:
+            if text.partition("=")[0] in method.option_names():
+                chosen = _with_option(chosen, text)
+        return chosen
+
+    def check_methods(self, methods: Sequence[Method]) -> None:
+        """Raise `InputError` unless each of `method_options` is of a method, and fits it."""
+        known = {name for method in methods for name in method.option_names()}
+        for text in self.method_options:
+            name, equals, _ = text.partition("=")
+            if not equals or name not in known:
+                raise InputError(
+                    f"option: expected NAME=VALUE with an option of {', '.join(self.methods)} "
+                    f"({', '.join(sorted(known))}), got {text!r}."
+                )
+        for method in methods:
+            self.options_of(method)
+
     def fit_options(self, *, fixed: bool) -> FitOptions:
         """Options of the fits.
 
@@ -88,3 +121,13 @@ class BenchOptions:
         if self.max_gaussians is None:
             return options
         return replace(options, max_gaussians=self.max_gaussians)
+
+
+def _with_option(options: Any, text: str) -> Any:
+    """Options with one of them, or of those that they hold, changed as ``NAME=VALUE`` says."""
+    name = text.partition("=")[0]
+    if name in {each.name for each in fields(options)}:
+        return replace(options, **dict([typed_field(type(options), text, what="option")]))
+    held = {each.name: getattr(options, each.name) for each in fields(options)}
+    inner = {key: one for key, one in held.items() if is_dataclass(one)}
+    return replace(options, **{key: _with_option(one, text) for key, one in inner.items()})

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, TypeGuard, cast
 
 import torch
 from jaxtyping import Int
@@ -16,7 +16,9 @@ from splatseg.core import (
     Labels,
     Layer,
     Selection,
+    VoxelFeatures,
     map_ids,
+    plain_features,
 )
 from splatseg.core.benchmark import TruePoints
 from splatseg.errors import InputError
@@ -28,10 +30,9 @@ from splatseg.io.npz_writing import save_arrays
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.lift.heads import ClassifierHead, has_classifier
-from splatseg.lift.words import WordIndex
 from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
-from splatseg.tasks.benchmark.spoken import words_of
+from splatseg.tasks.benchmark.spoken import word_index, words_of
 
 _LAYER = "layer"
 _MOVED = 1e-4
@@ -86,7 +87,7 @@ def _labels_of_points(
     """Ids of the truth for each point, which points count, and notes."""
     layer, seen = _layer(job)
     notes: list[str] = []
-    if isinstance(layer, Features) and not has_classifier(layer):
+    if read_in_words(layer):
         layer = read_by_words(job, seen, layer, truth.table, wanted.tolist())
     else:
         layer, note = _in_true_ids(job, seen, layer, truth.table)
@@ -101,7 +102,7 @@ def _labels_of_points(
 
 def _layer(job: Job) -> tuple[Layer, Seen]:
     seen = job.seen(words=evidence_wanted(job.protocol, job.method, job.options) == "words")
-    return job.layer(seen.name), seen
+    return job.whole_layer(seen.name), seen
 
 
 def _check_places(job: Job, truth: TruePoints) -> None:
@@ -120,8 +121,19 @@ def _check_places(job: Job, truth: TruePoints) -> None:
         )
 
 
+def read_in_words(layer: Layer) -> TypeGuard[Features | VoxelFeatures]:
+    """Whether classes of a layer are told by words: it has features, and no classifier."""
+    if isinstance(layer, VoxelFeatures):
+        return True
+    return isinstance(layer, Features) and not has_classifier(layer)
+
+
 def read_by_words(
-    job: Job, seen: Seen, layer: Features, table: ClassTable | None, wanted: Sequence[int]
+    job: Job,
+    seen: Seen,
+    layer: Features | VoxelFeatures,
+    table: ClassTable | None,
+    wanted: Sequence[int],
 ) -> Features:
     """Features with a classifier: the class whose name is nearest, as the method asks words.
 
@@ -139,8 +151,9 @@ def read_by_words(
     if not ids:
         raise InputError("words: expected vectors of names of classes, none has one.")
     vectors = vocabulary.vectors([table.name_of(id) for id in ids])
-    if job.method.words == "span":
-        vectors = WordIndex(layer, vocabulary).span.inside(vectors)
+    if job.words == "span" and (span := word_index(layer, vocabulary).span) is not None:
+        vectors = span.inside(vectors)
+    layer = plain_features(layer)
     weight, bias = vocabulary.space.linear(vectors)
     head = ClassifierHead(ids=torch.tensor(ids), weight=weight, bias=bias, blend="probabilities")
     return replace(layer, info=replace(layer.info, head=head.to_json()))

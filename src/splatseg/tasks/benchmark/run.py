@@ -108,6 +108,7 @@ def bench(
     chosen = find_protocol(protocol)
     chosen = chosen.with_switches(dict(switch_value(chosen, one) for one in options.switches))
     methods = [find_method(name) for name in options.methods]
+    options.check_methods(methods)
     if options.companions and not any(method.companions for method in methods):
         raise InputError(
             "companions: expected a method that takes more than its evidence, got "
@@ -222,7 +223,7 @@ def _scored(job: Job) -> tuple[dict[str, float], list[Mapping[str, Any]], list[s
 def _made_from(job: Job, digest: str) -> dict[str, Any]:
     """All that a result depends on, in values that JSON holds."""
     method = job.method
-    chosen = method.published_options if job.options.published else method.options()
+    chosen = job.options.options_of(method)
     # Left out where there is none: results of versions that did not know it stay what they are.
     given = bool(method.companions) and bool(job.options.companions)
     companions = {"companions": list(job.options.companions)} if given else {}

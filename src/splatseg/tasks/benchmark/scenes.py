@@ -1,12 +1,14 @@
 """Which scenes a run is of: those of the data set, of the protocol's list, or of a person's."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.errors import InputError
-from splatseg.evaluate.protocols import Protocol, RoomSwitches
+from splatseg.evaluate.protocols import Protocol, RoomSwitches, SpokenSwitches
 from splatseg.io.benchmarks import find_layout, read_benchmark
+from splatseg.io.benchmarks.spin_nerf import WORDS_FILE
 from splatseg.tasks.benchmark.options import BenchOptions
 
 
@@ -17,7 +19,8 @@ def asked_scenes(protocol: Protocol, data: Path, options: BenchOptions) -> list[
     name; of others all that are there, or those.
 
     Raises:
-        InputError: If the data set has another layout, or a scene is not there or not in the list.
+        InputError: If the data set has another layout, a scene is not there or not in the list, or
+            nobody says by which words it is asked for.
         MissingFileError: If the data set is not there, or lacks files of its layout.
     """
     there = {one.name: one for one in _read(protocol, data)}
@@ -38,7 +41,22 @@ def asked_scenes(protocol: Protocol, data: Path, options: BenchOptions) -> list[
             f"{protocol.name}, {len(lacking)} are not there ({', '.join(lacking)}); name those to "
             "run with `scenes`, or set scene_list=all."
         )
-    return [one for name, one in there.items() if not wanted or name in wanted]
+    return [_in_words(one, protocol) for name, one in there.items() if not wanted or name in wanted]
+
+
+def _in_words(scene: BenchmarkScene, protocol: Protocol) -> BenchmarkScene:
+    """The scene with the words that the protocol asks by, where it says them."""
+    switches = protocol.switches
+    if not isinstance(switches, SpokenSwitches):
+        return scene
+    words = switches.words_of_scenes.get(scene.name)
+    tasks = tuple(replace(task, words=words or task.words) for task in scene.tasks)
+    if any(task.words is None for task in tasks):
+        raise InputError(
+            f"scene {scene.name}: expected the words that ask for it, got none; write them into "
+            f"{scene.capture.path / WORDS_FILE}, or set scene_words={scene.name}:WORDS."
+        )
+    return replace(scene, tasks=tasks)
 
 
 def scene_notes(protocol: Protocol, scenes: Sequence[BenchmarkScene]) -> list[str]:

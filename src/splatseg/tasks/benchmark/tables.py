@@ -22,6 +22,8 @@ def bench_table(
 ) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
     """Names of columns, and a row a method: measured ones first, then published ones.
 
+    Published are means over the protocol's scenes; where none is known, figures of single scenes.
+
     Scores are shares in [0, 1], PSNR in decibels; an empty cell was not measured, or not published.
 
     Args:
@@ -29,7 +31,7 @@ def bench_table(
         notes: Whether sources of published figures come with what is known of their settings.
     """
     published = published_figures(run.protocol.name)
-    means = [one for one in published if one.scene is None]
+    means = [one for one in published if one.scene is None] or list(published)
     measures = list(dict.fromkeys(name for one in (*run.methods, *means) for name in one.scores))
     scenes = list(dict.fromkeys(one.scene for method in run.methods for one in method.scenes))
     if len(scenes) < 2:
@@ -102,14 +104,17 @@ def _published(
     own = {
         one.scene: one.scores.get(run.protocol.measure)
         for one in figures
-        if one.method == mean.method and one.source == mean.source
+        if one.method == mean.method
+        and one.source == mean.source
+        and mean.scene in (None, one.scene)
     }
+    source = mean.source if mean.scene is None else f"{mean.source}, {mean.scene}"
     note = f"; {mean.note}" if mean.note and notes else ""
     return (
         mean.method,
         *(_figure(mean.scores.get(name)) for name in measures),
         *(_figure(own.get(scene)) for scene in scenes),
-        f"{mean.source}{'' if mean.verified else _UNVERIFIED}{note}",
+        f"{source}{'' if mean.verified else _UNVERIFIED}{note}",
     )
 
 

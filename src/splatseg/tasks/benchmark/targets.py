@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from splatseg.core import (
@@ -18,6 +17,7 @@ from splatseg.core import (
     LabelMap,
     Layer,
     Selection,
+    plain_features,
 )
 from splatseg.core.benchmark import TargetTask, TrueMask
 from splatseg.errors import InputError
@@ -33,8 +33,6 @@ from splatseg.io.images import save_png
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.heads import has_classifier
-from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import WordIndex
 from splatseg.methods.prompt import mask_points
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks.benchmark.chosen import (
@@ -46,6 +44,7 @@ from splatseg.tasks.benchmark.chosen import (
     Cuttable,
     best_cut,
     ids_mask,
+    mask_overlap,
     segments_inside,
 )
 from splatseg.tasks.benchmark.job import Job
@@ -58,7 +57,7 @@ from splatseg.tasks.benchmark.prompts import (
 )
 from splatseg.tasks.benchmark.selecting import LayerSelector, is_affinity
 from splatseg.tasks.benchmark.sight import Seen
-from splatseg.tasks.benchmark.spoken import words_of
+from splatseg.tasks.benchmark.spoken import SpokenLayer, asks_for_all
 
 _LAYER = "layer"
 _THING, _REST = 1, 2
@@ -163,18 +162,21 @@ class TargetRun:
         It is asked by words where these are given, or a grounder was named to find them; else by
         points of the mask, or of the mask that the prompter makes of strokes.
         """
-        words = self._switches.prompt == "words" or self._job.options.grounder is not None
+        grounder = self._job.options.grounder
+        words = task.words or task.name
         given: PromptedMask | None = None
-        asked: dict[str, object] = {"words": (task.words or task.name,)}
-        if self._job.options.grounder is not None:
-            asked["grounder"] = self._job.options.grounder
-        if not words:
+        asked: dict[str, object] = {"words": (words,)}
+        if grounder is not None:
+            asked["grounder"] = grounder
+        if asks_for_all(words) and "objects" in self._job.method.option_names():
+            asked["objects"] = "all"
+        if self._switches.prompt != "words" and grounder is None:
             given = self._prompt(task)
             if given is None:
                 return None
             asked = {"point": mask_points(given.view, given.mask)}
         try:
-            layer = self._job.layer(self._job.seen(words=words).name, asked=asked)
+            layer = self._job.layer(self._method_seen.name, asked=asked)
         except InputError as error:
             self.notes.append(f"{task.name}: nothing was selected ({error})")
             return None
@@ -277,7 +279,7 @@ class TargetRun:
             with self._field.view(camera) as view:
                 found = view.label_map(address)
             ids = segments_inside(found, prompt.mask, share=self._switches.segment_share)
-            overlap = _iou(ids_mask(found, ids), prompt.mask)
+            overlap = mask_overlap(ids_mask(found, ids), prompt.mask)
             if overlap > best:
                 best, chosen = overlap, self._by_ids(self._field, address, ids)
         return chosen
@@ -311,13 +313,13 @@ class TargetRun:
     def _by_words(self, task: TargetTask) -> ByFeatures | BySelection | None:
         """What answers to the words more than to canonical ones, or as the method asks words."""
         words = task.words or task.name
-        vocabulary = self._vocabulary
+        vocabulary = self._spoken.vocabulary
         if not vocabulary.known(words):
             self.notes.append(f"{task.name}: no vector of its words was recorded.")
             return None
-        if self._job.method.words == "span":
+        if self._job.words == "span":
             return self._by_span(task, words)
-        layer = self._word_layer
+        layer = plain_features(self._spoken.layer)
         unknown = [word for word in self._switches.negatives if not vocabulary.known(word)]
         if unknown:
             raise InputError(
@@ -333,37 +335,23 @@ class TargetRun:
 
     def _by_span(self, task: TargetTask, words: str) -> BySelection:
         """What likelier is the thing than anything else, as `query` answers."""
-        index = self._word_index
-        sure = index.of_gaussians(index.ask([words]).probabilities)[:, 0].clamp(0, 1)
         found = BySelection(
             gaussians=self._job.scene.gaussians,
-            selection=Selection(mask=sure >= 0.5, confidence=sure),
+            selection=self._spoken.selection(words),
             switches=self._switches,
             backend=self._job.backend,
         )
         return self._with_cut(task, found, None)
 
     @cached_property
-    def _word_index(self) -> WordIndex:
-        return WordIndex(self._word_layer, self._vocabulary)
+    def _spoken(self) -> SpokenLayer:
+        return SpokenLayer(self._job)
 
     @cached_property
-    def _word_layer(self) -> Features:
-        layer = self._job.layer(self._words_seen.name)
-        if not isinstance(layer, Features):
-            raise InputError(
-                f"method {self._job.method.name}: expected one that gives features, as words are "
-                f"asked for by features, got {self._job.method.returns}."
-            )
-        return layer
-
-    @cached_property
-    def _words_seen(self) -> Seen:
-        return self._job.seen(words=True)
-
-    @cached_property
-    def _vocabulary(self) -> Vocabulary:
-        return words_of(self._job.scene, self._words_seen)
+    def _method_seen(self) -> Seen:
+        """Evidence of a method that selects: features of words where these find what is asked."""
+        words = self._switches.prompt == "words" and self._job.grounder is None
+        return self._job.seen(words=words)
 
     def _by_features(
         self, layer: Features, space: TextSpace, thing: Tensor, others: Tensor
@@ -409,8 +397,3 @@ _PROMPT_TABLE = ClassTable(
         ClassInfo(id=_REST, name="rest", isthing=False),
     )
 )
-
-
-def _iou(one: Bool[Tensor, "height width"], other: Bool[Tensor, "height width"]) -> float:
-    either = int((one | other).sum())
-    return int((one & other).sum()) / either if either else 1.0

@@ -23,6 +23,7 @@ _FIGURES = MappingProxyType(
     {
         "nvos": _nvos.FIGURES,
         "spin-nerf": _spin_nerf.FIGURES,
+        "spin-nerf-words": _spin_nerf.WORDS,
         "spin-nerf-ludvig": _spin_nerf.LUDVIG,
         "lerf-mask": _lerf_mask.FIGURES,
         "lerf-figurines-sa3d": _lerf_mask.SA3D_OBJECTS,
