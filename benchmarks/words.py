@@ -11,128 +11,92 @@ row `gaussians`, one of `segment --method features --evidence features_text` cal
 - `voxels`: by voxels, the layer `voxels` (`segment --method voxels --evidence features_text --layer
   voxels`), in the span as `query --every --from-layer voxels` asks, and by plain cosines, as the
   paper asks; `published` the same of the layer `voxels_published`, made with `--published`.
+- `paper`: `voxels`, `published` and `objects` asked for the classes of the voxel paper's table
+  alone, pixels of others left out.
 - `unknown`: how well the probabilities tell which of all classes are there: the area under the
   ROC, and the shares found at 0.5 of those that are there and of those that are not.
 - `speed`: milliseconds of a query of one word, and of ten: of the vectors, of the things, and of
   the probability of each Gaussian.
 """
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from scored import ScoredScene, run_rows
+from scored import run_rows
+from word_scene import PAPER_CLASSES, WordScene
 
-from splatseg.core import UNLABELLED, Features, Labels, VoxelFeatures
-from splatseg.io.scene import load_scene_layer
-from splatseg.lift import complete
+from splatseg.core import Features
 from splatseg.lift.voxels import VoxelWords
-from splatseg.tasks import QueryOptions, QuerySession
 
 
-def _features(bench: ScoredScene, name: str) -> Features:
-    layer = load_scene_layer(bench.scene.root, name)
-    if not isinstance(layer, Features):
-        raise TypeError(f"{name}: expected features.")
-    return layer
+def _calibrated(
+    bench: WordScene, row: str, name: str, words: Sequence[str], *, others: bool = True
+) -> None:
+    """By `query --every` from a layer."""
+    layer = bench.voxels(name) if "voxels" in name else bench.features(name)
+    found = bench.session(layer).ask(words).cosines
+    bench.scored(row, found, found.abs().amax(dim=1) > 0, words, others=others)
 
 
-def _classes(bench: ScoredScene) -> list[dict[str, Any]]:
-    return json.loads((bench.data / "metadata.json").read_text())["classes"]
-
-
-def _session(bench: ScoredScene, layer: Features | VoxelFeatures) -> QuerySession:
-    options = QueryOptions(from_layer="asked", every=True, features="features_text")
-    return QuerySession(bench.scene, options=options, layers={"asked": layer})
-
-
-def _scored(bench: ScoredScene, row: str, labels: Labels) -> None:
-    """With Gaussians of no object labelled by their neighbours."""
-    present = torch.tensor([UNLABELLED, *(c["id"] for c in _classes(bench) if c["present"])])
-    named = replace(labels, ids=present[labels.ids.long().clamp_min(0)].int())
-    whole = complete(bench.scene.gaussians, named)
-    said = bench.score("semantic", [bench.draw(whole, row)], "semantic")
-    print(row, {k: round(v, 4) for k, v in said.items() if isinstance(v, float)}, flush=True)
-
-
-def _names(bench: ScoredScene) -> list[str]:
-    return [row["name"] for row in _classes(bench) if row["present"]]
-
-
-def objects(bench: ScoredScene) -> None:
-    answers = _session(bench, _features(bench, "objects")).ask(_names(bench))
-    _scored(bench, "objects", answers.labels())
-
-
-def _plain(bench: ScoredScene, features: Features) -> Labels:
+def _plain(bench: WordScene, row: str, features: Features, words: Sequence[str]) -> None:
     """The word of the largest plain cosine."""
-    session = _session(bench, features)
-    vocabulary = session.index.vocabulary
-    cosines = vocabulary.space.cosines(features.values, vocabulary.vectors(_names(bench)))
-    known = features.values.abs().amax(dim=1) > 0
-    best = torch.where(known, cosines.argmax(dim=1) + 1, UNLABELLED)
-    return Labels(ids=best.int(), confidence=known.float())
+    vocabulary = bench.vocabulary
+    found = vocabulary.space.cosines(features.values, vocabulary.vectors(words))
+    bench.scored(row, found, features.values.abs().amax(dim=1) > 0, words)
 
 
-def gaussians(bench: ScoredScene) -> None:
-    _scored(bench, "gaussians", _plain(bench, _features(bench, "features_text")))
+def objects(bench: WordScene) -> None:
+    _calibrated(bench, "objects", "objects", bench.names)
 
 
-def means(bench: ScoredScene) -> None:
-    own, layer = _features(bench, "features_text"), _features(bench, "objects")
-    index = _session(bench, layer).index
-    rows, weights = index.rows, own.weights
-    if weights is None:
-        raise TypeError("features_text: expected weights.")
-    there = torch.nonzero(rows >= 0).squeeze(1)
-    sums = torch.zeros(len(index), own.values.shape[1] + 1, dtype=torch.float64)
-    weighted = torch.cat((own.values * weights[:, None], weights[:, None]), dim=1).double()
-    sums.index_add_(0, rows[there], weighted[there])
-    mean = (sums[:, :-1] / sums[:, -1:].clamp_min(1e-12)).float()
-    _scored(bench, "means", _plain(bench, replace(own, values=index.of_gaussians(mean))))
+def gaussians(bench: WordScene) -> None:
+    _plain(bench, "gaussians", bench.features("features_text"), bench.names)
 
 
-def _voxels(bench: ScoredScene, name: str) -> None:
-    layer = load_scene_layer(bench.scene.root or Path(), name)
-    if not isinstance(layer, VoxelFeatures):
-        raise TypeError(f"{name}: expected voxels.")
-    session = _session(bench, layer)
-    _scored(bench, f"{name}, span", session.ask(_names(bench)).labels())
-    asked = VoxelWords(layer, session.index.vocabulary, components=None)
-    cosines = asked.of_gaussians(asked.cosines(asked.vocabulary.vectors(_names(bench))))
+def means(bench: WordScene) -> None:
+    rows = bench.session(bench.features("objects")).index.rows
+    _plain(bench, "means", bench.means(bench.features("features_text"), rows), bench.names)
+
+
+def _voxels(bench: WordScene, name: str, words: Sequence[str], *, others: bool = True) -> None:
+    row = name if others else f"paper {name}"
+    _calibrated(bench, f"{row}, span", name, words, others=others)
+    asked = VoxelWords(bench.voxels(name), bench.vocabulary, components=None)
+    cosines = asked.of_gaussians(asked.cosines(asked.vocabulary.vectors(words)))
     known = cosines.abs().amax(dim=1) > 0
-    best = torch.where(known, cosines.argmax(dim=1) + 1, UNLABELLED)
-    plain = Labels(ids=best.int(), confidence=known.float())
-    _scored(bench, f"{name}, cosines", plain)
+    bench.scored(f"{row}, cosines", cosines, known, words, others=others)
 
 
-def voxels(bench: ScoredScene) -> None:
-    _voxels(bench, "voxels")
+def voxels(bench: WordScene) -> None:
+    _voxels(bench, "voxels", bench.names)
 
 
-def published(bench: ScoredScene) -> None:
-    _voxels(bench, "voxels_published")
+def published(bench: WordScene) -> None:
+    _voxels(bench, "voxels_published", bench.names)
 
 
-def unknown(bench: ScoredScene) -> None:
-    session = _session(bench, _features(bench, "objects"))
-    found = session.index.ask([row["name"] for row in _classes(bench)]).probabilities
-    best = found[session.index.weights > 5].amax(dim=0).numpy()
-    there = np.array([bool(row["present"]) for row in _classes(bench)])
+def paper(bench: WordScene) -> None:
+    words = [name for name in PAPER_CLASSES if name in bench.names]
+    for name in ("voxels_published", "voxels"):
+        _voxels(bench, name, words, others=False)
+    _calibrated(bench, "paper objects", "objects", words, others=False)
+
+
+def unknown(bench: WordScene) -> None:
+    index = bench.session(bench.features("objects")).index
+    found = index.ask([row["name"] for row in bench.classes]).probabilities
+    best = found[index.weights > 5].amax(dim=0).numpy()
+    there = np.array([bool(row["present"]) for row in bench.classes])
     area = (best[there][:, None] > best[~there][None]).mean()
     shares = {str(at): [float((best[one] > at).mean().round(3)) for one in (there, ~there)]
               for at in (0.1, 0.2, 0.3, 0.5, 0.7)}  # fmt: skip
     print("unknown", {"area": round(float(area), 4), "there, not there, above": shares}, flush=True)
 
 
-def speed(bench: ScoredScene) -> None:
-    session = _session(bench, _features(bench, "objects"))
-    names = _names(bench)
+def speed(bench: WordScene) -> None:
+    session = bench.session(bench.features("objects"))
+    names = bench.names
     for count in (1, 10):
         calls: list[Callable[[Sequence[str]], object]] = [
             session.index.ask,
@@ -154,13 +118,14 @@ def speed(bench: ScoredScene) -> None:
 if __name__ == "__main__":
     run_rows(
         __doc__,
-        ScoredScene,
+        WordScene,
         {
             "objects": objects,
             "means": means,
             "gaussians": gaussians,
             "voxels": voxels,
             "published": published,
+            "paper": paper,
             "unknown": unknown,
             "speed": speed,
         },

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from splatseg._check import check_shape
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.core.voxel_features import StoredTable, VoxelFeatures
@@ -25,7 +26,7 @@ _AT_ONCE = 8192
 """Rows that are widened at a time."""
 
 _SPAN_ROWS = 20_000
-"""Voxels, evenly among all, that the span is found from."""
+"""Rows, evenly among all, that the span is found from."""
 
 _TINY = 1e-12
 _MAX_EXPONENT = 80.0
@@ -35,34 +36,38 @@ LastLayers = Callable[[Tensor], Tensor]
 """The last layers of an image encoder: features before them -> vectors in the space of words."""
 
 
-class VoxelWords:
-    """Features of voxels, arranged to be asked for words again and again.
+class TableWords:
+    """Rows of features, arranged to be asked for words again and again.
 
     Args:
-        layer: The voxels.
-        vocabulary: Vectors of words in the space of their features.
+        table: Features, a row a thing.
+        weights: What each row rests on, at least 0; the span is found with them.
+        vocabulary: Vectors of words in the space of the features.
         components: Directions in which words are compared, at most; None compares plain cosines
             in the whole space, as the paper does.
         last_layers: Where features were kept before the last layers of the image encoder (section
             3.3): these, applied to each voxel now (section 3.5.1).
 
     Raises:
-        InputError: If no voxel has a feature.
+        InputError: If no row has a feature.
         ShapeError: If widths do not fit.
     """
 
     @boundary
     def __init__(
         self,
-        layer: VoxelFeatures,
+        table: StoredTable,
+        weights: Float[Tensor, "m"],
         vocabulary: Vocabulary,
         *,
         components: int | None = 32,
         last_layers: LastLayers | None = None,
     ) -> None:
-        self._layer = layer
+        check_shape("weights", weights, (len(table),))
+        self._weights = weights.detach().cpu().float()
         self._vocabulary = vocabulary
-        table = layer.table if last_layers is None else _applied(layer.table, last_layers)
+        if last_layers is not None:
+            table = _applied(table, last_layers)
         space = vocabulary.space
         expected = space.width if space.basis is None else len(space.basis)
         if table.channels != expected:
@@ -72,7 +77,7 @@ class VoxelWords:
             )
         self._lengths = _lengths(table, space)
         if not bool((self._lengths > 0).any()):
-            raise InputError("features: expected a feature of at least one voxel, got none.")
+            raise InputError("features: expected a feature of at least one row, got none.")
         self._table = table
         self._span: WordSpan | None = None
         if components is not None:
@@ -82,7 +87,7 @@ class VoxelWords:
         self._context = None
 
     def __len__(self) -> int:
-        """How many voxels there are."""
+        """How many rows there are."""
         return len(self._table)
 
     @property
@@ -97,14 +102,14 @@ class VoxelWords:
 
     @property
     def weights(self) -> Float[Tensor, "m"]:
-        """What the feature of each voxel rests on."""
-        return self._layer.weights
+        """What the feature of each row rests on."""
+        return self._weights
 
     @boundary
     def cosines(
         self, vectors: Float[Tensor, "k width"], *, least_energy: float = 0.0
     ) -> Float32[Tensor, "m k"]:
-        """Cosine of each voxel with each vector, 0 where one has no length.
+        """Cosine of each row with each vector, 0 where one has no length.
 
         Args:
             vectors: Vectors of words, any number.
@@ -136,7 +141,7 @@ class VoxelWords:
         context: Sequence[str] | None = None,
         options: AnswerOptions | None = None,
     ) -> WordAnswers:
-        """What each voxel answers, see `lift.words.answer_words`.
+        """What each row answers, see `lift.words.answer_words`.
 
         The result does not depend on the number of threads.
 
@@ -160,15 +165,6 @@ class VoxelWords:
             words=tuple(word.strip() for word in words), cosines=cosines, probabilities=found
         )
 
-    @boundary
-    def of_gaussians(self, found: Float[Tensor, "m words"]) -> Float[Tensor, "n words"]:
-        """Numbers of voxels as Gaussians read them, 0 where one reads none.
-
-        Args:
-            found: One row a voxel, such as the probabilities of `ask`.
-        """
-        return self._layer.of_gaussians(found)
-
     def _against(
         self, others: tuple[str, ...], rivals: Tensor, options: AnswerOptions
     ) -> tuple[StoredTable, Float32[Tensor, "m"]]:
@@ -186,7 +182,7 @@ class VoxelWords:
     def _found_span(self, components: int) -> WordSpan:
         known = torch.nonzero(self._lengths > 0).squeeze(1)
         chosen = known[torch.linspace(0, len(known) - 1, min(_SPAN_ROWS, len(known))).long()]
-        weights = self._layer.weights.cpu().float()[chosen]
+        weights = self._weights[chosen]
         return word_span(
             self._table.decode(chosen),
             torch.where(weights > 0, weights, _TINY),
@@ -205,6 +201,44 @@ class VoxelWords:
         found = torch.cat(parts)
         found[self._lengths <= 0] = 0
         return found
+
+
+class VoxelWords(TableWords):
+    """Features of voxels, arranged to be asked for words again and again.
+
+    Args:
+        layer: The voxels.
+        vocabulary: Vectors of words in the space of their features.
+        components: As in `TableWords`.
+        last_layers: As in `TableWords`.
+
+    Raises:
+        InputError: If no voxel has a feature.
+        ShapeError: If widths do not fit.
+    """
+
+    @boundary
+    def __init__(
+        self,
+        layer: VoxelFeatures,
+        vocabulary: Vocabulary,
+        *,
+        components: int | None = 32,
+        last_layers: LastLayers | None = None,
+    ) -> None:
+        super().__init__(
+            layer.table, layer.weights, vocabulary, components=components, last_layers=last_layers
+        )
+        self._layer = layer
+
+    @boundary
+    def of_gaussians(self, found: Float[Tensor, "m words"]) -> Float[Tensor, "n words"]:
+        """Numbers of voxels as Gaussians read them, 0 where one reads none.
+
+        Args:
+            found: One row a voxel, such as the probabilities of `ask`.
+        """
+        return self._layer.of_gaussians(found)
 
 
 def _lengths(table: StoredTable, space: TextSpace) -> Float32[Tensor, "m"]:
