@@ -168,7 +168,10 @@ def test_what_cannot_be(splatseg, photographs, tmp_path) -> None:
     for more, message in (
         (("--poses", "pointmaps"), "expected a folder of recorded ones or the name of a model"),
         (("--pointmaps", "x"), "pointmaps: expected none with --poses auto, got 'x'"),
-        (("--poses", "pointmaps", "--pointmaps", "nobody"), "nobody"),
+        (
+            ("--poses", "pointmaps", "--pointmaps", "nobody"),
+            "expected a folder with pointmaps.json, or a model of another package, got 'nobody'",
+        ),
         (("--poses", "pointmaps", "--pointmaps", photographs), "a folder of pointmaps, with"),
         (("--poses", "pointmaps", "--format", "colmap"), "with --poses pointmaps"),
     ):
@@ -177,3 +180,23 @@ def test_what_cannot_be(splatseg, photographs, tmp_path) -> None:
         assert message in err, err
         assert "Traceback" not in err
         assert not scene.exists()
+    status, _, err = splatseg("fit", tmp_path / "no", "-o", scene, "--poses", "pointmaps", *QUICK)
+    assert status != 0
+    assert "there is no such folder of photographs" in err
+
+
+def test_a_broken_pair_leaves_no_scene(splatseg, photographs, recorded, tmp_path) -> None:
+    """Each in a sentence that names the file, and a second run works when it is mended."""
+    scene = tmp_path / "scene"
+    words = ("fit", photographs, "-o", scene, "--poses", "pointmaps", "--pointmaps", recorded)
+    path = sorted(recorded.glob("*.npz"))[7]
+    whole = path.read_bytes()
+    for bad in (b"", whole[:1000], whole[:-100]):
+        path.write_bytes(bad)
+        status, _, err = splatseg(*words, *QUICK)
+        assert status == 2
+        assert path.name in err
+        assert "Traceback" not in err
+        assert not scene.exists()
+    path.write_bytes(whole)
+    assert splatseg(*words, *QUICK)[0] == 0

@@ -124,6 +124,14 @@ def test_gathered_rows_match_the_twin(isa: str) -> None:
         torch.testing.assert_close(leaf.detach(), getattr(slow, name))
 
 
+def test_no_rows_are_no_gaussians() -> None:
+    """Of a view that sees none: it has a loss nevertheless, and nothing to learn."""
+    parameters = _random(3, 50)
+    found = gathered(parameters, torch.tensor([], dtype=torch.int64))
+    assert len(found) == 0
+    assert found.sh.shape == (0, parameters.sh.shape[1] // 3, 3)
+
+
 def test_rows_beyond_the_parameters_are_refused() -> None:
     with pytest.raises(ValueError, match="rows do not fit"):
         gathered(_random(3, 50), torch.tensor([50]))

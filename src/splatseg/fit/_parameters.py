@@ -162,7 +162,7 @@ def gathered(parameters: Parameters, rows: Int64[Tensor, "m"]) -> Gaussians:
             rotations=rotations,
             scales=scales,
             opacities=opacities.squeeze(1),
-            sh=sh.view(count, -1, 3),
+            sh=sh.view(count, columns // 3, 3),
         )
     )
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from splatseg.core import Capture
 from splatseg.core.models import PointmapModel
-from splatseg.errors import InputError
+from splatseg.errors import InputError, MissingFileError
 from splatseg.io.paths import check_utf8
 from splatseg.io.pointmaps import HEADER_FILE, RecordedPointmaps, holds_pointmaps, open_pointmaps
 from splatseg.io.scene_folder import POSES_FOLDER
@@ -46,6 +46,7 @@ def capture_of_pointmaps(
         observer: Is told of the progress and of what was found.
 
     Raises:
+        MissingFileError: If there are no such photographs.
         InputError: If there is neither such a folder nor such a model.
     """
     check_utf8(data)
@@ -62,6 +63,8 @@ def capture_of_pointmaps(
 
 
 def _source(data: Path, named: str | None, observer: Observer) -> PointmapModel | RecordedPointmaps:
+    if not data.is_dir():
+        raise MissingFileError(f"{data}: there is no such folder of photographs.")
     if named is None:
         if not holds_pointmaps(data / POINTMAPS_FOLDER):
             raise InputError(
@@ -72,6 +75,12 @@ def _source(data: Path, named: str | None, observer: Observer) -> PointmapModel 
     # A name comes before a folder, as with evidence.
     if name_of(named) not in model_names() and Path(named).is_dir():
         return open_pointmaps(Path(named))
+    if name_of(named) not in model_names():
+        # Models that are there give none but where another package brings one: no list of them.
+        raise InputError(
+            f"pointmaps: expected a folder with {HEADER_FILE}, or a model of another package, got "
+            f"{named!r}."
+        )
     model = model_of(named, report=observer.note)
     if not isinstance(model, PointmapModel):
         raise InputError(f"pointmaps: expected a model that gives pointmaps, got {model.name}.")

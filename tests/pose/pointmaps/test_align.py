@@ -54,6 +54,23 @@ def test_outliers_lose_their_weight_and_the_published_alignment_believes_them(ph
     assert published.rotation.max() > 1.5 * robust.rotation.max()
 
 
+@pytest.mark.parametrize("bad", ["behind", "on a line"])
+def test_a_pair_of_no_geometry_spoils_nothing(photographed, bad: str) -> None:
+    """Its depths are those of no camera, and its scale is anything: thousands of the others'."""
+    pairs = complete(8)
+    samples = photographed.samples(pairs, PointmapErrors())
+    limit = _limit(photographed, samples)
+    one = pairs.index((2, 5))
+    line = torch.linspace(1, 2, samples.points.shape[2])[:, None].expand(-1, 3)
+    samples.points[one] = -samples.points[one] if bad == "behind" else line
+    assert _limit(photographed, samples) < 1.3 * limit
+
+
+def _limit(room: PhotographedRoom, samples) -> float:
+    found = solve(samples, options=PointmapOptions(), progress=lambda done, total: None)
+    return float(room.errors_of(aligned_cameras(room, found)).centre.max())
+
+
 def test_noise_does_not_shrink_the_focal_length(photographed) -> None:
     """Noise alone, four times the usual: eq. 4 on one map is off by a percent, all maps are not."""
     loud = PointmapErrors(noise=0.04, warp=0, sideways=1, wrong_confidence=0)

@@ -1,7 +1,7 @@
 """Photographs and pointmaps in, a capture out: from a folder, from a network, and begun again."""
 
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
@@ -149,6 +149,36 @@ def test_pairs_that_are_missing_are_named(tmp_path, photographed) -> None:
     alone = photographed.record(tmp_path / "alone", window(7, 1))
     with pytest.raises(InputError, match=f"got none with '{photographed.names[7]}'"):
         recover_from_pointmaps(photographs, alone, options=FEW)
+
+
+def test_a_map_of_a_single_point_is_named_and_nothing_is_left(tmp_path, photographed) -> None:
+    photographs = photographed.write(tmp_path / "photos")
+    source = photographed.record(tmp_path / "maps", window(8, 1))
+    first, second = photographed.names[3:5]
+    one, two = source.pointmaps(first, second)
+    source.save(first, second, (one, replace(two, points=torch.ones_like(two.points))))
+    message = f"points of '{second}' that differ, .* in the pair '{first}', '{second}'"
+    with pytest.raises(InputError, match=message):
+        recover_from_pointmaps(photographs, source, folder=tmp_path / "capture", options=FEW)
+    assert not (tmp_path / "capture").exists()
+
+
+def test_a_stop_in_the_middle_leaves_nothing_half_written(tmp_path, photographed) -> None:
+    photographs = photographed.write(tmp_path / "photos")
+    source = photographed.record(tmp_path / "maps", window(8, 1))
+    whole = recover_from_pointmaps(photographs, source, options=FEW)
+    for stage in ("pairs", "alignment", "cloud"):
+
+        def stop(now, stage=stage) -> None:
+            if now.stage == stage:
+                raise KeyboardInterrupt
+
+        kept = tmp_path / stage
+        with pytest.raises(KeyboardInterrupt):
+            recover_from_pointmaps(photographs, source, folder=kept, options=FEW, progress=stop)
+        assert not kept.exists()
+        again = recover_from_pointmaps(photographs, source, folder=kept, options=FEW)
+        assert torch.equal(again.capture.points.points, whole.capture.points.points)
 
 
 def test_photographs_that_are_no_photographs(tmp_path, photographed) -> None:

@@ -30,6 +30,8 @@ _MIN_LEVEL = 0.005
 _MIN_BASE = 0.005
 """Residuals of pairs that count as none: angle, logarithm of scale, share of the baseline."""
 
+_LEAST_WEIGHT = 1e-9
+
 
 def average(samples: PairSamples, geometry: PairGeometry, start: World) -> World:
     """Improve a world that a tree of pairs gave by all pairs."""
@@ -45,7 +47,7 @@ def average(samples: PairSamples, geometry: PairGeometry, start: World) -> World
     length = torch.maximum(length, 0.1 * length.median())
     for _ in range(_STEPS):
         residual = (centre[second] - centre[first] - steps).norm(dim=-1) / length
-        weights = trust * geman_mcclure(residual, _MIN_BASE) / length.square()
+        weights = _held(trust * geman_mcclure(residual, _MIN_BASE)) / length.square()
         centre = graph_solve(first, second, steps, weights, len(centre))
     return World(rotation=rotation, centre=centre, level=level)
 
@@ -65,10 +67,11 @@ def graph_solve(
     weights: Float[Tensor, "pairs"],
     count: int,
 ) -> Float[Tensor, "views channels"]:
-    """Values of which the second's minus the first's are nearest to `differences`; mean 0."""
+    """Values of which the second's minus the first's are nearest to `differences`; mean 0.
+
+    Pairs with weights must connect all of them.
+    """
     laplacian = torch.zeros(count, count, dtype=torch.float64)
-    # A pair without weight still holds its ends together where nothing else does.
-    weights = weights + 1e-9 * weights.max()
     flat = laplacian.view(-1)
     flat.index_add_(0, first * count + first, weights)
     flat.index_add_(0, second * count + second, weights)
@@ -81,6 +84,11 @@ def graph_solve(
     return torch.linalg.solve(laplacian + weights.mean() / count, right)
 
 
+def _held(weights: Tensor) -> Tensor:
+    """A pair without weight still holds its ends together where nothing else does."""
+    return weights.clamp_min(_LEAST_WEIGHT)
+
+
 def _rotations(
     samples: PairSamples, geometry: PairGeometry, rotation: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -90,7 +98,7 @@ def _rotations(
         between = rotation[second] @ geometry.rotation @ rotation[first].transpose(1, 2)
         delta = rotation_vector(between)
         weights = geman_mcclure(delta.norm(dim=-1), _MIN_ANGLE)
-        step = graph_solve(first, second, -delta, weights, len(rotation))
+        step = graph_solve(first, second, -delta, _held(weights), len(rotation))
         rotation = rotation_of_vector(step) @ rotation
     return rotation, weights
 
@@ -104,5 +112,5 @@ def _levels(
     for _ in range(_STEPS):
         residual = (level[second] - level[first] - wanted).abs()
         weights = trust * geman_mcclure(residual, _MIN_LEVEL)
-        level = graph_solve(first, second, wanted[:, None], weights, len(level))[:, 0]
+        level = graph_solve(first, second, wanted[:, None], _held(weights), len(level))[:, 0]
     return level, weights

@@ -3,7 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -223,10 +223,14 @@ def _report(
 
 @contextmanager
 def _given_or_temporary(folder: Path | None) -> Generator[Path]:
-    """The folder; where there is none, one that is deleted afterwards."""
+    """The folder; where there is none, one that is deleted afterwards. None is left empty."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        yield folder
+        try:
+            yield folder
+        finally:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
         return
     with tempfile.TemporaryDirectory(prefix="splatseg-") as temporary:
         yield Path(temporary)

@@ -85,7 +85,7 @@ def read_samples(
     Memory is 32 bytes a pixel that is kept, times pairs.
 
     Raises:
-        InputError: If maps of one photograph differ in size.
+        InputError: If maps of one photograph differ in size, or one is a single point.
     """
     rng = np.random.default_rng([seed, 31])
     sizes: dict[int, tuple[int, int]] = {}
@@ -107,6 +107,11 @@ def read_samples(
                 )
             rows, columns = chosen[i]
             points[e, slot] = one.points[rows, columns].cpu().float()
+            if bool((points[e, slot] == points[e, slot, 0]).all()):
+                raise InputError(
+                    f"pointmaps: expected points of {quoted(names[slot])} that differ, got one "
+                    f"point for all its pixels in the pair {quoted(names[0])}, {quoted(names[1])}."
+                )
             sure = one.confidence[rows, columns].cpu().float()
             weights[e, slot] = sure.log().clamp_min(MIN_WEIGHT)
         progress(e + 1, len(pairs))
