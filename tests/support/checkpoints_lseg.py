@@ -91,10 +91,10 @@ def shapes(
     return found
 
 
-def published() -> dict[str, Tensor]:
+def published(*, context: int = CONTEXT) -> dict[str, Tensor]:
     """Random weights by published name, such that answers vary; CLIP's halves as half floats."""
     found: dict[str, Tensor] = {}
-    for name, shape in shapes().items():
+    for name, shape in shapes(context=context).items():
         if name.endswith("running_var"):
             value = torch.rand(shape) + 0.5
         elif len(shape) == 1:
@@ -122,12 +122,22 @@ def extras() -> dict[str, Tensor]:
 
 
 class LSegFiles:
-    """What is written for a tiny LSeg: the checkpoint, and CLIP's vocabulary beside it."""
+    """What is written for a tiny LSeg: the checkpoint, and CLIP's vocabulary beside it.
+
+    Args:
+        context: Tokens of a text, at most.
+    """
+
+    def __init__(self, context: int = CONTEXT) -> None:
+        self._context = context
 
     def save_pretrained(self, folder: Path) -> None:
         """Write them."""
         folder.mkdir(parents=True)
-        state = {f"net.{name}": value for name, value in (published() | extras()).items()}
+        state = {
+            f"net.{name}": value
+            for name, value in (published(context=self._context) | extras()).items()
+        }
         content: dict[str, Any] = {"epoch": 200, "state_dict": state, "hyper_parameters": {"a": 1}}
         torch.save(content, folder / "demo_e200.ckpt")
         numbers = {token: i for i, token in enumerate(VOCABULARY)}

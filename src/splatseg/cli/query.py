@@ -89,7 +89,8 @@ class Command:
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None
     """Who encodes the words: the model that the features were made with, as
     NAME[=WEIGHTS][,OPTION=VALUE...], such as clip. None takes the vectors of words that were
-    recorded with the features."""
+    recorded with the features. To features from before its last layers (`see --model lseg --what
+    features`) it applies these, once for each voxel or Gaussian."""
 
     download: bool = False
     """Fetch weights that are not on this machine; what and how much is said before."""

@@ -223,6 +223,15 @@ class TextFeaturesWithWords(TextFeatures, Protocol):
         ...
 
 
+@runtime_checkable
+class LateTextFeatures(TextFeatures, DenseFeatures, Protocol):
+    """Text features whose last layers may come after lifting: at each Gaussian, or each voxel."""
+
+    def in_word_space(self, decoded: Float[Tensor, "*n decoder"]) -> Float[Tensor, "*n width"]:
+        """Unit vectors in the space of words of what `features` gives, or of means of it."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Boxes:
     """Boxes found for words."""

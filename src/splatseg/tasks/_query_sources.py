@@ -16,8 +16,10 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
+from splatseg.lift.voxels import LastLayers
 from splatseg.methods import find_method
 from splatseg.render import BackendName
+from splatseg.tasks._last_layers import in_word_space, last_layers
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.query_options import QueryOptions
 from splatseg.tasks.scene_parts import whole_layer
@@ -34,6 +36,8 @@ class WordSource:
     features: Features | VoxelFeatures
     layer: str
     vocabulary: Vocabulary
+    last_layers: LastLayers | None = None
+    """What leads from features of voxels to the space of words; None where they lie in it."""
     made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
     """Layers that were made, by the names to keep them under."""
 
@@ -59,6 +63,7 @@ def word_source(
     made: dict[str, Layer] = {}
     if name is None and (masks := mask_name(scene, options.masks)) is not None:
         evidence = feature_evidence(scene, options.features, encoder)
+        last_layers(evidence, encoder)
         if words:
             vocabulary_of(evidence, encoder).vectors(words)
         observer.note(f"finding objects by {masks} and their features by {evidence.folder.name}")
@@ -75,10 +80,14 @@ def word_source(
     if not isinstance(layer, Features | VoxelFeatures):
         raise InputError(f"from_layer: expected features, {name!r} has none.")
     evidence = feature_evidence(scene, options.features or layer.info.evidence, encoder)
+    later = last_layers(evidence, encoder)
+    if later is not None and isinstance(layer, Features):
+        layer = in_word_space(layer, later)
     return WordSource(
         features=layer,
         layer=name,
         vocabulary=vocabulary_of(evidence, encoder),
+        last_layers=later,
         made_layers=made,
     )
 

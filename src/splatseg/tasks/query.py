@@ -227,7 +227,12 @@ class QuerySession:
         self._places: Mapping[int, _Place] | None = None
         self._index: WordIndex | VoxelWords
         if isinstance(features, VoxelFeatures):
-            self._index = VoxelWords(features, vocabulary, components=components)
+            self._index = VoxelWords(
+                features,
+                vocabulary,
+                components=components,
+                last_layers=self._source.last_layers,
+            )
         else:
             self._index = WordIndex(features, vocabulary, components=components)
             # Of few vectors each is a thing, whose place does not depend on what is asked.

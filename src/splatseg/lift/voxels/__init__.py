@@ -15,5 +15,6 @@ from splatseg.lift.voxels.lifting import optical_depths as optical_depths
 from splatseg.lift.voxels.storage import products as products
 from splatseg.lift.voxels.storage import store as store
 from splatseg.lift.voxels.surface import surface_points as surface_points
+from splatseg.lift.voxels.words import LastLayers as LastLayers
 from splatseg.lift.voxels.words import TableWords as TableWords
 from splatseg.lift.voxels.words import VoxelWords as VoxelWords
