@@ -15,6 +15,11 @@ from splatseg.methods.prompt._table import MaskTable
 _FULL_CELLS = 50.0
 """Cells from which on a mask counts fully in the mean over views."""
 
+_AS_GOOD = 0.02
+"""How much less the cosine of a whole may be than that of its part, for the whole to be meant. The
+feature of a part is that of the thing, often a little purer, as cells at the rim hold other things;
+what only stands around it differs by far more."""
+
 _INSIDE = 0.5
 """Share of a mask in another from which on it is not another object."""
 
@@ -77,18 +82,22 @@ def answering(
 
     One object is the group of the largest cosine: a phrase says which of several alike things is
     meant, and the names of their class, which probabilities hold against it, say nothing of that.
+    Where that lies in others that answer as well it is the largest of them: a thing, not its part.
 
     Args:
         table: The masks.
         groups: One a mask.
         answers: What each answers to one word.
-        several: Whether all that answer are wanted; else the one of the largest cosine.
+        several: Whether all that answer are wanted; else one.
         least: Probability from which on one answers.
     """
     probabilities, word = answers.probabilities[:, 0], answers.words[0]
     order = torch.argsort(
         probabilities if several else answers.cosines[:, 0], descending=True, stable=True
     )
+    if not several and len(order):
+        whole = _whole(table, answers, int(order[0]), least)
+        order = torch.cat([torch.tensor([whole]), order])
     found: list[FoundObject] = []
     taken = torch.zeros(len(table), dtype=torch.bool)
     for row in order.tolist():
@@ -106,6 +115,15 @@ def answering(
             )
         )
     return found
+
+
+def _whole(table: MaskTable, answers: WordAnswers, best: int, least: float) -> int:
+    """The row of the largest mask that holds one, and answers as well."""
+    cosines, probabilities = answers.cosines[:, 0], answers.probabilities[:, 0]
+    near = (cosines >= cosines[best] - _AS_GOOD) & (probabilities >= least)
+    near &= table.contained[best] >= _INSIDE
+    near[best] = True
+    return int(torch.where(near, table.cells, -1.0).argmax())
 
 
 def _of_same(table: MaskTable, members: Sequence[int]) -> Bool[Tensor, "m"]:
