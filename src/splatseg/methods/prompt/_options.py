@@ -24,7 +24,8 @@ _PUBLISHED_WORDS, _PUBLISHED_POINTS = 0.6, 0.7
 
 _LEAST = {"one": 0.05, "all": 0.3}
 
-_THRESHOLDS = {"transposed": 0.5, "visible": 0.5}
+_THRESHOLDS = {"transposed": 0.3, "visible": 0.35}
+"""Below one half: the tails of a Gaussian reach over the rim of a thing, and masks end before it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,14 +107,19 @@ class PromptOptions:
     weight. visible: the share of the views with its centre unhidden that have it in the mask.
     published: that of all views, whether they see it or not (eq. 8)."""
 
+    least_light: float = 0.2
+    """With transposed votes: light in the views that vote, in shares of that of the median Gaussian
+    of the object, below which one of it takes the share of its neighbours instead: what only
+    shows in the corner of a mask is a speck, or the back of the thing."""
+
     rounds: int = 2
     """Rounds of masks and votes. In the first, masks are chosen by points; in further ones by what
     is selected so far, rendered into each view. An object that fits no mask then keeps what the
     round before gave. Published 1."""
 
     threshold: float | None = None
-    """Tau: the share in [0, 1] that a Gaussian must exceed. None is 0.5; published 0.6 with words
-    and 0.7 with points by hand."""
+    """Tau: the share in [0, 1] that a Gaussian must exceed. None is 0.3 with transposed votes,
+    0.35 with visible ones, and published 0.6 with words and 0.7 with points by hand."""
 
     answers: AnswerOptions = field(default_factory=AnswerOptions)
     """How cosines become probabilities."""
@@ -133,7 +139,7 @@ class PromptOptions:
         for name, low in (("initial_views", 1), ("points", 1), ("negatives", 0), ("rounds", 1)):
             if getattr(self, name) < low:
                 raise RangeError(f"{name}: expected at least {low}, got {getattr(self, name)}.")
-        for name in ("tolerance", "depth_tolerance"):
+        for name in ("tolerance", "depth_tolerance", "least_light"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise RangeError(f"{name}: expected 0 or more, got {value}.")

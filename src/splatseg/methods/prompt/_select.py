@@ -198,6 +198,7 @@ def vote_for(
             rule=options.vote,
             render_options=options_for(gaussians, backend),
             depth_tolerance=options.depth_tolerance,
+            least_light=options.least_light,
         )
         votes.add_views([len(one) for one in chosen])
         before, masks = masks, [[] for _ in prompts]
@@ -215,7 +216,7 @@ def vote_for(
                 masks[at].append((view, mask))
             if progress is not None:
                 progress(turn * len(ordered) + done + 1, options.rounds * len(ordered))
-        found = votes.shares()
+        found = votes.shares(options.tau)
         # What no mask overlaps by half keeps what the round before gave.
         lost = torch.tensor([not one for one in masks])
         masks = [one or old for one, old in zip(masks, before, strict=True)]

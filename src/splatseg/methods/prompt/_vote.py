@@ -10,6 +10,10 @@ with :math:`v_{ij} = 1` where view j has the centre of Gaussian i in its picture
 is rendered hides it. Published, a view that does not see a Gaussian votes against it, and one that
 sees the object through it votes for it. Views without a mask of the object vote when published
 only: against.
+
+Of a Gaussian that hardly shows in the views that vote, such as one in the corner of a single mask,
+little is known. Where its transposed share is above tau it takes the mean share of its neighbours
+that show well: specks go, and the backs of things stay.
 """
 
 from collections.abc import Sequence
@@ -21,9 +25,12 @@ from torch import Tensor
 from splatseg.core import Gaussians, Rle, View
 from splatseg.lift.mass.centres import centres_in, unoccluded
 from splatseg.methods.prompt._options import VoteRule
+from splatseg.neighbours import NeighbourIndex
 from splatseg.render import PreparedView, RenderOptions, SparseImage
 
 _STEEPNESS = 20.0
+_MOSTLY = 0.5
+_NEIGHBOURS = 8
 
 
 class MaskVotes:
@@ -35,6 +42,8 @@ class MaskVotes:
         rule: How views vote.
         render_options: Switches of the blending model.
         depth_tolerance: How far behind the median depth a centre is not hidden yet.
+        least_light: Of the transposed rule: light below which a Gaussian hardly shows, in shares of
+            the median of those that are mostly inside.
     """
 
     def __init__(
@@ -45,8 +54,10 @@ class MaskVotes:
         rule: VoteRule,
         render_options: RenderOptions,
         depth_tolerance: float,
+        least_light: float,
     ) -> None:
         self._gaussians, self._rule = gaussians, rule
+        self._least_light = least_light
         self._options, self._tolerance = render_options, depth_tolerance
         self._inside = torch.zeros(objects, len(gaussians))
         self._total = torch.zeros(objects, 1 if rule == "published" else len(gaussians))
@@ -93,10 +104,36 @@ class MaskVotes:
         self._inside[objects[found.channels.long()], found.gaussians] += found.sums
         self._total[objects] += found.weights
 
-    def shares(self) -> Float[Tensor, "objects n"]:
-        """Of each object and Gaussian, in [0, 1]; 0 where no view votes."""
+    def shares(self, tau: float) -> Float[Tensor, "objects n"]:
+        """Of each object and Gaussian, in [0, 1]; 0 where no view votes.
+
+        Args:
+            tau: Share above which a Gaussian is of an object.
+        """
         # Sums of half precision weights may leave a share a hair above 1.
-        return (self._inside / self._total.clamp_min(1e-12)).clamp(0, 1)
+        found = (self._inside / self._total.clamp_min(1e-12)).clamp(0, 1)
+        if self._rule == "transposed":
+            for share, light in zip(found, self._total, strict=True):
+                share.copy_(self._mended(share, light, tau))
+        return found
+
+    def _mended(
+        self, share: Float[Tensor, "n"], light: Float[Tensor, "n"], tau: float
+    ) -> Float[Tensor, "n"]:
+        """With the shares of neighbours for Gaussians that hardly show."""
+        inside = share > _MOSTLY
+        if not bool(inside.any()):
+            return share
+        shows = (light > 0) & (light >= self._least_light * light[inside].median())
+        faint = torch.nonzero((share > tau) & ~shows).squeeze(1)
+        if not len(faint):
+            return share
+        known = torch.nonzero(shows).squeeze(1)
+        means = self._gaussians.means.detach().cpu().double()
+        near = NeighbourIndex(means[known]).nearest(means[faint], min(_NEIGHBOURS, len(known)))
+        mended = share.clone()
+        mended[faint] = share[known[near.indices.long()]].mean(dim=1)
+        return mended
 
 
 def confidence_of(shares: Float[Tensor, "*batch"], tau: float) -> Float[Tensor, "*batch"]:
