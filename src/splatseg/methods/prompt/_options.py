@@ -25,7 +25,7 @@ _PUBLISHED_WORDS, _PUBLISHED_POINTS = 0.6, 0.7
 _LEAST = {"one": 0.05, "all": 0.3}
 
 _THRESHOLDS = {"transposed": 0.3, "visible": 0.35}
-"""Below one half: the tails of a Gaussian reach over the rim of a thing, and masks end before it."""
+"""Below one half: tails of Gaussians reach over the rim of a thing, and masks end before it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
