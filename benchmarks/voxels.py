@@ -57,6 +57,17 @@ SETTINGS = {
     "several hits": replace(_DEFAULT, projection=HitOptions(hits="several")),
     "weights of W": replace(_DEFAULT, projection=HitOptions(hits="weights")),
     "means of views": replace(_DEFAULT, projection=HitOptions(average="views")),
+    "weights of W, trilinear": replace(
+        _DEFAULT,
+        projection=HitOptions(hits="weights"),
+        assignment=AssignmentOptions(interpolation="trilinear"),
+    ),
+    "weights of W, means of views": replace(
+        _DEFAULT, projection=HitOptions(hits="weights", average="views")
+    ),
+    "weights of W, centres": replace(
+        _DEFAULT, cells="centres", projection=HitOptions(hits="weights")
+    ),
     "trilinear": replace(_DEFAULT, assignment=AssignmentOptions(interpolation="trilinear")),
     "any distance": replace(_DEFAULT, assignment=AssignmentOptions(max_distance=None)),
     "min points 1": replace(_DEFAULT, min_points=1),
