@@ -138,6 +138,10 @@ def test_exact_pairs_give_exact_worlds_along_the_tree_and_on_average(photographe
         for i, camera in enumerate(true):
             off = rotation_angle(turn @ found.rotation[i] @ camera.cam_from_world[:3, :3])
             assert math.degrees(float(off)) < 0.05
+        ours, theirs = found.centre, torch.stack([camera.centre for camera in true])
+        scale, turned, shift = similarity(ours[None], theirs[None], torch.ones(1, 8).double())
+        moved = scale * ours @ turned[0].T + shift
+        assert float((moved - theirs).norm(dim=1).max()) < 2e-3 * float(theirs.std(dim=0).norm())
 
 
 def test_pairs_that_contradict_others_are_not_in_the_tree(photographed) -> None:
