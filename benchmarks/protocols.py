@@ -118,6 +118,8 @@ RUNS = (
         evidence=(_CLASSES, _TEXT), switches=("frame_step=1",)),
     Run(protocol="scannetpp", layout="scannetpp", scene="office", methods=_WORDS,
         companions=(_MASKS,), evidence=(_TEXT,)),
+    Run(protocol="scannetpp", layout="scannetpp", scene="office", methods=("voxels",),
+        evidence=(_TEXT,), published=True),
     Run(protocol="cosseg-replica-semantic", layout="replica", scene="office",
         methods=("uplift", "associate", "cosseg"), companions=_BESIDES,
         evidence=(_CLASSES, _PANOPTIC), switches=_ANY),
