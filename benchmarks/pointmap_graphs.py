@@ -48,7 +48,7 @@ def row(capture: Path, photographs: Path, views: int, changes: dict[str, Any]) -
         off = compare(cameras, given) | between(cameras, given)
         out |= {name: round(value, 4) for name, value in off.items()}
         out |= {
-            "pairs": found.report.pairs,
+            "pairs kept": found.report.pairs,
             "contradictory": len(found.report.contradictory),
             "seconds": round(time.monotonic() - begin, 1),
             "of them": {name: round(x, 1) for name, x in found.report.seconds.items()},
