@@ -9,7 +9,8 @@ are asked for. Rows:
   voxels hit, seconds, bytes, and mIoU of names of classes on test views by plain cosines and in the
   span as `query --every --from-layer` asks. `--settings` picks some of them.
 - `lifting`: the scene's training views twice over (200 of 512x384 for office), 512 channels, onto
-  100 000 voxels: seconds and the peak memory of the process. `lifting` has feature maps with cells
+  100 000 voxels, to first hits of rays and by the weights of W: seconds and the peak memory of the
+  process. `lifting` has feature maps with cells
   of 8 pixels, read at every pixel; `dense` has a vector of its own for every pixel.
 - `asking`: one word and ten words asked of 100 000 voxels with 512 channels in float16, and of all
   Gaussians of the scene through them: median milliseconds of 15.
@@ -38,9 +39,11 @@ from splatseg.lift.voxels import (
     assign_voxels,
     lift_to_voxels,
     store,
+    surface_gaussians,
     surface_points,
     voxelise_to_count,
 )
+from splatseg.lift.voxels.lifting import HitRule
 from splatseg.methods.voxels import PUBLISHED, VoxelOptions
 from splatseg.tasks import SegmentOptions, segment
 
@@ -48,30 +51,19 @@ _CHANNELS, _VOXELS = 512, 100_000
 _DEFAULT = VoxelOptions()
 _ALL = FilterOptions(opaque_share=1.0, min_opacity=None, max_elongation=None, scale_share=None,
                      min_neighbours=0)  # fmt: skip
+_RAYS = replace(_DEFAULT, cells="depth", projection=HitOptions(hits="first"))
 SETTINGS = {
     "default": _DEFAULT,
     "published": PUBLISHED,
     "published, not filtered": replace(PUBLISHED, filtering=_ALL),
-    "published, default filter": replace(PUBLISHED, filtering=FilterOptions()),
-    "centres, 80 000": replace(_DEFAULT, cells="centres"),
+    "cells of depth": replace(_DEFAULT, cells="depth"),
+    "cells of depth, first hit": _RAYS,
+    "cells of depth, several hits": replace(_RAYS, projection=HitOptions(hits="several")),
+    "first hit": replace(_DEFAULT, projection=HitOptions(hits="first")),
     "several hits": replace(_DEFAULT, projection=HitOptions(hits="several")),
-    "weights of W": replace(_DEFAULT, projection=HitOptions(hits="weights")),
-    "means of views": replace(_DEFAULT, projection=HitOptions(average="views")),
-    "weights of W, trilinear": replace(
-        _DEFAULT,
-        projection=HitOptions(hits="weights"),
-        assignment=AssignmentOptions(interpolation="trilinear"),
-    ),
-    "weights of W, means of views": replace(
-        _DEFAULT, projection=HitOptions(hits="weights", average="views")
-    ),
-    "weights of W, centres": replace(
-        _DEFAULT, cells="centres", projection=HitOptions(hits="weights")
-    ),
+    "means of views": replace(_DEFAULT, projection=HitOptions(hits="weights", average="views")),
     "trilinear": replace(_DEFAULT, assignment=AssignmentOptions(interpolation="trilinear")),
     "any distance": replace(_DEFAULT, assignment=AssignmentOptions(max_distance=None)),
-    "min points 1": replace(_DEFAULT, min_points=1),
-    "min points 20": replace(_DEFAULT, min_points=20),
     "50 000": replace(_DEFAULT, voxels=50_000),
     "100 000": replace(_DEFAULT, voxels=100_000),
     "float32": replace(_DEFAULT, precision="float32"),
@@ -121,21 +113,24 @@ class _Maps:
         return self._map
 
 
-def _lifting(bench: WordScene, stride: int) -> None:
+def _lifting(bench: WordScene, stride: int, hits: HitRule) -> None:
     once = bench.scene.train_views
     views = [replace(view, name=f"{view.name}_{turn}") for turn in (0, 1) for view in once]
     camera = views[0].camera
     maps = _Maps([view.name for view in views], stride, camera.height, camera.width)
-    points = surface_points(bench.scene.gaussians, once)
-    grid = voxelise_to_count(points, _VOXELS)
-    del points
+    gaussians = bench.scene.gaussians
+    kept = surface_gaussians(gaussians)
+    grid = voxelise_to_count(gaussians.means.detach()[kept], _VOXELS)
+    nearest = assign_voxels(grid, gaussians.means.detach()).rows[:, 0].long()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     began = time.perf_counter()
-    lifted = lift_to_voxels(grid, views, maps)
+    lifted = lift_to_voxels(
+        grid, views, maps, options=HitOptions(hits=hits), gaussians=gaussians, rows=nearest
+    )
     seconds = time.perf_counter() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
-        f"lifting, cells of {stride} pixels: {len(views)} views of {camera.width}x{camera.height}, "
+        f"lifting, {hits}, cells of {stride} pixels: {len(views)} views of {camera.width}x{camera.height}, "
         f"{_CHANNELS} channels, {len(grid)} voxels, {int((lifted.totals > 0).sum())} hit: "
         f"{seconds:.1f} s, peak {peak / 1e6:.2f} GB ({before / 1e6:.2f} GB before)",
         flush=True,
@@ -143,11 +138,13 @@ def _lifting(bench: WordScene, stride: int) -> None:
 
 
 def lifting(bench: WordScene) -> None:
-    _lifting(bench, 8)
+    for hits in ("first", "weights"):
+        _lifting(bench, 8, hits)
 
 
 def dense(bench: WordScene) -> None:
-    _lifting(bench, 1)
+    for hits in ("first", "weights"):
+        _lifting(bench, 1, hits)
 
 
 def asking(bench: WordScene) -> None:

@@ -1,8 +1,9 @@
 """Open-vocabulary sparse voxels: features of pixels onto the voxels that their rays hit.
 
-Surfaces are put into a sparse grid of a number of cells, features of all views go to the first cell
-that the ray of each pixel hits, and every Gaussian reads the nearest cell; words are asked of the
-cells (`splatseg query`).
+Gaussians that stand for surfaces make a sparse grid of a number of cells, the features of all views
+go to the cells by the weights with which their Gaussians make the pixels, or to the first cell that
+the ray of each pixel hits, as published, and every Gaussian reads the nearest cell; words are asked
+of the cells (`splatseg query`).
 """
 
 from dataclasses import asdict, dataclass, field
@@ -42,9 +43,9 @@ class VoxelOptions:
     cell: float | None = None
     """Side of a cell, scene units; the number of cells follows. None takes `voxels`."""
 
-    cells: Literal["depth", "centres"] = "depth"
-    """Of what cells are made. depth: of the points where the light of pixels is half stopped, so
-    that no ray passes between them. centres: of the centres of Gaussians, as published."""
+    cells: Literal["centres", "depth"] = "centres"
+    """Of what cells are made. centres: of the centres of Gaussians. depth: of the points where the
+    light of pixels is half stopped, so that no ray passes between them."""
 
     min_points: int = 6
     """Pixels of all views, every second along both axes, that must end in a cell of depth: those of
@@ -53,7 +54,7 @@ class VoxelOptions:
     filtering: FilterOptions = field(default_factory=FilterOptions)
     """Which Gaussians make cells, where their centres do."""
 
-    projection: HitOptions = field(default_factory=HitOptions)
+    projection: HitOptions = field(default_factory=lambda: HitOptions(hits="weights"))
     """Which cells a pixel's feature goes to."""
 
     assignment: AssignmentOptions = field(default_factory=AssignmentOptions)
@@ -67,7 +68,7 @@ class VoxelOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("cells", self.cells, ("depth", "centres"))
+        check_choice("cells", self.cells, ("centres", "depth"))
         if self.min_points < 1:
             raise RangeError(f"min_points: expected at least 1, got {self.min_points}.")
         if self.voxels < 1:
@@ -80,7 +81,6 @@ class VoxelOptions:
 
 PUBLISHED = VoxelOptions(
     cell=0.04,
-    cells="centres",
     filtering=FilterOptions(
         opaque_share=0.5,
         min_opacity=None,
@@ -89,6 +89,7 @@ PUBLISHED = VoxelOptions(
         min_neighbours=4,
         radius=0.2,
     ),
+    projection=HitOptions(hits="first"),
     assignment=AssignmentOptions(max_distance=None),
     precision="float32",
 )
@@ -173,7 +174,7 @@ def _grid(inputs: MethodInputs, options: VoxelOptions) -> VoxelGrid:
 
 METHOD = Method(
     name="voxels",
-    summary="sparse voxels take the mean of the features whose rays hit them first",
+    summary="sparse voxels take the mean of the features that their pixels show",
     reference="Open-vocabulary semantic novel view synthesis, sections 3.2 to 3.5",
     evidence=("features",),
     options=VoxelOptions,

@@ -16,11 +16,12 @@ from splatseg.io.layers import load_layer, save_layer
 from splatseg.io.npz_writing import save_arrays
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift.vocabulary import vocabulary_of
-from splatseg.lift.voxels import VoxelWords, surface_points, voxelise
+from splatseg.lift.voxels import HitOptions, VoxelWords, surface_points, voxelise
 from splatseg.methods.voxels import VoxelOptions
 from splatseg.tasks import SegmentOptions, segment
 
 OPTIONS = VoxelOptions(voxels=600)
+DEPTH = replace(OPTIONS, cells="depth", projection=HitOptions(hits="first"))
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,8 @@ def layer(scene) -> VoxelFeatures:
     return made(scene)
 
 
-def test_cells_lie_where_views_see_surfaces(scene, layer) -> None:
+def test_cells_of_depth_lie_where_views_see_surfaces(scene) -> None:
+    layer = made(scene, DEPTH)
     points = surface_points(scene.gaussians, scene.train_views)
     cells = torch.floor((points - layer.grid.origin) / layer.grid.size).int()
     seen = {tuple(cell) for cell in cells.tolist()}
@@ -78,14 +80,18 @@ def test_cells_of_few_points_are_left_out() -> None:
     [
         {"voxels": 200},
         {"cell": 0.5},
-        {"cells": "centres"},
-        {"min_points": 40},
+        {"cells": "depth"},
+        {"min_points": 40, "cells": "depth"},
+        {"projection": HitOptions(hits="first")},
+        {"projection": HitOptions(hits="several")},
         {"precision": "int8"},
         {"precision": "product", "parts": 2},
     ],
 )
 def test_each_option_makes_a_difference(scene, layer, changed) -> None:
     found = made(scene, replace(OPTIONS, **changed))
+    if "min_points" in changed:
+        layer = made(scene, replace(OPTIONS, cells="depth"))
     same = len(found.grid) == len(layer.grid) and torch.equal(
         found.table.decode(), layer.table.decode()
     )
@@ -101,9 +107,10 @@ def test_parts_are_bytes_of_a_voxel(scene) -> None:
 
 
 def test_filtering_counts_where_centres_make_cells(scene) -> None:
-    options = replace(OPTIONS, cells="centres")
-    strict = replace(options, filtering=replace(options.filtering, scale_share=0.4))
-    assert made(scene, strict).grid.size != made(scene, options).grid.size
+    strict = replace(OPTIONS, filtering=replace(OPTIONS.filtering, scale_share=0.4))
+    assert made(scene, strict).grid.size != made(scene).grid.size
+    depth = replace(DEPTH, filtering=strict.filtering)
+    assert made(scene, depth).grid.size == made(scene, DEPTH).grid.size
 
 
 def test_published_is_the_paper(scene) -> None:
@@ -111,6 +118,7 @@ def test_published_is_the_paper(scene) -> None:
     assert found.grid.size == 0.04
     assert found.table.precision == "float32"
     assert found.info.options["cells"] == "centres"
+    assert found.info.options["projection"]["hits"] == "first"
 
 
 @pytest.mark.parametrize("precision", ["float32", "float16", "int8", "product"])
