@@ -130,8 +130,8 @@ def _lifting(bench: WordScene, stride: int, hits: HitRule) -> None:
     seconds = time.perf_counter() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
-        f"lifting, {hits}, cells of {stride} pixels: {len(views)} views of {camera.width}x{camera.height}, "
-        f"{_CHANNELS} channels, {len(grid)} voxels, {int((lifted.totals > 0).sum())} hit: "
+        f"lifting, {hits}, cells of {stride} pixels: {len(views)} views of "
+        f"{camera.width}x{camera.height}, {_CHANNELS} channels, {len(grid)} voxels, {int((lifted.totals > 0).sum())} hit: "
         f"{seconds:.1f} s, peak {peak / 1e6:.2f} GB ({before / 1e6:.2f} GB before)",
         flush=True,
     )
