@@ -131,8 +131,9 @@ def _lifting(bench: WordScene, stride: int, hits: HitRule) -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
         f"lifting, {hits}, cells of {stride} pixels: {len(views)} views of "
-        f"{camera.width}x{camera.height}, {_CHANNELS} channels, {len(grid)} voxels, {int((lifted.totals > 0).sum())} hit: "
-        f"{seconds:.1f} s, peak {peak / 1e6:.2f} GB ({before / 1e6:.2f} GB before)",
+        f"{camera.width}x{camera.height}, {_CHANNELS} channels, {len(grid)} voxels, "
+        f"{int((lifted.totals > 0).sum())} hit: {seconds:.1f} s, "
+        f"peak {peak / 1e6:.2f} GB ({before / 1e6:.2f} GB before)",
         flush=True,
     )
 
