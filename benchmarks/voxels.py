@@ -63,7 +63,7 @@ SETTINGS = {
     "several hits": replace(_DEFAULT, projection=HitOptions(hits="several")),
     "means of views": replace(_DEFAULT, projection=HitOptions(hits="weights", average="views")),
     "trilinear": replace(_DEFAULT, assignment=AssignmentOptions(interpolation="trilinear")),
-    "any distance": replace(_DEFAULT, assignment=AssignmentOptions(max_distance=None)),
+    "4 cells at most": replace(_DEFAULT, assignment=AssignmentOptions(max_distance=4.0)),
     "50 000": replace(_DEFAULT, voxels=50_000),
     "100 000": replace(_DEFAULT, voxels=100_000),
     "float32": replace(_DEFAULT, precision="float32"),

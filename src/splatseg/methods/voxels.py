@@ -6,7 +6,7 @@ the ray of each pixel hits, as published, and every Gaussian reads the nearest c
 of the cells (`splatseg query`).
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
 from splatseg._check import check_choice
@@ -90,7 +90,6 @@ PUBLISHED = VoxelOptions(
         radius=0.2,
     ),
     projection=HitOptions(hits="first"),
-    assignment=AssignmentOptions(max_distance=None),
     precision="float32",
 )
 """First hits, means over hits, the nearest voxel however far (sections 3.2, 3.4, 3.5.2); what the
@@ -113,7 +112,8 @@ def run(inputs: MethodInputs, options: VoxelOptions) -> VoxelFeatures:
     projection = options.projection
     nearest = None
     if projection.hits != "first":
-        nearest = assign_voxels(grid, means).rows[:, 0].long()
+        one = replace(options.assignment, interpolation="nearest")
+        nearest = assign_voxels(grid, means, options=one).rows[:, 0].long()
     lifted = lift_to_voxels(
         grid,
         inputs.views,

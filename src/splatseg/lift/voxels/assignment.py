@@ -25,9 +25,10 @@ class AssignmentOptions:
     """nearest: the voxel whose centre is nearest to that of the Gaussian. trilinear: the voxels
     whose eight centres are around it, those that are there; the nearest where none is."""
 
-    max_distance: float | None = 4.0
+    max_distance: float | None = None
     """Farthest that the nearest voxel may be, in sides of a cell; beyond, a Gaussian reads none.
-    None takes it however far it is."""
+    None takes it however far it is: what renders far from all cells is large and plain, and the
+    nearest cell mostly of the same thing."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
