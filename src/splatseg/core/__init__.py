@@ -70,6 +70,8 @@ from splatseg.core.renderable import RenderableView as RenderableView
 from splatseg.core.renderable import ViewSignals as ViewSignals
 from splatseg.core.rigid import Similarity as Similarity
 from splatseg.core.rle import Rle as Rle
+from splatseg.core.scans import Scan as Scan
+from splatseg.core.scans import ScanSource as ScanSource
 from splatseg.core.scene import Capture as Capture
 from splatseg.core.scene import ClassInfo as ClassInfo
 from splatseg.core.scene import ClassTable as ClassTable

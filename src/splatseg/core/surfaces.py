@@ -52,7 +52,7 @@ class LabelledMesh:
             )
         object.__setattr__(self, "faces", faces)
         for name, rows in (("vertex_labels", count), ("face_labels", len(faces))):
-            object.__setattr__(self, name, _labels(name, getattr(self, name), rows))
+            object.__setattr__(self, name, checked_labels(name, getattr(self, name), rows))
         twice = sorted(set(self.vertex_labels) & set(self.face_labels))
         if twice:
             raise InputError(
@@ -95,7 +95,7 @@ class LabelledPoints:
         object.__setattr__(self, "points", _positions("points", self.points))
         if not len(self.points):
             raise InputError("points: expected at least one point, got none.")
-        object.__setattr__(self, "labels", _labels("labels", self.labels, len(self.points)))
+        object.__setattr__(self, "labels", checked_labels("labels", self.labels, len(self.points)))
         if self.normals is not None:
             check_shape("normals", self.normals, (len(self.points), 3))
             object.__setattr__(self, "normals", _positions("normals", self.normals))
@@ -113,7 +113,8 @@ def _positions(name: str, values: Tensor) -> Tensor:
     return values.detach().cpu().double()
 
 
-def _labels(name: str, given: Mapping[str, Tensor], rows: int) -> dict[str, Tensor]:
+def checked_labels(name: str, given: Mapping[str, Tensor], rows: int) -> dict[str, Tensor]:
+    """Ids of rows, by the name of what they tell: int32, one a row, none below -1."""
     return dict(_checked(name, given, rows))
 
 
