@@ -1,4 +1,4 @@
-"""Scans of a laser: points of the world, from where they were measured, and what is known of each."""
+"""Scans of a laser: points of the world, and from where they were measured."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
