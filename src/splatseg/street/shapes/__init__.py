@@ -16,4 +16,6 @@ from splatseg.street.shapes.patches import cut_patches as cut_patches
 from splatseg.street.shapes.patches import primitive_scale as primitive_scale
 from splatseg.street.shapes.regularisers import MeshRegularisers as MeshRegularisers
 from splatseg.street.shapes.regularisers import mesh_regularisers as mesh_regularisers
+from splatseg.street.shapes.scores import ShapeScore as ShapeScore
+from splatseg.street.shapes.scores import score_shapes as score_shapes
 from splatseg.street.shapes.template import template as template

@@ -131,7 +131,6 @@ def new_shapes(config: ShapeConfig, *, seed: int) -> ShapeAutoEncoder:
 
 
 def with_tensors(shapes: ShapeAutoEncoder, state: Mapping[str, Tensor]) -> ShapeAutoEncoder:
-    """An auto-encoder that was made without memory (on ``meta``), with its tensors and template."""
+    """An auto-encoder that was made without memory (on ``meta``), with its tensors."""
     shapes.load_state_dict(dict(state), strict=True, assign=True)
-    shapes.vertices, shapes.faces = template()
     return shapes

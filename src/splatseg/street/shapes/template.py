@@ -52,7 +52,9 @@ def template() -> tuple[Float[Tensor, "42 3"], Int[Tensor, "80 3"]]:
         >>> len(vertices) - len(faces) * 3 // 2 + len(faces)
         2
     """
-    vertices, faces = _icosphere()
+    # Networks are made on `meta`, without memory, before their tensors are read.
+    with torch.device("cpu"):
+        vertices, faces = _icosphere()
     return vertices.float(), faces.clone()
 
 
