@@ -62,8 +62,7 @@ def interpolate_codes(
     .. math:: \frac{\sin((1 - t) \omega) z_0 + \sin(t \omega) z_1}{\sin \omega},
         \quad \cos \omega = z_0 \cdot z_1
 
-    Where the two are opposite, which no arc is the shorter for, it goes by zero and is of length
-    1 elsewhere.
+    Opposite codes have no shorter arc: there the middle is the code 0.
 
     Args:
         start: Codes of any length but 0, at 0.
@@ -73,11 +72,9 @@ def interpolate_codes(
     check_shape("start", start, (None, None))
     check_shape("end", end, tuple(start.shape))
     one, two = (functional.normalize(codes, dim=1)[:, None] for codes in (start, end))
-    cosine = (one * two).sum(dim=-1, keepdim=True).clamp(-1, 1)
+    # Codes that are alike have no arc, and no gradient of its angle: they are taken a little apart.
+    cosine = (one * two).sum(dim=-1, keepdim=True).clamp(-1 + _PARALLEL, 1 - _PARALLEL)
     angle = torch.acos(cosine)
     t = shares.to(start)[None, :, None]
-    plain = torch.sin(angle) < _PARALLEL
-    sine = torch.where(plain, torch.ones_like(angle), torch.sin(angle))
-    first = torch.where(plain, 1 - t, torch.sin((1 - t) * angle) / sine)
-    second = torch.where(plain, t, torch.sin(t * angle) / sine)
+    first, second = torch.sin((1 - t) * angle), torch.sin(t * angle)
     return functional.normalize(first * one + second * two, dim=-1)

@@ -21,7 +21,8 @@ def self_intersections(
 
     Two triangles that share no vertex meet if and only if an edge of one meets the other. Faces
     that only touch count, and so do those that overlap in one plane: a mesh that is flattened
-    to nothing intersects itself. Signs are of float64 determinants.
+    to nothing intersects itself. Signs are of float64 determinants, so that a bare contact may be
+    missed by a rounding.
 
     Args:
         vertices: Of each mesh.

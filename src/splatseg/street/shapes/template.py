@@ -34,7 +34,7 @@ class Topology:
     """The two faces that meet at each edge."""
 
     averages: Float[Tensor, "v v"]
-    """Row i times positions is the mean of the neighbours of vertex i."""
+    """Row i times positions is the mean of the neighbours of vertex i; float64."""
 
 
 def template() -> tuple[Float[Tensor, "42 3"], Int[Tensor, "80 3"]]:
@@ -103,7 +103,7 @@ def _topology(faces: tuple[tuple[int, ...], ...], count: int) -> Topology:
                 f"{a} to {b} at {len(owners)} faces."
             )
     edges = sorted(sides)
-    averages = torch.zeros(count, count)
+    averages = torch.zeros(count, count, dtype=torch.float64)
     for a, b in edges:
         averages[a, b] = averages[b, a] = 1.0
     degree = averages.sum(dim=1, keepdim=True)
