@@ -33,8 +33,8 @@ def test_patches_of_other_scenes_keep_their_shape() -> None:
         cut_patches(one, voxel_size=1.0, count=256, min_points=40, generator=generator)
         for one in clouds
     ])  # fmt: skip
-    assert len(patches) > 150
-    patches = patches[torch.randperm(len(patches), generator=generator)[:150]]
+    assert len(patches) > 100
+    patches = patches[torch.randperm(len(patches), generator=generator)[:100]]
     found = score_shapes(load_shapes(), patches, pairs=60)
     assert found.chamfer_squared < found.sphere_squared / 8
     assert found.chamfer < found.sphere / 4
