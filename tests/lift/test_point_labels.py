@@ -185,3 +185,20 @@ def test_bad_points_are_refused() -> None:
         classified_points(scene, two, head("features"), HERE)
     with pytest.raises(ShapeError, match="points"):
         classified_points(PAIR, two, head("features"), torch.zeros(1, 2))
+
+
+def test_points_that_no_gaussian_reaches_may_stay_without_a_label() -> None:
+    scene = gaussians_at([[0, 0, 0], [1, 0, 0]], scales=0.1)
+    # Two and four standard deviations from the first, and far from both.
+    points = torch.tensor([[-0.2, 0.0, 0], [-0.4, 0.0, 0], [0.0, 50, 0]])
+    ids = [1, 2]
+    assert at(scene, ids, points) == [1, 1, 1]
+    assert at(scene, ids, points, max_mahalanobis=3.0) == [1, -1, -1]
+    assert at(scene, ids, points, max_mahalanobis=5.0) == [1, 1, -1]
+    given = PointLabelOptions(max_mahalanobis=3.0)
+    found = classified_points(
+        scene, Features(values=LOGITS), head("features"), points, options=given
+    )
+    assert found.ids.tolist()[1:] == [-1, -1]
+    with pytest.raises(RangeError, match="max_mahalanobis: expected a positive number"):
+        PointLabelOptions(max_mahalanobis=0.0)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_range, check_shape
@@ -51,12 +51,20 @@ class PointLabelOptions:
     min_opacity: float = 0.1
     """Fainter Gaussians are not there, in [0, 1]; as in OpenGaussian's protocol on ScanNet."""
 
+    max_mahalanobis: float | None = None
+    """weighted: standard deviations beyond which a Gaussian does not reach a point, which has no
+    label where none does. None lets every density count, and the nearest centre where there is
+    none."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
         check_choice("rule", self.rule, get_args(PointRule))
         check_range("min_opacity", self.min_opacity, 0.0, 1.0)
         if self.neighbours < 1:
             raise RangeError(f"neighbours: expected at least 1, got {self.neighbours}.")
+        cap = self.max_mahalanobis
+        if cap is not None and not cap > 0:
+            raise RangeError(f"max_mahalanobis: expected a positive number, got {cap}.")
 
 
 @boundary
@@ -70,7 +78,8 @@ def labels_of_points(
     r"""The labels that labels of Gaussians give to points in the world.
 
     No label competes as one more id. Equal votes go to the smaller id, and no label loses them;
-    where no density reaches, the nearest centre decides, with a confidence of 0.
+    where no density reaches, the nearest centre decides, with a confidence of 0, or nothing does
+    where `PointLabelOptions.max_mahalanobis` is given.
 
     Args:
         gaussians: The Gaussians of the scene.
@@ -92,8 +101,10 @@ def labels_of_points(
     known = ids.cpu().int()
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)
     confidence = torch.zeros(len(points))
-    for part, rows, density in _around(gaussians, points, options or PointLabelOptions()):
+    options = options or PointLabelOptions()
+    for part, rows, density in _around(gaussians, points, options):
         out[part], confidence[part] = _winners(known[rows], density)
+        out[part][_out_of_reach(density, options)] = UNLABELLED
     return PointLabels(ids=out, confidence=confidence)
 
 
@@ -136,7 +147,8 @@ def classified_points(
     weights = None if features.weights is None else features.weights.cpu()
     out = torch.full((len(points),), UNLABELLED, dtype=torch.int32)
     confidence = torch.zeros(len(points))
-    for part, rows, density in _around(gaussians, points, options or PointLabelOptions()):
+    options = options or PointLabelOptions()
+    for part, rows, density in _around(gaussians, points, options):
         share = _shares(density).float()
         mean = None
         for rank in range(rows.shape[1]):
@@ -155,6 +167,8 @@ def classified_points(
         labelled = best >= nothing
         out[part] = torch.where(labelled, head.ids[index], UNLABELLED).int()
         confidence[part] = torch.where(labelled, best, nothing).clamp(0, 1)
+        beyond = _out_of_reach(density, options)
+        out[part][beyond], confidence[part][beyond] = UNLABELLED, 0.0
     return PointLabels(ids=out, confidence=confidence)
 
 
@@ -188,8 +202,17 @@ def _around(
             continue
         offsets = at[:, None] - there.means[found]
         local = torch.einsum("pkji,pkj->pki", rotations[found], offsets) / scales[found]
-        density = there.opacities[found] * torch.exp(-0.5 * local.square().sum(dim=-1))
+        squared = local.square().sum(dim=-1)
+        density = there.opacities[found] * torch.exp(-0.5 * squared)
+        if options.max_mahalanobis is not None:
+            density = torch.where(squared <= options.max_mahalanobis**2, density, 0.0)
         yield part, rows[found], density
+
+
+def _out_of_reach(density: Float[Tensor, "m k"], options: PointLabelOptions) -> Bool[Tensor, "m"]:
+    """Points that have no label because no Gaussian reaches them."""
+    none = density.sum(dim=1) <= 0
+    return none if options.max_mahalanobis is not None else torch.zeros_like(none)
 
 
 def _shares(density: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:

@@ -1,0 +1,328 @@
+"""Points of laser scans and novel views of a street, by every way to label them, in one table.
+
+    python benchmarks/street.py SCENE ../shared/data/street [--rows drive ...] [--json FILE]
+
+Evidence are the label maps of training views; truth are the labels of all points of all scans and
+the maps of `test` and `test_novel` views, scored by the independent scorer. A point without a
+label is wrong. Rows, each a field (`splatseg.core.Renderable`) and a layer of it:
+
+- `published`: region voting as Street Gaussians is compared in the paper of the mesh field: the
+  majority of centres in a ball, each of which has one vote, of votes of pixels (`uplift` without
+  relabelling). `fair`: centres vote by how much all views saw them, W^T 1; what none sees has none.
+- `majority`, `uplift`: labels of Gaussians without and with relabelling and completion; a point
+  takes those around it by density. `nearest`: that of the nearest centre. `surface`: by density
+  within three standard deviations, and undefined beyond.
+- `vote`, `vote_depth`: views vote at centres, without and with occlusion. `cosseg`: objects of
+  `masks_sam` vote. `sam`, `panoptic`: objects of `masks_sam` and `labels_panoptic`, associated,
+  each with the class that most of its Gaussians have.
+- `views`: points take what the views of the field show at them, and nothing else. `shapes`: and
+  what is shaped like them, without smoothing; `drive`: with it, the default for drives.
+
+`mIoU` is over all classes with points, `big` over those with 1 000 points or more, with 95 %
+intervals of a bootstrap over scans. The columns of classes are the paper's 13: bus counts as
+others. `test` and `novel` are mIoU of label maps, PSNR and SSIM those of the test views.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from scored import _SCORE
+from torch import Tensor
+
+from splatseg.core import InstanceTree, Labels, PointLabels, Renderable, RenderableLayer, View
+from splatseg.io.npz import read_npz
+from splatseg.io.scene import load_scene
+from splatseg.lift import GaussianField, PointLabelOptions
+from splatseg.lift.points import (
+    RegionOptions,
+    ViewedPointOptions,
+    ViewedPoints,
+    region_labels,
+)
+from splatseg.methods import find_method
+from splatseg.tasks.segment import SegmentOptions, segment
+
+LAYER = "street"
+BIG = 1000
+TABLE = (
+    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign",
+    "vegetation", "terrain", "car", "truck", "other",
+)  # fmt: skip
+OTHERS = "bus"
+METHODS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "majority": ("uplift", {"correct_confusion": False}, {"complete": False}),
+    "uplift": ("uplift", {}, {}),
+    "vote": ("vote", {}, {}),
+    "vote_depth": ("vote", {"occlusion": "depth"}, {}),
+    "cosseg": ("cosseg", {"masks": "masks_sam"}, {}),
+}
+
+
+class Region:
+    """A field whose points take the label of most centres around them."""
+
+    def __init__(self, field: GaussianField, labels: Labels, bench: "Bench", *, fair: bool) -> None:
+        self._field, self._labels, self._bench, self._fair = field, labels, bench, fair
+        self.layer_names, self.view = field.layer_names, field.view
+
+    def layer(self, layer: str) -> RenderableLayer:
+        """What there is to know of a layer."""
+        return self._field.layer(layer)
+
+    def labels_at(self, points: Float[Tensor, "p 3"], layer: str) -> PointLabels:
+        """The vote of the ball."""
+        del layer
+        return region_labels(
+            self._bench.scene.gaussians,
+            self._labels.ids,
+            points,
+            weights=self._labels.evidence if self._fair else None,
+            options=RegionOptions(radius=self._bench.radius),
+        )
+
+
+class Bench:
+    """A scene, its capture, and layers that rows share."""
+
+    def __init__(self, scene: Path, data: Path, radius: float) -> None:
+        self.scene = replace(load_scene(scene), source=data.resolve())
+        self.data, self.radius = data, radius
+        self._layers: dict[str, Labels] = {}
+
+    def labels(self, name: str) -> Labels:
+        """A layer of classes, made once."""
+        if name not in self._layers:
+            self._layers[name] = self._made(name)
+        return self._layers[name]
+
+    def field(self, name: str, points: PointLabelOptions | None = None) -> GaussianField:
+        """Gaussians with one of these layers."""
+        return GaussianField(self.scene.gaussians, {LAYER: self.labels(name)}, points=points)
+
+    def viewed(self, name: str, options: ViewedPointOptions) -> ViewedPoints:
+        """The same, its points labelled by views."""
+        cameras = [view.camera for view in self.scene.train_views]
+        return ViewedPoints(self.field(name), cameras, options=options)
+
+    def _made(self, name: str) -> Labels:
+        if name in ("sam", "panoptic"):
+            found = {"sam": "masks_sam", "panoptic": "labels_panoptic"}[name]
+            options = SegmentOptions(evidence=found, layer=LAYER)
+            tree = segment(self.scene, "associate", options=options).layer
+            objects = tree.cut("object") if isinstance(tree, InstanceTree) else tree
+            return with_objects(self.labels("uplift"), objects)
+        method, own, shared = METHODS[name]
+        chosen = replace(find_method(method).options(), **own)
+        options = SegmentOptions(evidence="labels_semantic", layer=LAYER, **shared)
+        layer = segment(self.scene, method, options=options, method_options=chosen).layer
+        if not isinstance(layer, Labels):
+            raise TypeError(name)
+        return layer
+
+    @cached_property
+    def scans(self) -> tuple[Tensor, np.ndarray, np.ndarray]:
+        """Points (p, 3), their true classes, and which scan each is of."""
+        path = self.data / "lidar.npz"
+        names = ["range_2mm", "semantic", "lidar_to_world", "elevation", "azimuth"]
+        given = read_npz(path, names)
+        e, a = given["elevation"][:, None], given["azimuth"][None]
+        ray = np.stack(
+            np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), -1
+        )
+        ranges = given["range_2mm"].astype(np.float64) * 0.002
+        points, truth, scan = [], [], []
+        for index, pose in enumerate(given["lidar_to_world"]):
+            hit = ranges[index] > 0
+            at = (ray * ranges[index][..., None])[hit]
+            points.append(at @ pose[:3, :3].T + pose[:3, 3])
+            truth.append(given["semantic"][index][hit].astype(np.int64))
+            scan.append(np.full(int(hit.sum()), index))
+        return torch.from_numpy(np.concatenate(points)), *map(np.concatenate, (truth, scan))
+
+    @cached_property
+    def classes(self) -> dict[int, str]:
+        """Names of the capture's classes."""
+        meta = json.loads((self.data / "metadata.json").read_text())
+        return {row["id"]: row["name"] for row in meta["classes"]}
+
+
+def with_objects(labels: Labels, objects: Labels) -> Labels:
+    """Each object with the class that most of its Gaussians have."""
+    out = labels.ids.clone().long()
+    for one in torch.unique(objects.ids[objects.ids >= 0]).tolist():
+        inside = objects.ids == one
+        own = labels.ids[inside & (labels.ids >= 0)]
+        if len(own):
+            out[inside] = int(torch.bincount(own).argmax())
+    return replace(labels, ids=out.int(), candidates=None, shares=None)
+
+
+Row = Callable[[Bench], Renderable]
+PLAIN = {"shapes": False, "smoothing_steps": 0}
+ROWS: dict[str, Row] = {
+    "published": lambda b: Region(b.field("majority"), b.labels("majority"), b, fair=False),
+    "fair": lambda b: Region(b.field("majority"), b.labels("majority"), b, fair=True),
+    "majority": lambda b: b.field("majority"),
+    "uplift": lambda b: b.field("uplift"),
+    "nearest": lambda b: b.field("uplift", PointLabelOptions(rule="nearest")),
+    "surface": lambda b: b.field("uplift", PointLabelOptions(max_mahalanobis=3.0)),
+    "vote": lambda b: b.field("vote"),
+    "vote_depth": lambda b: b.field("vote_depth"),
+    "cosseg": lambda b: b.field("cosseg"),
+    "sam": lambda b: b.field("sam"),
+    "panoptic": lambda b: b.field("panoptic"),
+    "views": lambda b: b.viewed("uplift", ViewedPointOptions(**PLAIN)),
+    "shapes": lambda b: b.viewed("uplift", ViewedPointOptions(smoothing_steps=0)),
+    "drive": lambda b: b.viewed("uplift", ViewedPointOptions()),
+}
+
+
+def scored(*arguments: str | Path) -> dict[str, Any]:
+    """What the independent scorer says."""
+    command = [sys.executable, str(_SCORE), *map(str, arguments)]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def points_score(bench: Bench, ids: np.ndarray, work: Path) -> dict[str, Any]:
+    """Scores of points, with intervals, and the paper's columns."""
+    _, truth, scan = bench.scans
+    ids = np.maximum(ids, 0)
+    np.savez(work / "p.npz", semantic=ids)
+    np.savez(work / "t.npz", semantic=truth)
+    said = scored("points", "--pred", work / "p.npz", "--truth", work / "t.npz")
+    n = max(bench.classes) + 1
+    flat = (scan * n + truth) * n + ids
+    counts = np.bincount(flat, minlength=(scan.max() + 1) * n * n).reshape(-1, n, n)
+    big = counts.sum((0, 2)) >= BIG
+    rng = np.random.default_rng(0)
+    again = [counts[rng.integers(0, len(counts), len(counts))].sum(0) for _ in range(1000)]
+    own = {name: id for id, name in bench.classes.items()}
+    merged = counts.sum(0)
+    for axis in (0, 1):
+        merged = np.moveaxis(merged, axis, 0)
+        merged[own["other"]] += merged[own[OTHERS]]
+        merged[own[OTHERS]] = 0
+        merged = np.moveaxis(merged, 0, axis)
+    column = iou(merged)
+    return {
+        "points": said["mIoU"],
+        "points_interval": interval([mean_iou(c) for c in again]),
+        "big": mean_iou(counts.sum(0), big),
+        "big_interval": interval([mean_iou(c, big) for c in again]),
+        "undefined": said["unlabelled"],
+        "accuracy": said["accuracy"],
+        "per_class": {name: float(column[own[name]]) for name in TABLE},
+        "table_1": float(np.mean([column[own[name]] for name in TABLE])),
+    }
+
+
+def iou(counts: np.ndarray) -> np.ndarray:
+    """IoU of each class of a confusion matrix, true by predicted."""
+    hit = np.diag(counts)
+    return hit / np.maximum(counts.sum(0) + counts.sum(1) - hit, 1)
+
+
+def mean_iou(counts: np.ndarray, among: np.ndarray | None = None) -> float:
+    """Mean over classes that the truth has."""
+    present = counts.sum(1) > 0
+    present[0] = False
+    return float(iou(counts)[present if among is None else present & among].mean())
+
+
+def interval(values: list[float]) -> list[float]:
+    """The middle 95 % of values."""
+    return [float(v) for v in np.percentile(values, (2.5, 97.5))]
+
+
+def views_score(bench: Bench, field: Renderable, work: Path) -> dict[str, Any]:
+    """Scores of label maps and of renders."""
+    shown: tuple[View, ...] = tuple(v for v in bench.scene.views if v.split != "train")
+    for name in ("ids", "rgb"):
+        (work / name).mkdir(exist_ok=True)
+    for view in shown:
+        with field.view(view.camera) as drawn:
+            ids = drawn.label_map(LAYER).ids.clamp_min(0).numpy().astype(np.uint8)
+            colour = drawn.signals().colour
+        Image.fromarray(ids).save(work / "ids" / f"{view.name}.png")
+        if colour is not None:
+            rgb = (colour.clamp(0, 1) * 255).round().byte().numpy()
+            Image.fromarray(rgb).save(work / "rgb" / f"{view.name}.png")
+    out: dict[str, Any] = {}
+    for key, views in (("test", "test_*"), ("novel", "testnovel_*")):
+        maps = ("--pred", work / "ids", "--truth", bench.data / "semantic")
+        said = scored("semantic", *maps, "--views", views)
+        out[key] = said["mIoU"]
+        names = bench.classes
+        out[f"{key}_per_class"] = {names[int(k)]: v for k, v in said["per_class"].items()}
+    images = ("--pred", work / "rgb", "--truth", bench.data / "images", "--views", "test_*")
+    return out | {key: scored("image", *images)[key] for key in ("PSNR", "SSIM")}
+
+
+def measured(bench: Bench, row: Row, known: dict[int, dict[str, Any]]) -> dict[str, Any]:
+    """One row; views are drawn once for all rows of the same labels."""
+    field = row(bench)
+    points, _, _ = bench.scans
+    begin = time.monotonic()
+    field.labels_at(points[:1000], LAYER)
+    middle = time.monotonic()
+    ids = field.labels_at(points, LAYER).ids.numpy().astype(np.int64)
+    seconds = {"first_call": middle - begin, "points": time.monotonic() - middle}
+    with tempfile.TemporaryDirectory() as folder:
+        found = points_score(bench, ids, Path(folder))
+        key = next((id(l) for l in bench._layers.values() if shows(field, l)), id(field))  # noqa: E741
+        if key not in known:
+            known[key] = views_score(bench, field, Path(folder))
+    return found | known[key] | {"seconds": seconds}
+
+
+def shows(field: Renderable, labels: Labels) -> bool:
+    """Whether a field's views are those of these labels."""
+    inner = field
+    while isinstance(inner, Region | ViewedPoints):
+        inner = inner._field
+    return isinstance(inner, GaussianField) and inner.labels(LAYER) is labels
+
+
+def main() -> None:
+    """Parse the command line and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--radius", type=float, default=0.5, help="of regions, metres")
+    parser.add_argument("--json", type=Path, help="write all figures here")
+    arguments = parser.parse_args()
+    bench = Bench(arguments.scene, arguments.data, arguments.radius)
+    print("| row | mIoU | big | undefined | test | novel | PSNR | SSIM | s | 13 classes | "
+          + " | ".join(TABLE) + " |")  # fmt: skip
+    print("|" + " --- |" * (10 + len(TABLE)))
+    all_found, known = {}, {}
+    for name in arguments.rows:
+        found = all_found[name] = measured(bench, ROWS[name], known)
+        spread = [f"{v:.3f} ({low:.3f} to {high:.3f})" for v, (low, high) in (
+            (found["points"], found["points_interval"]), (found["big"], found["big_interval"]),
+        )]  # fmt: skip
+        rest = [f"{found['undefined']:.3f}", f"{found['test']:.4f}", f"{found['novel']:.4f}",
+                f"{found['PSNR']:.2f}", f"{found['SSIM']:.3f}",
+                f"{found['seconds']['points']:.1f}", f"{100 * found['table_1']:.1f}"]  # fmt: skip
+        classes = [f"{100 * v:.1f}" for v in found["per_class"].values()]
+        print("| " + " | ".join([name, *spread, *rest, *classes]) + " |", flush=True)
+        if arguments.json is not None:
+            arguments.json.write_text(json.dumps(all_found, indent=1))
+
+
+if __name__ == "__main__":
+    main()
