@@ -1,0 +1,68 @@
+"""Scans of lasers in the layouts people have, in the world, read one at a time.
+
+One module a layout; `read_scans` finds out which. Points are in the world of the layout's poses,
+float64; labels are -1 where the file says that there is none.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from splatseg._check import check_choice
+from splatseg.core import ClassTable
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, MissingFileError
+from splatseg.io.scans._source import Scans as Scans
+from splatseg.io.scans.files import find_files, read_files
+from splatseg.io.scans.range_images import find_range_images, read_range_images
+
+_READERS: Mapping[str, tuple[Callable[[Path], object], Callable[[Path], Scans]]] = {
+    "lidar-npz": (find_range_images, read_range_images),
+    # Files of points come last: they may lie in the folder of any data set.
+    "las": (lambda path: "las" in find_files(path), partial(read_files, format="las")),
+    "ply": (lambda path: "ply" in find_files(path), partial(read_files, format="ply")),
+    "npz": (lambda path: "npz" in find_files(path), partial(read_files, format="npz")),
+}
+
+FORMATS = tuple(_READERS)
+"""Layouts that are read, in the order in which they are looked for."""
+
+
+@boundary
+def read_scans(
+    path: Path | str, *, format: str = "auto", classes: ClassTable | None = None
+) -> Scans:
+    """Scans by name; each is read when it is asked for, so that no drive is in memory.
+
+    Args:
+        path: The folder of a drive, or a file of points.
+        format: One of `FORMATS`, or ``auto`` for the first of them that is found.
+        classes: Names of the ids of ``semantic``, instead of the format's own. A label that the
+            table lacks is refused when its scan is read.
+
+    Raises:
+        MissingFileError: If there is no such path.
+        InputError: If no layout is found, poses are missing, or a file is broken; one sentence.
+    """
+    check_choice("format", format, ("auto", *FORMATS))
+    path = Path(path)
+    if not path.exists():
+        raise MissingFileError(f"{path}: there is no such folder or file of scans.")
+    if format == "auto":
+        format = find_scans(path)
+    found = _READERS[format][1](path)
+    return found if classes is None else replace(found, classes=classes)
+
+
+@boundary
+def find_scans(path: Path) -> str:
+    """The layout of a folder or file: the first of `FORMATS` that it has.
+
+    Raises:
+        InputError: If it has none of them.
+    """
+    for name, (found, _) in _READERS.items():
+        if found(path):
+            return name
+    raise InputError(f"{path}: expected scans of a laser ({', '.join(FORMATS)}), got none of them.")
