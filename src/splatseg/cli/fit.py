@@ -118,6 +118,10 @@ class Command:
     """Evidence of depth, as see --what depth writes it, instead of the capture's depth maps: a
     folder, or its name in DATA or in a scene that SCENE replaces."""
 
+    scans: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Laser scans of the drive: the fit starts at their points and learns their depth, as with
+    --depth metric. For streets, whose far and thin things photographs alone place badly."""
+
     refine_poses: bool = _DEFAULT.refine_poses
     """Correct the poses of training views while fitting."""
 
@@ -161,6 +165,7 @@ def run(command: Command) -> None:
             keep_checkpoint=command.keep_checkpoint,
             preset=command.preset,
             depth_evidence=command.depth_evidence,
+            scans=command.scans,
         ),
         fit_options=_options(command),
         backend=command.backend,
@@ -182,7 +187,7 @@ def _options(command: Command) -> FitOptions:
         antialiased=options.antialiased if command.antialiased is None else command.antialiased,
         exposure=command.exposure,
         masks=command.masks,
-        depth=command.depth,
+        depth="metric" if command.scans and command.depth == "off" else command.depth,
         refine_poses=command.refine_poses,
     )
     options = options.with_strategy(command.strategy)

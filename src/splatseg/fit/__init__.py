@@ -26,3 +26,6 @@ from splatseg.fit._refine import refine as refine
 from splatseg.fit._sensible import sensible_steps as sensible_steps
 from splatseg.fit._start import random_point_count as random_point_count
 from splatseg.fit._step import ExtraLoss as ExtraLoss
+from splatseg.fit.scan_depth import DepthPoints as DepthPoints
+from splatseg.fit.scan_depth import ScanDepthOptions as ScanDepthOptions
+from splatseg.fit.scan_depth import scan_depths as scan_depths

@@ -33,6 +33,7 @@ from splatseg.tasks._depth_evidence import with_depth_evidence
 from splatseg.tasks._fit_report import score_and_report
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._photographs import Poses, capture_of
+from splatseg.tasks._scan_depth import with_scans
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.stopped_fit import check_fit_output, fit_folder
 
@@ -67,6 +68,11 @@ class MakeSceneOptions(CheckpointOptions):
     depth_evidence: str | None = None
     """Evidence of depth to learn from instead of the capture's own depth maps, with the depth
     option of the fit: a folder, or its name in the capture or in the scene that is replaced."""
+
+    scans: Path | None = None
+    """Scans of lasers, in any layout that `splatseg.io.scans.read_scans` reads and in the world of
+    the capture: their points are where the fit starts, and the depth that it learns with the
+    metric depth option. None uses none."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
@@ -223,6 +229,13 @@ def _capture(
             capture, options.depth_evidence, scene=folder, depth=fit_options.depth,
             report=observer.note,
         )  # fmt: skip
+    if options.scans is not None:
+        if fit_options.depth != "metric":
+            raise InputError(f"depth: expected metric with scans, got {fit_options.depth}.")
+        if options.depth_evidence is not None:
+            raise InputError("depth_evidence: expected none with scans, which tell depths too.")
+        observer.info("scans become depth maps")
+        capture = with_scans(capture, read_scans(options.scans), scene=folder, report=observer.note)
     for note in (*capture.notes, reduction_note(capture.train_views, longest=fit_options.longest)):
         if note is not None:
             observer.note(note)
@@ -292,6 +305,7 @@ def _provenance(
         "seed": fit_options.seed,
         "preset": options.preset,
         **({} if options.depth_evidence is None else {"depth_evidence": options.depth_evidence}),
+        **({} if options.scans is None else {"scans": str(options.scans)}),
         "backend": backend,
         "options": asdict(fit_options),
         **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),
