@@ -43,7 +43,7 @@ from scored import _SCORE
 from torch import Tensor
 
 from splatseg.core import InstanceTree, Labels, PointLabels, Renderable, RenderableLayer, View
-from splatseg.io.npz import read_npz
+from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField, PointLabelOptions
 from splatseg.lift.points import (
@@ -135,22 +135,14 @@ class Bench:
     @cached_property
     def scans(self) -> tuple[Tensor, np.ndarray, np.ndarray]:
         """Points (p, 3), their true classes, and which scan each is of."""
-        path = self.data / "lidar.npz"
-        names = ["range_2mm", "semantic", "lidar_to_world", "elevation", "azimuth"]
-        given = read_npz(path, names)
-        e, a = given["elevation"][:, None], given["azimuth"][None]
-        ray = np.stack(
-            np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), -1
-        )
-        ranges = given["range_2mm"].astype(np.float64) * 0.002
+        source = read_scans(self.data)
         points, truth, scan = [], [], []
-        for index, pose in enumerate(given["lidar_to_world"]):
-            hit = ranges[index] > 0
-            at = (ray * ranges[index][..., None])[hit]
-            points.append(at @ pose[:3, :3].T + pose[:3, 3])
-            truth.append(given["semantic"][index][hit].astype(np.int64))
-            scan.append(np.full(int(hit.sum()), index))
-        return torch.from_numpy(np.concatenate(points)), *map(np.concatenate, (truth, scan))
+        for index, name in enumerate(source.scan_names):
+            found = source.scan(name)
+            points.append(found.points)
+            truth.append(found.labels["semantic"].clamp_min(0).numpy().astype(np.int64))
+            scan.append(np.full(len(found), index))
+        return torch.cat(points), np.concatenate(truth), np.concatenate(scan)
 
     @cached_property
     def classes(self) -> dict[int, str]:

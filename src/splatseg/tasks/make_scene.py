@@ -23,6 +23,7 @@ from splatseg.fit import (
     reduction_note,
 )
 from splatseg.io.npz_writing import discard_checkpoint_file
+from splatseg.io.scans import read_scans
 from splatseg.io.scene import save_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE
 from splatseg.pose import PoseReport
