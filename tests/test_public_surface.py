@@ -104,6 +104,7 @@ PACKAGES = {
     "raycast",
     "render",
     "report",
+    "street",
     "synthetic",
     "tasks",
 }

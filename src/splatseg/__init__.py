@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from splatseg import render as render
     from splatseg import report as report
     from splatseg import selection as selection
+    from splatseg import street as street
     from splatseg import synthetic as synthetic
     from splatseg import tasks as tasks
     from splatseg.core import Camera as Camera
@@ -156,6 +157,7 @@ _PACKAGES = frozenset(
         "raycast",
         "render",
         "report",
+        "street",
         "synthetic",
         "tasks",
     }
