@@ -218,6 +218,7 @@ def valid(world: World) -> dict[str, Any]:
         ),
         core.Renderable: GaussianField(world.gaussians, {"things": world.labels}),
         core.LabelSource: Maps(),
+        core.ScanSource: OneScan(),
         evaluate.Overlaps: overlaps,
         evaluate.Confusion: evaluate.Confusion.of(ids, ids),
         edit.Document: edit.Document(scene=scene, layers={"things": world.labels}),
@@ -283,6 +284,15 @@ def answers() -> Any:
         index=WordIndex(Features(values=values), vocabulary), layer="objects",
         options=QueryOptions(),
     )  # fmt: skip
+
+
+class OneScan:
+    """A source of one scan."""
+
+    scan_names = ("a",)
+
+    def scan(self, name: str) -> core.Scan:
+        return core.Scan(name=name, points=torch.ones(3, 3))
 
 
 def voxels() -> core.VoxelGrid:
