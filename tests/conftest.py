@@ -11,6 +11,7 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from support import shared
+from support.drive import write_drive
 from support.room import write_room
 from support.scorer import SCORERS, Score
 
@@ -79,6 +80,12 @@ def generated_room(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> 
     The workers of pytest-xdist share one: photographing it takes ten seconds.
     """
     return made_once(tmp_path_factory, worker_id, "room", write_room)
+
+
+@pytest.fixture(scope="session")
+def generated_drive(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """A generated street that was driven, with scans, see `support.drive`; not to be changed."""
+    return made_once(tmp_path_factory, worker_id, "drive", write_drive)
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, PointCloud, View
 from splatseg.core.boundary import boundary
+from splatseg.core.evidence import UNLABELLED
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
 from splatseg.synthetic._labels import machine_labels
@@ -218,11 +219,12 @@ def _metadata(
 
 
 def _train_pixels(views: Sequence[View], truths: Mapping[str, Truth]) -> dict[int, int]:
-    """How many pixels of the train views each object has."""
+    """How many pixels of the train views each object has; the sky is none."""
     total: dict[int, int] = {}
     for view in views:
         if view.split == "train":
-            ids, counts = truths[view.name].instance.unique(return_counts=True)
+            instance = truths[view.name].instance
+            ids, counts = instance[instance != UNLABELLED].unique(return_counts=True)
             for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
                 total[i] = total.get(i, 0) + n
     return total
