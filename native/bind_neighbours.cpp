@@ -159,6 +159,24 @@ void register_neighbours(nb::module_& module) {
            },
            nb::arg("queries").none(), nb::arg("rows").none(), nb::arg("max_squared"),
            nb::arg("starts"), nb::arg("indices"), nb::arg("squared"))
+      .def("ball_means",
+           [](const NeighbourIndex& self, const Points& queries, double max_squared,
+              const Array<const float, 2>& values, const Array<double, 2>& means,
+              const Array<int64_t, 1>& counts) {
+             expect(self.dimensions() == 3 && queries.shape(1) == 3, "neighbours: dimensions");
+             expect_finite(queries, "neighbours: queries must be finite");
+             expect(static_cast<int64_t>(values.shape(0)) == self.count(),
+                    "neighbours: a row for each point");
+             expect(means.shape(0) == queries.shape(0) && means.shape(1) == values.shape(1) &&
+                        counts.shape(0) == queries.shape(0),
+                    "neighbours: output size");
+             nb::gil_scoped_release released;
+             self.ball_means(queries.data(), static_cast<int64_t>(queries.shape(0)), max_squared,
+                             values.data(), static_cast<int64_t>(values.shape(1)), means.data(),
+                             counts.data());
+           },
+           nb::arg("queries"), nb::arg("max_squared"), nb::arg("values"), nb::arg("means"),
+           nb::arg("counts"))
       .def_prop_ro("nbytes", &NeighbourIndex::bytes);
   register_subset(module);
 }

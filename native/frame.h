@@ -219,6 +219,11 @@ struct Kernels {
                         double max_squared, const int64_t* starts, Candidates&, int64_t* indices,
                         double* squared);
 
+  // Means over balls around queries [begin, end), see NeighbourIndex::ball_means.
+  void (*ball_means)(const CellTree&, const Bundle&, int64_t begin, int64_t end,
+                     double max_squared, const float* values, int64_t channels, double* means,
+                     int64_t* counts);
+
   // Mean distance of the members of leaves [begin, end) of a subset to their k nearest others;
   // members [begin, end), 32 at most, within sqrt(max_squared) of a query, a bit each. See subset.h.
   void (*mean_distances)(const SubsetTree&, int64_t begin, int64_t end, int64_t k, SubsetScratch&,

@@ -283,4 +283,17 @@ void NeighbourIndex::within(const double* queries, const int64_t* points, int64_
   });
 }
 
+void NeighbourIndex::ball_means(const double* queries, int64_t m, double max_squared,
+                                const float* values, int64_t channels, double* means,
+                                int64_t* counts) const {
+  const CellTree cells = tree();
+  const Kernels& use = kernels();
+  in_blocks(queries, nullptr, m, [&](const Bundle& bundle, int64_t first, int64_t rows) {
+    parallel_for(rows, kGrain, [&](int64_t begin, int64_t end) {
+      use.ball_means(cells, bundle, begin, end, max_squared, values, channels,
+                     means + first * channels, counts + first);
+    });
+  });
+}
+
 }  // namespace splatseg

@@ -87,6 +87,13 @@ class NeighbourIndex {
   void within(const double* queries, const int64_t* points, int64_t m, double max_squared,
               const int64_t* starts, int64_t* indices, double* squared) const;
 
+  // Of each query the mean of the rows values[i] (count, channels) of the points i within
+  // sqrt(max_squared), weighted by their inverse distance, and how many they are. Points at the
+  // query itself have all the weight, in equal parts; without a point the mean is 0. Sums are
+  // taken in an order that depends on the index and the query alone. For three dimensions.
+  void ball_means(const double* queries, int64_t m, double max_squared, const float* values,
+                  int64_t channels, double* means, int64_t* counts) const;
+
  private:
   template <int D>
   friend class CellBuilder;

@@ -32,6 +32,7 @@ SPLATSEG_KERNEL(argmax)
 SPLATSEG_KERNEL(nearest_points)
 SPLATSEG_KERNEL(count_points)
 SPLATSEG_KERNEL(points_within)
+SPLATSEG_KERNEL(ball_means)
 SPLATSEG_KERNEL(mean_distances)
 SPLATSEG_KERNEL(points_near)
 SPLATSEG_KERNEL(match_panels)
@@ -43,7 +44,7 @@ const Kernels& table() {
                                   chain, block_weights, block_sums, blocks_forward, blocks_adjoint,
                                   tile_weights, gather_rows, scatter_rows, ids_below,
                                   sparse_adjoint, argmax, nearest_points, count_points,
-                                  points_within, mean_distances, points_near, match_panels,
+                                  points_within, ball_means, mean_distances, points_near, match_panels,
                                   row_products};
   return kernels;
 }

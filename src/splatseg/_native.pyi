@@ -299,6 +299,9 @@ class NeighbourIndex:
         indices: Tensor,
         squared: Tensor,
     ) -> None: ...
+    def ball_means(
+        self, queries: Tensor, max_squared: float, values: Tensor, means: Tensor, counts: Tensor
+    ) -> None: ...
 
 class Subset:
     count: int

@@ -65,6 +65,23 @@ def within(
     )
 
 
+def ball_means(
+    points: Float[Tensor, "n 3"],
+    values: Float[Tensor, "n c"],
+    queries: Float[Tensor, "m 3"],
+    radius: float,
+) -> tuple[Float64[Tensor, "m c"], Int64[Tensor, "m"]]:
+    """What `neighbours.ball_means` finds."""
+    squared = squared_distances(queries, points)
+    near = squared <= radius * radius
+    exact = (squared == 0) & near
+    weights = torch.where(exact.any(dim=1, keepdim=True), exact.double(), squared.rsqrt() * near)
+    weights = torch.where(near, weights, 0.0)
+    total = weights.sum(dim=1, keepdim=True)
+    means = weights @ values.float().double() / total
+    return torch.where(total > 0, means, 0.0), near.sum(dim=1)
+
+
 def mean_distances(
     points: Float[Tensor, "n 3"], members: Bool[Tensor, "n"], k: int
 ) -> Float64[Tensor, "n"]:
