@@ -18,6 +18,11 @@ from splatseg.io.export._objects import ObjectRow as ObjectRow
 from splatseg.io.export._objects import classes_of as classes_of
 from splatseg.io.export._objects import objects_of as objects_of
 from splatseg.io.export._points import write_points as write_points
+from splatseg.io.export._points import write_scan_points as write_scan_points
+from splatseg.io.export._scan_labels import FORMS as FORMS
+from splatseg.io.export._scan_labels import ScanLabelCounts as ScanLabelCounts
+from splatseg.io.export._scan_labels import ScanLabelForm as ScanLabelForm
+from splatseg.io.export._scan_labels import write_scan_labels as write_scan_labels
 from splatseg.io.export._splats import write_object_splats as write_object_splats
 from splatseg.io.export._tables import object_content as object_content
 from splatseg.io.export._tables import write_object_table as write_object_table

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +24,7 @@ _LAST_CLASS = 255
 _POINT_FORMAT = 7
 _STEPS = 2**30
 
-_PLY_TYPES = {"f4": "float", "i4": "int", "u1": "uchar"}
+_PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 _DESCRIPTIONS = {
     "class_id": "class, 0 for none",
     "instance_id": "object, 0 for none",
@@ -71,13 +72,52 @@ def write_points(
     if not np.isfinite(points).all():
         raise RangeError("means: expected finite values, got NaN or infinity.")
     colours = gaussians.colours.detach().cpu().double().clamp(0, 1).numpy()
+    return _written(path, points.astype(np.float32), colours, arrays)
+
+
+@boundary
+def write_scan_points(
+    points: Float[Tensor, "n 3"], path: Path, *, columns: Mapping[str, Tensor]
+) -> Mapping[int, int]:
+    """Write points of a scan with labels; atomic. As `write_points`, without colours.
+
+    A PLY has ``x y z`` double, as coordinates of maps have more digits than float holds.
+
+    Args:
+        points: World, scene units.
+        path: The file; its ending gives the format.
+        columns: int32 or float32 by name, one row a point, see `label_columns`.
+
+    Returns:
+        The classification of each class id in a LAS file, see `write_points`.
+
+    Raises:
+        InputError: If the name ends otherwise, or a column has another number of rows.
+        MissingPackageError: If laspy is not installed and LAS is asked for.
+        MissingFileError: If the folder of `path` does not exist.
+    """
+    arrays = {name: _plain(name, column) for name, column in columns.items()}
+    for name, array in arrays.items():
+        if array.shape != (len(points),):
+            raise InputError(
+                f"columns[{name!r}]: expected {len(points)} values, got {array.shape}."
+            )
+    return _written(path, points.detach().cpu().double().numpy(), None, arrays)
+
+
+def _written(
+    path: Path,
+    points: NDArray[Any],
+    colours: NDArray[np.float64] | None,
+    columns: Mapping[str, NDArray[Any]],
+) -> Mapping[int, int]:
     match path.suffix.lower():
         case ".ply":
             with atomic_file(path) as temporary:
-                _write_ply(temporary, points, colours, arrays)
+                _write_ply(temporary, points, colours, columns)
             return {}
         case ".las" | ".laz":
-            return _write_las(path, points, colours, arrays)
+            return _write_las(path, points.astype(np.float64), colours, columns)
         case _:
             raise InputError(
                 f"{path}: expected the name of a point cloud to end in .ply, .las or .laz."
@@ -96,19 +136,21 @@ def _plain(name: str, column: Tensor) -> NDArray[Any]:
 
 def _write_ply(
     path: Path,
-    points: NDArray[np.float64],
-    colours: NDArray[np.float64],
+    points: NDArray[Any],
+    colours: NDArray[np.float64] | None,
     columns: Mapping[str, NDArray[Any]],
 ) -> None:
-    bytes_ = np.floor(colours * 255 + 0.5).astype(np.uint8)
-    fields = [(axis, "f4") for axis in "xyz"]
-    fields += [(name, "u1") for name in ("red", "green", "blue")]
+    fields = [(axis, points.dtype.str[1:]) for axis in "xyz"]
+    if colours is not None:
+        fields += [(name, "u1") for name in ("red", "green", "blue")]
     fields += [(name, array.dtype.str[1:]) for name, array in columns.items()]
     table = np.zeros(len(points), np.dtype([(name, f"<{kind}") for name, kind in fields]))
     for k, axis in enumerate("xyz"):
         table[axis] = points[:, k]
-    for k, name in enumerate(("red", "green", "blue")):
-        table[name] = bytes_[:, k]
+    if colours is not None:
+        bytes_ = np.floor(colours * 255 + 0.5).astype(np.uint8)
+        for k, name in enumerate(("red", "green", "blue")):
+            table[name] = bytes_[:, k]
     for name, array in columns.items():
         table[name] = array
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
@@ -121,7 +163,7 @@ def _write_ply(
 def _write_las(
     path: Path,
     points: NDArray[np.float64],
-    colours: NDArray[np.float64],
+    colours: NDArray[np.float64] | None,
     columns: Mapping[str, NDArray[Any]],
 ) -> Mapping[int, int]:
     laspy = _laspy(path)
@@ -143,7 +185,8 @@ def _write_las(
         )
     las = laspy.LasData(header)
     las.xyz = points
-    las.red, las.green, las.blue = np.floor(colours * 65535 + 0.5).astype(np.uint16).T
+    if colours is not None:
+        las.red, las.green, las.blue = np.floor(colours * 65535 + 0.5).astype(np.uint16).T
     las.return_number = las.number_of_returns = np.ones(len(points), np.uint8)
     classes = columns.get("class_id", np.zeros(len(points), np.int32))
     known = {int(id): int(id) + FIRST_USER_CLASS - 1 for id in np.unique(classes) if id > 0}
