@@ -8,6 +8,7 @@ from splatseg.core.checkpoints import Checkpoints as Checkpoints
 from splatseg.fit._checkpoint import CheckpointSummary as CheckpointSummary
 from splatseg.fit._checkpoint import CheckpointVersionError as CheckpointVersionError
 from splatseg.fit._checkpoint import checkpoint_summary as checkpoint_summary
+from splatseg.fit._depth import aligned_inverse as aligned_inverse
 from splatseg.fit._exposure import Exposure as Exposure
 from splatseg.fit._loop import fit as fit
 from splatseg.fit._options import FitOptions as FitOptions

@@ -6,3 +6,4 @@
 
 from splatseg.raycast._caster import RayCaster as RayCaster
 from splatseg.raycast._hits import RayHits as RayHits
+from splatseg.raycast._hits import through_triangles as through_triangles
