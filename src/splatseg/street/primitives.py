@@ -7,7 +7,7 @@ every level, and rays look at the fine ones over the coarse ones.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from splatseg._check import check_choice, check_finite, check_range, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
+from splatseg.lift.points.thin import thin
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.shapes import ShapeAutoEncoder, primitive_scale, sphere_code
 from splatseg.street.shapes.template import VERTICES
@@ -35,7 +36,7 @@ _UNIT = 1e-3
 _DECODED = 8192
 """Primitives that are decoded together where no gradient is wanted."""
 
-_MAX_INDEX = 1 << 40
+_MAX_INDEX = 1 << 20
 _ENCODED_POINTS = 128
 _ENCODED = 256
 _MIN_ENCODED_POINTS = 8
@@ -199,9 +200,7 @@ def voxel_primitives(
         raise RangeError(f"metres_per_unit: expected a positive length, got {metres_per_unit:g}.")
     if not sizes or not all(0 < size < math.inf for size in sizes):
         raise RangeError(f"sizes: expected positive lengths in metres, got {tuple(sizes)}.")
-    given = points.detach().cpu().double()
-    # Sums of floating point numbers depend on their order: points get one of their own.
-    cloud = given[torch.from_numpy(np.lexsort(given.numpy().T[::-1]).copy())]
+    cloud = points.detach().cpu().double()
     units = tuple(size / metres_per_unit for size in sorted(sizes))
     sphere = sphere_code(shapes).cpu()
     left = torch.ones(len(cloud), dtype=torch.bool)
@@ -215,7 +214,8 @@ def voxel_primitives(
             left[rows[owners >= 0]] = False
         codes = sphere.expand(len(centres), -1)
         if start == "encoded":
-            codes = _encoded(shapes, cloud[rows], owners, centres, primitive_scale(size), sphere)
+            filled = _Filled(cloud[rows], owners, centres, primitive_scale(size))
+            codes = _encoded(shapes, filled, sphere)
         found.append((centres, codes))
     counts = [len(centres) for centres, _ in found]
     if not sum(counts):
@@ -237,32 +237,25 @@ def _voxels(points: Tensor, size: float, enough: int) -> tuple[Tensor, Tensor]:
     """Means of the points of voxels that hold enough of them, and the voxel of each point or -1."""
     if not len(points):
         return points.new_zeros(0, 3), torch.zeros(0, dtype=torch.int64)
-    cells = torch.floor(points / size)
-    if float(cells.abs().max()) > _MAX_INDEX:
+    furthest = float(points.abs().max())
+    if furthest / size >= _MAX_INDEX - 1:
         raise RangeError(
-            f"points: expected coordinates within {_MAX_INDEX:g} voxels of the origin, got "
-            f"{float(points.abs().max()):g} for voxels of {size:g}."
+            f"points: expected coordinates within {_MAX_INDEX} voxels of the origin, got "
+            f"{furthest:g} for voxels of {size:g}."
         )
-    _, owners, counts = torch.unique(cells.long(), dim=0, return_inverse=True, return_counts=True)
-    sums = torch.zeros(len(counts), 3, dtype=torch.float64).index_add_(0, owners, points)
-    kept = counts >= enough
+    cells = thin(points, size)
+    kept = torch.bincount(cells.cell_of) >= enough
     index = torch.where(kept, kept.cumsum(0) - 1, -1)
-    return (sums / counts[:, None])[kept], index[owners]
+    return cells.centres[kept], index[cells.cell_of]
 
 
-def _encoded(
-    shapes: ShapeAutoEncoder,
-    points: Tensor,
-    owners: Tensor,
-    centres: Tensor,
-    scale: float,
-    sphere: Tensor,
-) -> Tensor:
+def _encoded(shapes: ShapeAutoEncoder, voxels: "_Filled", sphere: Tensor) -> Tensor:
     """Codes of the points of voxels, spheres where they are few."""
-    codes = sphere.repeat(len(centres), 1)
-    inside = (owners >= 0).nonzero()[:, 0]
-    order = inside[torch.argsort(owners[inside], stable=True)]
-    counts = torch.bincount(owners[inside], minlength=len(centres))
+    codes = sphere.repeat(len(voxels.centres), 1)
+    inside = (voxels.owners >= 0).nonzero()[:, 0]
+    x, y, z = voxels.points[inside].numpy().T
+    order = inside[torch.from_numpy(np.lexsort((z, y, x, voxels.owners[inside].numpy())))]
+    counts = torch.bincount(voxels.owners[inside], minlength=len(codes))
     starts = counts.cumsum(0) - counts
     dense = (counts >= _MIN_ENCODED_POINTS).nonzero()[:, 0]
     share = torch.arange(_ENCODED_POINTS)
@@ -270,6 +263,16 @@ def _encoded(
         for part in dense.split(_ENCODED):
             # Evenly over a voxel's points; a repeated point changes no maximum.
             steps = share * counts[part, None] // _ENCODED_POINTS
-            local = points[order[starts[part, None] + steps]] - centres[part, None]
-            codes[part] = shapes.encode((local / scale).float())
+            rows = order[starts[part, None] + steps]
+            local = voxels.points[rows] - voxels.centres[part, None]
+            codes[part] = shapes.encode((local / voxels.scale).float())
     return functional.normalize(codes, dim=1)
+
+
+class _Filled(NamedTuple):
+    """Points, the voxel of each or -1, the voxels' centres, and the unit of their shapes."""
+
+    points: Tensor
+    owners: Tensor
+    centres: Tensor
+    scale: float
