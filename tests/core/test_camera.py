@@ -11,6 +11,7 @@ from splatseg.errors import InputError, RangeError
 EYE = torch.eye(4, dtype=torch.float64)
 OPENCV = (-0.28, 0.09, 0.001, -0.0015, -0.01, 0.02, -0.003, 0.001)
 FISHEYE = (-0.03, 0.004, -0.001, 0.0002)
+MEI = (2.2, 0.017, 1.65, 0.0004, 0.0002)
 
 
 def camera(**changes: object) -> Camera:
@@ -27,8 +28,10 @@ LENSES = [
     camera(model="opencv", distortion=(0.2,)),
     camera(model="fisheye", distortion=FISHEYE),
     camera(model="fisheye"),
+    camera(model="mei", distortion=MEI, fx=150.0, fy=152.0),
+    camera(model="mei", distortion=(0.6,)),
 ]
-IDS = ["pinhole", "opencv", "radial", "fisheye", "equidistant"]
+IDS = ["pinhole", "opencv", "radial", "fisheye", "equidistant", "mei", "sphere"]
 
 
 def test_projection_by_hand() -> None:
@@ -66,6 +69,28 @@ def test_fisheye_distortion_by_hand() -> None:
     assert pixels.tolist() == pytest.approx([31 + 50 * x * theta_d, 25 + 52 * y * theta_d])
 
 
+def test_mei_distortion_by_hand() -> None:
+    """A point of the sphere, seen from xi behind its centre, by the formula of the paper."""
+    xi, k1, k2, p1, p2 = MEI
+    x, y, z = 2 / 7, -3 / 7, 6 / 7  # of length 1
+    mx, my = x / (z + xi), y / (z + xi)
+    r2 = mx * mx + my * my
+    radial = 1 + k1 * r2 + k2 * r2**2
+    expected = (
+        31 + 150 * (mx * radial + 2 * p1 * mx * my + p2 * (r2 + 2 * mx * mx)),
+        25 + 152 * (my * radial + p1 * (r2 + 2 * my * my) + 2 * p2 * mx * my),
+    )
+    pixels, _ = LENSES[5].project(torch.tensor([2.0, -3.0, 6.0], dtype=torch.float64))
+    assert pixels.tolist() == pytest.approx(expected)
+
+
+def test_mei_without_its_mirror_is_opencv() -> None:
+    ours = camera(model="mei", distortion=(0.0, *OPENCV[:4]))
+    theirs = camera(model="opencv", distortion=OPENCV[:4])
+    points = torch.tensor([[0.2, -0.3, 1.0], [-0.1, 0.1, 0.5]], dtype=torch.float64)
+    torch.testing.assert_close(ours.project(points)[0], theirs.project(points)[0])
+
+
 @pytest.mark.parametrize("lens", LENSES, ids=IDS)
 def test_unproject_inverts_project(lens: Camera) -> None:
     pixels = lens.pixel_centres()
@@ -101,6 +126,9 @@ def test_the_undistorted_camera_covers_every_pixel(lens: Camera) -> None:
 def test_a_view_too_wide_for_a_plane_is_refused() -> None:
     with pytest.raises(InputError, match=r"too wide for a plane|narrower than 180 degrees"):
         camera(model="fisheye", fx=20.6, fy=20.6, cx=32.0, cy=24.0).undistorted()
+    for focal in (60.0, 80.0):  # past the lens' image, and past 90 degrees
+        with pytest.raises(InputError, match=r"too wide for a plane|narrower than 180 degrees"):
+            camera(model="mei", distortion=(2.2,), fx=focal, fy=focal).undistorted()
 
 
 def test_distortion_without_an_inverse_is_refused() -> None:

@@ -17,12 +17,18 @@ from splatseg.core._distortion import (
     undistort_fisheye,
     undistort_opencv,
 )
+from splatseg.core._mei import MEI_PARAMETERS, distort_mei, undistort_mei
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.rigid import Similarity, check_rotation
 from splatseg.errors import InputError, RangeError
 
-CameraModel = Literal["pinhole", "opencv", "fisheye"]
-_PARAMETERS = {"pinhole": 0, "opencv": OPENCV_PARAMETERS, "fisheye": FISHEYE_PARAMETERS}
+CameraModel = Literal["pinhole", "opencv", "fisheye", "mei"]
+_PARAMETERS = {
+    "pinhole": 0,
+    "opencv": OPENCV_PARAMETERS,
+    "fisheye": FISHEYE_PARAMETERS,
+    "mei": MEI_PARAMETERS,
+}
 _MAX_UNDISTORTED_GROWTH = 8.0
 
 
@@ -55,11 +61,11 @@ class Camera:
     """Rigid transform into camera axes, float64. It may require a gradient."""
 
     model: CameraModel = "pinhole"
-    """Lens model, see `core._distortion`."""
+    """Lens model, see `core._distortion` and `core._mei`."""
 
     distortion: tuple[float, ...] = ()
-    """opencv: k1 k2 p1 p2 k3 k4 k5 k6; fisheye: k1 k2 k3 k4; pinhole: nothing. Missing
-    trailing values are 0."""
+    """opencv: k1 k2 p1 p2 k3 k4 k5 k6; fisheye: k1 k2 k3 k4; mei: xi k1 k2 p1 p2; pinhole:
+    nothing. Missing trailing values are 0."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
@@ -272,6 +278,8 @@ class Camera:
             return plane
         if self.model == "fisheye":
             return undistort_fisheye(plane, self.distortion)
+        if self.model == "mei":
+            return undistort_mei(plane, self.distortion)
         return undistort_opencv(plane, self.distortion)
 
     def _pixels_from_plane(self, plane: Tensor, *, distorted: bool = False) -> Tensor:
@@ -279,6 +287,8 @@ class Camera:
         if not distorted and not self.is_pinhole:
             if self.model == "fisheye":
                 plane = distort_fisheye(plane, self.distortion)
+            elif self.model == "mei":
+                plane = distort_mei(plane, self.distortion)
             else:
                 plane = distort_opencv(plane, self.distortion)
         return plane * self._focal(plane) + self._offset(plane)

@@ -20,13 +20,19 @@ from splatseg.io.captures.build import checked_pose, opencv_from_opengl
 from splatseg.io.captures.nerfstudio import MILLIMETRE, frame_matrix, lens_of, number, size_of
 from splatseg.io.foreign import made_from
 
-_MODEL_NAMES = {"pinhole": "PINHOLE", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+_MODEL_NAMES = {
+    "pinhole": "PINHOLE",
+    "opencv": "OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+    "mei": "MEI",
+}
 _DISTORTION = {
     "pinhole": (),
     "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
+    "mei": ("xi", "k1", "k2", "p1", "p2"),
 }
-_LENS = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", *_DISTORTION["opencv"])
+_LENS = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "xi", *_DISTORTION["opencv"])
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _FILES = {"image": "file_path", "mask": "mask_path", "depth": "depth_file_path"}
 

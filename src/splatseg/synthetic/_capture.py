@@ -24,11 +24,12 @@ from splatseg.synthetic._views import cameras, start_points
 
 _JPEG_QUALITY = 92
 _DEPTH_UNIT = 0.001
-_MODELS = {"pinhole": "OPENCV", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+_MODELS = {"pinhole": "OPENCV", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE", "mei": "MEI"}
 _COEFFICIENTS = {
     "pinhole": ("k1", "k2", "p1", "p2"),
     "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
+    "mei": ("xi", "k1", "k2", "p1", "p2"),
 }
 
 

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.cameras import cameras_content, views_from_content
 from splatseg.io.captures import read_capture
 from splatseg.io.images import load_image, load_mask
 from support.shared import generated_and
@@ -56,6 +57,17 @@ def test_fisheye_is_another_lens(nerfstudio) -> None:
     camera = read_capture(nerfstudio(top=top)).views[0].camera
     assert camera.model == "fisheye"
     assert camera.distortion == (0.1, 0.2, 0.3, 0.4)
+
+
+def test_the_unified_lens_is_kept_by_a_scene(nerfstudio) -> None:
+    top = {"camera_model": "MEI", "xi": 2.2, "k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}
+    capture = read_capture(nerfstudio(top=top))
+    camera = capture.views[0].camera
+    assert (camera.model, camera.distortion) == ("mei", (2.2, 0.1, 0.2, 0.3, 0.4))
+    content = cameras_content(capture.views, folder=capture.path, source=None)
+    assert content["xi"] == 2.2
+    back = views_from_content(content, folder=capture.path, source=None, path=capture.path)
+    assert back[1].camera.distortion == camera.distortion
 
 
 def test_a_field_of_view_gives_the_focal_length(nerfstudio) -> None:

@@ -37,9 +37,15 @@ _MODELS: dict[str, CameraModel] = {
     "PERSPECTIVE": "opencv",
     "FULL_OPENCV": "opencv",
     "OPENCV_FISHEYE": "fisheye",
+    "MEI": "mei",
 }
 _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE = ("k1", "k2", "k3", "k4")
+_KEYS: dict[CameraModel, tuple[str, ...]] = {
+    "opencv": _OPENCV,
+    "fisheye": _FISHEYE,
+    "mei": ("xi", "k1", "k2", "p1", "p2"),
+}
 
 
 def read_nerfstudio(folder: Path, *, file: str = FILE, strict: bool = False) -> Capture:
@@ -108,8 +114,7 @@ def lens_of(source: Mapping[str, Any], *, where: str) -> tuple[CameraModel, tupl
         known = ", ".join(sorted(_MODELS))
         raise FileFormatError(f"{where}: expected a camera_model of {known}, got {quoted(name)}.")
     model = _MODELS[name]
-    keys = _FISHEYE if model == "fisheye" else _OPENCV
-    return model, tuple(number(source, key, 0.0, where=where) for key in keys)
+    return model, tuple(number(source, key, 0.0, where=where) for key in _KEYS[model])
 
 
 def _frames(content: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
