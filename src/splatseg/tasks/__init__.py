@@ -47,6 +47,10 @@ from splatseg.tasks.render import Rendering as Rendering
 from splatseg.tasks.render import RenderingOptions as RenderingOptions
 from splatseg.tasks.render import render_views as render_views
 from splatseg.tasks.render_truth import render_truth as render_truth
+from splatseg.tasks.scan_labels import LabelBy as LabelBy
+from splatseg.tasks.scan_labels import ScanLabelOptions as ScanLabelOptions
+from splatseg.tasks.scan_labels import ScanLabels as ScanLabels
+from splatseg.tasks.scan_labels import label_scans as label_scans
 from splatseg.tasks.see import SeeOptions as SeeOptions
 from splatseg.tasks.see import see as see
 from splatseg.tasks.segment import Segmentation as Segmentation

@@ -1,0 +1,207 @@
+"""Labels of the points of laser scans, from the fields of a scene."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol, runtime_checkable
+
+from splatseg._check import check_choice
+from splatseg.core import Labels, Layer, PointLabels, Renderable, Scan, ScanSource, Scene
+from splatseg.core.boundary import boundary, convert_fields
+from splatseg.errors import InputError
+from splatseg.io.export import FORMS, ScanLabelCounts, ScanLabelForm, write_scan_labels
+from splatseg.io.scans import Scans, read_scans
+from splatseg.io.scene import load_scene_layer, scene_layer_names
+from splatseg.lift.points import ViewedPointOptions, ViewedPoints
+from splatseg.render import BackendName
+from splatseg.tasks._observer import SILENT, Observer
+from splatseg.tasks.scene_parts import gaussian_field
+
+LabelBy = Literal["gaussians", "mesh"]
+"""gaussians: what the views of the Gaussians show at a point, and its shape. mesh: the vertices of
+the mesh field around it, eq. 9."""
+
+
+_LABEL_FILES = ("semantic-kitti", "kitti-raw", "kitti-odometry")
+"""Formats whose points come as ``.bin``, for which SemanticKITTI has a form of labels."""
+
+
+@runtime_checkable
+class ScanLabeller(Protocol):
+    """A field that labels many scans better than one after the other."""
+
+    def labels_of_scans(self, scans: ScanSource, layer: str) -> Iterator[tuple[str, PointLabels]]:
+        """Labels of the points of every scan, by its name, in the order of the source."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanLabelOptions:
+    """How points of scans take labels, and how these are written."""
+
+    layer: str | None = None
+    """Name of the layer of labels. None takes the only one there is."""
+
+    form: ScanLabelForm | Literal["auto"] = "auto"
+    """npz: semantic and confidence, a value for each of the scan's file. label: SemanticKITTI's.
+    ply, las: points with columns. auto: label, ply or las where scans came as such, else npz."""
+
+    scan_format: str = "auto"
+    """How scans are read: auto, or one of `io.scans.FORMATS`."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_choice("form", self.form, ("auto", *FORMS))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanLabels:
+    """What was written."""
+
+    folder: Path
+    form: ScanLabelForm
+    layer: str
+    counts: ScanLabelCounts
+
+
+@boundary
+def label_scans(
+    scene: Scene,
+    scans: Path | Scans,
+    folder: Path,
+    *,
+    field: Renderable | None = None,
+    options: ScanLabelOptions | None = None,
+    points: ViewedPointOptions | None = None,
+    layers: Mapping[str, Layer] | None = None,
+    backend: BackendName = "auto",
+    observer: Observer = SILENT,
+) -> ScanLabels:
+    """Label the points of all scans, one after the other, and write a folder of labels.
+
+    Args:
+        scene: The scene.
+        scans: Scans in the world of the scene, in any layout that `read_scans` reads, or these.
+        folder: What to write, see `io.export.write_scan_labels`; it appears whole or not at all.
+        field: Whose `labels_at` the points take, or `labels_of_scans` where it has it. None is
+            the scene's Gaussians, as `lift.points.ViewedPoints` of the training views.
+        options: Of which layer, and in which form.
+        points: How points take labels from Gaussians; with a field none.
+        layers: Layers at hand; others are read from the scene's folder.
+        backend: Who renders the Gaussians.
+        observer: Is told of the progress.
+
+    Raises:
+        InputError: If there is no such layer, it has no labels, or the scans cannot be used.
+        MissingFileError: If there are no scans.
+    """
+    options = options or ScanLabelOptions()
+    if isinstance(scans, Path):
+        scans = read_scans(scans, format=options.scan_format)
+    if field is None:
+        layer = options.layer or _only_layer(scene, layers)
+        field = _viewed(scene, layer, points, layers, backend)
+        if scene.metres_per_unit is None:
+            observer.note("the scene does not say how long its unit is; a metre is assumed")
+    else:
+        if points is not None:
+            raise InputError("points: expected none with a field, which has its own rule.")
+        layer = options.layer or _only(field.layer_names, "the field")
+    summary = field.layer(layer)
+    if summary.kind != "labels":
+        raise InputError(f"layer: expected labels, {layer!r:.80} holds {summary.kind}.")
+    form = _form(scans) if options.form == "auto" else options.form
+    with observer.stage("label scans") as step:
+        counts = write_scan_labels(
+            _labelled(field, scans, layer, step),
+            folder,
+            form=form,
+            array_shape=scans.array_shape if form == "npz" else None,
+            about={
+                "source": str(scans.path),
+                "layer": layer,
+                "names": {str(id): name for id, name in summary.info.names.items()},
+            },
+        )
+    return ScanLabels(folder=folder, form=form, layer=layer, counts=counts)
+
+
+class _Kept:
+    """Scans of which the last that was read is kept: its labels are written in its order."""
+
+    def __init__(self, scans: ScanSource) -> None:
+        self._scans = scans
+        self._last: Scan | None = None
+
+    @property
+    def scan_names(self) -> tuple[str, ...]:
+        return tuple(self._scans.scan_names)
+
+    def scan(self, name: str) -> Scan:
+        if self._last is None or self._last.name != name:
+            self._last = self._scans.scan(name)
+        return self._last
+
+
+def _labelled(
+    field: Renderable, scans: Scans, layer: str, step: Callable[[int, int], None]
+) -> Iterator[tuple[Scan, PointLabels]]:
+    """Scans with their labels, in their order."""
+    kept = _Kept(scans)
+    names = kept.scan_names
+    if isinstance(field, ScanLabeller):
+        for done, (name, labels) in enumerate(field.labels_of_scans(kept, layer), start=1):
+            yield kept.scan(name), labels
+            step(done, len(names))
+        return
+    for done, name in enumerate(names, start=1):
+        scan = kept.scan(name)
+        yield scan, field.labels_at(scan.points, layer)
+        step(done, len(names))
+
+
+def _viewed(
+    scene: Scene,
+    layer: str,
+    points: ViewedPointOptions | None,
+    layers: Mapping[str, Layer] | None,
+    backend: BackendName,
+) -> ViewedPoints:
+    if not len(scene.gaussians):
+        raise InputError(
+            "by: expected mesh for a scene without Gaussians, got gaussians; `splatseg fit` makes "
+            "a scene with them."
+        )
+    cameras = [view.camera for view in scene.train_views or scene.views]
+    return ViewedPoints(
+        gaussian_field(scene, [layer], layers, backend=backend),
+        cameras,
+        options=points,
+        up=scene.up or (0.0, 0.0, 1.0),
+        metres_per_unit=scene.metres_per_unit or 1.0,
+    )
+
+
+def _only_layer(scene: Scene, layers: Mapping[str, Layer] | None) -> str:
+    """The only layer of labels."""
+    if layers:
+        return _only([n for n, layer in layers.items() if isinstance(layer, Labels)], "layers")
+    if scene.root is None:
+        raise InputError("layer: expected a name, the scene has no folder to look for layers in.")
+    names = scene_layer_names(scene.root)
+    labels = [n for n in names if isinstance(load_scene_layer(scene.root, n), Labels)]
+    return _only(labels, str(scene.root))
+
+
+def _only(names: Sequence[str], where: str) -> str:
+    if len(names) == 1:
+        return names[0]
+    known = f"several ({', '.join(names)})" if names else "none; `splatseg segment` makes one"
+    raise InputError(f"layer: expected the name of a layer of labels, {where} has {known}.")
+
+
+def _form(scans: Scans) -> ScanLabelForm:
+    """What scans came as."""
+    if scans.format in _LABEL_FILES:
+        return "label"
+    return scans.format if scans.format in ("las", "ply") else "npz"
