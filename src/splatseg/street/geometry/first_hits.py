@@ -1,0 +1,97 @@
+"""What rays meet first: fine primitives over coarse ones."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import Camera
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError
+from splatseg.raycast import RayCaster, RayHits
+from splatseg.street.geometry.depth_views import axis_cosines
+from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.shapes.template import FACES
+
+
+class PrimitiveCaster:
+    """A mesh of primitives, arranged level by level to be met by rays.
+
+    Args:
+        mesh: With at least one primitive.
+
+    Raises:
+        InputError: If it has none.
+        MissingPackageError: If embreex is not installed.
+    """
+
+    @boundary
+    def __init__(self, mesh: PrimitiveMesh) -> None:
+        if not len(mesh):
+            raise InputError("mesh: expected at least one primitive, got none.")
+        self._levels: list[tuple[Tensor, RayCaster]] = []
+        faces = mesh.faces
+        for level in torch.unique(mesh.levels).tolist():
+            rows = (mesh.levels == level).nonzero()[:, 0]
+            own = (FACES * rows[:, None] + torch.arange(FACES)).flatten()
+            self._levels.append((own, RayCaster(mesh.vertices, faces[own])))
+
+    @boundary
+    def first(self, origins: Float[Tensor, "*n 3"], directions: Float[Tensor, "n 3"]) -> RayHits:
+        """The first triangle of the finest level that a ray meets at all.
+
+        Args:
+            origins: Where rays start, world: one each, or one point for all.
+            directions: Where they go.
+
+        Returns:
+            Hits, their faces those of the mesh.
+        """
+        found: RayHits | None = None
+        for faces, caster in self._levels:
+            hits = caster.cast(origins, directions)
+            own = torch.where(hits.faces >= 0, faces[hits.faces.clamp_min(0)], -1)
+            hits = RayHits(faces=own, distances=hits.distances, weights=hits.weights)
+            found = hits if found is None else _over(found, hits)
+        if found is None:
+            raise InputError("mesh: expected at least one primitive, got none.")
+        return found
+
+
+def _over(fine: RayHits, coarse: RayHits) -> RayHits:
+    met = fine.faces >= 0
+    return RayHits(
+        faces=torch.where(met, fine.faces, coarse.faces),
+        distances=torch.where(met, fine.distances, coarse.distances),
+        weights=torch.where(met[:, None], fine.weights, coarse.weights),
+    )
+
+
+@boundary
+def mesh_distances(
+    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
+) -> Float[Tensor, "height width"]:
+    """Distances from the camera's centre to the first hits of the pixels' rays, float32, 0 none.
+
+    Args:
+        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
+        camera: Its pixels.
+    """
+    caster = mesh if isinstance(mesh, PrimitiveCaster) else PrimitiveCaster(mesh)
+    origin, directions = camera.rays()
+    hits = caster.first(origin, directions.reshape(-1, 3))
+    found = torch.where(hits.faces >= 0, hits.distances, 0.0)
+    return found.view(camera.height, camera.width).float()
+
+
+@boundary
+def mesh_depth(
+    mesh: PrimitiveMesh | PrimitiveCaster, camera: Camera
+) -> Float[Tensor, "height width"]:
+    """z-depth of the first hits of the pixels' rays, scene units, float32, 0 where there is none.
+
+    Args:
+        mesh: The mesh, or the caster of a mesh that is looked at from several cameras.
+        camera: Its pixels.
+    """
+    _, directions = camera.rays()
+    return (mesh_distances(mesh, camera) * axis_cosines(camera, directions)).float()
