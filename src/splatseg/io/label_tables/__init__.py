@@ -2,10 +2,11 @@
 
 Names, ids and colours are facts that the data sets publish; each table's file says where they
 are from. ``NAME`` has the ids of the annotations, where 0 is void, ``NAME-train`` the ids from 0
-in which networks learn them, where 255 is void.
+in which networks learn them, where 255 is void (of SemanticKITTI: from 1, and 0 is void). Where
+several classes have one id in training, it is called as the first of them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from splatseg.errors import InputError
 from splatseg.io.class_tables import class_table
 from splatseg.io.json_files import read_json
 
-TABLES = ("ade20k", "coco", "cityscapes", "scannet")
+TABLES = ("ade20k", "coco", "cityscapes", "scannet", "kitti360", "semantic-kitti")
 """Data sets whose tables are known by name."""
 
 _VOID_NAMES = ("background", "ignore", "none", "unannotated", "unknown", "unlabel", "void")
@@ -22,6 +23,7 @@ _VOID_NAMES = ("background", "ignore", "none", "unannotated", "unknown", "unlabe
 
 _TRAIN = "-train"
 _TRAIN_VOID = 255
+_LEARNED_FROM_ONE = frozenset({"semantic-kitti"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +80,29 @@ def training_table(name: str) -> LabelTable | None:
     return _training(base) if base in TABLES else None
 
 
+def learned_as(name: str) -> dict[int, int]:
+    """Which class each id of the annotations counts as, by id; others have no class in training.
+
+    Classes that networks learn as one count as the first of them: a garage of KITTI-360 is a
+    building.
+
+    Raises:
+        InputError: If the data set is not known by name.
+
+    Example:
+        >>> learned_as("kitti360")[34], 9 in learned_as("kitti360")
+        (11, False)
+    """
+    if name not in TABLES:
+        raise InputError(f"classes: expected one of {', '.join(TABLES)}, got {name!r:.80}.")
+    first: dict[int, int] = {}
+    found: dict[int, int] = {}
+    for train, info in _rows(name):
+        if train is not None:
+            found[info.id] = first.setdefault(train, info.id)
+    return found
+
+
 def is_void_name(name: str) -> bool:
     """Whether a table means nothing by a class of this name, such as background or void."""
     return name.lower().startswith(_VOID_NAMES)
@@ -88,19 +113,16 @@ def _annotated(base: str) -> LabelTable:
 
 
 def _training(base: str) -> LabelTable:
-    rows = sorted(
-        (
-            ClassInfo(id=train, name=info.name, isthing=info.isthing, colour=info.colour)
-            for train, info in _rows(base)
-            if train is not None
-        ),
-        key=lambda info: info.id,
-    )
+    rows: dict[int, ClassInfo] = {}
+    for train, info in _rows(base):
+        if train is not None:
+            rows.setdefault(train, replace(info, id=train))
+    from_zero = base not in _LEARNED_FROM_ONE
     return LabelTable(
         name=base + _TRAIN,
-        classes=ClassTable(rows=tuple(rows)),
-        zero_is_class=True,
-        void=_TRAIN_VOID,
+        classes=ClassTable(rows=tuple(rows[id] for id in sorted(rows))),
+        zero_is_class=from_zero,
+        void=_TRAIN_VOID if from_zero else None,
     )
 
 
