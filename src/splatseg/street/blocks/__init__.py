@@ -1,0 +1,11 @@
+"""Long drives in overlapping blocks: cut, fitted and labelled one by one, joined without a seam."""
+
+from splatseg.street.blocks.cut import Drive as Drive
+from splatseg.street.blocks.cut import DriveBlock as DriveBlock
+from splatseg.street.blocks.cut import DriveBlockOptions as DriveBlockOptions
+from splatseg.street.blocks.cut import cut_drive as cut_drive
+from splatseg.street.blocks.field import DriveField as DriveField
+from splatseg.street.blocks.field import ScanLabeller as ScanLabeller
+from splatseg.street.blocks.order import frame_centres as frame_centres
+from splatseg.street.blocks.parts import DriveScans as DriveScans
+from splatseg.street.blocks.parts import block_capture as block_capture
