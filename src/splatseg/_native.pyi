@@ -325,6 +325,18 @@ def match_features(
     member: Tensor | None,
 ) -> None: ...
 
+class PrimitiveTree:
+    nbytes: int
+    def __init__(self, vertices: Tensor, faces: Tensor, /) -> None: ...
+    def hits(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        faces: Tensor,
+        distances: Tensor,
+        weights: Tensor,
+    ) -> None: ...
+
 class VoxelGrid:
     nbytes: int
     def __init__(self, cells: Tensor, /) -> None: ...
