@@ -16,6 +16,7 @@ from splatseg.io.captures.blender import find_blender, read_blender
 from splatseg.io.captures.colmap import find_colmap, read_colmap
 from splatseg.io.captures.idr import FILES as _IDR_FILES
 from splatseg.io.captures.idr import find_idr, read_idr
+from splatseg.io.captures.kitti360 import find_kitti360, read_kitti360
 from splatseg.io.captures.llff import FILE as _LLFF_FILE
 from splatseg.io.captures.llff import read_llff
 from splatseg.io.captures.nerfstudio import FILE as _NERFSTUDIO_FILE
@@ -24,9 +25,14 @@ from splatseg.io.captures.replica import FILE as _REPLICA_FILE
 from splatseg.io.captures.replica import find_replica, read_replica
 from splatseg.io.captures.scannet import find_scannet, read_scannet
 from splatseg.io.captures.scannetpp import find_scannetpp, read_scannetpp
+from splatseg.io.captures.waymo import find_waymo, read_waymo
+from splatseg.io.captures.waymo_segment import SUFFIX as _WAYMO_SUFFIX
 from splatseg.io.images import find_images
 
-FORMATS = ("nerfstudio", "blender", "colmap", "llff", "idr", "replica", "scannet", "scannetpp")
+FORMATS = (
+    "nerfstudio", "blender", "colmap", "llff", "idr", "replica", "scannet", "scannetpp", "kitti360",
+    "waymo",
+)  # fmt: skip
 """Layouts that are read, in the order in which they are looked for."""
 
 
@@ -41,7 +47,9 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
 
     Args:
         path: The capture's folder, or its transforms.json, poses_bounds.npy,
-            cameras_sphere.npz or traj_w_c.txt, or the folder of a COLMAP model.
+            cameras_sphere.npz or traj_w_c.txt, the folder of a COLMAP model, a component of a
+            segment of Waymo, or of KITTI-360 a drive, a camera or a window of frames of one
+            (see `kitti360_drive`).
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
         strict: Refuse a capture that lists a photograph which is not there.
 
@@ -56,10 +64,11 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     """
     check_choice("format", format, ("auto", *FORMATS))
     folder = Path(path)
-    if folder.is_file():
+    window = not folder.is_dir() and find_kitti360(folder)
+    if folder.is_file() and not window:
         folder, named = _from_file(folder)
         format = named if format == "auto" else format
-    if not folder.is_dir():
+    if not folder.is_dir() and format != "waymo" and not window:
         raise MissingFileError(f"{path}: there is no such capture.")
     if format == "auto":
         found = find_formats(folder)
@@ -81,8 +90,12 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             return read_replica(folder, strict=strict)
         case "scannet":
             return read_scannet(folder, strict=strict)
-        case _:
+        case "waymo":
+            return read_waymo(folder, strict=strict)
+        case "scannetpp":
             return read_scannetpp(folder, strict=strict)
+        case _:
+            return read_kitti360(folder, strict=strict)
 
 
 @boundary
@@ -97,6 +110,8 @@ def find_formats(folder: Path) -> tuple[str, ...]:
         "replica": find_replica(folder) is not None,
         "scannet": find_scannet(folder),
         "scannetpp": find_scannetpp(folder),
+        "kitti360": find_kitti360(folder),
+        "waymo": find_waymo(folder),
     }
     return tuple(format for format in FORMATS if found[format])
 
@@ -108,6 +123,8 @@ def bare_photographs(folder: Path) -> tuple[Path, ...]:
 
 
 def _from_file(path: Path) -> tuple[Path, str]:
+    if path.suffix == _WAYMO_SUFFIX:
+        return path, "waymo"
     named = {_NERFSTUDIO_FILE: "nerfstudio", "transforms_train.json": "blender"}
     named |= {_LLFF_FILE: "llff", _REPLICA_FILE: "replica"} | dict.fromkeys(_IDR_FILES, "idr")
     if path.name not in named:
@@ -124,5 +141,6 @@ def _nothing_found(folder: Path) -> str:
         )
     return (
         f"{folder}: expected a capture (transforms.json, a COLMAP model, poses_bounds.npy, "
-        "cameras_sphere.npz, or a scene of Replica, ScanNet or ScanNet++), got none of them."
+        "cameras_sphere.npz, or a scene of Replica, ScanNet, ScanNet++, KITTI-360 or Waymo), got "
+        "none of them."
     )
