@@ -73,6 +73,23 @@ class Scan:
             f"Scan({self.name!r}, {len(self):,} points, labels: {', '.join(self.labels) or 'none'})"
         )
 
+    def take(self, rows: Int[Tensor, "m"]) -> "Scan":
+        """The scan of some of its points; `rows` of it tells which values of the file they are.
+
+        Args:
+            rows: Which points, ascending.
+        """
+        return Scan(
+            name=self.name,
+            points=self.points[rows],
+            rows=rows if self.rows is None else self.rows[rows],
+            recorded=len(self) if self.recorded is None else self.recorded,
+            origin=self.origin,
+            intensity=None if self.intensity is None else self.intensity[rows],
+            labels={name: ids[rows] for name, ids in self.labels.items()},
+            time=self.time,
+        )
+
     def recorded_labels(self, ids: Int[Tensor, "n"], missing: int = -1) -> Int[Tensor, "recorded"]:
         """Ids in the order of the file's values, `missing` where there is no point.
 

@@ -4,6 +4,7 @@ Views are named by files that others made, and name files that are written: labe
 renders. A name that climbs, or that one file system takes for another name, must not get there.
 """
 
+import re
 import unicodedata
 from collections.abc import Sequence
 
@@ -20,6 +21,22 @@ _TABLES = ("evidence", "segments", "tracks", "legend", "quant", "basis", "text_e
 
 _REFUSED = ("Cc", "Cs", "Zl", "Zp")
 """Unicode categories: control characters, lone surrogates (bytes that are no UTF-8), line ends."""
+
+
+_NUMBER = re.compile(r"(\d+)\D*$")
+
+
+def frame_number(name: str) -> tuple[str, int] | None:
+    """The rest of a name and its last number, which counts the frames; None without one.
+
+    Example:
+        >>> frame_number("image_01/0000000003"), frame_number("train_0003_L"), frame_number("a")
+        (('image_01/', 3), ('train__L', 3), None)
+    """
+    found = _NUMBER.search(name)
+    if found is None:
+        return None
+    return name[: found.start(1)] + name[found.end(1) :], int(found[1])
 
 
 def view_name_fault(name: str) -> str | None:

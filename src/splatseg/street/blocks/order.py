@@ -1,6 +1,5 @@
 """Where a drive went: the places of its views in the order in which they were taken."""
 
-import re
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -9,12 +8,11 @@ from torch import Tensor
 
 from splatseg.core import View
 from splatseg.core.boundary import boundary
+from splatseg.core.view_names import frame_number
 from splatseg.errors import InputError
 
 RIG = 5.0
 """Metres that cameras of one vehicle may stand apart."""
-
-_NUMBER = re.compile(r"^(.*?)(\d+)(\D*)$", re.DOTALL)
 
 
 @boundary
@@ -49,26 +47,16 @@ def frame_centres(views: Sequence[View], *, metres_per_unit: float = 1.0) -> Flo
     if not views:
         raise InputError("views: expected views along a drive, got none.")
     named = sorted(views, key=lambda view: view.name)
-    if not all(_NUMBER.match(view.name) for view in named):
-        return torch.stack([view.camera.centre for view in named]).double()
-    frames: dict[int, list[Tensor]] = {}
-    for view in named:
-        frames.setdefault(_parts(view.name)[1], []).append(view.camera.centre.double())
-    if all(_extent(places) * metres_per_unit <= RIG for places in frames.values()):
-        return _means(frames)
+    numbers = [frame_number(view.name) for view in named]
     drives: dict[tuple[str, int], list[Tensor]] = {}
-    for view in named:
-        drives.setdefault(_parts(view.name), []).append(view.camera.centre.double())
-    return _means(drives)
-
-
-def _parts(name: str) -> tuple[str, int]:
-    """The rest of a name, and its last number."""
-    found = _NUMBER.match(name)
-    if found is None:
-        return name, 0
-    # `.*?` takes no digit that the number could have.
-    return found[1] + found[3], int(found[2])
+    frames: dict[int, list[Tensor]] = {}
+    for view, number in zip(named, numbers, strict=True):
+        if number is None:
+            return torch.stack([view.camera.centre for view in named]).double()
+        drives.setdefault(number, []).append(view.camera.centre.double())
+        frames.setdefault(number[1], []).append(view.camera.centre.double())
+    one_rig = all(_extent(places) * metres_per_unit <= RIG for places in frames.values())
+    return _means(frames if one_rig else drives)
 
 
 def _extent(places: Sequence[Tensor]) -> float:

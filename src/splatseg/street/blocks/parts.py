@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from splatseg.core import Capture, PointCloud, ScanSource
 from splatseg.core.boundary import boundary
@@ -141,7 +139,8 @@ class _NearScans:
         """One of them, its far points left out."""
         _check_name(name, self._names)
         scan = self._scans.scan(name)
-        return some_points(scan, torch.nonzero(self._drive.near(self._block, scan.points))[:, 0])
+        near = self._drive.near(self._block, scan.points)
+        return scan.take(torch.nonzero(near).squeeze(1))
 
 
 class ScansToLabel:
@@ -166,7 +165,7 @@ class ScansToLabel:
         scan = self._scans.scan(name)
         share = next(s for s in self._drive.shares(scan.points) if s.block == self._block.index)
         self._read[name] = share
-        return some_points(scan, share.rows)
+        return scan.take(share.rows)
 
     def share(self, name: str) -> BlockShare:
         """What the block counts at the points of a scan that was read; it is forgotten then."""
@@ -178,15 +177,3 @@ class ScansToLabel:
 def _check_name(name: str, names: Sequence[str]) -> None:
     if name not in names:
         raise InputError(f"scan: there is no {name!r:.80} in this block of the drive.")
-
-
-def some_points(scan: Scan, rows: Int[Tensor, "m"]) -> Scan:
-    """A scan of some of its points; `Scan.rows` tells which values of the file these are."""
-    return replace(
-        scan,
-        points=scan.points[rows],
-        rows=rows if scan.rows is None else scan.rows[rows],
-        recorded=scan.recorded if scan.recorded is not None else len(scan),
-        intensity=None if scan.intensity is None else scan.intensity[rows],
-        labels={name: ids[rows] for name, ids in scan.labels.items()},
-    )
