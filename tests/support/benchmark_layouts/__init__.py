@@ -11,6 +11,7 @@ from support.benchmark_layouts.rooms import (
     write_scannetpp,
 )
 from support.benchmark_layouts.source import Source, read_source
+from support.benchmark_layouts.waymo import write_waymo
 from support.benchmark_layouts.words import write_lerf_mask, write_lerf_ovs, write_ovs3d
 
 WRITERS: Mapping[str, Callable[[Source, Path], None]] = {
@@ -23,6 +24,7 @@ WRITERS: Mapping[str, Callable[[Source, Path], None]] = {
     "replica-gg": write_grouping_replica,
     "scannet": write_scannet,
     "scannetpp": write_scannetpp,
+    "waymo": write_waymo,
 }
 
 __all__ = ["WRITERS", "Source", "read_source", "write_layout"]

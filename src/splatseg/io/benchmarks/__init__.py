@@ -27,6 +27,7 @@ from splatseg.io.benchmarks.replica import (
 from splatseg.io.benchmarks.scannet import find_scannet_scenes, read_scannet_scenes
 from splatseg.io.benchmarks.scannetpp import find_scannetpp_scenes, read_scannetpp_scenes
 from splatseg.io.benchmarks.spin_nerf import find_spin_nerf, read_spin_nerf
+from splatseg.io.benchmarks.waymo import find_waymo_scenes, read_waymo_scenes
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,7 @@ _LAYOUTS: Mapping[str, _Layout] = {
     "replica-gg": _Layout(find_grouping_replica, read_grouping_replica),
     "scannet": _Layout(find_scannet_scenes, read_scannet_scenes),
     "scannetpp": _Layout(find_scannetpp_scenes, read_scannetpp_scenes),
+    "waymo": _Layout(find_waymo_scenes, read_waymo_scenes),
     # Last: masks beside photographs are all that tells it.
     "spin-nerf": _Layout(find_spin_nerf, read_spin_nerf),
 }

@@ -1,0 +1,203 @@
+"""Reads a segment of the Waymo Open Dataset, perception v2 (Sun et al., CVPR 2020).
+
+Its photographs are JPEG files inside of Parquet. Everything that reads photographs reads files, so
+they are unpacked once, byte for byte, into ROOT/photographs/CONTEXT; see `unpack_photographs`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core import Capture
+from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
+from splatseg.io.atomic import atomic_folder, sweep
+from splatseg.io.captures.build import MAX_SIDE, Intrinsics, RawView, build_capture
+from splatseg.io.captures.replica import inverse_pose
+from splatseg.io.captures.waymo_segment import (
+    CAMERAS,
+    IMAGES,
+    SUFFIX,
+    TIMESTAMP,
+    WaymoSegment,
+    find_segments,
+    one_segment,
+    transform,
+)
+from splatseg.io.foreign import is_file
+from splatseg.io.json_files import read_json, write_json
+from splatseg.io.parquet import RowReader, bytes_of, integer_of, number_of, read_rows
+from splatseg.io.paths import path_inside
+
+CALIBRATIONS = "camera_calibration"
+PHOTOGRAPHS = "photographs"
+"""Folder beside the components where photographs are unpacked to, a folder a segment."""
+
+TEST_EVERY = 5
+"""Of so many frames the last is a test view: 4, 9, 14, ... counted from 0."""
+
+CAMERA = "key.camera_name"
+_IMAGE = "[CameraImageComponent].image"
+_POSE = "[CameraImageComponent].pose.transform"
+_CALIBRATION = "[CameraCalibrationComponent]"
+_LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+_RECORD = "source.json"
+
+# Waymo's cameras look along x, with y left and z up; OpenCV's x is right, y down, z forward.
+_OPENCV_FROM_WAYMO = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+def find_waymo(path: Path) -> bool:
+    """Whether a folder has segments with cameras, or a file is of one."""
+    return any(segment.has(IMAGES) and segment.has(CALIBRATIONS) for segment in find_segments(path))
+
+
+def read_waymo(path: Path, *, strict: bool = False) -> Capture:
+    """Read the cameras of a segment; see `read_capture`.
+
+    A view is called TIMESTAMP_CAMERA, such as ``1507678826876435_FRONT``. Its pose is that of
+    the vehicle when the photograph was taken, as the component says, times the camera's place on
+    it; that the shutter rolls is not modelled. The lens is OpenCV's with k1 k2 p1 p2 k3. Every
+    fifth frame, with all of its cameras, is a test view. The world is the segment's, z up, moved
+    by whole kilometres (`WaymoSegment.origin`).
+
+    Args:
+        path: The folder of the components, if it has one segment, else the file of any component
+            of it, such as ``camera_image/CONTEXT.parquet``.
+        strict: As photographs are in the component, none can be listed that is not there.
+
+    Raises:
+        MissingFileError: If a component is missing.
+        InputError: If there are several segments, or a component is damaged.
+        MissingPackageError: If pyarrow is not installed.
+        OutputError: If photographs cannot be unpacked.
+    """
+    segment = one_segment(path)
+    segment.needed(IMAGES, CALIBRATIONS)
+    calibrations = _calibrations(segment)
+    file = segment.component(IMAGES)
+    rows = read_rows(file, (TIMESTAMP, CAMERA, _POSE))
+    keys = [
+        (integer_of(row, TIMESTAMP, where=file), integer_of(row, CAMERA, where=file))
+        for row in rows
+    ]
+    folder = unpack_photographs(segment, keys)
+    frames = {time: i for i, time in enumerate(sorted({time for time, _ in keys}))}
+    raw: list[RawView] = []
+    for row, (time, camera) in zip(rows, keys, strict=True):
+        where = f"{file}: frame {time}, camera {camera}"
+        if camera not in calibrations:
+            raise FileFormatError(
+                f"{where}: expected one of the cameras {sorted(calibrations)} of {CALIBRATIONS}."
+            )
+        lens, vehicle_from_camera = calibrations[camera]
+        pose = segment.placed(transform(row, _POSE, where=where)) @ vehicle_from_camera
+        raw.append(
+            RawView(
+                image=folder / photograph_name(time, camera),
+                relative=photograph_name(time, camera),
+                intrinsics=lens,
+                cam_from_world=_OPENCV_FROM_WAYMO @ inverse_pose(pose, where=where),
+                split="test" if frames[time] % TEST_EVERY == TEST_EVERY - 1 else "train",
+            )
+        )
+    notes = [
+        f"photographs were unpacked from {IMAGES} into {folder}",
+        segment.origin_note,
+        f"every {TEST_EVERY}th frame is a test view, with all of its cameras",
+    ]
+    capture = build_capture(segment.root, raw, format="waymo", notes=notes, strict=strict)
+    return replace(
+        capture,
+        path=path if path.suffix == SUFFIX else segment.root,
+        metres_per_unit=capture.metres_per_unit or 1.0,
+        up=capture.up or (0.0, 0.0, 1.0),
+    )
+
+
+def photograph_name(time: int, camera: int) -> str:
+    """Name of the file of a photograph.
+
+    Example:
+        >>> photograph_name(1507678826876435, 1)
+        '1507678826876435_FRONT.jpg'
+    """
+    return f"{time:016d}_{CAMERAS.get(camera, f'CAMERA{camera}')}.jpg"
+
+
+def unpack_photographs(segment: WaymoSegment, keys: Sequence[tuple[int, int]]) -> Path:
+    """The folder of a segment's photographs; they are unpacked if it is not there or not whole.
+
+    The folder appears when all of them are in it. It is written again when the component has
+    another size than the one it was unpacked from. To have it elsewhere, or where the data set
+    may not be written to, make a folder with links to those of the components and read that.
+
+    Args:
+        segment: The segment.
+        keys: Timestamp and camera of each row of its photographs.
+
+    Raises:
+        FileFormatError: If a photograph is missing in the component, or two have one key.
+        OutputError: If the folder cannot be written.
+    """
+    file = segment.component(IMAGES)
+    folder = segment.root / PHOTOGRAPHS / segment.context
+    names = [photograph_name(time, camera) for time, camera in keys]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise FileFormatError(
+            f"{file}: expected one photograph a frame and camera, got {twice} twice."
+        )
+    size = file.stat().st_size
+    if _unpacked_size(folder) == size and all(is_file(folder / name) for name in names):
+        return folder
+    path_inside(segment.root, PHOTOGRAPHS, segment.context)
+    sweep(folder.parent)
+    reader = RowReader(file, (_IMAGE,))
+    with atomic_folder(folder) as temporary:
+        for i, name in enumerate(names):
+            content = bytes_of(reader.row(i), _IMAGE, where=f"{file}: row {i}")
+            (temporary / name).write_bytes(content)
+        write_json({"component": IMAGES, "bytes": size}, temporary / _RECORD)
+    return folder
+
+
+def _unpacked_size(folder: Path) -> int | None:
+    """Bytes of the component that a folder was unpacked from, None where it is not known."""
+    try:
+        size: object = read_json(folder / _RECORD).get("bytes")
+    except (SplatsegError, MissingFileError):
+        return None
+    return size if isinstance(size, int) else None
+
+
+def _calibrations(segment: WaymoSegment) -> dict[int, tuple[Intrinsics, NDArray[np.float64]]]:
+    """Lens and vehicle_from_camera of each camera."""
+    path = segment.component(CALIBRATIONS)
+    numbers = [f"{_CALIBRATION}.intrinsic.{name}" for name in _LENS]
+    sides = [f"{_CALIBRATION}.{name}" for name in ("width", "height")]
+    extrinsic = f"{_CALIBRATION}.extrinsic.transform"
+    found: dict[int, tuple[Intrinsics, NDArray[np.float64]]] = {}
+    for row in read_rows(path, (CAMERA, *numbers, *sides, extrinsic)):
+        camera = integer_of(row, CAMERA, where=path)
+        where = f"{path}: camera {camera}"
+        fx, fy, cx, cy, *distortion = (number_of(row, name, where=where) for name in numbers)
+        width, height = (integer_of(row, name, where=where) for name in sides)
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise FileFormatError(f"{where}: expected 1 to {MAX_SIDE} pixels a side, got others.")
+        lens = Intrinsics(
+            model="opencv",
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            distortion=tuple(distortion),
+            width=width,
+            height=height,
+        )
+        found[camera] = lens, transform(row, extrinsic, where=where)
+    return found

@@ -1,0 +1,142 @@
+"""Components of the Waymo Open Dataset, perception v2, written without the code under test.
+
+Columns and their types are those of the schemas of waymo_open_dataset.v2, which was read for them.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+CONTEXT = "1024360143612057520_3580_000_3600_000"
+TIME = 1_553_629_304_000_000
+"""Microseconds of the first frame."""
+
+STEP = 100_000
+"""From frame to frame, microseconds."""
+
+_FLOAT, _DOUBLE = pa.float32(), pa.float64()
+_TRANSFORM = pa.list_(_DOUBLE, 16)
+_SHAPE = pa.list_(pa.int32(), 3)
+_KEY = {"key.segment_context_name": pa.string()}
+_TIME = {"key.frame_timestamp_micros": pa.int64()}
+_CAMERA = {"key.camera_name": pa.int8()}
+_LASER = {"key.laser_name": pa.int8()}
+
+
+def _prefixed(prefix: str, columns: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"[{prefix}].{name}": kind for name, kind in columns.items()}
+
+
+def _returns(prefix: str, kind: Any, count: int) -> dict[str, Any]:
+    columns: dict[str, Any] = {}
+    for i in range(1, count + 1):
+        columns[f"range_image_return{i}.values"] = pa.list_(kind)
+        columns[f"range_image_return{i}.shape"] = _SHAPE
+    return _prefixed(prefix, columns)
+
+
+LENS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+_VELOCITY = {f"velocity.linear_velocity.{a}": _FLOAT for a in "xyz"}
+_VELOCITY |= {f"velocity.angular_velocity.{a}": _DOUBLE for a in "xyz"}
+_SHUTTER = {
+    f"rolling_shutter_params.{name}": _DOUBLE
+    for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
+}
+_MAPPING = {
+    "local_instance_ids": pa.list_(pa.int32()),
+    "global_instance_ids": pa.list_(pa.int32()),
+    "is_tracked": pa.list_(pa.bool_()),
+}
+
+SCHEMAS: Mapping[str, Mapping[str, Any]] = {
+    "camera_image": _KEY | _TIME | _CAMERA | _prefixed(
+        "CameraImageComponent",
+        {"image": pa.binary(), "pose.transform": _TRANSFORM, **_VELOCITY,
+         "pose_timestamp": _DOUBLE, **_SHUTTER},
+    ),
+    "camera_calibration": _KEY | _CAMERA | _prefixed(
+        "CameraCalibrationComponent",
+        {**{f"intrinsic.{name}": _DOUBLE for name in LENS}, "extrinsic.transform": _TRANSFORM,
+         "width": pa.int32(), "height": pa.int32(), "rolling_shutter_direction": pa.int8()},
+    ),
+    "camera_segmentation": _KEY | _TIME | _CAMERA | _prefixed(
+        "CameraSegmentationLabelComponent",
+        {"panoptic_label_divisor": pa.int32(), "panoptic_label": pa.binary(),
+         **{f"instance_id_to_global_id_mapping.{k}": v for k, v in _MAPPING.items()},
+         "sequence_id": pa.string(), "num_cameras_covered": pa.binary()},
+    ),
+    "vehicle_pose": _KEY | _TIME | _prefixed(
+        "VehiclePoseComponent", {"world_from_vehicle.transform": _TRANSFORM}
+    ),
+    "lidar": _KEY | _TIME | _LASER | _returns("LiDARComponent", _FLOAT, 2),
+    "lidar_calibration": _KEY | _LASER | _prefixed(
+        "LiDARCalibrationComponent",
+        {"extrinsic.transform": _TRANSFORM, "beam_inclination.min": _DOUBLE,
+         "beam_inclination.max": _DOUBLE, "beam_inclination.values": pa.list_(_DOUBLE)},
+    ),
+    "lidar_pose": _KEY | _TIME | _LASER | _returns("LiDARPoseComponent", _FLOAT, 1),
+    "lidar_segmentation": _KEY | _TIME | _LASER
+    | _returns("LiDARSegmentationLabelComponent", pa.int32(), 2),
+}  # fmt: skip
+"""Types by column, by component."""
+
+
+def write_component(
+    root: Path,
+    component: str,
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    context: str = CONTEXT,
+    group: int = 4,
+    without: str | None = None,
+) -> Path:
+    """One file of a component.
+
+    Args:
+        root: Folder of the components.
+        component: Its name.
+        rows: Values by column, where the part of a name before the last bracket may lack; columns
+            that a row lacks are null.
+        context: Name of the segment.
+        group: Rows of a row group.
+        without: A column to leave out.
+    """
+    schema = {"index": pa.string(), **SCHEMAS[component]}
+    short = {name.rpartition("].")[2]: name for name in schema}
+    whole = [
+        {"key.segment_context_name": context} | {short.get(k, k): v for k, v in row.items()}
+        for row in rows
+    ]
+    for row in whole:
+        keys = [str(value) for name, value in row.items() if name.startswith("key.")]
+        row["index"] = ";".join(keys)
+    arrays = {
+        name: pa.array([row.get(name) for row in whole], kind)
+        for name, kind in schema.items()
+        if name != without
+    }
+    file = root / component / f"{context}.parquet"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table(arrays), file, row_group_size=group)
+    return file
+
+
+def frame(number: int, *, camera: int | None = None, laser: int | None = None) -> dict[str, int]:
+    """Key columns of a row."""
+    keys = {"key.frame_timestamp_micros": TIME + number * STEP}
+    if camera is not None:
+        keys["key.camera_name"] = camera
+    if laser is not None:
+        keys["key.laser_name"] = laser
+    return keys
+
+
+def image(values: Any, number: int = 1) -> dict[str, Any]:
+    """Columns of an array of a return."""
+    return {
+        f"range_image_return{number}.values": values.ravel().tolist(),
+        f"range_image_return{number}.shape": list(values.shape),
+    }
