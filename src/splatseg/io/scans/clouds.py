@@ -45,6 +45,18 @@ def ply_points(path: Path) -> Piece:
         FileFormatError: If it is no PLY whose first element is vertex with x, y and z, or it
             ends early.
     """
+    count, columns = ply_pieces(path)
+    return count, lambda start, end: _raw(path, columns(start, end))
+
+
+def ply_pieces(path: Path) -> tuple[int, Callable[[int, int], Mapping[str, NDArray[Any]]]]:
+    """How many points a PLY file has, and what reads all columns of a range of them.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no PLY whose first element is vertex with x, y and z, or it
+            ends early.
+    """
     header = read_ply_header(path)
     element = header.elements[0] if header.elements else None
     names = [] if element is None else [one.name for one in element.properties]
@@ -56,9 +68,9 @@ def ply_points(path: Path) -> Piece:
     lists = any(one.count_code is not None for one in element.properties)
     if not header.order or lists:
         columns = read_ply_tables(path, header, ["vertex"])["vertex"].numbers
-        return element.count, lambda start, end: _raw(
-            path, {name: values[start:end] for name, values in columns.items()}
-        )
+        return element.count, lambda start, end: {
+            name: values[start:end] for name, values in columns.items()
+        }
     dtype = np.dtype([(one.name, header.order + one.code) for one in element.properties])
     with reading(path, "a PLY file"):
         have = path.stat().st_size - header.offset
@@ -123,12 +135,12 @@ def _array_rows(
 
 def _ply_rows(
     path: Path, header: PlyHeader, dtype: np.dtype[np.void], start: int, end: int
-) -> RawScan:
+) -> Mapping[str, NDArray[Any]]:
     with reading(path, "a PLY file"):
         rows = np.fromfile(path, dtype, end - start, offset=header.offset + start * dtype.itemsize)
     if len(rows) != end - start:
         raise FileFormatError(f"{path}: expected {end} points, but the file ends early.")
-    return _raw(path, {name: rows[name] for name in dtype.names or ()})
+    return {name: rows[name] for name in dtype.names or ()}
 
 
 def _raw(path: Path, columns: Mapping[str, NDArray[Any]]) -> RawScan:

@@ -1,0 +1,289 @@
+"""Scans of KITTI-360: the turning laser, the two that look sideways, and accumulated points.
+
+    data_3d_raw/DRIVE/velodyne_points/data/0000000005.bin    float32 x y z intensity, its own axes
+    data_3d_raw/DRIVE/sick_points/data/0000000123.bin        float32, two a point; own numbers
+    data_3d_semantics/train/DRIVE/static/0000000002_0000000385.ply    points of the world, labelled
+
+`captures.kitti360_drive` says how a drive, a window of frames and a sensor are named. All of it is
+in the world of the poses, with z up.
+"""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.captures.kitti360 import static_windows
+from splatseg.io.captures.kitti360_drive import (
+    ACCUMULATED,
+    SCANS,
+    SICK,
+    VELODYNE,
+    Drive,
+    drive_at,
+    find_drive,
+    read_poses,
+    sick_pose,
+    velodyne_pose,
+)
+from splatseg.io.label_tables import label_table
+from splatseg.io.scans import clouds
+from splatseg.io.scans._records import read_records
+from splatseg.io.scans._source import RawScan, Scans
+from splatseg.io.scans._velodyne import (
+    numbered_files,
+    read_points,
+    read_times,
+    skipped,
+    unrolled,
+)
+
+_INSTANCES = 1000
+"""An instance is its class times this and a number; 0 of it is none."""
+
+
+def find_velodyne(path: Path) -> bool:
+    """Whether a path names a drive with scans of the turning laser, and nothing else of it."""
+    return _sensor(path, VELODYNE)
+
+
+def find_sick(path: Path) -> bool:
+    """The same of the lasers that look sideways."""
+    return _sensor(path, SICK)
+
+
+def find_accumulated(path: Path) -> bool:
+    """Whether a path names a drive with accumulated points."""
+    drive = find_drive(path)
+    if drive is None or drive.top not in (None, ACCUMULATED):
+        return False
+    return bool(static_windows(drive, part=_part(drive)))
+
+
+def read_velodyne(path: Path) -> Scans:
+    """Scans of the turning laser that have a pose; names are the frames'.
+
+    The laser turns once a frame, and the car moves meanwhile: points are brought to where the car
+    is at the frame's pose, as KITTI-360's own accumulation does it (`unrolled`).
+
+    Raises:
+        MissingFileError: If there are no scans, or poses or calibration lack.
+        InputError: If one of these is broken, or no scan has a pose.
+    """
+    drive = drive_at(path)
+    files = _files(drive, VELODYNE)
+    meant = {name: file for name, file in files.items() if drive.has(int(name))}
+    everywhere = Drive(root=drive.root, name=drive.name)
+    poses = read_poses(everywhere)
+    car_from_laser = velodyne_pose(drive)
+    posed = [name for name in meant if int(name) in poses]
+    _check_posed(drive, path, meant, posed)
+    times = read_times(drive.of(SCANS, VELODYNE, "timestamps.txt"))
+
+    def read(name: str) -> RawScan:
+        frame = int(name)
+        points, intensity = read_points(meant[name])
+        pose = poses[frame] @ car_from_laser
+        motion = _motion(poses, frame)
+        if motion is not None:
+            motion = np.linalg.inv(car_from_laser) @ motion @ car_from_laser
+            points = unrolled(points, motion)
+        return RawScan(
+            where=meant[name],
+            points=points,
+            world_from_sensor=pose,
+            intensity=intensity,
+            time=_time(times, frame),
+        )
+
+    return Scans(
+        path=path,
+        format="kitti360",
+        scan_names=tuple(posed),
+        read=read,
+        notes=skipped(list(meant), posed),
+    )
+
+
+def read_sick(path: Path) -> Scans:
+    """Rows of points of the lasers that look sideways; names are their own numbers.
+
+    They are measured between frames. Their pose is that of the turning laser at their time,
+    between the two frames around it, then ``calib_sick_to_velo``; so ``timestamps.txt`` of both
+    are needed. A row without frames on both sides that have poses is left out.
+
+    Raises:
+        MissingFileError: If there are no rows, or times, poses or calibration lack.
+        InputError: If one of these is broken, or no row lies between two posed frames.
+    """
+    drive = drive_at(path)
+    files = _files(drive, SICK)
+    clock, frames = (
+        _needed_times(drive.of(SCANS, sensor, "timestamps.txt")) for sensor in (SICK, VELODYNE)
+    )
+    poses = {f: p for f, p in read_poses(drive).items() if np.isfinite(_at(frames, f))}
+    if len(poses) < 2:
+        raise InputError(
+            f"{path}: expected at least two frames with a pose and a time, got {len(poses)}."
+        )
+    numbers = sorted(poses, key=lambda frame: float(frames[frame]))
+    moments = np.array([float(frames[frame]) for frame in numbers])
+    if (np.diff(moments) <= 0).any():
+        raise FileFormatError(
+            f"{drive.of(SCANS, VELODYNE, 'timestamps.txt')}: expected times of distinct frames, "
+            "got one twice."
+        )
+    car_from_laser = velodyne_pose(drive)
+    laser = np.stack([poses[frame] @ car_from_laser for frame in numbers])
+    turn = Slerp(moments, Rotation.from_matrix(laser[:, :3, :3]))
+    own = sick_pose(drive)
+    inside = [
+        name
+        for name in files
+        if int(name) < len(clock) and moments[0] <= clock[int(name)] <= moments[-1]
+    ]
+    _check_posed(drive, path, files, inside)
+
+    def read(name: str) -> RawScan:
+        moment = float(clock[int(name)])
+        pose = np.eye(4)
+        pose[:3, :3] = turn(moment).as_matrix()
+        pose[:3, 3] = [np.interp(moment, moments, laser[:, axis, 3]) for axis in range(3)]
+        across = read_records(files[name], 2).astype(np.float64)
+        # Its first number runs to the right, its second up; it sees a plane.
+        points = np.stack((np.zeros(len(across)), -across[:, 0], across[:, 1]), axis=1)
+        return RawScan(where=files[name], points=points, world_from_sensor=pose @ own, time=moment)
+
+    return Scans(
+        path=path,
+        format="kitti360-sick",
+        scan_names=tuple(inside),
+        read=read,
+        notes=skipped(list(files), inside),
+    )
+
+
+def read_accumulated(path: Path) -> Scans:
+    """Labelled points of windows, a million at a time; names are those of the windows.
+
+    What stands is read (``static``), or what moved where the path names ``dynamic``. Labels are
+    ``semantic`` in the ids of KITTI-360, ``instance`` where it is a thing, and ``visible``, which
+    is 1 where a photograph shows the point.
+
+    Raises:
+        MissingFileError: If there are none.
+        FileFormatError: If one is damaged.
+    """
+    drive = drive_at(path)
+    windows = static_windows(drive, part=_part(drive))
+    if not windows:
+        raise MissingFileError(
+            f"{path}: expected accumulated points, {ACCUMULATED}/train/{drive.name}/"
+            f"{_part(drive)}/START_END.ply, got none."
+        )
+    opened = lru_cache(maxsize=1)(clouds.ply_pieces)
+    pieces: dict[str, tuple[Path, int, int]] = {}
+    for file in windows.values():
+        count, _ = opened(file)
+        starts = range(0, max(count, 1), clouds.PIECE)
+        for i, start in enumerate(starts):
+            name = file.stem if len(starts) == 1 else f"{file.stem}_{i:04d}"
+            pieces[name] = (file, start, min(count, start + clouds.PIECE))
+
+    def read(name: str) -> RawScan:
+        file, start, end = pieces[name]
+        columns = opened(file)[1](start, end)
+        return RawScan(
+            where=file,
+            points=np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1),
+            labels=accumulated_labels(file, columns),
+        )
+
+    return Scans(
+        path=path,
+        format="kitti360-points",
+        scan_names=tuple(pieces),
+        read=read,
+        classes=label_table("kitti360").classes,
+    )
+
+
+def accumulated_labels(
+    path: Path, columns: Mapping[str, NDArray[Any]]
+) -> dict[str, NDArray[np.int64]]:
+    """Ids of accumulated points by what they tell, those columns that are there.
+
+    Raises:
+        FileFormatError: If an id is no whole number.
+    """
+    found = {
+        name: clouds.whole_ids(path, name, columns[name])
+        for name in ("semantic", "instance", "visible")
+        if name in columns
+    }
+    if "instance" in found:
+        ids = found["instance"]
+        found["instance"] = np.where(ids % _INSTANCES == 0, 0, ids)
+    return found
+
+
+def _sensor(path: Path, sensor: str) -> bool:
+    drive = find_drive(path)
+    if drive is None or drive.part not in (None, sensor) or drive.top == ACCUMULATED:
+        return False
+    return drive.of(SCANS, sensor, "data").is_dir()
+
+
+def _part(drive: Drive) -> str:
+    return "dynamic" if drive.part == "dynamic" else "static"
+
+
+def _files(drive: Drive, sensor: str) -> dict[str, Path]:
+    folder = drive.of(SCANS, sensor, "data")
+    files = numbered_files(folder, ".bin")
+    if not files:
+        raise MissingFileError(f"{folder}: expected scans, 0000000000.bin and so on, got none.")
+    return files
+
+
+def _check_posed(drive: Drive, path: Path, files: Mapping[str, Path], posed: list[str]) -> None:
+    if not posed:
+        frames = "" if drive.window is None else f" of frames {drive.window[0]} to "
+        frames += "" if drive.window is None else str(drive.window[1])
+        raise InputError(
+            f"{path}: expected scans with poses, got {len(files)} scans{frames} of which none has "
+            "a pose."
+        )
+
+
+def _motion(poses: Mapping[int, NDArray[np.float64]], frame: int) -> NDArray[np.float64] | None:
+    """The previous frame's pose as seen from this one's; of the first by the next one."""
+    if frame - 1 in poses:
+        return np.linalg.inv(poses[frame]) @ poses[frame - 1]
+    if frame == 0 and 1 in poses:
+        return np.linalg.inv(poses[1]) @ poses[0]
+    return None
+
+
+def _needed_times(path: Path) -> NDArray[np.float64]:
+    times = read_times(path)
+    if times is None:
+        raise MissingFileError(
+            f"{path}: expected the times of scans, without which rows of points between frames "
+            "have no pose, got none."
+        )
+    return times
+
+
+def _at(times: NDArray[np.float64], frame: int) -> float:
+    return float(times[frame]) if frame < len(times) else float("nan")
+
+
+def _time(times: NDArray[np.float64] | None, frame: int) -> float | None:
+    moment = float("nan") if times is None else _at(times, frame)
+    return moment if np.isfinite(moment) else None
