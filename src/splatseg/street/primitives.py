@@ -155,6 +155,7 @@ def voxel_primitives(
     coarse: CoarseRule = "everywhere",
     start: StartShape = "sphere",
     min_points: int = 1,
+    sphere: Float[Tensor, "mu"] | None = None,
 ) -> Primitives:
     """One primitive in each voxel that holds points, level by level; the order of points is free.
 
@@ -171,6 +172,8 @@ def voxel_primitives(
         start: What the codes are at first. A voxel with fewer than 8 points is a sphere.
         min_points: Points that a voxel needs; with coarse ``sparse`` what fails is left to the
             next level, and the coarsest level takes all.
+        sphere: `shapes.sphere_code` of the shapes, where the caller has it already; None searches
+            for it, which takes about a second.
 
     Returns:
         Primitives ordered by level and voxel.
@@ -202,7 +205,8 @@ def voxel_primitives(
         raise RangeError(f"sizes: expected positive lengths in metres, got {tuple(sizes)}.")
     cloud = points.detach().cpu().double()
     units = tuple(size / metres_per_unit for size in sorted(sizes))
-    sphere = sphere_code(shapes).cpu()
+    sphere = (sphere_code(shapes) if sphere is None else sphere).detach().cpu().float()
+    check_shape("sphere", sphere, (shapes.code_size,))
     left = torch.ones(len(cloud), dtype=torch.bool)
     found: list[tuple[Tensor, Tensor]] = []
     for level, size in enumerate(units):
