@@ -31,7 +31,7 @@ def test_points_in_a_box_with_its_faces():
         [[2.0, 1, 0.5], [2.01, 0, 0], [-1.9, -0.9, 0.4], [0, 1.1, 0], [0, 0, 0.6]]
     )
     assert inside_boxes(points, [box()]).tolist() == [True, False, True, False, False]
-    assert inside_boxes(points, [box()], margin=0.1).tolist() == [True] * 5
+    assert inside_boxes(points, [box()], margin=0.11).tolist() == [True] * 5
     assert inside_boxes(points, []).tolist() == [False] * 5
 
 
@@ -172,3 +172,4 @@ def test_numbers_of_frames():
     assert frame_number("0001TP_006690") == ("0001TP_", 6690)
     assert frame_number("3_left2b") == ("3_leftb", 2)
     assert frame_number("left") is None
+    assert frame_number("1" * 19) is None

@@ -23,18 +23,21 @@ _REFUSED = ("Cc", "Cs", "Zl", "Zp")
 """Unicode categories: control characters, lone surrogates (bytes that are no UTF-8), line ends."""
 
 
+_DIGITS = 18
 _NUMBER = re.compile(r"(\d+)\D*$")
 
 
 def frame_number(name: str) -> tuple[str, int] | None:
     """The rest of a name and its last number, which counts the frames; None without one.
 
+    Numbers of more than 18 digits count nothing.
+
     Example:
         >>> frame_number("image_01/0000000003"), frame_number("train_0003_L"), frame_number("a")
         (('image_01/', 3), ('train__L', 3), None)
     """
     found = _NUMBER.search(name)
-    if found is None:
+    if found is None or len(found[1]) > _DIGITS:
         return None
     return name[: found.start(1)] + name[found.end(1) :], int(found[1])
 
