@@ -187,7 +187,7 @@ def one_segment(path: Path) -> WaymoSegment:
             f"{path}: expected one segment, got {len(found)}; name one by its file, such as "
             f"{found[0].component(IMAGES)}."
         )
-    return found[0]
+    return next(iter(found))
 
 
 def transform(row: Row, column: str, *, where: object) -> NDArray[np.float64]:

@@ -25,6 +25,7 @@ from splatseg.io.scans.kitti360 import (
     read_sick,
     read_velodyne,
 )
+from splatseg.io.scans.nuscenes import find_nuscenes, read_nuscenes
 from splatseg.io.scans.range_images import find_range_images, read_range_images
 from splatseg.io.scans.semantic_kitti import (
     find_odometry,
@@ -43,6 +44,7 @@ _READERS: Mapping[str, tuple[Callable[[Path], object], Callable[[Path], Scans]]]
     "kitti-odometry": (find_odometry, read_odometry),
     "kitti-raw": (find_kitti_raw, read_kitti_raw),
     "waymo": (find_waymo_scans, read_waymo_scans),
+    "nuscenes": (find_nuscenes, read_nuscenes),
     # Files of points come last: they may lie in the folder of any data set.
     "las": (lambda path: "las" in find_files(path), partial(read_files, format="las")),
     "ply": (lambda path: "ply" in find_files(path), partial(read_files, format="ply")),
