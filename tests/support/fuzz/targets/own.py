@@ -24,6 +24,7 @@ from splatseg.fit._checkpoint import Checkpoint, read_checkpoint, write_checkpoi
 from splatseg.fit._state import FitState
 from splatseg.io.export import column_table_of, write_column_table
 from splatseg.io.layers import load_layer, save_layer
+from splatseg.io.moving import read_moving
 from splatseg.io.scene import load_scene, save_scene
 from splatseg.io.tensors import read_tensors
 from splatseg.lift.training import _state as training
@@ -195,6 +196,14 @@ def points(folder: Path) -> Target:
     """Points with true ids."""
     np.savez(folder / "a.npz", xyz=np.ones((5, 3), np.float32), instance=np.arange(5))
     return Target(file=folder / "a.npz", read=lambda: read_points(folder / "a.npz", "instance"))
+
+
+@target("moving.json")
+def moving(folder: Path) -> Target:
+    """Boxes around moving things."""
+    box = {"centre": [0, 1.5, 2], "size": [4, 2, 1.5], "rotation": [1, 0, 0, 0]}
+    rows = [box | {"start": 1, "end": 2.5, "name": "car 3"}, box | {"time": 7}]
+    return whole(folder / "moving.json", json.dumps({"boxes": rows}).encode(), read_moving)
 
 
 @target("scores.json")
