@@ -37,7 +37,7 @@ def test_no_mask_is_read_to_know_a_scene(layout, converted, tmp_path) -> None:
     damaged = [
         path
         for path in folder.rglob("*.png")
-        if path.parent.name not in ("rgb", "color", "depth", "images", "images_train")
+        if path.parent.name not in ("rgb", "color", "depth", "images", "images_train", "data_rect")
     ]
     for path in damaged:
         path.unlink()  # photographs are links, masks are not

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from support.benchmark_layouts.kitti360 import write_kitti360
 from support.benchmark_layouts.prompts import write_nvos, write_spin_nerf
 from support.benchmark_layouts.rooms import (
     write_grouping_replica,
@@ -24,6 +25,7 @@ WRITERS: Mapping[str, Callable[[Source, Path], None]] = {
     "replica-gg": write_grouping_replica,
     "scannet": write_scannet,
     "scannetpp": write_scannetpp,
+    "kitti360": write_kitti360,
     "waymo": write_waymo,
 }
 

@@ -12,6 +12,7 @@ from splatseg._check import check_choice
 from splatseg.core import BenchmarkScene
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.benchmarks.kitti360 import find_kitti360_scenes, read_kitti360_scenes
 from splatseg.io.benchmarks.lerf_mask import find_lerf_mask, read_lerf_mask
 from splatseg.io.benchmarks.lerf_ovs import find_lerf_ovs, read_lerf_ovs
 from splatseg.io.benchmarks.nvos import find_nvos, read_nvos
@@ -28,6 +29,7 @@ from splatseg.io.benchmarks.scannet import find_scannet_scenes, read_scannet_sce
 from splatseg.io.benchmarks.scannetpp import find_scannetpp_scenes, read_scannetpp_scenes
 from splatseg.io.benchmarks.spin_nerf import find_spin_nerf, read_spin_nerf
 from splatseg.io.benchmarks.waymo import find_waymo_scenes, read_waymo_scenes
+from splatseg.io.captures.kitti360_drive import window_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ _LAYOUTS: Mapping[str, _Layout] = {
     "replica-gg": _Layout(find_grouping_replica, read_grouping_replica),
     "scannet": _Layout(find_scannet_scenes, read_scannet_scenes),
     "scannetpp": _Layout(find_scannetpp_scenes, read_scannetpp_scenes),
+    "kitti360": _Layout(find_kitti360_scenes, read_kitti360_scenes),
     "waymo": _Layout(find_waymo_scenes, read_waymo_scenes),
     # Last: masks beside photographs are all that tells it.
     "spin-nerf": _Layout(find_spin_nerf, read_spin_nerf),
@@ -69,7 +72,8 @@ def read_benchmark(
 
     Args:
         layout: One of `LAYOUTS`.
-        folder: A scene, or the data set's folder with several.
+        folder: A scene, or the data set's folder with several. Of KITTI-360 also a window of a
+            drive, ``.../DRIVE/START_END``, which is no folder.
         sequence: Which walk through a scene is read, of a layout with several (``replica``); None
             reads the first.
 
@@ -83,7 +87,7 @@ def read_benchmark(
         if layout != REPLICA:
             raise InputError(f"sequence: scenes of layout {layout} have one, got {sequence!r}.")
         check_choice("sequence", sequence, SEQUENCES)
-    if not folder.is_dir():
+    if not folder.is_dir() and window_of(folder.name) is None:
         raise MissingFileError(f"{folder}: there is no such folder of a benchmark.")
     if sequence is not None:
         return read_replica_scenes(folder, sequence=sequence)
@@ -98,7 +102,7 @@ def find_layout(folder: Path) -> str:
         MissingFileError: If there is no such folder.
         InputError: If it has none of them.
     """
-    if not folder.is_dir():
+    if not folder.is_dir() and window_of(folder.name) is None:
         raise MissingFileError(f"{folder}: there is no such folder of a benchmark.")
     for name, layout in _LAYOUTS.items():
         if layout.found(folder):
