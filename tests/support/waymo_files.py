@@ -3,12 +3,16 @@
 Columns and their types are those of the schemas of waymo_open_dataset.v2, which was read for them.
 """
 
+import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from PIL import Image
 
 CONTEXT = "1024360143612057520_3580_000_3600_000"
 TIME = 1_553_629_304_000_000
@@ -140,3 +144,106 @@ def image(values: Any, number: int = 1) -> dict[str, Any]:
         f"range_image_return{number}.values": values.ravel().tolist(),
         f"range_image_return{number}.shape": list(values.shape),
     }
+
+
+PLACE = (12_345.5, -678.25, 30.0)
+"""Where the vehicle of the tiny segment starts; it drives a metre a frame along x."""
+
+ORIGIN = (12_000.0, -1_000.0, 0.0)
+"""What is subtracted from that: whole kilometres."""
+
+WIDTH, HEIGHT = 8, 6
+FRAMES = 6
+CAMERA_PLACE = (1.0, 0.0, 2.0)
+DISTORTION = (0.04, -0.3, 0.001, 0.002, 0.01)
+LASER_PLACE = (1.0, 0.0, 2.0)
+
+Rows = dict[str, list[dict[str, Any]]]
+
+
+def pose_of(place: Sequence[float], yaw: float = 0.0) -> list[float]:
+    """Sixteen numbers of a pose that is turned about z."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    x, y, z = place
+    return [c, -s, 0, x, s, c, 0, y, 0, 0, 1, z, 0, 0, 0, 1]
+
+
+def driven(number: int) -> list[float]:
+    """The vehicle's pose in a frame."""
+    return pose_of((PLACE[0] + number, *PLACE[1:]))
+
+
+def tiny_rows() -> Rows:
+    """Six frames of two cameras that look ahead and to the left, and one scan of two lasers.
+
+    The top laser is turned by a quarter on the vehicle and has two rows, level and 30 degrees
+    down, of four columns at 135, 45, -45 and -135 degrees of the vehicle; the left one has one
+    value. The vehicle's pose of each value of the top laser is that of frame 0.
+    """
+    keys = [(number, camera) for number in range(FRAMES) for camera in (1, 4)]
+    ranges = np.full((2, 4, 4), -1, np.float32)
+    ranges[0, 1, :2] = math.sqrt(2), 0.5
+    ranges[1, 2, :2] = 2, 0.25
+    ranges[0, 3, :2] = 3, 0.75
+    ranges[0, 3, 3] = 1  # in a no-label zone
+    moments = np.zeros((2, 4, 6), np.float32)
+    moments[..., 3:] = PLACE
+    labels = np.zeros((2, 4, 2), np.int32)
+    labels[0, 1], labels[1, 2], labels[0, 3] = (7, 1), (0, 18), (9, 14)
+    left = np.array([[[4, 0.125, 0, -1]]], np.float32)
+    lens = {f"intrinsic.{name}": v for name, v in zip(LENS, (9, 9, 4, 3, *DISTORTION), strict=True)}
+    lens |= {"width": WIDTH, "height": HEIGHT}
+    beams = {"beam_inclination.min": -math.pi / 6, "beam_inclination.max": math.pi / 6}
+    top = {"beam_inclination.values": [-math.pi / 6, 0.0]}
+    return {
+        "camera_image": [
+            frame(n, camera=c) | {"image": jpeg(40 * n), "pose.transform": driven(n)}
+            for n, c in keys
+        ],
+        "camera_calibration": [
+            lens | {"key.camera_name": c, "extrinsic.transform": pose_of(CAMERA_PLACE, yaw)}
+            for c, yaw in ((1, 0.0), (4, math.pi / 2))
+        ],
+        "camera_segmentation": [
+            frame(2, camera=1) | {"panoptic_label_divisor": 1000, "panoptic_label": panoptic()}
+        ],
+        "vehicle_pose": [
+            frame(n) | {"world_from_vehicle.transform": driven(n)} for n in range(FRAMES)
+        ],
+        "lidar": [frame(0, laser=1) | image(ranges), frame(0, laser=3) | image(left)],
+        "lidar_calibration": [
+            {"key.laser_name": 1, "extrinsic.transform": pose_of(LASER_PLACE, math.pi / 2)}
+            | beams
+            | top,
+            {"key.laser_name": 3, "extrinsic.transform": pose_of((0, 1, 1))} | beams,
+        ],
+        "lidar_pose": [frame(0, laser=1) | image(moments)],
+        "lidar_segmentation": [frame(0, laser=1) | image(labels)],
+    }
+
+
+def write_segment(
+    root: Path, *, context: str = CONTEXT, without: Sequence[str] = (), **changes: Any
+) -> Path:
+    """The tiny segment; `changes` has rows of components instead of its own."""
+    for component, rows in (tiny_rows() | changes).items():
+        if component not in without:
+            write_component(root, component, rows, context=context)
+    return root
+
+
+def jpeg(grey: int) -> bytes:
+    """A photograph of one grey."""
+    stream = io.BytesIO()
+    Image.new("RGB", (WIDTH, HEIGHT), (grey,) * 3).save(stream, format="JPEG")
+    return stream.getvalue()
+
+
+def panoptic(shape: tuple[int, int] = (HEIGHT, WIDTH)) -> bytes:
+    """Labels: undefined above, car 7 on the left of the rest, road on the right."""
+    ids = np.zeros(shape, np.uint16)
+    ids[shape[0] // 2 :] = 20_000
+    ids[shape[0] // 2 :, : shape[1] // 2] = 2_007
+    stream = io.BytesIO()
+    Image.fromarray(ids).save(stream, format="PNG")
+    return stream.getvalue()
