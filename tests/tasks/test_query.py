@@ -252,6 +252,8 @@ def test_a_film_of_heat_along_a_path(folder, layers, words, capsys, tmp_path) ->
     assert seconds == pytest.approx(2.0, abs=0.1)
     assert main(["query", str(folder), words[0], "--video"]) == 2
     assert "video: expected --heat" in capsys.readouterr().err
+    assert main(["query", str(folder), words[0], "--views", "train_0010"]) == 2
+    assert "views: expected --heat" in capsys.readouterr().err
 
 
 def test_pictures_from_python(scene, layers, words, tmp_path) -> None:

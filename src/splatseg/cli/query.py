@@ -28,6 +28,7 @@ from splatseg.tasks.named_models import model_of
 from splatseg.tasks.scene_parts import views_asked
 
 _LISTED = 5
+_HEAT_VIEWS = ("train",)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,7 @@ class Command:
     heat: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also write DIR/WORD/VIEW.png: the probability of each word over the views."""
 
-    views: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VIEWS")] = ("train",)
+    views: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VIEWS")] = _HEAT_VIEWS
     """Views of the heat maps: train, all, path (a smooth path near the cameras), or names by comma
     or by space."""
 
@@ -162,6 +163,8 @@ def _views(command: Command, scene: Scene) -> tuple[View, ...]:
     if command.heat is None:
         if command.video:
             raise InputError("video: expected --heat, whose maps the film is of, with it.")
+        if command.views != _HEAT_VIEWS:
+            raise InputError("views: expected --heat, whose maps are of these views, with it.")
         return ()
     return views_asked(scene, _names(command.views), frames=command.frames)
 
