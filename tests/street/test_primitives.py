@@ -16,8 +16,7 @@ from splatseg.street.shapes import (
     primitive_scale,
     sphere_code,
 )
-
-from .support import shipped, sphere, spheres
+from support.primitives import shipped, sphere, spheres
 
 
 def voxels(points: torch.Tensor, **options: Any) -> Primitives:
