@@ -202,7 +202,7 @@ def _raw(
     sides = image.shape[:2]
     laser = lasers[key.laser]
     world_from_laser = segment.placed(segment.vehicle_poses[key.time]) @ laser.vehicle_from_laser
-    distance = image[..., 0].astype(np.float64)
+    distance = _finite(image[..., 0], "ranges", where=where)
     points = distance[..., None] * _directions(laser, sides, where=where)
     missing = distance <= 0
     part = {name: (images, partial(images.array, key)) for name, images in optional.items()}
@@ -211,7 +211,11 @@ def _raw(
         moments = part[POSES][1](6, sides)
     if moments is not None:
         points[~missing] = _at_moments(
-            points[~missing], moments[~missing].astype(np.float64), segment, laser, world_from_laser
+            points[~missing],
+            _finite(moments[~missing], f"poses in {POSES}", where=where),
+            segment,
+            laser,
+            world_from_laser,
         )
     labels: dict[str, NDArray[Any]] = {}
     found = None
@@ -230,6 +234,16 @@ def _raw(
         labels=labels,
         time=key.time * _MICROSECOND,
     )
+
+
+def _finite(values: NDArray[Any], what: str, *, where: str) -> NDArray[np.float64]:
+    strange = int((~np.isfinite(values)).sum())
+    if strange:
+        raise FileFormatError(
+            f"{where}: expected finite {what}, got {strange} numbers of {values.size} that are NaN "
+            "or infinite; where nothing came back the range is 0 or less."
+        )
+    return values.astype(np.float64)
 
 
 def _directions(laser: Laser, sides: Sequence[int], *, where: str) -> NDArray[np.float64]:
