@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <map>
+#include <set>
 #include <stdexcept>
 #include <utility>
 
@@ -50,6 +50,13 @@ void axes_across(const double* d, double* across) {
   across[5] = -y;
 }
 
+// Whether a ray at (0, 0) has the directed edge from a to b, whose cross product is `cross`, on its
+// one side. The edge from b to a gives the opposite, whatever is rounded.
+bool passes_left(double cross, double ax, double ay, double bx, double by) {
+  if (cross != 0.0) return cross > 0.0;
+  return ay != by ? ay > by : bx > ax;
+}
+
 }  // namespace
 
 struct PrimitiveTree::Found {
@@ -83,30 +90,19 @@ struct PrimitiveTree::Found {
 
 PrimitiveTree::PrimitiveTree(const float* vertices, int64_t count, int each, const int32_t* faces,
                              int face_count)
-    : count_(count), each_(each), faces_(faces, faces + 3 * face_count) {
-  std::map<std::pair<int32_t, int32_t>, std::pair<int32_t, int>> known;
+    : count_(count), each_(each), corners_(faces, faces + 3 * face_count) {
+  // Every directed edge once, and its opposite once.
+  std::set<std::pair<int32_t, int32_t>> edges;
   for (int f = 0; f < face_count; ++f)
     for (int k = 0; k < 3; ++k) {
-      // The edge opposite of corner k.
-      const int32_t a = faces[3 * f + (k + 1) % 3], b = faces[3 * f + (k + 2) % 3];
+      const int32_t a = faces[3 * f + k], b = faces[3 * f + (k + 1) % 3];
       if (a == b || a < 0 || b < 0 || a >= each || b >= each)
         throw std::invalid_argument("PrimitiveTree: corners of a face");
-      const auto key = std::make_pair(std::min(a, b), std::max(a, b));
-      auto [found, fresh] =
-          known.try_emplace(key, static_cast<int32_t>(edges_.size() / 2), a < b ? 0 : 2);
-      if (fresh) {
-        edges_.push_back(key.first);
-        edges_.push_back(key.second);
-      }
-      // Each direction once: 0 and 2 as begun, then 1.
-      int& state = found->second.second;
-      if (!fresh && state != (a < b ? 2 : 0))
+      if (!edges.emplace(a, b).second)
         throw std::invalid_argument("PrimitiveTree: the faces are not those of a closed surface");
-      if (!fresh) state = 1;
-      face_edges_.push_back(2 * found->second.first + (a < b ? 0 : 1));
     }
-  for (const auto& edge : known)
-    if (edge.second.second != 1)
+  for (const auto& edge : edges)
+    if (!edges.count({edge.second, edge.first}))
       throw std::invalid_argument("PrimitiveTree: the faces are not those of a closed surface");
   const size_t n = static_cast<size_t>(count);
   vertices_.resize(n * 3 * static_cast<size_t>(each));
@@ -193,33 +189,32 @@ void PrimitiveTree::meet(int32_t primitive, const double* origin, const double* 
     y[v] = a * across[3] + b * across[4] + c * across[5];
     z[v] = a * direction[0] + b * direction[1] + c * direction[2];
   }
-  double sides[3 * kMaxMeshVertices];
-  bool positive[3 * kMaxMeshVertices];
-  const int edge_count = static_cast<int>(edges_.size() / 2);
-  for (int e = 0; e < edge_count; ++e) {
-    const int a = edges_[static_cast<size_t>(2 * e)], b = edges_[static_cast<size_t>(2 * e + 1)];
-    const double side = x[a] * y[b] - y[a] * x[b];
-    sides[e] = side;
-    positive[e] = side != 0.0 ? side > 0.0 : (y[a] != y[b] ? y[a] > y[b] : x[b] > x[a]);
+  // Which sides of the two planes through the ray each vertex is on: a triangle all on one side
+  // is not met, which leaves a few of them.
+  uint8_t side[kMaxMeshVertices];
+  unsigned all = 15;
+  for (int v = 0; v < each_; ++v) {
+    const unsigned code = static_cast<unsigned>(x[v] < 0.0) | static_cast<unsigned>(x[v] > 0.0) << 1 |
+                          static_cast<unsigned>(y[v] < 0.0) << 2 |
+                          static_cast<unsigned>(y[v] > 0.0) << 3;
+    side[v] = static_cast<uint8_t>(code);
+    all &= code;
   }
+  if (all) return;
   const int64_t first = static_cast<int64_t>(primitive) * face_count();
-  for (int64_t f = 0; f < face_count(); ++f) {
-    const int32_t* edge = face_edges_.data() + 3 * f;
-    const bool one = positive[edge[0] >> 1] != (edge[0] & 1);
-    const bool two = positive[edge[1] >> 1] != (edge[1] & 1);
-    const bool three = positive[edge[2] >> 1] != (edge[2] & 1);
-    if (one != two || two != three) continue;
-    double weight[3];
-    for (int k = 0; k < 3; ++k) {
-      const double side = sides[edge[k] >> 1];
-      weight[k] = edge[k] & 1 ? -side : side;
-    }
+  const uint8_t* corner = corners_.data();
+  for (int64_t f = 0; f < face_count(); ++f, corner += 3) {
+    const int a = corner[0], b = corner[1], c = corner[2];
+    if (side[a] & side[b] & side[c]) continue;
+    double weight[3] = {x[b] * y[c] - y[b] * x[c], x[c] * y[a] - y[c] * x[a],
+                        x[a] * y[b] - y[a] * x[b]};
+    const bool one = passes_left(weight[0], x[b], y[b], x[c], y[c]);
+    if (passes_left(weight[1], x[c], y[c], x[a], y[a]) != one ||
+        passes_left(weight[2], x[a], y[a], x[b], y[b]) != one)
+      continue;
     const double sum = weight[0] + weight[1] + weight[2];
-    double distance = 0.0;
-    for (int k = 0; k < 3; ++k) {
-      weight[k] = sum != 0.0 ? weight[k] / sum : 1.0 / 3.0;
-      distance += weight[k] * z[faces_[static_cast<size_t>(3 * f + k)]];
-    }
+    for (double& w : weight) w = sum != 0.0 ? w / sum : 1.0 / 3.0;
+    const double distance = weight[0] * z[a] + weight[1] * z[b] + weight[2] * z[c];
     if (distance >= 0.0) found.add(first + f, distance, weight);
   }
 }
@@ -252,8 +247,8 @@ void PrimitiveTree::hits(const double* origins, bool one_origin, const double* d
           for (int32_t k = 0; k < ~node.right; ++k) {
             const int32_t p = order_[static_cast<size_t>(node.left + k)];
             const float* box = boxes_.data() + 6 * static_cast<size_t>(p);
-            if (enters(box, box + 3, origin, inverse) <= found.farthest() &&
-                std::isfinite(enters(box, box + 3, origin, inverse)))
+            const double enter = enters(box, box + 3, origin, inverse);
+            if (std::isfinite(enter) && enter <= found.farthest())
               meet(p, origin, along, across, found);
           }
           continue;

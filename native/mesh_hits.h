@@ -1,10 +1,10 @@
 // Primitives: closed meshes of one topology, and all of their triangles that rays meet.
 //
-// A primitive's triangles are tested together: its vertices are seen along the ray, and the sign
-// of every edge's cross product says on which side of the edge the ray passes. Where that is 0 the
-// ray is thought to pass infinitely little aside (first in x, then in y), the same for all edges:
-// so a ray through an edge or a vertex meets a closed mesh as often as its neighbours do. The
-// readable twin is street/hits_reference.py.
+// A primitive's vertices are seen along the ray, and the sign of an edge's cross product says on
+// which side of the edge the ray passes. Where that is 0 the ray is thought to pass infinitely
+// little aside (first in x, then in y), the same for all edges: so a ray through an edge or a
+// vertex meets a closed mesh as often as its neighbours do. The readable twin is
+// street/hits_reference.py.
 #pragma once
 
 #include <cstdint>
@@ -24,7 +24,7 @@ class PrimitiveTree {
                 int face_count);
 
   int64_t count() const { return count_; }
-  int64_t face_count() const { return static_cast<int64_t>(faces_.size()) / 3; }
+  int64_t face_count() const { return static_cast<int64_t>(corners_.size()) / 3; }
   int64_t bytes() const;
 
   // The first `limit` triangles that each ray meets at t >= 0, nearest first, of equal distances
@@ -46,9 +46,7 @@ class PrimitiveTree {
   int64_t count_;
   int each_;
   std::vector<float> vertices_;     // (count, 3, each): an axis after the other
-  std::vector<int32_t> faces_;      // (face_count, 3)
-  std::vector<int32_t> edges_;      // (e, 2)
-  std::vector<int32_t> face_edges_; // (face_count, 3): 2 edge + (1 if run through backwards)
+  std::vector<uint8_t> corners_;    // (face_count, 3)
   std::vector<float> boxes_;        // (count, 6)
   std::vector<int32_t> order_;
   std::vector<Node> nodes_;

@@ -20,6 +20,7 @@ from torch import Tensor
 from splatseg import _native
 from splatseg._check import check_finite, check_range, check_shape
 from splatseg.core.boundary import boundary
+from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.shapes.template import FACES, VERTICES, template
@@ -138,17 +139,18 @@ class MeshCaster:
         faces = torch.empty(len(rays), width, dtype=torch.int64)
         distances = torch.empty(len(rays), width, dtype=torch.float64)
         weights = torch.empty(len(rays), width, 3)
-        for begin in range(0, len(rays), _RAYS):
-            part = slice(begin, begin + _RAYS)
-            own = starts if len(starts) == 1 else starts[part]
-            found = [
-                level.hits(own, rays[part], limit)
-                for level, limit in zip(self._levels, limits, strict=True)
-                if limit
-            ]
-            merged = found[0] if len(found) == 1 else _merged(found, width)
-            faces[part], distances[part] = merged.faces, merged.distances
-            weights[part] = merged.weights
+        with one_torch_thread():
+            for begin in range(0, len(rays), _RAYS):
+                part = slice(begin, begin + _RAYS)
+                own = starts if len(starts) == 1 else starts[part]
+                found = [
+                    level.hits(own, rays[part], limit)
+                    for level, limit in zip(self._levels, limits, strict=True)
+                    if limit
+                ]
+                merged = found[0] if len(found) == 1 else _merged(found, width)
+                faces[part], distances[part] = merged.faces, merged.distances
+                weights[part] = merged.weights
         return MeshHits(faces=faces, distances=distances, weights=weights)
 
 

@@ -26,8 +26,8 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.errors import FileFormatError, quoted
-from splatseg.io.atomic import atomic_folder
+from splatseg.errors import FileFormatError, InputError, quoted
+from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.street.hits import MeshHits
 
@@ -108,9 +108,12 @@ def cached_hits(
         identity: What the hits are of: files of another one are replaced, and so are damaged ones.
 
     Raises:
+        InputError: If the folder holds something else.
         OutputError: If they cannot be written.
     """
-    if folder is not None and (folder / _HEADER).is_file():
+    if folder is not None and folder.exists() and not is_vacant(folder):
+        if not (folder / _HEADER).is_file():
+            raise InputError(f"cache_folder: expected a folder of hits or none, got {folder}.")
         try:
             return read_hits(folder, identity=identity)
         except FileFormatError:  # of something else or damaged: found again

@@ -127,12 +127,17 @@ def train_radiance(
         raise InputError("ids: expected ids of classes where there is no evidence, got none.")
     found = label_ids(views, evidence) if ids is None and evidence is not None else ids or ()
     classes = checked_ids(tuple(found))
-    rays = training_rays(views, evidence, classes, options, seed=seed, read=read)
-    surface = Surface(mesh)
-    hits = _hits(mesh, surface, rays, options, cache_folder)
-    try:
+    threads = torch.get_num_threads()
+    with ExitStack() as stack:
+        stack.enter_context(one_torch_thread())
+        rays = training_rays(views, evidence, classes, options, seed=seed, read=read)
+        surface = Surface(mesh)
+        hits = _hits(mesh, surface, rays, options, cache_folder)
+        stack.callback(hits.close)
         model = RadianceModel(mesh, classes, options, seed=seed)
-        records = _steps(model, surface, rays, hits, seed=seed, progress=progress)
+        pool = stack.enter_context(ThreadPoolExecutor(threads)) if threads > 1 else None
+        worker = StepWorker(model, surface, rays, hits, pool)
+        records = _steps(model, worker, len(rays), seed=seed, progress=progress)
         return RadianceFit(
             model=model.eval().requires_grad_(requires_grad=False),
             records=records,
@@ -141,8 +146,6 @@ def train_radiance(
             cache_bytes=hits.nbytes,
             in_files=hits.folder is not None,
         )
-    finally:
-        hits.close()
 
 
 def _hits(
@@ -171,9 +174,8 @@ def _hits(
 
 def _steps(
     model: RadianceModel,
-    surface: Surface,
-    rays: TrainingRays,
-    hits: CachedHits,
+    worker: StepWorker,
+    rays: int,
     *,
     seed: int,
     progress: Callable[[RadianceRecord], None] | None,
@@ -183,40 +185,33 @@ def _steps(
     moments = RowMoments.zeros(features)
     adam = RowAdam(AdamConstants(), max_steps=options.iterations)
     parameters = network_parameters(model)
-    optimiser = torch.optim.Adam(parameters, lr=options.rate, eps=1e-8)
+    optimiser = torch.optim.Adam(parameters, lr=options.rate)
     records: list[RadianceRecord] = []
-    threads = torch.get_num_threads()
-    with ExitStack() as stack:
-        stack.enter_context(one_torch_thread())
-        pool = stack.enter_context(ThreadPoolExecutor(threads)) if threads > 1 else None
-        worker = StepWorker(model, surface, rays, hits, pool)
-        for iteration in range(1, options.iterations + 1):
-            drawn = _drawn(len(rays), options.rays, seed, iteration)
-            found = worker.step(drawn)
-            factor = options.final_rate ** ((iteration - 1) / options.iterations)
-            for parameter, gradient in zip(parameters, found.parameters, strict=True):
-                parameter.grad = gradient
-            for group in optimiser.param_groups:
-                group["lr"] = options.rate * factor
-            optimiser.step()
-            adam.step(
-                features,
-                moments,
-                rows=found.rows,
-                gradient=found.features,
-                rate=options.feature_rate * factor,
-            )
-            loss = found.colour_loss + options.semantic_weight * found.semantic_loss
-            record = RadianceRecord(
-                iteration=iteration,
-                iterations=options.iterations,
-                colour_loss=found.colour_loss,
-                semantic_loss=found.semantic_loss,
-                loss=loss,
-            )
-            records.append(record)
-            if progress is not None:
-                progress(record)
+    for iteration in range(1, options.iterations + 1):
+        found = worker.step(_drawn(rays, options.rays, seed, iteration))
+        factor = options.final_rate ** ((iteration - 1) / options.iterations)
+        for parameter, gradient in zip(parameters, found.parameters, strict=True):
+            parameter.grad = gradient
+        for group in optimiser.param_groups:
+            group["lr"] = options.rate * factor
+        optimiser.step()
+        adam.step(
+            features,
+            moments,
+            rows=found.rows,
+            gradient=found.features,
+            rate=options.feature_rate * factor,
+        )
+        record = RadianceRecord(
+            iteration=iteration,
+            iterations=options.iterations,
+            colour_loss=found.colour_loss,
+            semantic_loss=found.semantic_loss,
+            loss=found.colour_loss + options.semantic_weight * found.semantic_loss,
+        )
+        records.append(record)
+        if progress is not None:
+            progress(record)
     return tuple(records)
 
 
