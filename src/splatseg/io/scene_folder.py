@@ -28,7 +28,7 @@ FOLDERS = ("cameras", "evidence", "layers", "reports")
 PENDING = f"{TEMPORARY}pending"
 """Folder of files of a new scene that count already, but are not in their places yet."""
 
-_WORK_FOLDERS = (*FOLDERS, "exports", "fit", TRAINING_FOLDER)
+_WORK_FOLDERS = (*FOLDERS, "exports", "fields", "fit", TRAINING_FOLDER)
 _POSES_ENTRIES = (
     "poses.json", "sparse", "frames", "frames.txt", "work", "aligned.npz", "pointmaps",
 )  # fmt: skip

@@ -17,6 +17,9 @@ _OWN = (
     "uplift", "features", "objects", "voxels", "vote", "associate", "identity", "saga", "cosseg",
     "logits", "probabilities", "prompt",
 )  # fmt: skip
+_ABOVE = {"dnmp": "splatseg.street.method:METHOD"}
+"""Methods of packages above this one, imported when they are asked for, and where they are."""
+
 _REGISTERED: dict[str, Method] = {}
 
 
@@ -101,11 +104,10 @@ def keeps_boundaries(method: object) -> bool:
 
 
 def _known() -> dict[str, EntryPoint]:
+    modules = {name: f"splatseg.methods.{name}:METHOD" for name in _OWN} | _ABOVE
     own = {
-        name: EntryPoint(
-            name=name, value=f"splatseg.methods.{name}:METHOD", group=ENTRY_POINT_GROUP
-        )
-        for name in _OWN
+        name: EntryPoint(name=name, value=value, group=ENTRY_POINT_GROUP)
+        for name, value in modules.items()
     }
     others = {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
     # Another package cannot take the place of a method of ours.

@@ -2,11 +2,21 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from splatseg.core import FlatLayer, Layer, LayerInfo, Scene, View, flat_layer, layer_address
+from splatseg.core import (
+    FlatLayer,
+    Layer,
+    LayerInfo,
+    Renderable,
+    Scene,
+    View,
+    flat_layer,
+    layer_address,
+)
 from splatseg.errors import InputError
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene_layer, scene_layer_names
+from splatseg.io.scene_fields import scene_field_file
 from splatseg.lift import GaussianField, PointLabelOptions
 from splatseg.render import BackendName
 from splatseg.tasks._film import path_views
@@ -116,6 +126,20 @@ def gaussian_field(
         backend=backend,
         points=points,
     )
+
+
+def scene_field(scene: Scene, name: str) -> Renderable:
+    """A field of the scene that is no Gaussians, by name: what `tasks.street_field` made.
+
+    Raises:
+        InputError: If the scene has none of this name.
+        FileFormatError: If its file is damaged.
+    """
+    from splatseg.street.files import load_mesh_field  # here: most commands need no street
+
+    if scene.root is None:
+        raise InputError(f"field {name!r:.80}: the scene has no folder to read it from.")
+    return load_mesh_field(scene_field_file(scene.root, name))
 
 
 def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:

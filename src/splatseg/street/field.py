@@ -1,0 +1,227 @@
+"""Primitives with colours and classes as one field, to be rendered, scored and asked of points."""
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from types import TracebackType
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg._check import check_shape
+from splatseg.core import (
+    UNLABELLED,
+    Camera,
+    LabelMap,
+    LayerInfo,
+    PointLabels,
+    RenderableLayer,
+    ViewSignals,
+)
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError, RangeError
+from splatseg.street.hits import MeshCaster
+from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.point_query import BallQuery
+from splatseg.street.radiance import (
+    RadianceModel,
+    RayValues,
+    depth_from_distance,
+    render_view,
+)
+
+_COVERED = 0.5
+"""Sum of probabilities that a pixel needs for a label."""
+
+
+class MeshField:
+    """Deformable neural mesh primitives with semantics, a `splatseg.core.Renderable`.
+
+    It has one layer, the classes it was trained on. Views are cast through the camera's own rays,
+    its lens included; points take labels from the vertices around them (eq. 9).
+
+    Args:
+        mesh: The primitives.
+        model: What was trained on them.
+        layer: Name of its layer.
+        info: How it was made, and what ids are called.
+        radius: Of the ball of eq. 9, scene units; None is the side of the finest voxels.
+
+    Raises:
+        ShapeError: If the model has not one row of features a vertex.
+        RangeError: If the radius is not positive.
+        InputError: If an id of the model is not 1 or more.
+    """
+
+    @boundary
+    def __init__(
+        self,
+        mesh: PrimitiveMesh,
+        model: RadianceModel,
+        *,
+        layer: str = "semantic",
+        info: LayerInfo | None = None,
+        radius: float | None = None,
+    ) -> None:
+        check_shape("model.features", model.features, (len(mesh.vertices), None))
+        if min(model.ids) < 1:
+            raise InputError(f"model.ids: expected ids of 1 and more, got {min(model.ids)}.")
+        radius = mesh.sizes[0] if radius is None else radius
+        if not (math.isfinite(radius) and radius > 0):
+            raise RangeError(f"radius: expected a positive length, got {radius}.")
+        if not layer or "@" in layer:
+            raise InputError(f"layer: expected a name without @, got {layer!r:.80}.")
+        self._mesh, self._model = mesh, model.eval().requires_grad_(requires_grad=False)
+        self._layer, self._radius = layer, radius
+        self._info = LayerInfo() if info is None else info
+
+    def __repr__(self) -> str:
+        return (
+            f"MeshField({len(self._mesh):,} primitives, {len(self._model.ids)} classes, layer "
+            f"{self._layer!r})"
+        )
+
+    @property
+    def mesh(self) -> PrimitiveMesh:
+        """The primitives."""
+        return self._mesh
+
+    @property
+    def model(self) -> RadianceModel:
+        """What was trained on them; it takes no gradients any more."""
+        return self._model
+
+    @property
+    def radius(self) -> float:
+        """Of the ball of eq. 9, scene units."""
+        return self._radius
+
+    @property
+    def info(self) -> LayerInfo:
+        """How it was made."""
+        return self._info
+
+    @property
+    def layer_names(self) -> Sequence[str]:
+        """The name of its layer."""
+        return (self._layer,)
+
+    def layer(self, layer: str) -> RenderableLayer:
+        """What there is to know of its layer.
+
+        Raises:
+            InputError: If it is another's name.
+        """
+        if layer != self._layer:
+            raise InputError(f"layer: expected {self._layer}, got {layer!r:.80}.")
+        return RenderableLayer(ids=tuple(sorted(self._model.ids)), info=self._info)
+
+    def view(self, camera: Camera) -> "MeshFieldView":
+        """What it shows through a camera."""
+        return MeshFieldView(self, camera)
+
+    @boundary
+    def labels_at(self, points: Float[Tensor, "p 3"], layer: str) -> PointLabels:
+        """Labels of points of the world by eq. 9, see `BallQuery`.
+
+        Args:
+            points: World, scene units.
+            layer: Name of its layer.
+
+        Returns:
+            Ids, -1 where no vertex is near, and the winner's share of the sum.
+
+        Raises:
+            InputError: If it is another layer's name.
+            ShapeError: If the points are not (p, 3).
+            RangeError: If a point is not finite.
+        """
+        self.layer(layer)
+        columns, shares = self.query.columns(points)
+        ids = torch.tensor([*self._model.ids, UNLABELLED], dtype=torch.int32)
+        return PointLabels(ids=ids[columns], confidence=shares)
+
+    @cached_property
+    def query(self) -> BallQuery:
+        """Its vertices with opacities and probabilities, made when first asked for."""
+        opacity, probabilities = self._model.vertex_outputs(self._mesh)
+        return BallQuery(self._mesh.vertices, opacity, probabilities, radius=self._radius)
+
+    @cached_property
+    def caster(self) -> MeshCaster:
+        """Its triangles arranged for rays, when first asked for."""
+        return MeshCaster(self._mesh)
+
+
+class MeshFieldView:
+    """One view of a mesh field, a `splatseg.core.RenderableView`: rays are cast when first asked.
+
+    Args:
+        field: What is looked at.
+        camera: From where.
+    """
+
+    def __init__(self, field: MeshField, camera: Camera) -> None:
+        self._field, self._camera = field, camera
+        self._seen: RayValues | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._seen = None
+
+    def signals(self, *, colour: bool = True) -> ViewSignals:
+        """Colour with what is behind the primitives, alpha and z-depths of these."""
+        seen = self._values(colour=colour)
+        return ViewSignals(
+            colour=seen.colour if colour else None,
+            alpha=seen.alpha,
+            depth=depth_from_distance(self._camera, seen.distance),
+            median_depth=depth_from_distance(self._camera, seen.median_distance),
+        )
+
+    def features(self, layer: str) -> Float[Tensor, "height width channels"]:
+        """It has none.
+
+        Raises:
+            InputError: Always.
+        """
+        self._field.layer(layer)
+        raise InputError(f"layer {layer!r}: expected features, got labels.")
+
+    def label_map(self, layer: str) -> LabelMap:
+        """The most probable class of each pixel, what is behind the primitives included.
+
+        Without a background, pixels that primitives cover by less than half have no label.
+        """
+        self._field.layer(layer)
+        probabilities = self._values(colour=False).probabilities
+        best, column = probabilities.max(dim=-1)
+        ids = torch.tensor(self._field.model.ids, dtype=torch.int32)[column]
+        known = probabilities.sum(dim=-1) >= _COVERED
+        return LabelMap(
+            ids=torch.where(known, ids, UNLABELLED).int(),
+            confidence=torch.where(known, best, 0.0).clamp(0, 1),
+        )
+
+    def confidence(self, layer: str) -> Float[Tensor, "height width"]:
+        """Probability of each pixel's class, -1 where it has none."""
+        shown = self.label_map(layer)
+        sure = torch.zeros(shown.ids.shape) if shown.confidence is None else shown.confidence
+        return torch.where(shown.ids == UNLABELLED, -1.0, sure)
+
+    def _values(self, *, colour: bool) -> RayValues:
+        seen = self._seen
+        if seen is None or (colour and seen.colour is None):
+            field = self._field
+            seen = render_view(field.model, field.caster, self._camera, colour=colour)
+            self._seen = seen
+        return seen

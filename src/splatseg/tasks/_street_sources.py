@@ -1,0 +1,166 @@
+"""What a mesh field is made from: points on surfaces, and depth of views."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseg.core import Camera, Capture, ScanSource, Scene, View
+from splatseg.errors import InputError
+from splatseg.io.captures import find_formats, read_capture
+from splatseg.io.evidence import DepthEvidence, find_evidence, open_evidence
+from splatseg.lift import GaussianField
+from splatseg.render import BackendName
+from splatseg.street.geometry import (
+    DepthView,
+    capture_views,
+    evidence_views,
+    field_views,
+    point_views,
+    scan_views,
+)
+from splatseg.street.sources import depth_points, gaussian_points, scan_points
+
+DEPTHS = ("auto", "scans", "maps", "gaussians", "points")
+"""Where depth may come from; another word is the name of evidence of depth."""
+
+MAX_DEPTH = 50.0
+"""z-depth above which maps give no points, metres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DriveSources:
+    """What is known of the surfaces of a drive."""
+
+    points: Float[Tensor, "n 3"]
+    """World, scene units, thinned."""
+
+    depths: Callable[[], Iterable[DepthView]]
+    """Depth of views, read once each time."""
+
+    said: str
+    """Where both come from, in words."""
+
+
+def drive_sources(
+    scene: Scene,
+    views: Sequence[View],
+    *,
+    depth: str,
+    scans: ScanSource | None,
+    points: Float[Tensor, "n 3"] | None,
+    cell: float,
+    backend: BackendName,
+) -> DriveSources:
+    """Points and depth of a drive.
+
+    Points are those of scans and of the capture together; where there are none, those of depth
+    maps, or else the centres of Gaussians.
+
+    Args:
+        scene: The scene.
+        views: Those that are learned from.
+        depth: One of `DEPTHS`, or the name of evidence of depth. auto takes the first that is
+            there.
+        scans: In the world of the scene.
+        points: The capture's, world, scene units.
+        cell: Side of the cells of which each gives one point, scene units.
+        backend: Who renders the Gaussians.
+
+    Raises:
+        InputError: If what is asked for is not there, or there are no points at all.
+    """
+    metres = scene.metres_per_unit or 1.0
+    cameras = [view.camera for view in views]
+    clouds: list[Tensor] = []
+    words: list[str] = []
+    if scans is not None:
+        clouds.append(scan_points(scans, cell))
+        words.append(f"{len(clouds[-1]):,} points of scans")
+    if points is not None and len(points):
+        clouds.append(points.double())
+        words.append(f"{len(points):,} points of the capture")
+    sparse = torch.cat(clouds) if clouds else torch.zeros(0, 3, dtype=torch.float64)
+    kind = _first(scene, views, scans) if depth == "auto" else depth
+    depths = _depths(scene, views, kind, scans=scans, points=sparse, backend=backend)
+    cloud = sparse
+    if not len(cloud) and kind not in ("points", "gaussians"):
+        cloud = depth_points(depths(), cell, max_depth=MAX_DEPTH / metres)
+        words.append(f"{len(cloud):,} points of depth maps")
+    if not len(cloud) and len(scene.gaussians):
+        cloud = gaussian_points(scene.gaussians, cell)
+        words.append(f"{len(cloud):,} centres of Gaussians")
+    if not len(cloud):
+        raise InputError(
+            "points: expected points to put primitives at (of the capture, of scans, of depth "
+            "maps, or centres of opaque Gaussians), got none."
+        )
+    if kind == "points" and not len(sparse):
+        depths = _of_points(cloud, cameras, metres)
+    said = {"maps": "depth maps of the capture", "gaussians": "depth of the Gaussians"}
+    words.append(said.get(kind, f"depth of {kind}"))
+    return DriveSources(points=cloud, depths=depths, said=", ".join(words))
+
+
+def capture_points(source: Capture | Path | None) -> Float[Tensor, "n 3"] | None:
+    """The start points of a capture, or of the capture in a folder; None where it has none."""
+    if isinstance(source, Path):
+        if not source.is_dir() or not find_formats(source):
+            return None
+        source = read_capture(source)
+    return None if source is None or source.points is None else source.points.points
+
+
+def _first(scene: Scene, views: Sequence[View], scans: ScanSource | None) -> str:
+    if scans is not None:
+        return "scans"
+    if any(view.depth is not None for view in views):
+        return "maps"
+    return "gaussians" if len(scene.gaussians) else "points"
+
+
+def _depths(
+    scene: Scene,
+    views: Sequence[View],
+    kind: str,
+    *,
+    scans: ScanSource | None,
+    points: Tensor,
+    backend: BackendName,
+) -> Callable[[], Iterable[DepthView]]:
+    metres = scene.metres_per_unit or 1.0
+    cameras = [view.camera for view in views]
+    match kind:
+        case "scans":
+            if scans is None:
+                raise InputError("depth: expected scans to be given with scans, got none.")
+            return lambda: scan_views(scans, cameras, metres_per_unit=metres)
+        case "maps":
+            if all(view.depth is None for view in views):
+                raise InputError(f"depth: expected maps of the {len(views)} views, got none.")
+            return lambda: capture_views(views)
+        case "gaussians":
+            if not len(scene.gaussians):
+                raise InputError("depth: expected a scene with Gaussians, got one without.")
+            return lambda: field_views(GaussianField(scene.gaussians, backend=backend), cameras)
+        case "points":
+            return _of_points(points, cameras, metres)
+        case name:
+            folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+            found = open_evidence(find_evidence(folders, name))
+            if not isinstance(found, DepthEvidence):
+                raise InputError(
+                    f"depth: expected {', '.join(DEPTHS)} or evidence of depth, got {name!r:.80} "
+                    f"of {found.kind}."
+                )
+            known = [view for view in views if view.name in found.files]
+            return lambda: evidence_views(found, known, points=points, metres_per_unit=metres)
+
+
+def _of_points(
+    points: Tensor, cameras: Sequence[Camera], metres: float
+) -> Callable[[], Iterable[DepthView]]:
+    return lambda: point_views(points, cameras, metres_per_unit=metres)

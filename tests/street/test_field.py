@@ -1,0 +1,179 @@
+"""A mesh field as something to be looked at: by hand, through lenses, at points."""
+
+import math
+
+import pytest
+import torch
+
+from splatseg.core import Camera, LayerInfo, Renderable, RenderableView
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.street import reference
+from splatseg.street.field import MeshField
+from splatseg.street.hits_reference import mesh_hits
+from splatseg.street.radiance.model import RadianceModel
+from support.mesh_fields import IDS, SMALL, balls, random_field, told_field
+
+CAR, SKY = 8, 5
+
+
+def camera(**lens: object) -> Camera:
+    return Camera(
+        width=41, height=31, fx=40.0, fy=40.0, cx=20.5, cy=15.5,
+        cam_from_world=torch.eye(4, dtype=torch.float64), **lens,
+    )  # fmt: skip
+
+
+def first_hits(field: MeshField, seen: Camera) -> torch.Tensor:
+    """Distances of the first hits of all pixels, infinite where there is none, by trying all."""
+    origin, directions = seen.rays()
+    hits = mesh_hits(field.mesh, origin, directions.reshape(-1, 3), max_hits=1)
+    return hits.distances[:, 0].view(seen.height, seen.width)
+
+
+def test_it_is_a_renderable() -> None:
+    field = random_field()
+    assert isinstance(field, Renderable)
+    assert isinstance(field.view(camera()), RenderableView)
+    assert field.layer_names == ("classes",)
+    summary = field.layer("classes")
+    assert (summary.kind, summary.ids, summary.background) == ("labels", (3, 5, 8), -1)
+    assert summary.info.names[CAR] == "car"
+
+
+def test_an_opaque_ball_before_the_sky() -> None:
+    """Its first surface is 1.5 ahead; behind and around it is the sky, which has no depth."""
+    field = told_field(balls([[0.013, 0.007, 2]]), [1])
+    seen = camera()
+    hit = torch.isfinite(first_hits(field, seen))
+    assert 0.1 < hit.float().mean() < 0.5
+    with field.view(seen) as view:
+        signals = view.signals()
+        shown = view.label_map("semantic")
+        sure = view.confidence("semantic")
+    torch.testing.assert_close(signals.alpha, hit.float(), atol=1e-5, rtol=0)
+    assert torch.equal(shown.ids, torch.where(hit, CAR, SKY).int())
+    torch.testing.assert_close(sure, torch.ones_like(sure), atol=1e-5, rtol=0)
+    assert float(signals.depth[15, 20]) == pytest.approx(1.5, abs=0.05)
+    assert bool((signals.depth[~hit] == 0).all())
+    assert bool((signals.median_depth[~hit] == 0).all())
+    want = torch.zeros(*hit.shape, 3)
+    want[hit, 1], want[~hit, 2] = 1, 1
+    torch.testing.assert_close(signals.colour, want, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "lens", [{}, {"model": "opencv", "distortion": (-0.2, 0.03)}], ids=["pinhole", "lens"]
+)
+def test_depth_is_along_the_axis_through_the_cameras_own_lens(lens) -> None:
+    field = told_field(balls([[0.4, 0.1, 2.2], [-0.5, 0.2, 1.7]]), [1, 0])
+    seen = camera(**lens)
+    _, directions = seen.rays()
+    distances = first_hits(field, seen)
+    want = torch.where(distances < math.inf, distances * directions[..., 2], 0.0).float()
+    signals = field.view(seen).signals(colour=False)
+    assert signals.colour is None
+    torch.testing.assert_close(signals.depth, want, atol=1e-4, rtol=0)
+    torch.testing.assert_close(signals.median_depth, want, atol=1e-4, rtol=0)
+
+
+def test_half_transparent_surfaces_are_composited_front_to_back() -> None:
+    """sigma is 1/2 at each of the two faces of a ball: a quarter passes to the sky."""
+    field = told_field(balls([[0.013, 0.007, 2]]), [1], opaque=0.0)
+    seen = camera()
+    hit = torch.isfinite(first_hits(field, seen))
+    with field.view(seen) as view:
+        signals = view.signals()
+        shown = view.label_map("semantic")
+    # Rays along an edge of the outline may meet it in a point, whose weight is the same.
+    torch.testing.assert_close(signals.alpha[hit], torch.full_like(signals.alpha[hit], 0.75))
+    torch.testing.assert_close(signals.colour[hit][:, 1], signals.alpha[hit], atol=1e-5, rtol=0)
+    torch.testing.assert_close(shown.confidence[hit], signals.alpha[hit], atol=1e-5, rtol=0)
+    assert bool((shown.ids[hit] == CAR).all())
+    near = float(signals.median_depth[15, 20])
+    far = near + 2 * (2 - near)
+    assert near == pytest.approx(1.5, abs=0.05)
+    assert float(signals.depth[15, 20]) == pytest.approx((0.5 * near + 0.25 * far) / 0.75, abs=1e-3)
+
+
+def test_without_a_background_nothing_is_said_of_what_nothing_covers() -> None:
+    from dataclasses import replace
+
+    mesh = balls([[0.013, 0.007, 2]])
+    model = RadianceModel(mesh, IDS, replace(SMALL, background="none"))
+    with torch.no_grad():
+        model.opacity.bias.fill_(30)
+        model.opacity.weight.zero_()
+    field = MeshField(mesh, model)
+    hit = torch.isfinite(first_hits(field, camera()))
+    with field.view(camera()) as view:
+        shown, sure = view.label_map("semantic"), view.confidence("semantic")
+    assert torch.equal(shown.ids >= 0, hit)
+    assert torch.equal(sure >= 0, hit)
+    assert bool((shown.confidence[~hit] == 0).all())
+
+
+def test_what_is_asked_first_does_not_matter() -> None:
+    field = random_field()
+    with field.view(camera()) as view:
+        ids, colour = view.label_map("classes").ids, view.signals().colour
+    with field.view(camera()) as view:
+        again, labels = view.signals().colour, view.label_map("classes").ids
+    assert torch.equal(colour, again)
+    assert torch.equal(ids, labels)
+
+
+def test_points_take_the_vertices_around_them() -> None:
+    field = told_field(balls([[0, 0, 2], [3, 0, 2]]), [1, 0])
+    points = torch.tensor([[0.5, 0, 2], [2.6, 0, 2], [1.5, 0, 2], [0, 0, 40]])
+    labels = field.labels_at(points, "semantic")
+    assert labels.ids.tolist() == [8, 3, -1, -1]
+    assert labels.ids.dtype == torch.int32
+    torch.testing.assert_close(labels.confidence, torch.tensor([1.0, 1, 0, 0]))
+    wide = MeshField(field.mesh, field.model, radius=1.2)
+    assert wide.labels_at(points, "semantic").ids[2] != -1
+
+
+def test_points_are_eq_9_of_the_fields_outputs() -> None:
+    field = random_field()
+    opacity, probabilities = field.model.vertex_outputs(field.mesh)
+    points = field.mesh.vertices[::7] + 0.05
+    want = reference.point_columns(
+        field.mesh.vertices, opacity, probabilities, points, radius=field.radius
+    )
+    found = field.labels_at(points, "classes").ids
+    assert found.tolist() == [IDS[column] for column in want.tolist()]
+
+
+def test_empty_primitives_show_the_background() -> None:
+    field = random_field(balls([]))
+    signals = field.view(camera()).signals()
+    assert bool((signals.alpha == 0).all())
+    assert field.labels_at(torch.zeros(2, 3), "classes").ids.tolist() == [-1, -1]
+
+
+def test_what_is_refused() -> None:
+    mesh = balls([[0.013, 0.007, 2]])
+    model = RadianceModel(mesh, IDS, SMALL)
+    field = MeshField(mesh, model)
+    for ask in (field.layer, field.view(camera()).label_map, field.view(camera()).confidence):
+        with pytest.raises(InputError, match="^layer: expected semantic, got 'other'"):
+            ask("other")
+    with pytest.raises(InputError, match="^layer: expected semantic, got 'other'"):
+        field.labels_at(torch.zeros(1, 3), "other")
+    with pytest.raises(InputError, match="expected features, got labels"):
+        field.view(camera()).features("semantic")
+    with pytest.raises(RangeError, match="^points: "):
+        field.labels_at(torch.full((1, 3), math.nan), "semantic")
+    with pytest.raises(ShapeError, match="^model.features: "):
+        MeshField(balls([[0, 0, 2], [1, 0, 2]]), model)
+    with pytest.raises(InputError, match="^model.ids: expected ids of 1 and more, got 0"):
+        MeshField(mesh, RadianceModel(mesh, (0, 1), SMALL))
+    for radius in (0.0, math.nan, math.inf, -1.0):
+        with pytest.raises(RangeError, match="^radius: expected a positive length"):
+            MeshField(mesh, model, radius=radius)
+    for name in ("", "a@part"):
+        with pytest.raises(InputError, match="^layer: expected a name without @"):
+            MeshField(mesh, model, layer=name)
+    with pytest.raises(InputError, match="^info: "):
+        MeshField(mesh, model, info="mine")  # pyright: ignore[reportArgumentType]
+    assert LayerInfo() == field.info

@@ -1,0 +1,75 @@
+"""Small mesh fields that were never trained, and one that says what it is told."""
+
+import torch
+
+from splatseg.core import LayerInfo
+from splatseg.street.field import MeshField
+from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.radiance.model import RadianceModel
+from splatseg.street.radiance.options import RadianceOptions
+from splatseg.street.shapes.template import template
+
+SMALL = RadianceOptions(
+    feature_size=4,
+    position_frequencies=2,
+    view_frequencies=1,
+    width=16,
+    depth=2,
+    semantic_width=0,
+    colour_widths=(8,),
+    background_widths=(8,),
+)
+IDS = (3, 8, 5)
+"""Of the classes, in no order; the last is what is behind everything."""
+
+
+def balls(centres: list[list[float]], radius: float = 0.5, size: float = 0.5) -> PrimitiveMesh:
+    """Near spheres around centres, all of one level."""
+    vertices, _ = template()
+    where = torch.tensor(centres, dtype=torch.float32).reshape(-1, 1, 3)
+    return PrimitiveMesh(
+        vertices=(where + radius * vertices).reshape(-1, 3),
+        levels=torch.zeros(len(where), dtype=torch.int64),
+        sizes=(size,),
+    )
+
+
+def random_field(mesh: PrimitiveMesh | None = None, *, seed: int = 1) -> MeshField:
+    """A field with weights as they are before training."""
+    mesh = balls([[0, 0, 2], [0.6, 0, 2]]) if mesh is None else mesh
+    info = LayerInfo(method="dnmp", names={3: "road", 8: "car", 5: "sky"}, views=("a", "b"))
+    return MeshField(mesh, RadianceModel(mesh, IDS, SMALL, seed=seed), info=info, layer="classes")
+
+
+def told_field(
+    mesh: PrimitiveMesh,
+    columns: list[int],
+    *,
+    opaque: float = 20.0,
+    background: int = 2,
+) -> MeshField:
+    """A field whose primitives have classes by hand, a column each, and colours by the class.
+
+    Features are the classes themselves, and the networks read them; colour j is 1 in channel j.
+    """
+    options = RadianceOptions(
+        feature_size=3, position_frequencies=0, view_encoding="none", width=3, depth=1,
+        semantic_width=0, colour_widths=(), background="constant", background_widths=(),
+    )  # fmt: skip
+    model = RadianceModel(mesh, IDS, options)
+    eye = torch.eye(3)
+    with torch.no_grad():
+        for tensor in model.state_dict().values():
+            if tensor.ndim:
+                tensor.zero_()
+        of = torch.tensor(columns).repeat_interleave(42)
+        model.features.copy_(eye[of])
+        model.trunk.layers[0].weight[:, :3] = eye
+        model.opacity.bias.fill_(opaque)
+        model.semantic.layers[0].weight.copy_(40 * eye)
+        model.colour.layers[0].weight.copy_(80 * eye)
+        model.colour.layers[0].bias.fill_(-40)
+        last = model.background.layers[0]
+        last.bias.fill_(-40)
+        last.bias[background] = last.bias[3 + background] = 40
+    return MeshField(mesh, model, info=LayerInfo(names={3: "road", 8: "car", 5: "sky"}))
