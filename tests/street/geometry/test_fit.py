@@ -86,10 +86,11 @@ def test_primitives_reach_a_wall_and_a_floor(kind: str) -> None:
 def test_each_level_is_fitted_as_if_it_were_alone() -> None:
     primitives, view = corner()
     both = fitted((primitives, view)).primitives
-    fine = primitives.subset(primitives.levels == 0)
-    alone = fitted((fine, view)).primitives
-    assert same(both.subset(both.levels == 0), alone)
-    assert not same(both.subset(both.levels == 1), primitives.subset(primitives.levels == 1))
+    for level in (0, 1):
+        own = primitives.subset(primitives.levels == level)
+        alone = fitted((own, view)).primitives
+        assert same(both.subset(both.levels == level), alone)
+        assert not same(alone, own)
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:
@@ -331,6 +332,8 @@ def test_bad_arguments_are_refused() -> None:
         fit_geometry(primitives, shipped(), [])
     with pytest.raises(RangeError, match="metres_per_unit: expected a positive"):
         fit_geometry(primitives, shipped(), [view], metres_per_unit=0.0)
+    with pytest.raises(RangeError, match="seed: expected a value"):
+        fit_geometry(primitives, shipped(), [view], seed=-1)
     other = new_shapes(ShapeConfig(code_size=3), seed=0)
     with pytest.raises(ShapeError, match="codes: expected shape"):
         fit_geometry(primitives, other, [view])

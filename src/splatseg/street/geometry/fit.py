@@ -3,8 +3,10 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
+from splatseg._check import check_range
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
@@ -82,7 +84,7 @@ def fit_geometry(
         shapes: The auto-encoder of their codes, which stays as it is.
         depths: Depth of views, read once, one at a time.
         options: How they are fitted.
-        seed: Of the rays that are drawn.
+        seed: Of the rays that are drawn, 0 or more.
         metres_per_unit: Length of a scene unit.
         progress: Told every record.
 
@@ -96,15 +98,15 @@ def fit_geometry(
     options = GeometryOptions() if options is None else options
     if not len(primitives):
         raise InputError("primitives: expected at least one to fit, got none.")
+    check_range("seed", seed, 0, 2**63 - 1)
     if not 0 < metres_per_unit < float("inf"):
         raise RangeError(f"metres_per_unit: expected a positive length, got {metres_per_unit:g}.")
-    generator = torch.Generator().manual_seed(seed)
     with one_torch_thread():
         rays = collect_rays(
             depths,
             max_rays=options.max_rays,
             max_depth=options.max_depth / metres_per_unit,
-            generator=generator,
+            generator=_generator(seed, 0),
         )
         around = enclosing(primitives.mesh(shapes), rays.origins)
         if bool(around.any()) and options.carve > 1:
@@ -119,6 +121,7 @@ def fit_geometry(
         carved = 0
         levels = torch.unique(left.levels).tolist()
         for i, level in enumerate(levels):
+            generator = _generator(seed, 1 + level)
             fit = LevelFit(left.subset(left.levels == level), shapes, options)
             for record in _records(fit, rays, options, generator):
                 told = replace(record, level=level, progress=(i + record.progress) / len(levels))
@@ -138,6 +141,12 @@ def fit_geometry(
         enclosing=int(around.sum()),
         carved=carved,
     )
+
+
+def _generator(seed: int, stream: int) -> torch.Generator:
+    """Random numbers of its own for what is independent of all else."""
+    state = np.random.SeedSequence([seed, stream]).generate_state(1)
+    return torch.Generator().manual_seed(int(state[0]))
 
 
 def _records(
