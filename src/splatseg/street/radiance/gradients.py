@@ -98,13 +98,15 @@ class StepWorker:
         corners = torch.cat([one.corners for one in found])
         weights = torch.cat([one.weights for one in found])
         gradients = torch.cat([one.features for one in found])
-        self._met[corners.reshape(-1)] = True
+        self._met.index_fill_(0, corners.reshape(-1), value=True)
         rows = self._met.nonzero()[:, 0]
-        self._met[rows] = False
-        self._place[rows] = torch.arange(len(rows))
+        self._met.index_fill_(0, rows, value=False)
+        self._place.index_copy_(0, rows, torch.arange(len(rows)))
         sums = torch.zeros(len(rows), gradients.shape[1])
         for k in range(3):
-            sums.index_add_(0, self._place[corners[:, k]], weights[:, k, None] * gradients)
+            sums.index_add_(
+                0, self._place.index_select(0, corners[:, k]), weights[:, k, None] * gradients
+            )
         return rows, sums
 
     def _share(self, drawn: Int64[Tensor, "b"], total: int) -> "_Share":
@@ -118,13 +120,13 @@ class StepWorker:
         opacity = torch.zeros(len(drawn) * width).index_copy(0, places, model.opacity_of(hidden))
         shares, passed = ray_weights(opacity.view(len(drawn), width))
         ray = places // width
-        each = shares.reshape(-1)[places]
-        colours = model.colour_of(hidden, directions[ray], samples.normals)
+        each = shares.reshape(-1).index_select(0, places)
+        colours = model.colour_of(hidden, directions.index_select(0, ray), samples.normals)
         behind, behind_classes = model.background_of(directions)
         colour = (passed[:, None] * behind).index_add(0, ray, each[:, None] * colours)
-        truth = self._rays.colours[drawn].float() / 255
+        truth = self._rays.colours.index_select(0, drawn).float() / 255
         colour_loss = (colour - truth).square().sum() / total
-        columns = self._rays.columns[drawn].long()
+        columns = self._rays.columns.index_select(0, drawn).long()
         known = columns >= 0
         wanted = columns.clamp_min(0)
         # Eq. 7 asks for the label's probability alone: no other class is composited.

@@ -55,7 +55,8 @@ class TrainingRays:
     def directions(self, rays: Int[Tensor, "b"]) -> Float[Tensor, "b 3"]:
         """Unit world directions of some rays, float32."""
         views = torch.searchsorted(self.view_starts, rays, right=True) - 1
-        flat = self.planes[self.plane_starts[views] + self.pixels[rays]]
+        rows = self.plane_starts[views] + self.pixels.index_select(0, rays)
+        flat = self.planes.index_select(0, rows)
         return torch.einsum("bij,bj->bi", self.rotations[views], flat)
 
     def view_directions(self, view: int) -> Float[Tensor, "n 3"]:

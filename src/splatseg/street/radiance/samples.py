@@ -31,7 +31,8 @@ class SurfaceSamples:
 
     def interpolate(self, values: Float[Tensor, "v c"]) -> Float[Tensor, "s c"]:
         """Values of vertices at the points (eq. 3)."""
-        flat = values[self.corners.reshape(-1)].view(len(self.corners), 3, values.shape[1])
+        flat = values.index_select(0, self.corners.reshape(-1))
+        flat = flat.view(len(self.corners), 3, values.shape[1])
         return torch.einsum("sk,skc->sc", self.weights, flat)
 
 
@@ -50,8 +51,10 @@ class Surface:
 
     def samples(self, faces: Int64[Tensor, "s"], weights: Float[Tensor, "s 3"]) -> SurfaceSamples:
         """Points of triangles, with barycentric weights of their corners."""
-        corners = self._faces[faces % FACES] + (VERTICES * (faces // FACES))[:, None]
-        a, b, c = self._vertices[corners.T].unbind(0)
+        corners = self._faces.index_select(0, faces % FACES)
+        corners += (VERTICES * (faces // FACES))[:, None]
+        found = self._vertices.index_select(0, corners.T.reshape(-1))
+        a, b, c = found.view(3, len(corners), 3).unbind(0)
         positions = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c
         normals = functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
         return SurfaceSamples(
