@@ -14,7 +14,7 @@ crosses itself as well: there the blocks of all passes count.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -59,7 +59,13 @@ class DriveBlockOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DriveBlock:
-    """One block of a drive."""
+    """One block of a drive.
+
+    Raises:
+        ShapeError: If a line is not (n, 3).
+        InputError: If a line has no place.
+        RangeError: If a place is not finite, or the piece ends before it begins.
+    """
 
     index: int
     """From 0 along the drive."""
@@ -76,6 +82,18 @@ class DriveBlock:
     span: Float[Tensor, "m 3"]
     """The line of the piece with half an overlap on either side, where the drive goes on."""
 
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        for name in ("piece", "span"):
+            line: Tensor = getattr(self, name)
+            check_shape(name, line, (None, 3))
+            check_finite(name, line)
+            if not len(line):
+                raise InputError(f"{name}: expected at least one place, got none.")
+            object.__setattr__(self, name, line.detach().cpu().double())
+        if not -math.inf < self.start <= self.end < math.inf:
+            raise RangeError(f"start, end: expected a piece, got {self.start:g} to {self.end:g}.")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BlockShare:
@@ -90,9 +108,18 @@ class BlockShare:
     """In (0, 1], float64; those of all blocks at a point add up to 1."""
 
 
+def _no_places() -> Float[Tensor, "0 3"]:
+    return torch.zeros(0, 3, dtype=torch.float64)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drive:
-    """A drive in blocks: `cut_drive`."""
+    """A drive in blocks: `cut_drive`.
+
+    Raises:
+        InputError: If there are no blocks, or they do not count from 0.
+        RangeError: If a length is not positive.
+    """
 
     blocks: tuple[DriveBlock, ...]
 
@@ -101,6 +128,26 @@ class Drive:
 
     reach: float
     """Scene units."""
+
+    _low: Float[Tensor, "b 3"] = field(init=False, repr=False, default_factory=_no_places)
+    """Lowest corners of the boxes around pieces, and highest."""
+
+    _high: Float[Tensor, "b 3"] = field(init=False, repr=False, default_factory=_no_places)
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        if not self.blocks or [b.index for b in self.blocks] != list(range(len(self.blocks))):
+            raise InputError(
+                f"blocks: expected blocks that count from 0, got {[b.index for b in self.blocks]}."
+            )
+        for name in ("overlap", "reach"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise RangeError(f"{name}: expected a positive length, got {value}.")
+        low = torch.stack([block.piece.amin(dim=0) for block in self.blocks])
+        high = torch.stack([block.piece.amax(dim=0) for block in self.blocks])
+        object.__setattr__(self, "_low", low)
+        object.__setattr__(self, "_high", high)
 
     def __len__(self) -> int:
         return len(self.blocks)
@@ -163,16 +210,13 @@ class Drive:
 
     def _weights(self, points: Float[Tensor, "n 3"]) -> Iterator[tuple[int, Float[Tensor, "n"]]]:
         """Blocks that may count at some points, with their weights there."""
-        low, high = points.amin(dim=0), points.amax(dim=0)
-        apart = [
-            float(torch.linalg.vector_norm(torch.maximum(a - high, low - b).clamp_min(0)))
-            for a, b in ((x.piece.amin(dim=0), x.piece.amax(dim=0)) for x in self.blocks)
-        ]
+        gaps = torch.maximum(self._low - points.amax(dim=0), points.amin(dim=0) - self._high)
+        gaps = torch.linalg.vector_norm(gaps.clamp_min(0), dim=1)
         nearest = points.new_full((len(points),), math.inf)
         found: dict[int, Tensor] = {}
-        for block in sorted(range(len(apart)), key=lambda i: (apart[i], i)):
+        for block in torch.argsort(gaps, stable=True).tolist():
             # A block that is half an overlap farther than another from all points counts nothing.
-            if apart[block] > float(nearest.max()) + self.overlap / 2:
+            if float(gaps[block]) > float(nearest.max()) + self.overlap / 2:
                 break
             found[block] = distances(points, self.blocks[block].piece)
             nearest = torch.minimum(nearest, found[block])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from splatseg.core import Capture, PointCloud, ScanSource
+from splatseg.core import Capture, PointCloud, ScanSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.scans import Scan
 from splatseg.errors import InputError
@@ -27,15 +27,27 @@ def block_capture(capture: Capture, drive: Drive, block: DriveBlock) -> Capture:
     Raises:
         InputError: If no training view is of the block.
     """
-    centres = torch.stack([view.camera.centre for view in capture.views])
-    of_block = drive.counts(block, centres).tolist()
-    views = tuple(view for view, own in zip(capture.views, of_block, strict=True) if own)
-    if not any(view.split == "train" for view in views):
+    views = block_views(capture.views, drive, block)
+    return replace(capture, views=views, points=_cloud(capture.points, drive, block))
+
+
+@boundary
+def block_views(views: Sequence[View], drive: Drive, block: DriveBlock) -> tuple[View, ...]:
+    """The views at whose place a block counts, in their order.
+
+    Raises:
+        InputError: If no training view is among them.
+    """
+    centres = [view.camera.centre for view in views]
+    at = torch.stack(centres) if centres else torch.zeros(0, 3)
+    of_block = drive.counts(block, at).tolist()
+    found = tuple(view for view, own in zip(views, of_block, strict=True) if own)
+    if not any(view.split == "train" for view in found):
         raise InputError(
             f"blocks: expected training views in every block, block {block.index} of {len(drive)} "
             "has none; longer blocks bridge a gap of the drive."
         )
-    return replace(capture, views=views, points=_cloud(capture.points, drive, block))
+    return found
 
 
 def _cloud(cloud: PointCloud | None, drive: Drive, block: DriveBlock) -> PointCloud | None:
