@@ -4,12 +4,14 @@ from support.fuzz.targets import (
     benchmarks,
     captures,
     evidence,
+    kitti,
     own,
     pictures,
     pointmaps,
     points,
     splats,
     surfaces,
+    waymo,
 )
 from support.fuzz.targets.base import TARGETS, Target
 
@@ -19,10 +21,12 @@ __all__ = [
     "benchmarks",
     "captures",
     "evidence",
+    "kitti",
     "own",
     "pictures",
     "pointmaps",
     "points",
     "splats",
     "surfaces",
+    "waymo",
 ]
