@@ -8,6 +8,7 @@ import pytest
 from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.limits import unpacking
 from splatseg.io.parquet import RowReader, bytes_of, integer_of, list_of, number_of, read_rows
+from splatseg.io.parquet_footer import read_chunks
 
 
 @pytest.fixture
@@ -69,6 +70,29 @@ def test_a_small_file_of_many_values(tmp_path) -> None:
     table = pa.table({"lists": [np.zeros(1 << 20, np.float32)] * 2})
     pq.write_table(table, file, compression="zstd")
     assert file.stat().st_size < 10_000
-    with unpacking(1 << 20), pytest.raises(FileFormatError, match="rows of group 0, which is 16"):
+    with unpacking(1 << 20), pytest.raises(FileFormatError, match="rows of a group, which is 16"):
         RowReader(file, ("lists",)).row(0)
     assert len(RowReader(file, ("lists",)).row(1)["lists"]) == 1 << 20
+
+
+def test_the_footer_says_what_pyarrow_says(file) -> None:
+    described = pq.ParquetFile(file).metadata
+    groups = read_chunks(file)
+    assert len(groups) == described.num_row_groups == 3
+    for i, group in enumerate(groups):
+        known = [described.row_group(i).column(j) for j in range(len(group))]
+        assert [chunk.values for chunk in group] == [one.num_values for one in known]
+        assert [chunk.size for chunk in group] == [one.total_uncompressed_size for one in known]
+        # A name with a full stop in it is one name.
+        assert [chunk.column for chunk in group] == ["a.b", "lists", "fixed", "bytes"]
+
+
+@pytest.mark.parametrize("cut", [1, 5, 9, 40, 200])
+def test_a_footer_that_is_damaged(file, cut) -> None:
+    content = file.read_bytes()
+    file.write_bytes(content[:-cut])
+    with pytest.raises(FileFormatError, match="expected a Parquet file"):
+        read_chunks(file)
+    file.write_bytes(content[: -8 - cut] + b"\xff" * cut + content[-8:])
+    with pytest.raises(FileFormatError, match="expected a Parquet file"):
+        read_chunks(file)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from splatseg.errors import FileFormatError, MissingFileError, MissingPackageError, quoted, reason
 from splatseg.io.foreign import is_file, reading
 from splatseg.io.limits import check_unpacked
+from splatseg.io.parquet_footer import Chunk, read_chunks
 
 Row = Mapping[str, Any]
 """Values by column: numbers, text, bytes, arrays of one axis for lists, None for nothing."""
@@ -62,6 +63,9 @@ class RowReader:
             raise FileFormatError(
                 f"{path}: expected the column {missing[0]}, got {quoted(', '.join(known))}."
             )
+        self._chunks = read_chunks(path)
+        if len(self._chunks) != len(counts):
+            raise FileFormatError(f"{path}: expected a Parquet file, got a damaged footer.")
         self._ends = np.cumsum(counts, dtype=np.int64)
         self._rows: Iterator[Row] = iter(())
         self._group, self._position = -1, 0
@@ -81,6 +85,7 @@ class RowReader:
         if group != self._group or index < self._position:
             self._group = group
             self._position = int(self._ends[group - 1]) if group else 0
+            _check_size(self.path, self.columns, self._chunks[group])
             self._rows = _group_rows(self.path, self.columns, group)
         for row in self._rows:
             self._position += 1
@@ -170,7 +175,6 @@ def _opened(path: Path) -> Generator[Any]:
 
 def _group_rows(path: Path, columns: Sequence[str], group: int) -> Iterator[Row]:
     with _opened(path) as file:
-        _check_size(path, file, columns, group)
         batches = file.iter_batches(
             batch_size=1, row_groups=[group], columns=list(columns), use_threads=False
         )
@@ -179,16 +183,12 @@ def _group_rows(path: Path, columns: Sequence[str], group: int) -> Iterator[Row]
                 yield {name: _value(batch.column(name)[i]) for name in columns}
 
 
-def _check_size(path: Path, file: Any, columns: Sequence[str], group: int) -> None:
+def _check_size(path: Path, columns: Sequence[str], chunks: Sequence[Chunk]) -> None:
     """Refuse a group whose wanted columns unpack to more than a file of its size may."""
-    described = file.metadata.row_group(group)
-    size = 0
-    for i in range(described.num_columns):
-        column = described.column(i)
-        parts = str(column.path_in_schema)
-        if any(parts == name or parts.startswith(f"{name}.") for name in columns):
-            size += max(int(column.total_uncompressed_size), _WIDEST * int(column.num_values), 0)
-    check_unpacked(path, size, packed=path.stat().st_size, what=f"rows of group {group}")
+    size = sum(
+        max(chunk.size, _WIDEST * chunk.values) for chunk in chunks if chunk.column in columns
+    )
+    check_unpacked(path, size, packed=path.stat().st_size, what="rows of a group")
 
 
 def _value(scalar: Any) -> Any:

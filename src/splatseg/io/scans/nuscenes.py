@@ -9,7 +9,7 @@ tokens; the large ones are read row by row, and only what is of the laser is kep
 CVPR 2020; Fong et al., RA-L 2022; tables as docs/schema_nuscenes.md of nuscenes-devkit has them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,8 @@ _MICROSECOND = 1e-6
 _STUFF = ("flat.", "static.")
 _MAX_CLASS = 255
 _UNIT = 1e-3
+_LONGEST = 150
+"""Characters of the name of a file."""
 
 _Rows = Mapping[str, Mapping[str, Any]]
 
@@ -111,7 +113,7 @@ def _sweeps(root: Path, version: Path) -> dict[str, _Sweep]:
     mounted = _table(
         version / "calibrated_sensor.json",
         ("sensor_token", "translation", "rotation"),
-        kept=lambda row: row.get("sensor_token") in lasers,
+        kept=lambda row: _is_one_of(row.get("sensor_token"), lasers),
     )
     data = _table(
         version / "sample_data.json",
@@ -120,11 +122,11 @@ def _sweeps(root: Path, version: Path) -> dict[str, _Sweep]:
             row.get("is_key_frame") is True and row.get("calibrated_sensor_token") in mounted
         ),
     )
-    asked = {row["ego_pose_token"] for row in data.values()}
+    asked = {token for row in data.values() if isinstance(token := row["ego_pose_token"], str)}
     poses = _table(
         version / "ego_pose.json",
         ("translation", "rotation"),
-        kept=lambda row: row.get("token") in asked,
+        kept=lambda row: _is_one_of(row.get("token"), asked),
     )
     samples = _table(version / "sample.json", ("scene_token",))
     scenes = _table(version / "scene.json", ("name",))
@@ -153,6 +155,10 @@ def _sweeps(root: Path, version: Path) -> dict[str, _Sweep]:
             f"{quoted(twice)} twice."
         )
     return {name: sweep for name, (_, _, sweep) in zip(names, found, strict=True)}
+
+
+def _is_one_of(token: object, known: Container[str]) -> bool:
+    return isinstance(token, str) and token in known
 
 
 def _table(
@@ -198,7 +204,10 @@ def _text(value: object, where: str) -> str:
 
 def _named(root: Path, value: object, where: str) -> Path:
     """A file that a table names, below the root."""
-    return path_inside(root, _text(value, where), make=False)
+    name = _text(value, where)
+    if len(name) > _LONGEST:
+        raise FileFormatError(f"{where}: expected the name of a file, got {quoted(name)}.")
+    return path_inside(root, name, make=False)
 
 
 def _label_files(root: Path, version: Path) -> dict[str, Path]:
