@@ -69,6 +69,10 @@ COMMANDS: dict[str, CommandEntry] = {
         module="splatseg.cli.segment",
         summary="evidence (label maps, masks, features) -> a layer of the scene",
     ),
+    "street": CommandEntry(
+        module="splatseg.cli.street",
+        summary="a drive -> a mesh field with classes, and labels of laser points",
+    ),
     "select": CommandEntry(
         module="splatseg.cli.select",
         summary="clicks, boxes, strokes, masks, places -> a selection of Gaussians",

@@ -47,14 +47,22 @@ Backend: TypeAlias = Annotated[
     ),
 ]
 
+Field: TypeAlias = Annotated[
+    str | None,
+    _named(
+        "NAME",
+        "A field of the scene that street made, instead of the Gaussians and their layers.",
+    ),
+]
+
 Seed: TypeAlias = Annotated[int, _named("N", "Seed of everything that is drawn at random.")]
 
 Format: TypeAlias = Annotated[
     str,
     _named(
         "NAME",
-        "How the capture is read: auto, nerfstudio, blender, colmap, llff, idr, replica, scannet "
-        "or scannetpp. auto takes the first of these that is there.",
+        "How the capture is read: auto, nerfstudio, blender, colmap, llff, idr, replica, scannet, "
+        "scannetpp, kitti360 or waymo. auto takes the first of these that is there.",
     ),
 ]
 

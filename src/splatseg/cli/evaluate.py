@@ -9,12 +9,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from splatseg.cli._types import Backend, Data, Json, Quiet, SceneFolder, Split
+from splatseg.cli._types import Backend, Data, Field, Json, Quiet, SceneFolder, Split
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Scene
 from splatseg.io.json_files import write_json
 from splatseg.tasks import EvaluationOptions, evaluate_scene
 from splatseg.tasks.new_scene import check_parent
+from splatseg.tasks.scene_parts import scene_field
 from splatseg.tasks.score_tables import check_table_file, write_class_table, write_confusion
 
 _PER_CLASS = {
@@ -55,6 +56,8 @@ class Command:
     scoring: tyro.conf.OmitArgPrefixes[_Options] = field(default_factory=_Options)
     """What is scored against what."""
 
+    field: Field = None
+
     table: Path | None = None
     """Also write the scores of classes (id, name, pixels, IoU) to this file: .csv, .md or .tex."""
 
@@ -81,10 +84,13 @@ def run(command: Command) -> None:
     figures = evaluate_scene(
         scene,
         options=command.scoring,
+        field=None if command.field is None else scene_field(scene, command.field),
         backend=command.backend,
         observer=ConsoleObserver(quiet=command.quiet, json=command.json),
     )
     figures["scene"] = str(command.scene)
+    if command.field is not None:
+        figures["field"] = command.field
     if command.table is not None:
         write_class_table(figures, command.table)
     if command.confusion is not None:

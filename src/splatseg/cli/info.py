@@ -73,6 +73,7 @@ def _scene_sentence(facts: dict[str, Any]) -> str:
         _views(facts) if facts["views"] else "no views",
         *_world(facts),
         f"layers {layers}" if layers else "no layers",
+        *([f"fields {', '.join(facts['fields'])}"] if facts["fields"] else []),
     ]
     if facts["evidence"]:
         parts.append(f"evidence {', '.join(facts['evidence'])}")

@@ -7,7 +7,16 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._types import Backend, Data, Frames, Json, Quiet, SceneFolder, SplitOrPath
+from splatseg.cli._types import (
+    Backend,
+    Data,
+    Field,
+    Frames,
+    Json,
+    Quiet,
+    SceneFolder,
+    SplitOrPath,
+)
 from splatseg.cli._words import listed
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Capture, Scene
@@ -16,6 +25,7 @@ from splatseg.evaluate import PointSurfaceOptions
 from splatseg.io.captures import read_capture
 from splatseg.io.scene_folder import is_scene
 from splatseg.tasks import Observer, Rendering, RenderingOptions, render_truth, render_views
+from splatseg.tasks.scene_parts import scene_field
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +65,8 @@ class Command:
     """What to draw: rgb, depth, alpha, and names of layers, by comma or by space. NAME@part is a
     cut of a tree; NAME@hard reads features Gaussian by Gaussian and not view by view. Without it
     rgb, or with --surface all of its labels."""
+
+    field: Field = None
 
     coloured: bool = False
     """Also write DIR/<layer>_coloured with images of label layers in the legend's colours."""
@@ -96,10 +108,12 @@ def run(command: Command) -> None:
     observer = ConsoleObserver(quiet=command.quiet, json=command.json)
     if command.surface is None:
         _check_without_surface(command)
+        scene = open_scene(command.scene, command.data)
         done = render_views(
-            open_scene(command.scene, command.data),
+            scene,
             command.output,
             options=_options(command, ("rgb",)),
+            field=None if command.field is None else scene_field(scene, command.field),
             backend=command.backend,
             observer=observer,
         )
@@ -133,6 +147,8 @@ def _check_without_surface(command: Command) -> None:
 
 
 def _truth(command: Command, path: Path, observer: Observer) -> Rendering:
+    if command.field is not None:
+        raise InputError("field: expected none with a surface, which is drawn instead of it.")
     source: Scene | Capture
     if is_scene(command.scene):
         source = open_scene(command.scene, command.data)

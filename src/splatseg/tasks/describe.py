@@ -28,6 +28,7 @@ from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import load_layer
 from splatseg.io.lock import lock_owner
 from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
+from splatseg.io.scene_fields import scene_field_names
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished, training_files
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
 from splatseg.tasks.stopped_fit import where_it_stopped
@@ -193,6 +194,7 @@ def _scene_facts(scene: Scene) -> dict[str, Any]:
         "layers": {
             name: _layer_kind(load_scene_layer(root, name)) for name in scene_layer_names(root)
         },
+        "fields": list(scene_field_names(root)),
         "evidence": list(evidence_names(folders)),
         "notes": notes,
     }

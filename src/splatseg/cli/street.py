@@ -1,0 +1,188 @@
+"""``splatseg street``: a drive becomes a mesh field, and points of laser scans get labels."""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, Seed
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result
+from splatseg.core import Renderable, Scene
+from splatseg.errors import InputError
+from splatseg.io.scene_fields import scene_field_names
+from splatseg.io.scene_folder import is_scene, work_on_scene
+from splatseg.street.options import DnmpOptions
+from splatseg.tasks import (
+    LabelBy,
+    ScanLabelOptions,
+    StreetOptions,
+    label_scans,
+    open_drive,
+    save_street_field,
+    street_field,
+)
+from splatseg.tasks.scene_parts import scene_field
+
+CONFIG = (tyro.conf.HelptextFromCommentsOff,)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Street(StreetOptions):
+    seed: Seed = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """Make the mesh field of a drive, or label the points of its laser scans.
+
+    A mesh field is made of deformable neural mesh primitives with semantics: small meshes at the
+    surfaces of the drive, fitted to depth, that learn colours and classes from photographs and
+    label maps. It is written to SCENE/fields; render and evaluate take it with --field.
+
+    With --label-scans every point of laser scans gets a label: from what the views of the scene's
+    Gaussians show at it, or, with --by mesh, from the vertices of the mesh field around it. Points
+    about which nothing can be said have none, and are counted.
+
+    For example:
+
+    splatseg street drive --scans lidar --evidence labels_semantic
+
+    splatseg street capture --scene drive --published
+
+    splatseg street drive --label-scans lidar -o labels --layer labels_semantic
+    """
+
+    drive: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE_OR_CAPTURE")]
+    """A scene folder, or a capture with --scene."""
+
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="NEW")] = None
+    """With a capture: the scene folder to write, without Gaussians."""
+
+    inputs: tyro.conf.OmitArgPrefixes[_Street] = field(default_factory=_Street)
+    """What the field is made from."""
+
+    primitives: tyro.conf.OmitArgPrefixes[DnmpOptions] = field(default_factory=DnmpOptions)
+    """How the field is made."""
+
+    overwrite: Overwrite = False
+
+    label_scans: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Laser scans whose points are labelled: the folder of a drive, or a file of points, in the
+    world of the scene."""
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    """With --label-scans: the folder of labels to write, one file a scan, and labels.json."""
+
+    by: LabelBy = "gaussians"
+    """Who labels points. gaussians: what views of the Gaussians show there, and shapes. mesh: the
+    field, which is made first where it is not there."""
+
+    form: Literal["auto", "npz", "label", "ply", "las"] = "auto"
+    """Of the files of labels. npz: semantic and confidence, a value for each of the scan's file.
+    label: SemanticKITTI's. ply, las: points with columns. auto: what the scans came as."""
+
+    backend: Backend = "auto"
+    data: Data = None
+    json: Json = False
+    quiet: Quiet = False
+
+
+def run(command: Command) -> None:
+    """Make the field of a drive, label its scans, or both."""
+    started = time.monotonic()
+    observer = ConsoleObserver(quiet=command.quiet, json=command.json)
+    _check(command)
+    scene, root = _scene(command)
+    facts: dict[str, Any] = {"scene": root}
+    lines: list[str] = []
+    found: Renderable | None = None
+    if command.label_scans is None or command.by == "mesh":
+        found = _field(command, scene, root, observer, facts=facts, lines=lines)
+    if command.label_scans is not None and command.output is not None:
+        made = label_scans(
+            scene,
+            command.label_scans,
+            command.output,
+            field=found,
+            options=ScanLabelOptions(
+                layer=command.inputs.layer if found is None else None, form=command.form
+            ),
+            backend=command.backend,
+            observer=observer,
+        )
+        counts = made.counts
+        share = 100 * counts.unlabelled / max(counts.points, 1)
+        facts["labels"] = {
+            "folder": made.folder,
+            "by": command.by,
+            "layer": made.layer,
+            "form": made.form,
+            "scans": counts.scans,
+            "points": counts.points,
+            "unlabelled": counts.unlabelled,
+            "ids": {str(id): count for id, count in counts.ids.items()},
+        }
+        lines.append(
+            f"{counts.points - counts.unlabelled} of {counts.points} points of {counts.scans} "
+            f"scans labelled, {counts.unlabelled} ({share:.1f} %) without a label; in "
+            f"{made.folder}"
+        )
+    facts["seconds"] = round(time.monotonic() - started, 3)
+    print_result(facts, lines, json=command.json)
+
+
+def _check(command: Command) -> None:
+    if (command.label_scans is None) != (command.output is None):
+        raise InputError(
+            "label_scans, output: expected scans to label and a folder for their labels, got one "
+            "of the two."
+        )
+    if command.label_scans is None and command.form != "auto":
+        raise InputError("form: expected scans to label with it, got none.")
+
+
+def _scene(command: Command) -> tuple[Scene, Path]:
+    """The scene, and its folder."""
+    if is_scene(command.drive) and command.scene is None:
+        return open_scene(command.drive, command.data), command.drive
+    scene = open_drive(command.drive, scene=command.scene, data=command.data)
+    return scene, command.scene or command.drive
+
+
+def _field(
+    command: Command,
+    scene: Scene,
+    root: Path,
+    observer: ConsoleObserver,
+    *,
+    facts: dict[str, Any],
+    lines: list[str],
+) -> Renderable:
+    """The field of this name: read, where points are to be labelled by it, or made."""
+    name = command.inputs.field
+    there = name in scene_field_names(root)
+    if there and not command.overwrite:
+        if command.label_scans is not None:
+            return scene_field(scene, name)
+        raise InputError(
+            f"field: expected a new name, or overwrite, got {name!r}, which {root} has already."
+        )
+    with work_on_scene(root, "street", writes=["fields"]):
+        made = street_field(
+            scene,
+            options=command.inputs,
+            field_options=command.primitives,
+            backend=command.backend,
+            observer=observer,
+        )
+        path = save_street_field(made, root)
+    facts |= made.facts | {"file": path}
+    seconds = sum(made.timings.values())
+    lines += [
+        f"{len(made.field.mesh)} primitives with {len(made.field.model.ids)} classes, from "
+        f"{len(made.views)} views in {seconds:.1f} s; layer {made.layer}",
+        str(path),
+    ]
+    return made.field

@@ -1,0 +1,121 @@
+"""``splatseg street``: fields of drives, labels of scans, and one sentence for what is wrong."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FAST = ("--voxels", "2.0", "4.0", "--geometry-iterations", "1", "--iterations", "3", "--rays", "64")
+
+
+@pytest.fixture(scope="module")
+def made(generated_drive, tmp_path_factory) -> Path:
+    """A scene of the drive with a field; not to be changed."""
+    from splatseg.cli import main
+
+    root = tmp_path_factory.mktemp("street") / "scene"
+    words = ("street", generated_drive, "--scene", root, "--scans", generated_drive, *FAST)
+    assert main([str(word) for word in (*words, "--quiet")]) == 0
+    return root
+
+
+def test_the_field_is_in_the_scene_and_seen_from_the_command_line(
+    made, generated_drive, splatseg, tmp_path
+) -> None:
+    assert (made / "fields/street.safetensors").is_file()
+    status, out, _ = splatseg("info", made)
+    assert status == 0
+    assert "fields street" in out
+    status, out, _ = splatseg(
+        "render", made, "-o", tmp_path / "views", "--field", "street",
+        "--what", "rgb,labels_semantic", "--coloured", "--json",
+    )  # fmt: skip
+    assert status == 0
+    assert json.loads(out)["entries"] == ["rgb", "labels_semantic", "labels_semantic_coloured"]
+    status, out, _ = splatseg(
+        "evaluate", made, "--field", "street", "--layer", "labels_semantic",
+        "--truth", generated_drive / "semantic", "--json",
+    )  # fmt: skip
+    assert status == 0
+    scores = json.loads(out)
+    assert scores["field"] == "street"
+    assert {"mIoU", "PSNR"} <= set(scores)
+
+
+def test_scans_are_labelled_by_the_field(made, generated_drive, splatseg, tmp_path) -> None:
+    status, out, _ = splatseg(
+        "street", made, "--label-scans", generated_drive, "-o", tmp_path / "out", "--by", "mesh",
+        "--json", "--quiet",
+    )  # fmt: skip
+    assert status == 0
+    facts = json.loads(out)["labels"]
+    assert (facts["by"], facts["form"], facts["layer"]) == ("mesh", "npz", "labels_semantic")
+    assert facts["points"] == sum(facts["ids"].values()) + facts["unlabelled"]
+    shape = np.load(generated_drive / "lidar.npz")["range_2mm"].shape
+    assert np.load(tmp_path / "out/labels.npz")["semantic"].shape == shape
+    status, out, _ = splatseg(
+        "street", made, "--label-scans", generated_drive, "-o", tmp_path / "out", "--by", "mesh",
+        "--form", "label",
+    )  # fmt: skip
+    assert status == 0
+    assert f"of {facts['points']} points of 3 scans labelled, {facts['unlabelled']} (" in out
+    assert (tmp_path / "out/0001.label").is_file()
+
+
+def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path) -> None:
+    def refused(*words: object) -> str:
+        status, out, err = splatseg("street", *words, "--quiet")
+        assert (status, out, err.count("\n")) == (2, "", 1), err
+        return err
+
+    out = tmp_path / "out"
+    mesh = ("--label-scans", generated_drive, "-o", out, "--by", "mesh")
+    assert "expected a new name, or --overwrite, got 'street'" in refused(made)
+    assert "got one of the two" in refused(made, "--label-scans", generated_drive)
+    assert "got one of the two" in refused(made, "-o", out)
+    assert "--form: expected scans to label with it" in refused(made, "--form", "las")
+    assert "expected mesh for a scene without Gaussians" in refused(
+        made, "--label-scans", generated_drive, "-o", out, "--layer", "a"
+    )
+    assert "--scene: expected a scene folder to write" in refused(generated_drive)
+    assert "there is no such" in refused(tmp_path / "none")
+    assert "there is no such folder or file of scans" in refused(
+        made, "--label-scans", tmp_path / "none", "-o", out, "--by", "mesh"
+    )
+    assert "--voxels: expected positive lengths" in refused(made, "--voxels", "0")
+    assert "evidence: expected one of those at hand" in refused(
+        made, "--field", "b", "--evidence", "none"
+    )
+    # Half a file, as a disk that was full would leave it.
+    root = shutil.copytree(made, tmp_path / "half")
+    file = root / "fields/street.safetensors"
+    file.write_bytes(file.read_bytes()[:5000])
+    assert "street.safetensors" in refused(root, *mesh)
+    assert not out.exists()
+
+
+def test_damaged_scans_are_one_sentence(made, generated_drive, splatseg, tmp_path) -> None:
+    with np.load(generated_drive / "lidar.npz") as found:
+        arrays = dict(found)
+
+    def refused(**changes: object) -> str:
+        (tmp_path / "scans").mkdir(exist_ok=True)
+        left = {k: v for k, v in (arrays | changes).items() if v is not None}
+        np.savez(tmp_path / "scans/lidar.npz", **left)
+        words = ("--scans", tmp_path / "scans", "--field", "b", *FAST, "--quiet")
+        status, out, err = splatseg("street", made, *words)
+        assert (status, out, err.count("\n")) == (2, "", 1), err
+        return err
+
+    broken = arrays["range_2mm"].astype(np.float32) * 0.002
+    broken[0, 0, :3] = np.nan
+    assert "expected finite positions, got 3 of" in refused(range_2mm=None, range=broken)
+    assert "expected scans of a laser" in refused(lidar_to_world=None)
+    poses = arrays["lidar_to_world"].copy()
+    poses[0, 0, 3] = np.nan
+    assert "scan 0" in refused(lidar_to_world=poses)
+    near = np.where(arrays["range_2mm"] > 0, 5, 0).astype(np.uint16)
+    assert "scans" in refused(range_2mm=near) or "points" in refused(range_2mm=near)
+    assert not (made / "fields/b.safetensors").exists()

@@ -1,0 +1,107 @@
+"""The method dnmp: labels of Gaussians by the mesh field of the same drive."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splatseg.core import Gaussians
+from splatseg.errors import InputError
+from splatseg.io.captures import read_capture
+from splatseg.io.evidence import open_evidence
+from splatseg.io.scans import read_scans
+from splatseg.methods import MethodInputs, find_method, keeps_ids, method_names
+from splatseg.street.options import PUBLISHED, DnmpOptions
+
+QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=1, iterations=150, rays=256)
+
+
+@pytest.fixture(scope="module")
+def inputs(generated_drive) -> MethodInputs:
+    """Gaussians where lasers hit something, and one far away."""
+    capture, scans = read_capture(generated_drive), read_scans(generated_drive)
+    found = [scans.scan(name).points for name in scans.scan_names]
+    points = torch.cat([*found, torch.full((1, 3), 900.0)]).float()
+    rotations = torch.zeros(len(points), 4)
+    rotations[:, 0] = 1
+    gaussians = Gaussians(
+        means=points, rotations=rotations, scales=torch.full((len(points), 3), 0.25),
+        opacities=torch.full((len(points),), 0.9), sh=torch.zeros(len(points), 1, 3),
+    )  # fmt: skip
+    return MethodInputs(
+        gaussians=gaussians, views=capture.train_views[::2], classes=capture.classes,
+        evidence=open_evidence(generated_drive / "labels_semantic"), backend="cpu",
+        metres_per_unit=capture.metres_per_unit, up=capture.up,
+    )  # fmt: skip
+
+
+def test_it_is_found_by_its_name() -> None:
+    method = find_method("dnmp")
+    assert "dnmp" in method_names()
+    assert keeps_ids("dnmp")
+    assert (method.evidence, method.returns, method.seeded) == (("labels",), "labels", True)
+    assert method.published_options == PUBLISHED
+    assert method.published_options.radiance.iterations == 50_000
+    assert method.published_options.geometry.iterations == 5000
+
+
+def test_gaussians_take_the_labels_of_the_field_and_far_ones_none(inputs, generated_drive) -> None:
+    steps: list[int] = []
+    told = replace(inputs, progress=lambda done, total: steps.append(done))
+    labels = find_method("dnmp").run(told, QUICK)
+    scans = read_scans(generated_drive)
+    truth = torch.cat([scans.scan(name).labels["semantic"] for name in scans.scan_names])
+    ids = labels.ids
+    assert len(ids) == len(inputs.gaussians)
+    assert int(ids[-1]) == -1
+    assert float(labels.confidence[-1]) == 0
+    assert float((ids[:-1] == truth).float().mean()) > 0.5
+    sky = max(row.id for row in inputs.classes.rows)
+    assert labels.background == sky
+    assert labels.info.method == "dnmp"
+    assert labels.info.names[1] == "road"
+    assert steps == sorted(steps)
+    assert steps[-1] == 1000
+
+
+def test_without_gaussians_there_is_nothing_to_label(inputs) -> None:
+    none = inputs.gaussians[torch.zeros(0, dtype=torch.int64)]
+    with pytest.raises(InputError, match="^gaussians: expected Gaussians to label, got none"):
+        find_method("dnmp").run(replace(inputs, gaussians=none), QUICK)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"setting": "slow"}, "setting: expected one of"),
+        ({"coarse": "all"}, "coarse: expected one of"),
+        ({"start": "cube"}, "start: expected one of"),
+        ({"voxels": ()}, "voxels: expected positive lengths"),
+        ({"voxels": (0.5, -1.0)}, "voxels: expected positive lengths"),
+        ({"iterations": 0}, "iterations: expected 1 or more, got 0"),
+        ({"rays": 0}, "rays: expected 1 or more"),
+        ({"geometry_iterations": -1}, "geometry_iterations: expected 0 or more"),
+        ({"carve": 0.0}, "carve: expected a positive number"),
+        ({"radius": float("nan")}, "radius: expected a positive number"),
+        ({"semantic_weight": -1.0}, "semantic_weight: expected 0 or more"),
+        ({"memory": -1}, "memory: expected 0 or more"),
+    ],
+)
+def test_options_check_themselves(values: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=f"^{words}"):
+        DnmpOptions(**values)
+
+
+def test_every_option_reaches_the_stage_that_it_is_of() -> None:
+    given = DnmpOptions(
+        geometry_iterations=7, carve=0.9, iterations=11, rays=33, semantic_weight=0.4, memory=99
+    )
+    assert (given.geometry.iterations, given.geometry.carve) == (7, 0.9)
+    radiance = given.radiance
+    assert (radiance.iterations, radiance.rays, radiance.semantic_weight) == (11, 33, 0.4)
+    assert radiance.cache_memory == 99
+    fast, published = DnmpOptions(), DnmpOptions(setting="published")
+    assert fast.geometry.carve == 0.5
+    assert published.geometry.carve > 1
+    assert published.radiance.width == 256 > fast.radiance.width
+    assert replace(published, iterations=5).radiance.iterations == 5
