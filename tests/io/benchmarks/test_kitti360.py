@@ -8,10 +8,11 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.benchmarks import find_layout, read_benchmark
 from splatseg.io.benchmarks import kitti360 as layout
 from splatseg.io.benchmarks.kitti360 import EVALUATED, read_true_points
+from splatseg.io.scans import find_scans, read_scans
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence
 from support.benchmark_layouts.kitti360 import write_window
-from support.kitti import DRIVE, HEIGHT, WIDTH, picture, write_drive
+from support.kitti import DRIVE, HEIGHT, WIDTH, picture, write_bin, write_drive
 
 WINDOW = "0000000002_0000000005"
 XYZ = np.arange(15.0).reshape(5, 3)
@@ -91,11 +92,17 @@ def test_windows_of_several_drives(root, monkeypatch) -> None:
     ]
     assert len(scenes[1].capture.views) == 6
     folder = root / "data_2d_raw" / other
+    for frame in range(6):
+        name = f"data_3d_raw/{other}/velodyne_points/data/{frame:010d}.bin"
+        write_bin(root / name, [[1, 2, 3, 4]])
     assert len(read_benchmark("kitti360", folder)) == 2
     for path in (folder / "3_5", folder / "image_00" / "3_5"):
         (alone,) = read_benchmark("kitti360", path)
         assert find_layout(path) == "kitti360"
         assert len(alone.points.points) == 5
+        # Its path names the window's scans too; labelled points are no scans of the photographs.
+        assert find_scans(alone.capture.path) == "kitti360"
+        assert len(read_scans(alone.capture.path)) == 3
     monkeypatch.setattr(layout, "MAX_POINTS", 9)
     with pytest.raises(InputError, match=r"at most 9 labelled points together, got 10 of 2 windo"):
         read_benchmark("kitti360", folder)

@@ -86,6 +86,8 @@ def test_a_window_is_named_behind_the_drive(root) -> None:
     capture = read_capture(window)
     assert sorted({view.name[-1] for view in capture.views}) == ["2", "3", "4"]
     assert "frames 2 to 4 of the drive" in capture.notes
+    assert capture.path == window
+    assert len(read_capture(capture.path).views) == len(capture.views)
     alone = read_capture(window.parent / "image_01" / "2_3")
     assert [view.name for view in alone.views] == ["0000000002", "0000000003"]
     with pytest.raises(InputError, match=r"got 0 frames from 90 to 95 of which none has a pose"):

@@ -25,6 +25,7 @@ from splatseg.io.captures.kitti360_drive import (
     drive_at,
     find_drive,
     read_poses,
+    window_name,
     window_of,
 )
 from splatseg.io.captures.replica import inverse_pose
@@ -115,7 +116,9 @@ def read_kitti360(path: Path, *, strict: bool = False) -> Capture:
         notes=_notes(drive, cameras, left_out=len(frames) - len(posed)),
         strict=strict,
     )
-    return replace(capture, metres_per_unit=1.0, up=(0.0, 0.0, 1.0))
+    # The path of a window names it again, for what is read beside the photographs.
+    named = drive.folder if drive.window is None else drive.folder / window_name(drive.window)
+    return replace(capture, path=named, metres_per_unit=1.0, up=(0.0, 0.0, 1.0))
 
 
 def static_windows(drive: Drive, *, part: str = "static") -> dict[tuple[int, int], Path]:
