@@ -1,0 +1,126 @@
+"""Hits that are kept: compressed within the step, in files as in memory, and never half of them."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.errors import FileFormatError, InputError
+from splatseg.street.hits import MeshCaster, MeshHits
+from splatseg.street.radiance.cache import CachedHits, cached_hits, read_hits
+from street.radiance.scene import two_balls
+
+
+def found() -> list[MeshHits]:
+    rng = torch.Generator().manual_seed(0)
+    caster = MeshCaster(two_balls())
+    directions = torch.randn(90, 3, generator=rng) * 0.3 + torch.tensor([0.0, 0, 1])
+    return [
+        caster.hits(torch.tensor([0.0, 0, -5]), part, max_hits=4) for part in directions.split(40)
+    ]
+
+
+def same(one: CachedHits, two: CachedHits) -> bool:
+    return (
+        torch.equal(one.starts, two.starts)
+        and np.array_equal(one.faces, two.faces)
+        and np.array_equal(one.weights, two.weights)
+    )
+
+
+def refuse() -> Iterator[MeshHits]:
+    raise RuntimeError("asked again")
+    yield
+
+
+def test_hits_come_back_ray_by_ray_within_a_step_of_their_weights() -> None:
+    parts = found()
+    kept = cached_hits(parts, memory=1 << 20, folder=None, identity="a")
+    rays = torch.tensor([80, 3, 3, 41])
+    places, faces, weights = kept.of(rays, 4)
+    all_faces = torch.cat([part.faces for part in parts])[rays].reshape(-1)
+    all_weights = torch.cat([part.weights for part in parts])[rays].reshape(-1, 3)
+    assert torch.equal(places, (all_faces >= 0).nonzero()[:, 0])
+    assert torch.equal(faces, all_faces[places])
+    assert float((weights - all_weights[places]).abs().max()) < 2 / 65535
+    assert torch.allclose(weights.sum(dim=1), torch.ones(len(weights)), atol=1e-5)
+    assert kept.folder is None
+    assert kept.nbytes == 8 * kept.hits
+
+
+@pytest.mark.parametrize("memory", [0, 500])
+def test_in_files_they_are_the_same_as_in_memory(tmp_path: Path, memory: int) -> None:
+    in_memory = cached_hits(found(), memory=1 << 20, folder=None, identity="a")
+    in_files = cached_hits(found(), memory=memory, folder=tmp_path / "hits", identity="a")
+    again = cached_hits(refuse(), memory=memory, folder=tmp_path / "hits", identity="a")
+    assert in_files.folder == again.folder == tmp_path / "hits"
+    assert same(in_memory, in_files)
+    assert same(in_memory, again)
+    again.close()
+    assert (tmp_path / "hits").is_dir()
+
+
+def test_temporary_files_go_with_it() -> None:
+    kept = cached_hits(found(), memory=0, folder=None, identity="a")
+    assert kept.folder is not None
+    assert kept.folder.is_dir()
+    kept.close()
+    assert not kept.folder.exists()
+    assert not kept.folder.parent.exists()
+
+
+def test_hits_of_something_else_are_found_again(tmp_path: Path) -> None:
+    cached_hits(found()[:1], memory=0, folder=tmp_path / "hits", identity="a")
+    with pytest.raises(FileFormatError, match="hits of these rays"):
+        read_hits(tmp_path / "hits", identity="b")
+    other = cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="b")
+    assert same(other, cached_hits(found(), memory=1 << 20, folder=None, identity="b"))
+
+
+@pytest.mark.parametrize("name", ["counts.bin", "faces.bin", "weights.bin"])
+def test_half_a_file_is_refused_and_found_again(tmp_path: Path, name: str) -> None:
+    whole = cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+    path = tmp_path / "hits" / name
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(FileFormatError, match=name):
+        read_hits(tmp_path / "hits", identity="a")
+    again = cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+    assert again.hits == whole.hits
+    assert read_hits(tmp_path / "hits", identity="a").hits == whole.hits
+
+
+@pytest.mark.parametrize("change", [{"rays": -1}, {"rays": "9"}, {"hits": None}, {"version": 2}])
+def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
+    cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+    header = tmp_path / "hits" / "cache.json"
+    header.write_text(json.dumps(json.loads(header.read_text()) | change))
+    with pytest.raises(FileFormatError):
+        read_hits(tmp_path / "hits", identity="a")
+
+
+def test_counts_that_do_not_add_up_are_refused(tmp_path: Path) -> None:
+    cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+    path = tmp_path / "hits" / "counts.bin"
+    path.write_bytes(bytes(len(path.read_bytes())))
+    with pytest.raises(FileFormatError, match="counts"):
+        read_hits(tmp_path / "hits", identity="a")
+
+
+def test_an_interrupted_search_leaves_nothing(tmp_path: Path) -> None:
+    def broken() -> Iterator[MeshHits]:
+        yield found()[0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cached_hits(broken(), memory=0, folder=tmp_path / "hits", identity="a")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="cache_folder"):
+        cached_hits(found(), memory=0, folder=tmp_path, identity="a")
+    assert (tmp_path / "mine.txt").read_text() == "mine"
