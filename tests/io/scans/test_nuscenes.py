@@ -205,3 +205,11 @@ def test_two_versions_of_tables(tmp_path) -> None:
     (tmp_path / "v1.0-test" / "sample_data.json").write_text("[]")
     with pytest.raises(InputError, match=r"one version of tables, got 2 \(v1.0-mini, v1.0-test\)"):
         read_scans(tmp_path)
+
+
+def test_links_that_are_no_tokens_lead_nowhere(tmp_path) -> None:
+    """A row whose sensor is a list is of no laser; one whose pose is one has no pose."""
+    write(tmp_path, **changed("sample_data", "calibrated_sensor_token", ["c-lidar"]))
+    assert len(read_scans(tmp_path)) == 1
+    with pytest.raises(FileFormatError, match=r"ego_pose_token of a row that is there, got \['e"):
+        read_scans(write(tmp_path, **changed("sample_data", "ego_pose_token", ["e-a"])))

@@ -119,7 +119,8 @@ def _sweeps(root: Path, version: Path) -> dict[str, _Sweep]:
         version / "sample_data.json",
         ("sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp"),
         kept=lambda row: (
-            row.get("is_key_frame") is True and row.get("calibrated_sensor_token") in mounted
+            row.get("is_key_frame") is True
+            and _is_one_of(row.get("calibrated_sensor_token"), mounted)
         ),
     )
     asked = {token for row in data.values() if isinstance(token := row["ego_pose_token"], str)}
