@@ -49,7 +49,7 @@ ROWS = {
     "default": DEFAULT,
     "published": PUBLISHED_GEOMETRY,
     "regularised": replace(DEFAULT, normal_weight=0.1, laplacian_weight=0.1),
-    "plane": replace(DEFAULT, error="plane"),
+    "ray": replace(DEFAULT, error="ray"),
     "truncation": replace(DEFAULT, truncation=2.0),
     "distance": replace(DEFAULT, distance_power=1.0),
     "carve": replace(DEFAULT, carve=0.9),

@@ -17,10 +17,10 @@ plane of the triangle, |t - d| times the cosine between ray and normal."""
 class GeometryOptions:
     """How primitives are fitted to depth (eq. 2). Lengths are metres."""
 
-    iterations: int = 400
+    iterations: int = 200
     """Steps of the optimiser, 0 or more."""
 
-    rays: int = 65536
+    rays: int = 32768
     """Rays of a step."""
 
     refresh: int = 20
@@ -49,7 +49,7 @@ class GeometryOptions:
     depth_weight: float = 1.0
     """Factor of the error of depth; it counts beside regularisers."""
 
-    error: ErrorKind = "ray"
+    error: ErrorKind = "plane"
     """What is minimised."""
 
     truncation: float = math.inf
@@ -105,6 +105,7 @@ PUBLISHED_GEOMETRY = GeometryOptions(
     offset_rate=5e-4,
     final_rate=0.999999**5000,
     depth_weight=0.05,
+    error="ray",
 )
 """The paper's iterations and rays, and the rates of the public code of DNMP, which rasterises its
 meshes in each step where first hits are searched every 100 here."""
