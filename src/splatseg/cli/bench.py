@@ -169,7 +169,7 @@ def _facts(done: BenchRun, paths: tuple[Path, ...]) -> dict[str, object]:
 
 
 def _print_table(done: BenchRun) -> None:
-    columns, rows = bench_table(done, notes=False)
+    columns, rows = bench_table(done, notes=False, classes=False)
     table = Table(*columns, title=f"{done.protocol.name}: {done.protocol.summary}")
     for column in table.columns[1:-1]:
         column.justify = "right"

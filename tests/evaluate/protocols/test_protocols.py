@@ -12,6 +12,7 @@ from splatseg.evaluate.protocols import (
     PointSwitches,
     RoomSwitches,
     SpokenSwitches,
+    StreetSwitches,
     TargetSwitches,
     differences,
     find_protocol,
@@ -201,3 +202,37 @@ def test_words_of_scenes_are_a_recorded_choice() -> None:
 def test_words_of_scenes_that_say_nothing(given, message) -> None:
     with pytest.raises(InputError, match=f"^scene_words: {message}"):
         SpokenSwitches(prompt="words", scene_words=given)
+
+
+def test_streets_are_one_experiment_but_for_the_data_set() -> None:
+    kitti, waymo = (find_protocol(name) for name in ("kitti360", "waymo"))
+    assert kitti.switches == waymo.switches
+    assert isinstance(kitti.switches, StreetSwitches)
+    assert (kitti.switches.undefined, kitti.switches.classes) == ("wrong", "table-1")
+    typed = dict(
+        switch_value(kitti, text)
+        for text in ("points=region,views", "radius=1", "undefined=skipped", "scans=no", "sky=no")
+    )
+    other = kitti.with_switches(typed).switches
+    assert isinstance(other, StreetSwitches)
+    assert (other.points, other.radius, other.undefined) == (("region", "views"), 1.0, "skipped")
+    assert (other.scans, other.sky) == (False, False)
+    assert len(differences(kitti.switches, other)) == 5
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"points": ("nearest",)}, InputError, "points: expected one of"),
+        ({"points": ()}, InputError, "points: expected each rule once"),
+        ({"points": ("views", "views")}, InputError, "points: expected each rule once"),
+        ({"radius": 0.0}, RangeError, "radius: expected a positive number"),
+        ({"undefined": "kept"}, InputError, "undefined: expected one of"),
+        ({"classes": "mine"}, InputError, "classes: expected one of"),
+        ({"averaging": "pooled"}, InputError, "averaging: drives are averaged over"),
+        ({"missing": "skipped"}, InputError, "missing: a pixel without a label is wrong"),
+    ],
+)
+def test_switches_of_streets_that_cannot_be(changes, error, message) -> None:
+    with pytest.raises(error, match=message):
+        find_protocol("kitti360").with_switches(changes)

@@ -12,10 +12,14 @@ from splatseg.evaluate.protocols._protocol import switch_value as switch_value
 from splatseg.evaluate.protocols._published import PublishedFigure as PublishedFigure
 from splatseg.evaluate.protocols._scene_lists import SCENE_LISTS as SCENE_LISTS
 from splatseg.evaluate.protocols._scene_lists import SceneList as SceneList
+from splatseg.evaluate.protocols._streets import SKY as SKY
+from splatseg.evaluate.protocols._streets import TABLE_1 as TABLE_1
+from splatseg.evaluate.protocols._streets import merged_name as merged_name
 from splatseg.evaluate.protocols._switches import MapSwitches as MapSwitches
 from splatseg.evaluate.protocols._switches import PointSwitches as PointSwitches
 from splatseg.evaluate.protocols._switches import RoomSwitches as RoomSwitches
 from splatseg.evaluate.protocols._switches import SpokenSwitches as SpokenSwitches
+from splatseg.evaluate.protocols._switches import StreetSwitches as StreetSwitches
 from splatseg.evaluate.protocols._switches import Switches as Switches
 from splatseg.evaluate.protocols._switches import TargetSwitches as TargetSwitches
 from splatseg.evaluate.protocols._switches import differences as differences

@@ -9,6 +9,7 @@ from splatseg.errors import InputError
 from splatseg.evaluate.protocols._protocol import Protocol
 from splatseg.evaluate.protocols._rooms import ROOMS
 from splatseg.evaluate.protocols._scene_lists import SCENE_LISTS
+from splatseg.evaluate.protocols._streets import STREETS
 from splatseg.evaluate.protocols._switches import (
     MapSwitches,
     PointSwitches,
@@ -218,6 +219,7 @@ PROTOCOLS: tuple[Protocol, ...] = (
         "the open-vocabulary voxel paper: mIoU and frequency-weighted IoU",
     ),
     *ROOMS,
+    *STREETS,
 )  # fmt: skip
 """All of them, in the order of the documentation."""
 

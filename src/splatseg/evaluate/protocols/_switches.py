@@ -21,6 +21,12 @@ Threshold = Literal["fixed", "reference", "oracle"]
 evaluated, which no user has."""
 
 
+POINT_RULES = ("field", "views", "density", "region", "fair")
+"""How points take labels. field: by the method's own field that is no Gaussians (eq. 9). views:
+from what views show at them and from their shapes. density: from the Gaussians around them.
+region: by the majority of centres in a ball, as published. fair: the same, where a centre's vote
+is how much all views saw it."""
+
 _SAMPLED = ("positive_share", "negative_share")
 
 
@@ -239,6 +245,47 @@ class PointSwitches(Switches):
         check_range("min_opacity", self.min_opacity, 0.0, 1.0)
         if self.frame_step < 1:
             raise RangeError(f"frame_step: expected 1 or more, got {self.frame_step}.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreetSwitches(Switches):
+    """Choices of a drive along a street: points of lasers, and views that were held out."""
+
+    points: tuple[str, ...] = ("field", "views", "region", "fair")
+    """By which rules points take labels, a row of the table each, of `POINT_RULES`; a method is
+    run by those of them that it has."""
+
+    radius: float = 0.5
+    """Of the balls of regions, metres."""
+
+    undefined: Missing = "wrong"
+    """What a point without a label counts as: nothing right, or as if it were not asked."""
+
+    classes: Literal["table-1", "own"] = "table-1"
+    """table-1: all classes are merged to the 13 of the paper's Table 1, and sky. own: those of the
+    data set."""
+
+    sky: bool = True
+    """Whether sky is one of the classes of views; points have none."""
+
+    scans: bool = True
+    """Whether fits take the scans of the layout, where it has any."""
+
+    def __post_init__(self) -> None:
+        Switches.__post_init__(self)
+        for rule in self.points:
+            check_choice("points", rule, POINT_RULES)
+        if not self.points or len(set(self.points)) != len(self.points):
+            raise InputError(f"points: expected each rule once, got {', '.join(self.points)!r}.")
+        if not self.radius > 0:
+            raise RangeError(f"radius: expected a positive number, got {self.radius}.")
+        check_choice("undefined", self.undefined, ("wrong", "skipped"))
+        check_choice("classes", self.classes, ("table-1", "own"))
+        # What would change nothing is no choice.
+        if self.averaging != "scenes":
+            raise InputError(f"averaging: drives are averaged over, got {self.averaging!r}.")
+        if self.missing != "wrong":
+            raise InputError(f"missing: a pixel without a label is wrong, got {self.missing!r}.")
 
 
 def recorded(switches: Switches) -> dict[str, Any]:

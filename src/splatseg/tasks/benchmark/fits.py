@@ -14,12 +14,14 @@ from splatseg.evaluate.protocols import (
     PointSwitches,
     Protocol,
     RoomSwitches,
+    StreetSwitches,
     TargetSwitches,
 )
 from splatseg.io.benchmarks.replica import LAYOUT as REPLICA
 from splatseg.io.benchmarks.replica import SEQUENCES
 from splatseg.io.captures.replica import TRAIN_EVERY
 from splatseg.io.paths import path_inside
+from splatseg.io.scans import find_scans
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.render import BackendName
@@ -54,6 +56,9 @@ def fitted_scene(
         _check_views(scene, bench, protocol)
         return scene
     fit_options = options.fit_options(fixed=fixed)
+    scans = scans_of(bench, protocol)
+    if scans is not None:
+        fit_options = replace(fit_options, depth="metric")
     folder = path_inside(root, SCENES_FOLDER, _kind(bench, protocol, fixed=fixed), bench.name)
     capture = _capture(bench, protocol, fixed=fixed)
     if not is_scene(folder) or (folder / CHECKPOINT_FILE).is_file():
@@ -61,7 +66,9 @@ def fitted_scene(
             capture,
             folder,
             options=MakeSceneOptions(
-                preset=options.preset, resume=(folder / CHECKPOINT_FILE).is_file()
+                preset=options.preset,
+                resume=(folder / CHECKPOINT_FILE).is_file(),
+                scans=scans,
             ),
             fit_options=fit_options,
             backend=backend,
@@ -80,13 +87,22 @@ def held_out_views(bench: BenchmarkScene, protocol: Protocol) -> frozenset[str]:
     """Names of the views that a fit must not learn from.
 
     Of things that are asked for they are the scored ones, else those of the data set's split, or
-    every so many where it has none. Of rooms they are the frames between those that are fitted.
+    every so many where it has none. Of rooms they are the frames between those that are fitted, of
+    streets those of the layout's split.
+
+    Raises:
+        InputError: If a drive holds none out.
     """
     if protocol.switches.scored_in_training:
         return frozenset()
     if isinstance(protocol.switches, RoomSwitches):
         splits = walk_splits(bench.capture, protocol.switches.train_every)
         return frozenset(name for name, split in splits.items() if split == "test")
+    if isinstance(protocol.switches, StreetSwitches):
+        tests = frozenset(view.name for view in bench.capture.test_views)
+        if not tests:
+            raise InputError(f"scene {bench.name}: expected held-out views, got none.")
+        return tests
     if isinstance(protocol.switches, MapSwitches):
         own = frozenset(view.name for view in bench.capture.test_views)
         names = sorted(view.name for view in bench.capture.views)
@@ -98,6 +114,18 @@ def held_out_views(bench: BenchmarkScene, protocol: Protocol) -> frozenset[str]:
         if one is not None
     }
     return frozenset(true.view for task in bench.tasks for true in task.truth) - prompts
+
+
+def scans_of(bench: BenchmarkScene, protocol: Protocol) -> Path | None:
+    """Where the scans of a drive are that its fit takes; None where it has none, or takes none."""
+    path = bench.capture.path
+    if not (isinstance(protocol.switches, StreetSwitches) and protocol.switches.scans):
+        return None
+    try:
+        find_scans(path)
+    except InputError:  # of no layout that is known: the drive has photographs alone
+        return None
+    return path
 
 
 def gaussians_digest(scene: Scene) -> str:

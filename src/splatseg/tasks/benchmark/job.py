@@ -37,6 +37,14 @@ class Job:
     backend: BackendName
     observer: Observer
 
+    rule: str | None = None
+    """By which rule points take labels, where the protocol has several."""
+
+    @property
+    def row(self) -> str:
+        """What its row of the table is called."""
+        return self.method.name if self.rule is None else f"{self.method.name}-{self.rule}"
+
     def seen(self, *, words: bool = False) -> Seen:
         """Evidence for the method, of the first model that gives what it takes."""
         return seen_for(

@@ -2,8 +2,8 @@
 
 import importlib.metadata
 import time
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from splatseg.evaluate.protocols import (
     PointSwitches,
     Protocol,
     RoomSwitches,
+    StreetSwitches,
     TargetSwitches,
     find_protocol,
     mask_scores,
@@ -53,7 +54,11 @@ from splatseg.tasks.benchmark.sight import (
     evidence_wanted,
     kinds_wanted,
 )
+from splatseg.tasks.benchmark.streets import Drive, point_rules
 from splatseg.tasks.benchmark.targets import TargetRun
+
+_Scorer = Callable[[Job], tuple[dict[str, float], Sequence[Mapping[str, Any]], list[str]]]
+"""Scores, rows and notes of a job."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,7 +134,7 @@ def bench(
                 kinds = kinds_wanted(chosen, method)
                 chosen_model(method, one, words=wanted == "words", kinds=kinds, options=options)
     prompter, grounder = _models(chosen, options, observer)
-    found: dict[str, list[SceneResult]] = {method.name: [] for method in methods}
+    found: dict[str, list[SceneResult]] = {}
     kept = 0
     for one in scenes:
         for note in one.notes if one.notes != one.capture.notes else ():
@@ -145,9 +150,10 @@ def bench(
                 prompter=prompter, grounder=grounder, options=options, backend=backend,
                 observer=observer,
             )  # fmt: skip
-            result, was_kept = _result(job, digest, command)
-            found[method.name].append(result)
-            kept += was_kept
+            for row, scored in _rows(job):
+                result, was_kept = _result(row, scored, digest, command)
+                found.setdefault(row.row, []).append(result)
+                kept += was_kept
     measured = [over_scenes(chosen, name, results) for name, results in found.items()]
     others = [one for root in options.beside for one in results_of(root, chosen)]
     for one in others:
@@ -162,21 +168,30 @@ def bench(
     )
 
 
-def _result(job: Job, digest: str, command: str) -> tuple[SceneResult, bool]:
+def _rows(job: Job) -> list[tuple[Job, "_Scorer"]]:
+    """Rows of the table that a method has, each with who scores it."""
+    if not isinstance(job.protocol.switches, StreetSwitches):
+        return [(job, _scored)]
+    drive = Drive(job)
+    rules = point_rules(job.protocol, job.method, job.bench)
+    return [(replace(job, rule=rule), drive.scores) for rule in rules]
+
+
+def _result(job: Job, scored: "_Scorer", digest: str, command: str) -> tuple[SceneResult, bool]:
     """The result of a method in a scene, and whether it was there."""
     made = _made_from(job, digest)
     key = key_of(made)
-    path = result_path(job.root, job.protocol.name, job.method.name, job.bench.name)
+    path = result_path(job.root, job.protocol.name, job.row, job.bench.name)
     before = None if job.options.again else kept_result(path, key)
     if before is not None:
-        job.observer.info(f"{job.bench.name}, {job.method.name}: as it was measured before")
+        job.observer.info(f"{job.bench.name}, {job.row}: as it was measured before")
         return before, True
     began = time.monotonic()
-    scores, rows, notes = _scored(job)
+    scores, rows, notes = scored(job)
     result = SceneResult(
         protocol=job.protocol.name,
         scene=job.bench.name,
-        method=job.method.name,
+        method=job.row,
         scores=scores,
         rows=tuple(rows),
         switches=switches_of(job.protocol),
@@ -188,9 +203,9 @@ def _result(job: Job, digest: str, command: str) -> tuple[SceneResult, bool]:
     save_result(result, path)
     figure = scores.get(job.protocol.measure)
     shown = "not measured" if figure is None else f"{figure:.4f}"
-    job.observer.info(f"{job.bench.name}, {job.method.name}: {job.protocol.measure} {shown}")
+    job.observer.info(f"{job.bench.name}, {job.row}: {job.protocol.measure} {shown}")
     for note in notes:
-        job.observer.note(f"{job.bench.name}, {job.method.name}: {note.rstrip('.')}")
+        job.observer.note(f"{job.bench.name}, {job.row}: {note.rstrip('.')}")
     return result, False
 
 
@@ -227,6 +242,7 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
     # Left out where there is none: results of versions that did not know it stay what they are.
     given = bool(method.companions) and bool(job.options.companions)
     companions = {"companions": list(job.options.companions)} if given else {}
+    rule = {} if job.rule is None else {"rule": job.rule}
     return plain_object(
         "made",
         {
@@ -239,6 +255,7 @@ def _made_from(job: Job, digest: str) -> dict[str, Any]:
             "seed": job.options.seed,
             "models": list(job.options.models),
             **companions,
+            **rule,
             "prompter": _recorded_model(job.prompter),
             "grounder": _recorded_model(job.grounder),
             "gaussians": digest,

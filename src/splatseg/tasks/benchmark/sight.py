@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 from splatseg.core import Model, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.errors import InputError
-from splatseg.evaluate.protocols import Protocol, RoomSwitches, TargetSwitches
+from splatseg.evaluate.protocols import Protocol, RoomSwitches, StreetSwitches, TargetSwitches
 from splatseg.io.evidence import TEXT_FILE, EvidenceKind, evidence_header, open_evidence
 from splatseg.methods import Method
 from splatseg.models import What, find_family, model_names
@@ -210,9 +210,11 @@ def kinds_wanted(protocol: Protocol, method: Method) -> tuple[EvidenceKind, ...]
     """Kinds of evidence that will do; None where any will that the method takes.
 
     In rooms every pixel needs a class: label maps of classes, or segments whose class is known,
-    which tell things apart as well.
+    which tell things apart as well. Along streets classes are all that counts.
     """
     switches = protocol.switches
+    if isinstance(switches, StreetSwitches):
+        return ("features",) if method.evidence == ("features",) else ("labels",)
     if not isinstance(switches, RoomSwitches):
         return None
     if switches.task == "panoptic":

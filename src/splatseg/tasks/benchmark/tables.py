@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatseg.evaluate.protocols import PublishedFigure, published_figures
+from splatseg.evaluate.protocols import TABLE_1, PublishedFigure, published_figures
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import write_json
 from splatseg.io.paths import path_inside
@@ -18,7 +18,7 @@ _KINDS = (".md", ".csv", ".tex")
 
 
 def bench_table(
-    run: BenchRun, *, notes: bool = True
+    run: BenchRun, *, notes: bool = True, classes: bool = True
 ) -> tuple[tuple[str, ...], list[tuple[Cell, ...]]]:
     """Names of columns, and a row a method: measured ones first, then published ones.
 
@@ -29,10 +29,13 @@ def bench_table(
     Args:
         run: What was measured.
         notes: Whether sources of published figures come with what is known of their settings.
+        classes: Whether figures of single classes of streets have columns.
     """
     published = published_figures(run.protocol.name)
     means = [one for one in published if one.scene is None] or list(published)
     measures = list(dict.fromkeys(name for one in (*run.methods, *means) for name in one.scores))
+    if not classes:
+        measures = [name for name in measures if name not in TABLE_1]
     scenes = list(dict.fromkeys(one.scene for method in run.methods for one in method.scenes))
     if len(scenes) < 2:
         scenes = []

@@ -16,6 +16,7 @@ from splatseg.evaluate.protocols.published import (
     _ovs_3d,
     _scannet,
     _spin_nerf,
+    _streets,
     _views,
 )
 
@@ -42,6 +43,8 @@ _FIGURES = MappingProxyType(
         "cosseg-replica-panoptic": _cosseg.REPLICA_PANOPTIC,
         "cosseg-scannet-semantic": _cosseg.SCANNET_SEMANTIC,
         "cosseg-scannet-panoptic": _cosseg.SCANNET_PANOPTIC,
+        "kitti360": _streets.KITTI360,
+        "waymo": _streets.WAYMO,
     }
 )
 

@@ -1,0 +1,270 @@
+"""Protocols of streets end to end on a tiny drive in the layouts of KITTI-360 and Waymo."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import Gaussians, Scene
+from splatseg.core.benchmark import BenchmarkScene
+from splatseg.core.sh import SH_C0
+from splatseg.errors import InputError, RangeError
+from splatseg.evaluate.protocols import TABLE_1, find_protocol, merged_name
+from splatseg.io.benchmarks import read_benchmark
+from splatseg.io.scene import load_scene, save_scene
+from splatseg.methods import Method, register_method, uplift
+from splatseg.methods import _registry as registry
+from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, load_result
+from splatseg.tasks.benchmark.fits import scans_of
+from splatseg.tasks.scene_parts import scene_field
+from support.benchmark_layouts import read_source, write_layout
+from support.benchmark_layouts.evidence import write_evidence
+
+LAYOUTS = ("kitti360", "waymo")
+NAME = "labels_semantic"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Set:
+    """A data set with evidence, and a fit."""
+
+    scene: BenchmarkScene
+    folder: Path
+    fit: Path
+
+
+@pytest.fixture(scope="module")
+def sets(generated_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Set]:
+    """The drive in a layout, with a Gaussian at every point of the truth; not to be changed."""
+    made: dict[str, Set] = {}
+
+    def of(layout: str) -> Set:
+        if layout not in made:
+            root = tmp_path_factory.mktemp(layout)
+            folder = write_layout(layout, generated_drive, root / "set")
+            (scene,) = read_benchmark(layout, folder)
+            write_evidence(read_source(generated_drive), scene.capture, NAME, root / "evidence")
+            fit = root / "fit"
+            views = scene.capture.views
+            save_scene(
+                Scene(
+                    gaussians=gaussians_of(scene), views=views, metres_per_unit=1.0,
+                    source=scene.capture.path,
+                ),
+                fit,
+            )  # fmt: skip
+            made[layout] = Set(scene=scene, folder=folder, fit=fit)
+        return made[layout]
+
+    return of
+
+
+def gaussians_of(scene: BenchmarkScene) -> Gaussians:
+    assert scene.points is not None
+    means = scene.points.points.float()
+    gaps = torch.cdist(means, means).topk(4, largest=False).values[:, 3:]
+    return Gaussians(
+        means=means,
+        rotations=torch.tensor([[1.0, 0, 0, 0]]).repeat(len(means), 1),
+        scales=0.6 * gaps.clamp(0.05, 0.5).repeat(1, 3),
+        opacities=torch.full((len(means),), 0.97),
+        sh=torch.full((len(means), 1, 3), 0.1 / SH_C0),
+    )
+
+
+@pytest.fixture
+def run(sets: Callable[[str], Set], tmp_path: Path) -> Callable[..., BenchRun]:
+    """Runs uplift on a copy of the fit; what it found."""
+
+    def go(layout: str, *switches: str, **options: Any) -> BenchRun:
+        data = sets(layout)
+        fit = tmp_path / "fit"
+        if not fit.exists():
+            shutil.copytree(data.fit, fit)
+        given: dict[str, Any] = {
+            "models": (str(data.fit.parent / "evidence" / NAME),),
+            "fitted": str(fit),
+            "switches": ("points=views,density,region,fair", *switches),
+        }
+        return bench(layout, data.folder, tmp_path / "out", options=BenchOptions(**given | options))
+
+    return go
+
+
+def only(run: BenchRun, row: str) -> dict[str, float]:
+    return dict(next(one for one in run.methods if one.method == row).scores)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_row_a_rule_and_scores_of_another_scorer(layout, run, tmp_path, score) -> None:
+    """The table has Table 1's classes; points are as in files, which another scorer reads."""
+    done = run(layout)
+    assert [one.method for one in done.methods] == [
+        f"uplift-{rule}" for rule in ("views", "density", "region", "fair")
+    ]
+    for one in done.methods:
+        (scene,) = one.scenes
+        found = tmp_path / "out/predictions" / layout / one.method / f"{scene.scene}.npz"
+        with np.load(found) as arrays:
+            np.savez(tmp_path / "p.npz", semantic=arrays["semantic"])
+            np.savez(tmp_path / "t.npz", semantic=arrays["truth"])
+        theirs = score("points", "--pred", tmp_path / "p.npz", "--truth", tmp_path / "t.npz")
+        assert one.scores["miou"] == pytest.approx(theirs["mIoU"], abs=1e-6)
+        columns = [name for name in one.scores if name in TABLE_1]
+        assert np.mean([one.scores[name] for name in columns]) == pytest.approx(theirs["mIoU"])
+        assert {"view_miou", "psnr", "ssim", "undefined"} <= set(one.scores)
+        kept = load_result(tmp_path / "out/results" / layout / one.method / f"{scene.scene}.json")
+        assert kept.made["rule"] == one.method.removeprefix("uplift-")
+        assert kept.rows == scene.rows
+    views, region = only(done, "uplift-views"), only(done, "uplift-region")
+    assert views["miou"] > 0.2, "chance is a few percent"
+    assert views["undefined"] == 0
+    assert views["miou"] != region["miou"]
+    assert views["view_miou"] == region["view_miou"], "rules are of points"
+
+
+def test_what_was_measured_is_kept_and_published_stands_beside(run) -> None:
+    first = run("waymo", "points=density,region")
+    assert first.kept == 0
+    assert run("waymo", "points=density,region").kept == 2
+    columns, rows = bench_table(first, notes=False)
+    assert "road" in columns
+    assert [row[0] for row in rows[-2:]] == ["DNMP with semantics", "StreetGaussians"]
+    assert rows[-2][columns.index("psnr")] == 29.31
+    short, _ = bench_table(first, notes=False, classes=False)
+    assert not set(TABLE_1) & set(short)
+
+
+def test_rules_and_choices_count(run) -> None:
+    usual = run("kitti360", "points=region,fair")
+    wider = run("kitti360", "points=region,fair", "radius=2.5")
+    for rule in ("region", "fair"):
+        assert only(wider, f"uplift-{rule}") != only(usual, f"uplift-{rule}")
+    skipped = run("kitti360", "points=region", "undefined=skipped", "radius=0.02")
+    wrong = run("kitti360", "points=region", "radius=0.02")
+    assert only(wrong, "uplift-region")["undefined"] > 0
+    assert only(skipped, "uplift-region")["miou"] > only(wrong, "uplift-region")["miou"]
+    assert only(skipped, "uplift-region")["undefined"] == only(wrong, "uplift-region")["undefined"]
+    no_sky = run("kitti360", "points=fair", "sky=no")
+    assert only(no_sky, "uplift-fair")["view_miou"] != only(usual, "uplift-fair")["view_miou"]
+    assert only(no_sky, "uplift-fair")["miou"] == only(usual, "uplift-fair")["miou"]
+
+
+def test_own_classes_have_their_own_names(run) -> None:
+    merged, own = (run("waymo", "points=density", f"classes={c}") for c in ("table-1", "own"))
+    names = {row["name"] for row in own.methods[0].scenes[0].rows if "class" in row}
+    assert "sign" in names, "Waymo's name of it"
+    assert not names & {"traffic sign", "others"}
+    assert not set(TABLE_1) & set(own.methods[0].scores)
+    assert "traffic sign" in merged.methods[0].scores
+
+
+def test_a_method_has_at_least_one_of_the_rules(run) -> None:
+    with pytest.raises(InputError, match="expected one of views, density, region, fair for"):
+        run("waymo", "points=field")
+    with pytest.raises(InputError, match="points: expected one of"):
+        run("waymo", "points=nearest")
+    with pytest.raises(InputError, match="points: expected each rule once"):
+        run("waymo", "points=views,views")
+    with pytest.raises(RangeError, match="radius: expected a positive number"):
+        run("waymo", "radius=0")
+
+
+def test_segments_are_no_classes(run) -> None:
+    with pytest.raises(InputError, match="expected one that takes labels"):
+        run("waymo", methods=("associate",))
+
+
+def test_a_mesh_field_is_its_own_row(run, tmp_path) -> None:
+    """Points by eq. 9, and by what its views show; the field is kept in the scene."""
+    few = ("geometry_iterations=4", "iterations=12", "rays=128")
+    done = run("waymo", "points=field,views", methods=("dnmp",), method_options=few)
+    assert [one.method for one in done.methods] == ["dnmp-field", "dnmp-views"]
+    field, views = (one.scores for one in done.methods)
+    assert field["undefined"] > 0
+    assert field["miou"] != views["miou"]
+    assert field["psnr"] == views["psnr"]
+    kept = scene_field(load_scene(tmp_path / "fit"), "dnmp")
+    assert kept.layer_names == ("layer",)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_scans_are_those_of_the_layout(layout, sets) -> None:
+    scene, protocol = sets(layout).scene, find_protocol(layout)
+    assert scans_of(scene, protocol) == scene.capture.path
+    assert scans_of(scene, protocol.with_switches({"scans": False})) is None
+    assert scans_of(scene, find_protocol("replica")) is None
+
+
+def test_a_drive_without_scans_has_none(sets, tmp_path) -> None:
+    scene = sets("waymo").scene
+    bare = replace(scene, capture=replace(scene.capture, path=tmp_path))
+    assert scans_of(bare, find_protocol("waymo")) is None
+
+
+def test_fits_learn_the_depth_of_scans(sets, tmp_path) -> None:
+    data = sets("waymo")
+    options = BenchOptions(
+        models=(str(data.fit.parent / "evidence" / NAME),), steps=3, max_gaussians=300,
+        switches=("points=density",),
+    )  # fmt: skip
+    for name, switches in (("with", ()), ("without", ("scans=no",))):
+        out = tmp_path / name
+        chosen = replace(options, switches=(*options.switches, *switches))
+        bench("waymo", data.folder, out, options=chosen)
+        (folder,) = (out / "scenes/waymo").iterdir()
+        depth = load_scene(folder).provenance["options"]["depth"]
+        assert (depth == "metric") == (name == "with")
+
+
+def test_classes_are_merged_by_name() -> None:
+    assert [merged_name(name) for name in ("Road", "gate", "person", "out of roi", "sky")] == [
+        "road", "fence", "others", None, "sky",
+    ]  # fmt: skip
+    assert all(merged_name(name) == name for name in TABLE_1)
+
+
+def test_truth_without_points_is_scored_in_views_alone(sets, tmp_path, monkeypatch) -> None:
+    data = sets("waymo")
+    bare = replace(data.scene, points=None)
+    monkeypatch.setattr("splatseg.tasks.benchmark.scenes.read_benchmark", lambda *_, **__: (bare,))
+    fit = tmp_path / "fit"
+    shutil.copytree(data.fit, fit)
+    options = BenchOptions(models=(str(data.fit.parent / "evidence" / NAME),), fitted=str(fit))
+    done = bench("waymo", data.folder, tmp_path / "out", options=options)
+    assert [one.method for one in done.methods] == ["uplift-views"]
+    assert set(done.methods[0].scores) == {"view_miou", "psnr", "ssim"}
+
+
+def test_no_held_out_view_is_refused(sets, tmp_path, monkeypatch) -> None:
+    data = sets("waymo")
+    capture = data.scene.capture
+    views = tuple(replace(view, split="train") for view in capture.views)
+    bare = replace(data.scene, capture=replace(capture, views=views))
+    monkeypatch.setattr("splatseg.tasks.benchmark.scenes.read_benchmark", lambda *_, **__: (bare,))
+    options = BenchOptions(models=(str(data.fit.parent / "evidence" / NAME),), fitted=str(data.fit))
+    with pytest.raises(InputError, match="expected held-out views, got none"):
+        bench("waymo", data.folder, tmp_path / "out", options=options)
+
+
+@pytest.fixture
+def bare_labels(monkeypatch: pytest.MonkeyPatch) -> Method:
+    """A method whose labels do not say how much views saw."""
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+
+    def run(inputs: Any, options: Any) -> Any:
+        return replace(uplift.METHOD.run(inputs, options), evidence=None)
+
+    method = replace(uplift.METHOD, name="bare", run=run, reference="-")
+    register_method(method)
+    return method
+
+
+def test_fair_votes_need_how_much_was_seen(run, bare_labels) -> None:
+    with pytest.raises(InputError, match="expected labels that say how much views saw"):
+        run("waymo", "points=fair", methods=(bare_labels.name,))
