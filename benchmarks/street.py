@@ -1,6 +1,7 @@
 """Points of laser scans and novel views of a street, by every way to label them, in one table.
 
     python benchmarks/street.py SCENE ../shared/data/street [--rows drive ...] [--json FILE]
+    python benchmarks/street.py SCENE ../shared/data/street --field SCENE/fields/street.safetensors
 
 Evidence are the label maps of training views; truth are the labels of all points of all scans and
 the maps of `test` and `test_novel` views, scored by the independent scorer. A point without a
@@ -17,6 +18,10 @@ label is wrong. Rows, each a field (`splatseg.core.Renderable`) and a layer of i
   each with the class that most of its Gaussians have.
 - `views`: points take what the views of the field show at them, and nothing else. `shapes`: and
   what is shaped like them, without smoothing; `drive`: with it, the default for drives.
+
+- `mesh`: points of a mesh field by its eq. 9, and its views; `mesh_views`: points by what its views
+  show at them and by their shapes; `mesh_published`: as `mesh`, of the field of --published-field.
+  `splatseg street` makes these fields; their rows need --field or --published-field.
 
 `mIoU` is over all classes with points, `big` over those with 1 000 points or more, with 95 %
 intervals of a bootstrap over scans. The columns of classes are the paper's 13: bus counts as
@@ -53,6 +58,8 @@ from splatseg.lift.points import (
     region_labels,
 )
 from splatseg.methods import find_method
+from splatseg.street.field import MeshField
+from splatseg.street.files import load_mesh_field
 from splatseg.tasks.segment import SegmentOptions, segment
 
 LAYER = "street"
@@ -97,10 +104,13 @@ class Region:
 class Bench:
     """A scene, its capture, and layers that rows share."""
 
-    def __init__(self, scene: Path, data: Path, radius: float) -> None:
+    def __init__(
+        self, scene: Path, data: Path, radius: float, fields: dict[str, Path | None]
+    ) -> None:
         self.scene = replace(load_scene(scene), source=data.resolve())
-        self.data, self.radius = data, radius
+        self.data, self.radius, self.fields = data, radius, fields
         self._layers: dict[str, Labels] = {}
+        self._meshes: dict[str, MeshField] = {}
 
     def labels(self, name: str) -> Labels:
         """A layer of classes, made once."""
@@ -116,6 +126,18 @@ class Bench:
         """The same, its points labelled by views."""
         cameras = [view.camera for view in self.scene.train_views]
         return ViewedPoints(self.field(name), cameras, options=options)
+
+    def mesh(self, name: str) -> MeshField:
+        """The mesh field of a row, renamed."""
+        path = self.fields[name]
+        if path is None:
+            raise SystemExit(f"row {name}: expected a mesh field, see --help; got none")
+        if name not in self._meshes:
+            self._meshes[name] = self._renamed(load_mesh_field(path))
+        return self._meshes[name]
+
+    def _renamed(self, found: MeshField) -> MeshField:
+        return MeshField(found.mesh, found.model, layer=LAYER, info=found.info, radius=found.radius)
 
     def _made(self, name: str) -> Labels:
         if name in ("sam", "panoptic"):
@@ -179,7 +201,14 @@ ROWS: dict[str, Row] = {
     "views": lambda b: b.viewed("uplift", ViewedPointOptions(**PLAIN)),
     "shapes": lambda b: b.viewed("uplift", ViewedPointOptions(smoothing_steps=0)),
     "drive": lambda b: b.viewed("uplift", ViewedPointOptions()),
+    "mesh": lambda b: b.mesh("mesh"),
+    "mesh_views": lambda b: ViewedPoints(
+        b.mesh("mesh"), [view.camera for view in b.scene.train_views]
+    ),
+    "mesh_published": lambda b: b.mesh("mesh_published"),
 }
+OF_FIELDS = {"mesh": "field", "mesh_views": "field", "mesh_published": "published_field"}
+"""Rows that need a field, and the option that names it."""
 
 
 def scored(*arguments: str | Path) -> dict[str, Any]:
@@ -274,18 +303,18 @@ def measured(bench: Bench, row: Row, known: dict[int, dict[str, Any]]) -> dict[s
     seconds = {"first_call": middle - begin, "points": time.monotonic() - middle}
     with tempfile.TemporaryDirectory() as folder:
         found = points_score(bench, ids, Path(folder))
-        key = next((id(l) for l in bench._layers.values() if shows(field, l)), id(field))  # noqa: E741
+        key = id(shown(field))
         if key not in known:
             known[key] = views_score(bench, field, Path(folder))
     return found | known[key] | {"seconds": seconds}
 
 
-def shows(field: Renderable, labels: Labels) -> bool:
-    """Whether a field's views are those of these labels."""
+def shown(field: Renderable) -> object:
+    """What views of a field are drawn of: labels of Gaussians, or a field of meshes."""
     inner = field
     while isinstance(inner, Region | ViewedPoints):
         inner = inner._field
-    return isinstance(inner, GaussianField) and inner.labels(LAYER) is labels
+    return inner.labels(LAYER) if isinstance(inner, GaussianField) else inner
 
 
 def main() -> None:
@@ -293,16 +322,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), help="all that can be run")
+    parser.add_argument("--field", type=Path, help="of the rows mesh and mesh_views")
+    parser.add_argument("--published-field", type=Path, help="of the row mesh_published")
     parser.add_argument("--radius", type=float, default=0.5, help="of regions, metres")
     parser.add_argument("--json", type=Path, help="write all figures here")
     arguments = parser.parse_args()
-    bench = Bench(arguments.scene, arguments.data, arguments.radius)
+    fields = {row: getattr(arguments, option) for row, option in OF_FIELDS.items()}
+    rows = arguments.rows or [row for row in ROWS if fields.get(row, True) is not None]
+    bench = Bench(arguments.scene, arguments.data, arguments.radius, fields)
     print("| row | mIoU | big | undefined | test | novel | PSNR | SSIM | s | 13 classes | "
           + " | ".join(TABLE) + " |")  # fmt: skip
     print("|" + " --- |" * (10 + len(TABLE)))
     all_found, known = {}, {}
-    for name in arguments.rows:
+    for name in rows:
         found = all_found[name] = measured(bench, ROWS[name], known)
         spread = [f"{v:.3f} ({low:.3f} to {high:.3f})" for v, (low, high) in (
             (found["points"], found["points_interval"]), (found["big"], found["big_interval"]),
