@@ -91,9 +91,10 @@ class EvaluationOptions:
     _gt for 000_gt.png; files without it are left aside."""
 
     classes: str | None = None
-    """Names of the truth's ids: ade20k, coco, cityscapes or scannet, with -train behind it for
-    the ids from 0 that networks learn; or a JSON file with "classes". Pictures in a table's
-    colours are read by it. None takes what the truth, the layer or the scene tells."""
+    """Names of the truth's ids: ade20k, coco, cityscapes, scannet, kitti360 or semantic-kitti,
+    with -train behind it for the ids that networks learn; or a JSON file with "classes". Pictures
+    in a table's colours are read by it. None takes what the truth, the layer or the scene
+    tells."""
 
     split: str = "test"
     """Which views: test, train, another split of the scene, or all."""

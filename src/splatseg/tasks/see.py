@@ -59,10 +59,10 @@ class SeeOptions:
     for 000_pred.png; files without it are left aside."""
 
     classes: str | None = None
-    """Names of the ids of recorded label maps: ade20k, coco, cityscapes or scannet, for the ids
-    of their annotations, with -train behind it for the ids from 0 that networks learn; or a
-    JSON file with "classes" (id, name, isthing, colour), where 0 is a class if it is called so.
-    Pictures in a table's colours are read by it."""
+    """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360 or
+    semantic-kitti, for the ids of their annotations, with -train behind it for the ids that
+    networks learn; or a JSON file with "classes" (id, name, isthing, colour), where 0 is a class
+    if it is called so. Pictures in a table's colours are read by it."""
 
     depth_unit: float | None = None
     """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
