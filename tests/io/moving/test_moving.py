@@ -171,6 +171,28 @@ def test_times_can_be_given(tmp_path):
         mask_moving(source, tmp_path / "masks", boxes=boxes)
 
 
+def test_boxes_on_another_clock_are_refused(tmp_path):
+    source = capture(tmp_path, view("1", tmp_path), view("2", tmp_path))
+    boxes = [box(start=1.5e9, end=1.5e9), box(start=1.6e9, end=1.7e9)]
+    with pytest.raises(InputError, match=r"views, 1 to 2, got boxes from 1\.5e\+09 to 1\.7e\+09"):
+        mask_moving(source, tmp_path / "masks", boxes=boxes)
+
+
+def test_the_clock_can_be_the_number_of_frames(generated_drive, tmp_path):
+    drive = read_capture(generated_drive)
+    there = box(centre=drive.views[-1].camera.centre.tolist(), start=11.0, end=11.0)
+    assert view_times(drive, clock="frames")["testnovel_0000"] == 0.0
+    options = MovingOptions(clock="frames")
+    found = mask_moving(drive, tmp_path / "m", boxes=[there], options=options)
+    assert [one.name for one in found.views if one.mask is not None] == ["train_0011"]
+    scans = read_scans(generated_drive)
+    at = box(centre=scans.scan("0001").points[40].tolist(), start=1.0, end=1.0)
+    assert len(StaticScans(scans, [at]).scan("0001")) == len(scans.scan("0001"))
+    assert len(StaticScans(scans, [at], clock="frames").scan("0001")) < len(scans.scan("0001"))
+    with pytest.raises(InputError, match="clock"):
+        MovingOptions(clock="hours")
+
+
 def test_only_training_views_are_masked(tmp_path):
     source = capture(tmp_path, view("1", tmp_path), view("2", tmp_path, split="test"))
     found = mask_moving(source, tmp_path / "masks", boxes=[box()])
@@ -188,7 +210,8 @@ def test_masks_of_the_capture_count_as_well(tmp_path):
     both = SHOWN.clone()
     both[0] = True
     assert torch.equal(ignored(found.views[0]), both)
-    nothing = mask_moving(source, tmp_path / "masks", boxes=[box(start=5.0)])
+    beside = box(centre=(0.0, 0, -50))
+    nothing = mask_moving(source, tmp_path / "masks", boxes=[beside])
     assert nothing.views[0].mask == tmp_path / "own.png"
 
 

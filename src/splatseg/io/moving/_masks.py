@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
+from splatseg._check import check_choice
 from splatseg.core import Capture, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.moving import MovingBox, boxes_at, pixels_of_boxes
@@ -17,7 +18,7 @@ from splatseg.core.scene import camera_of_map
 from splatseg.errors import InputError, RangeError
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import load_mask, save_png
-from splatseg.io.moving._times import view_times
+from splatseg.io.moving._times import CLOCKS, Clock, view_times
 from splatseg.io.paths import path_inside
 
 
@@ -32,8 +33,13 @@ class MovingOptions:
     """Pixels around those of moving classes that are left out too, borders of labels being
     rough."""
 
+    clock: Clock = "recorded"
+    """What the times of boxes are. recorded: what the data set has, such as seconds. frames: the
+    last number in the name of a view or scan."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
+        check_choice("clock", self.clock, CLOCKS)
         if not (math.isfinite(self.margin) and self.margin >= 0):
             raise RangeError(f"margin: expected 0 or more metres, got {self.margin}.")
         if self.grow < 0:
@@ -62,19 +68,22 @@ def mask_moving(
         boxes: Boxes of moving things, see `read_moving`.
         labels: Label maps of views, for `classes`.
         classes: Names of classes of these whose things move, such as ``car``.
-        times: When views were taken, by their names; None is `view_times`.
+        times: When views were taken, by their names; None is `view_times` of the options' clock.
         options: Margins.
         report: Told in a sentence what is left out.
 
     Raises:
-        InputError: If classes are given without label maps, the maps do not know one, or a view
-            has no time.
+        InputError: If classes are given without label maps, the maps do not know one, a view has
+            no time, or no box is there at the time of any view.
         ShapeError: If a label map is not of its view.
         OutputError: If a mask cannot be written.
     """
     options = options or MovingOptions()
     ids = _ids_of(labels, classes)
-    known = (view_times(capture) if times is None else times) if boxes else {}
+    known = {} if times is None else times
+    if boxes:
+        known = view_times(capture, clock=options.clock) if times is None else times
+        _check_clock(boxes, [_time_of(view, known) for view in capture.train_views])
     unit = capture.metres_per_unit or 1.0
     views: list[View] = []
     changed = left_out = pixels = 0
@@ -118,6 +127,17 @@ def _time_of(view: View, times: Mapping[str, float]) -> float:
     if view.name not in times:
         raise InputError(f"times: expected one of every training view, got none of {view.name!r}.")
     return times[view.name]
+
+
+def _check_clock(boxes: Sequence[MovingBox], times: Sequence[float]) -> None:
+    """Refuse boxes of which none is there when a view was taken: their clock is another."""
+    if any(boxes_at(boxes, time) for time in times) or not times:
+        return
+    raise InputError(
+        f"boxes: expected some at the times of views, {min(times):g} to {max(times):g}, got boxes "
+        f"from {min(box.start for box in boxes):g} to {max(box.end for box in boxes):g}; is their "
+        "clock another (recorded or frames)?"
+    )
 
 
 def _labelled(

@@ -5,26 +5,27 @@ from dataclasses import replace
 
 import torch
 
+from splatseg._check import check_choice
 from splatseg.core import UNLABELLED, LabelMap, LabelSource, ScanSource, View
 from splatseg.core.boundary import boundary
 from splatseg.core.moving import MovingBox, boxes_at, inside_boxes
 from splatseg.core.scans import Scan
 from splatseg.core.scene import camera_of_map
-from splatseg.core.view_names import frame_number
-from splatseg.errors import InputError
 from splatseg.io.images import load_mask
+from splatseg.io.moving._times import CLOCKS, Clock, scan_time
 
 
 class StaticScans:
     """Scans without their points in boxes of moving things; a `core.ScanSource`.
 
-    The boxes of a scan are those that are there at its time: `Scan.time`, else the last number in
-    its name, which counts the frames.
+    The boxes of a scan are those that are there at its time: `Scan.time`, unless `clock` says
+    frames, else the last number in its name, which counts the frames.
 
     Args:
         scans: The scans.
         boxes: Boxes of moving things.
         margin: By how much boxes are larger on every side, scene units.
+        clock: What the times of boxes are.
         times: When scans were measured, by their names, where that is known better.
     """
 
@@ -35,10 +36,13 @@ class StaticScans:
         boxes: Sequence[MovingBox],
         *,
         margin: float = 0.0,
+        clock: Clock = "recorded",
         times: Mapping[str, float] | None = None,
     ) -> None:
         self._scans, self._boxes = scans, tuple(boxes)
         self._margin, self._times = margin, dict(times or {})
+        check_choice("clock", clock, CLOCKS)
+        self._clock: Clock = clock
 
     @property
     def scan_names(self) -> Sequence[str]:
@@ -52,22 +56,11 @@ class StaticScans:
             InputError: If there is none of that name, its file is broken, or it has no time.
         """
         scan = self._scans.scan(name)
-        there = boxes_at(self._boxes, self._time(scan))
+        known = self._times.get(name)
+        time = scan_time(scan, self._clock) if known is None else known
+        there = boxes_at(self._boxes, time)
         moving = inside_boxes(scan.points, there, margin=self._margin)
         return scan.take(torch.nonzero(~moving).squeeze(1)) if bool(moving.any()) else scan
-
-    def _time(self, scan: Scan) -> float:
-        if scan.name in self._times:
-            return self._times[scan.name]
-        if scan.time is not None:
-            return scan.time
-        number = frame_number(scan.name)
-        if number is None:
-            raise InputError(
-                f"scan {scan.name!r}: expected the time at which it was measured, to know which "
-                "boxes of moving things are there, got none."
-            )
-        return float(number[1])
 
 
 class MaskedLabels:

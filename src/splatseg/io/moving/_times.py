@@ -1,9 +1,10 @@
-"""When views were taken, on the clock of boxes and scans."""
+"""When views were taken and scans measured, on the clock of boxes."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, Literal, cast
 
-from splatseg.core import Capture
+from splatseg._check import check_choice
+from splatseg.core import Capture, Scan
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import is_json_number
 from splatseg.core.view_names import frame_number
@@ -11,19 +12,27 @@ from splatseg.errors import InputError
 from splatseg.io.captures.nerfstudio import FILE
 from splatseg.io.json_files import read_json
 
+Clock = Literal["recorded", "frames"]
+"""What times are. recorded: what the data set has, such as seconds, else frames. frames: the last
+number in a name, as boxes of KITTI-360 are counted."""
+
+CLOCKS = ("recorded", "frames")
+
 
 @boundary
-def view_times(capture: Capture) -> Mapping[str, float]:
+def view_times(capture: Capture, *, clock: Clock = "recorded") -> Mapping[str, float]:
     """The time of each view by its name.
 
-    It is ``time`` of the view's frame in transforms.json where all frames have one, else the last
-    number in the view's name, which counts the frames of a drive.
+    It is ``time`` of the view's frame in transforms.json where all frames have one, unless
+    `clock` says frames, else the last number in the view's name, which counts the frames.
 
     Raises:
         InputError: If a view has neither.
         FileFormatError: If transforms.json is broken.
     """
-    recorded = _recorded(capture) if capture.format == "nerfstudio" else {}
+    check_choice("clock", clock, CLOCKS)
+    known = clock == "recorded" and capture.format == "nerfstudio"
+    recorded = _recorded(capture) if known else {}
     times: dict[str, float] = {}
     for view in capture.views:
         number = frame_number(view.name)
@@ -39,6 +48,23 @@ def view_times(capture: Capture) -> Mapping[str, float]:
                 "transforms.json, or number the views as their frames."
             )
     return times
+
+
+def scan_time(scan: Scan, clock: Clock) -> float:
+    """When a scan was measured: `Scan.time`, or the last number in its name.
+
+    Raises:
+        InputError: If it has neither.
+    """
+    if clock == "recorded" and scan.time is not None:
+        return scan.time
+    number = frame_number(scan.name)
+    if number is None:
+        raise InputError(
+            f"scan {scan.name!r}: expected the time at which it was measured, to know which boxes "
+            "of moving things are there, got none."
+        )
+    return float(number[1])
 
 
 def _recorded(capture: Capture) -> dict[str, float]:
