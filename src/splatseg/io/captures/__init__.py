@@ -27,6 +27,7 @@ from splatseg.io.captures.scannet import find_scannet, read_scannet
 from splatseg.io.captures.scannetpp import find_scannetpp, read_scannetpp
 from splatseg.io.captures.waymo import find_waymo, read_waymo
 from splatseg.io.captures.waymo_segment import SUFFIX as _WAYMO_SUFFIX
+from splatseg.io.captures.waymo_tfrecord import ENDING as _TFRECORD
 from splatseg.io.images import find_images
 
 FORMATS = (
@@ -123,7 +124,7 @@ def bare_photographs(folder: Path) -> tuple[Path, ...]:
 
 
 def _from_file(path: Path) -> tuple[Path, str]:
-    if path.suffix == _WAYMO_SUFFIX:
+    if path.suffix in (_WAYMO_SUFFIX, _TFRECORD):
         return path, "waymo"
     named = {_NERFSTUDIO_FILE: "nerfstudio", "transforms_train.json": "blender"}
     named |= {_LLFF_FILE: "llff", _REPLICA_FILE: "replica"} | dict.fromkeys(_IDR_FILES, "idr")

@@ -26,6 +26,7 @@ from splatseg.io.captures.waymo_segment import (
     one_segment,
     transform,
 )
+from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.parquet import RowReader, bytes_of, integer_of, number_of, read_rows
@@ -67,7 +68,8 @@ def read_waymo(path: Path, *, strict: bool = False) -> Capture:
 
     Args:
         path: The folder of the components, if it has one segment, else the file of any component
-            of it, such as ``camera_image/CONTEXT.parquet``.
+            of it, such as ``camera_image/CONTEXT.parquet``, or a TFRecord file of version 1, whose
+            components are written beside it (see `waymo_tfrecord`).
         strict: As photographs are in the component, none can be listed that is not there.
 
     Raises:
@@ -113,7 +115,7 @@ def read_waymo(path: Path, *, strict: bool = False) -> Capture:
     capture = build_capture(segment.root, raw, format="waymo", notes=notes, strict=strict)
     return replace(
         capture,
-        path=path if path.suffix == SUFFIX else segment.root,
+        path=path if path.suffix in (SUFFIX, ENDING) else segment.root,
         metres_per_unit=capture.metres_per_unit or 1.0,
         up=capture.up or (0.0, 0.0, 1.0),
     )

@@ -16,6 +16,12 @@ from numpy.typing import NDArray
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures.build import checked_pose
+from splatseg.io.captures.waymo_tfrecord import (
+    ENDING,
+    components_folder,
+    context_of,
+    unpack_components,
+)
 from splatseg.io.foreign import is_file
 from splatseg.io.parquet import Row, integer_of, list_of, read_rows
 
@@ -157,7 +163,13 @@ class WaymoSegment:
 
 
 def find_segments(path: Path) -> tuple[WaymoSegment, ...]:
-    """Segments below a folder of components, by name, or the one that a component's file is of."""
+    """Segments below a folder of components, by name, or the one that a file is of.
+
+    Of a TFRecord file it is that of its components, which `one_segment` writes.
+    """
+    if path.suffix == ENDING and is_file(path):
+        root = components_folder(path)
+        return (WaymoSegment(root=root, context=context_of(path)),)
     if path.suffix == SUFFIX:
         return (WaymoSegment(root=path.parent.parent, context=path.stem),) if is_file(path) else ()
     names = {
@@ -174,8 +186,11 @@ def one_segment(path: Path) -> WaymoSegment:
 
     Raises:
         MissingFileError: If there is none.
-        InputError: If there are several.
+        InputError: If there are several, or a TFRecord file is damaged.
+        OutputError: If the components of a TFRecord file cannot be written.
     """
+    if path.suffix == ENDING:
+        unpack_components(path)
     found = find_segments(path)
     if not found:
         raise MissingFileError(

@@ -4,10 +4,13 @@ import json
 import struct
 from pathlib import Path
 
+from splatseg.errors import FileFormatError, InputError
 from splatseg.io.benchmarks.waymo import read_waymo_scenes
+from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
 from support.fuzz.targets.base import Target, target
-from support.waymo_files import CONTEXT, SCHEMAS, write_segment
+from support.waymo_files import CONTEXT, SCHEMAS, tiny_rows, write_segment
+from support.waymo_tfrecord import framed, frames_of, write_tfrecord
 
 _TOKENS = "sensor", "calibrated_sensor", "ego_pose", "sample_data", "sample", "scene", "lidarseg"
 
@@ -30,6 +33,36 @@ def _of_waymo(component: str) -> None:
 
 for _component in SCHEMAS:
     _of_waymo(_component)
+
+
+@target("waymo.tfrecord")
+def tfrecord(folder: Path) -> Target:
+    """Frames of version 1."""
+    file = write_tfrecord(folder, tiny_rows())
+
+    def read() -> None:
+        read_capture(file)
+        scans = read_scans(file)
+        for name in scans.scan_names:
+            scans.scan(name)
+
+    return Target(file=file, read=read)
+
+
+@target("waymo-frame.tfrecord")
+def frame(folder: Path) -> Target:
+    """A frame whose checksums are those of its damaged bytes."""
+    file, framed_file = folder / "frame", folder / "a.tfrecord"
+    file.write_bytes(frames_of(tiny_rows())[0])
+
+    def read() -> None:
+        framed_file.write_bytes(framed(file.read_bytes()))
+        try:
+            read_scans(framed_file)
+        except InputError as error:  # of another file than the one that is damaged
+            raise FileFormatError(f"{file}: {error}") from error
+
+    return Target(file=file, read=read)
 
 
 def _nuscenes(folder: Path) -> None:
