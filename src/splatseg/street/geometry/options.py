@@ -31,7 +31,8 @@ class GeometryOptions:
     """In how many of these steps a ray is used; as many fewer rays are searched for."""
 
     max_rays: int = 4_000_000
-    """Rays with depth that are kept in memory, drawn evenly from all views: 32 bytes each."""
+    """Rays with depth that are kept in memory, drawn evenly from all views: 24 bytes each, and as
+    much again when they are put together."""
 
     max_depth: float = 50.0
     """Larger z-depths are not used."""
