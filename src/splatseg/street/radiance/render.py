@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from splatseg._check import check_shape
 from splatseg.core import Camera
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
@@ -68,6 +69,9 @@ def render_rays(
         ShapeError: If the shapes do not fit, or the field is of other primitives.
         RangeError: If a value is not finite, or a direction is 0.
     """
+    check_shape("directions", directions, (None, 3))
+    check_shape("origins", origins, (3,) if origins.ndim < 2 else (len(directions), 3))
+    check_shape("caster: vertices", caster.mesh.vertices, (len(model.features), 3))
     surface = Surface(caster.mesh)
     count = len(directions)
 
@@ -176,4 +180,4 @@ def _summed(
     """Sums over the samples of each ray, which stand in `rows` of ``n * hits`` places."""
     all_values = values.new_zeros(weights.numel(), values.shape[1])
     all_values[rows] = values
-    return torch.einsum("nl,nlc->nc", weights, all_values.view(*weights.shape, -1))
+    return torch.einsum("nl,nlc->nc", weights, all_values.view(*weights.shape, values.shape[1]))
