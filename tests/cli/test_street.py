@@ -72,7 +72,7 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path
 
     out = tmp_path / "out"
     mesh = ("--label-scans", generated_drive, "-o", out, "--by", "mesh")
-    assert "expected a new name, or --overwrite, got 'street'" in refused(made)
+    assert "has one called 'street'; give another name, or --overwrite" in refused(made)
     assert "got one of the two" in refused(made, "--label-scans", generated_drive)
     assert "got one of the two" in refused(made, "-o", out)
     assert "--form: expected scans to label with it" in refused(made, "--form", "las")
@@ -80,11 +80,10 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path
         made, "--label-scans", generated_drive, "-o", out, "--layer", "a"
     )
     assert "--scene: expected a scene folder to write" in refused(generated_drive)
-    assert "there is no such" in refused(tmp_path / "none")
+    assert "there is no such capture" in refused(tmp_path / "none")
     assert "there is no such folder or file of scans" in refused(
         made, "--label-scans", tmp_path / "none", "-o", out, "--by", "mesh"
     )
-    assert "--voxels: expected positive lengths" in refused(made, "--voxels", "0")
     assert "evidence: expected one of those at hand" in refused(
         made, "--field", "b", "--evidence", "none"
     )
@@ -112,7 +111,7 @@ def test_damaged_scans_are_one_sentence(made, generated_drive, splatseg, tmp_pat
     broken = arrays["range_2mm"].astype(np.float32) * 0.002
     broken[0, 0, :3] = np.nan
     assert "expected finite positions, got 3 of" in refused(range_2mm=None, range=broken)
-    assert "expected scans of a laser" in refused(lidar_to_world=None)
+    assert "expected an array 'lidar_to_world'" in refused(lidar_to_world=None)
     poses = arrays["lidar_to_world"].copy()
     poses[0, 0, 3] = np.nan
     assert "scan 0" in refused(lidar_to_world=poses)

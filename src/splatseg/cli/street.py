@@ -167,7 +167,7 @@ def _field(
         if command.label_scans is not None:
             return scene_field(scene, name)
         raise InputError(
-            f"field: expected a new name, or overwrite, got {name!r}, which {root} has already."
+            f"field: {root} has one called {name!r}; give another name, or --overwrite."
         )
     with work_on_scene(root, "street", writes=["fields"]):
         made = street_field(

@@ -35,8 +35,9 @@ def find_range_images(path: Path) -> Path | None:
     if file.suffix.lower() != ".npz" or not file.is_file():
         return None
     names = npz_names(file)
-    ranged = any(name in names for name in _RANGES)
-    return file if ranged and all(name in names for name in _NEEDED) else None
+    # Without poses or angles it is still one, of which the reader says what is missing.
+    ranged = any(name in names for name in _RANGES) and "xyz" not in names
+    return file if ranged else None
 
 
 def read_range_images(path: Path) -> Scans:
