@@ -25,6 +25,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,9 @@ LAYER = "semantic"
 PIECE = 200.0
 SEEDS = (0, 1, 2, 3, 4, 5)
 STEP = 20.0
+RANGE = 80.0
+KEPT = 48
+"""Scans and views that are kept when they were made."""
 WIDTH, HEIGHT = 48, 32
 BEAMS, COLUMNS = 16, 90
 VOXEL = 3.0
@@ -126,11 +130,13 @@ class Road:
         return start + turned(heading) @ (place - lane[0]), yaw
 
     def cast(self, along: float, origin: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """The first surface of the street here and of the next one: distance and class, -1 none."""
+        """The first surface of the streets in range: distance and class, -1 none."""
         piece = min(int(along // PIECE), len(self.poses) - 1)
         distance = torch.full((len(rays),), math.inf, dtype=torch.float64)
         classes = torch.full((len(rays),), -1, dtype=torch.int32)
-        for index in {max(piece - 1, 0), piece, min(piece + 1, len(self.poses) - 1)}:
+        into = along - piece * PIECE
+        reached = {piece, piece - (into < RANGE), piece + (into > PIECE - RANGE)}
+        for index in sorted(reached & set(range(len(self.poses)))):
             caster, labels = self._caster(index)
             hits = caster.cast(origin, rays)
             nearer = hits.distances < distance
@@ -170,8 +176,10 @@ class Recorder:
         azimuth = np.linspace(-math.pi, math.pi, COLUMNS, endpoint=False)
         e, a = (grid.reshape(-1) for grid in np.meshgrid(elevation, azimuth, indexing="ij"))
         self.rays = np.stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=1)
+        self.scan = lru_cache(KEPT)(self._scan)
+        self.classes = lru_cache(KEPT)(self._classes)
 
-    def scan(self, name: str) -> Scan:
+    def _scan(self, name: str) -> Scan:
         """What the laser measures, with true classes."""
         along = float(self.along[int(name)])
         place, yaw = self.road.place(along)
@@ -180,7 +188,7 @@ class Recorder:
         origin = torch.tensor([*place, 1.73], dtype=torch.float64)
         rays = torch.from_numpy(self.rays @ rotation.T)
         distance, classes = self.road.cast(along, origin, rays)
-        seen = distance < 80.0
+        seen = distance < RANGE
         points = origin + distance[seen, None] * rays[seen]
         return Scan(
             name=name, points=points, origin=origin, labels={"semantic": classes[seen]},
@@ -198,7 +206,7 @@ class Recorder:
             made.append(View(name=f"{i:06d}", camera=camera))
         return tuple(made)
 
-    def classes(self, view: View) -> Tensor:
+    def _classes(self, view: View) -> Tensor:
         """True classes of a view's pixels, -1 the sky."""
         origin, rays = view.camera.rays()
         _, classes = self.road.cast(float(self.along[int(view.name)]), origin, rays.reshape(-1, 3))

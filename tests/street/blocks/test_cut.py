@@ -128,6 +128,21 @@ def test_reach_is_what_a_block_has():
     assert one.near(one.blocks[0], points * 100).all()
 
 
+def test_drives_far_apart_are_not_connected():
+    """Two drives of 100 m, 300 m apart: no block lies between them, and none goes over."""
+    places = torch.cat((straight(100.0), straight(100.0) + torch.tensor([400.0, 0, 0])))
+    drive = cut_drive(places)
+    assert [(b.start, b.end) for b in drive.blocks] == [(0, 50), (50, 100), (100, 150), (150, 200)]
+    assert [float(b.span[-1, 0]) for b in drive.blocks] == [60.0, 100.0, 460.0, 500.0]
+    assert drive.blocks[2].span[0].tolist() == [400.0, 0, 0]
+    near = drive.shares(torch.tensor([[130.0, 0, 0], [390.0, 0, 0]]))
+    assert [(s.block, s.rows.tolist(), s.weights.tolist()) for s in near] == [
+        (1, [0], [1.0]), (2, [1], [1.0])
+    ]  # fmt: skip
+    bridged = cut_drive(places, options=DriveBlockOptions(length=320.0))
+    assert bridged.blocks[-1].end == 500.0
+
+
 def test_standing_still_makes_no_way(rng):
     """A car that waits for ten minutes: noise of centimetres adds up to nothing."""
     moving = straight(100.0)

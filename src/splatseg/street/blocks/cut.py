@@ -13,8 +13,9 @@ crosses itself as well: there the blocks of all passes count.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -244,7 +245,8 @@ def cut_drive(
     """Cut a drive into the fewest equal blocks that are not longer than asked for.
 
     What stands still makes no way: places nearer than an eighth of the overlap to the last one
-    are left out, and the line is straightened by at most a two-hundredth of the overlap.
+    are left out, and the line is straightened by at most a two-hundredth of the overlap. Places
+    farther apart than a block is long are not connected: there one drive ends and another begins.
 
     Args:
         centres: Places along the drive in its order, world, scene units: `frame_centres`.
@@ -271,24 +273,37 @@ def cut_drive(
     if not (math.isfinite(metres_per_unit) and metres_per_unit > 0):
         raise RangeError(f"metres_per_unit: expected a length, got {metres_per_unit}.")
     options = options or DriveBlockOptions()
-    overlap = options.overlap / metres_per_unit
-    line = thinned(centres.detach().cpu().double(), overlap / _STEPS_AN_OVERLAP)
+    overlap, length = options.overlap / metres_per_unit, options.length / metres_per_unit
+    places = centres.detach().cpu().double()
+    gaps = torch.linalg.vector_norm(places[1:] - places[:-1], dim=1) > length
+    starts = [0, *(torch.nonzero(gaps).squeeze(1) + 1).tolist(), len(places)]
+    blocks: list[DriveBlock] = []
+    for first, last in pairwise(starts):
+        blocks += _blocks(places[first:last], length, overlap, before=blocks)
+    return Drive(blocks=tuple(blocks), overlap=overlap, reach=options.reach / metres_per_unit)
+
+
+def _blocks(
+    places: Float[Tensor, "n 3"], length: float, overlap: float, *, before: Sequence[DriveBlock]
+) -> list[DriveBlock]:
+    """Blocks of a drive without gaps, which go on counting after those before it."""
+    line = thinned(places, overlap / _STEPS_AN_OVERLAP)
     along = lengths(line)
-    total, length = float(along[-1]), options.length / metres_per_unit
+    total = float(along[-1])
     count = 1 if total <= length else math.ceil(total / (length - overlap))
     ends = [total * i / count for i in range(count + 1)]
+    driven = before[-1].end if before else 0.0
 
     def part(start: float, end: float) -> Tensor:
         return simplified(between(line, along, start, end), _TOLERANCE * overlap)
 
-    blocks = tuple(
+    return [
         DriveBlock(
-            index=i,
-            start=ends[i],
-            end=ends[i + 1],
+            index=len(before) + i,
+            start=driven + ends[i],
+            end=driven + ends[i + 1],
             piece=part(ends[i], ends[i + 1]),
             span=part(ends[i] - overlap / 2, ends[i + 1] + overlap / 2),
         )
         for i in range(count)
-    )
-    return Drive(blocks=blocks, overlap=overlap, reach=options.reach / metres_per_unit)
+    ]

@@ -1,5 +1,6 @@
 """What of a capture and of its scans is a block's: views, start points and scans near it."""
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,10 @@ from splatseg.core.boundary import boundary
 from splatseg.core.scans import Scan
 from splatseg.errors import InputError
 from splatseg.street.blocks.cut import BlockShare, Drive, DriveBlock
+
+_KEPT_SHARES = 64
+"""Scans of which it is kept what a block counts there: more than a window of scans with those
+around it."""
 
 
 @boundary
@@ -164,7 +169,7 @@ class ScansToLabel:
         """Take what `DriveScans.to_label` knows."""
         self._scans, self._names = scans, tuple(names)
         self._drive, self._block = drive, block
-        self._read: dict[str, BlockShare] = {}
+        self._read: OrderedDict[str, BlockShare] = OrderedDict()
 
     @property
     def scan_names(self) -> Sequence[str]:
@@ -177,10 +182,13 @@ class ScansToLabel:
         scan = self._scans.scan(name)
         share = next(s for s in self._drive.shares(scan.points) if s.block == self._block.index)
         self._read[name] = share
+        self._read.move_to_end(name)
+        if len(self._read) > _KEPT_SHARES:
+            self._read.popitem(last=False)
         return scan.take(share.rows)
 
     def share(self, name: str) -> BlockShare:
-        """What the block counts at the points of a scan that was read; it is forgotten then."""
+        """What the block counts at these points of a scan, known still if it was read lately."""
         if name not in self._read:
             self.scan(name)
         return self._read.pop(name)
