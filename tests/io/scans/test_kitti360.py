@@ -127,6 +127,14 @@ def test_rows_between_two_frames(root) -> None:
     assert find_scans(root / "data_3d_raw" / DRIVE / "sick_points") == "kitti360-sick"
 
 
+def test_rows_in_a_long_gap_between_poses_are_left_out(root) -> None:
+    sick(root)
+    write_poses(root, {frame: car_pose(frame) for frame in (1, 4, 5)})
+    assert len(read_scans(root, format="kitti360-sick")) == 2
+    write_poses(root, {frame: car_pose(frame) for frame in (0, 4, 5)})
+    assert read_scans(root, format="kitti360-sick").scan_names == ("0000000002",)
+
+
 def test_rows_need_times_and_frames(root) -> None:
     sick(root)
     folder = root / "data_3d_raw" / DRIVE

@@ -43,6 +43,9 @@ from splatseg.io.scans._velodyne import (
     unrolled,
 )
 
+_MAX_GAP = 3
+"""Frames between two poses, beyond which nobody knows how the car went from one to the other."""
+
 _INSTANCES = 1000
 """An instance is its class times this and a number; 0 of it is none."""
 
@@ -115,7 +118,8 @@ def read_sick(path: Path) -> Scans:
 
     They are measured between frames. Their pose is that of the turning laser at their time,
     between the two frames around it, then ``calib_sick_to_velo``; so ``timestamps.txt`` of both
-    are needed. A row without frames on both sides that have poses is left out.
+    are needed. A row without frames on both sides that have poses is left out, and one between
+    frames more than three apart.
 
     Raises:
         MissingFileError: If there are no rows, or times, poses or calibration lack.
@@ -142,11 +146,16 @@ def read_sick(path: Path) -> Scans:
     laser = np.stack([poses[frame] @ car_from_laser for frame in numbers])
     turn = Slerp(moments, Rotation.from_matrix(laser[:, :3, :3]))
     own = sick_pose(drive)
-    inside = [
-        name
-        for name in files
-        if int(name) < len(clock) and moments[0] <= clock[int(name)] <= moments[-1]
-    ]
+    near = np.diff(numbers) <= _MAX_GAP
+
+    def placed(name: str) -> bool:
+        moment = _at(clock, int(name))
+        after = int(np.searchsorted(moments, moment))
+        if not np.isfinite(moment) or after == len(moments):
+            return False
+        return bool(near[after - 1]) if after else moment == moments[0]
+
+    inside = [name for name in files if placed(name)]
     _check_posed(drive, path, files, inside)
 
     def read(name: str) -> RawScan:
