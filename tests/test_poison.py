@@ -31,6 +31,7 @@ NEEDED = {
     "lift.training.DrawnRows",
     "lift.training.Values",
     "lift.training.train",
+    "tasks.save_street_field",
 }
 SLOW = (
     "lift.sharpen",
@@ -44,6 +45,8 @@ SLOW = (
     "tasks.render_truth",
     "tasks.render_views",
     "tasks.attach_layers",
+    "tasks.label_scans",
+    "tasks.open_drive",
     "tasks.s",
     "tasks.report_layer",
     "lift.cut_",

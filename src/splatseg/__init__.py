@@ -89,10 +89,12 @@ if TYPE_CHECKING:
     from splatseg.tasks import MakeSceneOptions as MakeSceneOptions
     from splatseg.tasks import QueryOptions as QueryOptions
     from splatseg.tasks import RenderingOptions as RenderingOptions
+    from splatseg.tasks import ScanLabelOptions as ScanLabelOptions
     from splatseg.tasks import SeeOptions as SeeOptions
     from splatseg.tasks import SegmentOptions as SegmentOptions
     from splatseg.tasks import SelectOptions as SelectOptions
     from splatseg.tasks import SharpenSceneOptions as SharpenSceneOptions
+    from splatseg.tasks import StreetOptions as StreetOptions
     from splatseg.tasks import attach_layers as attach_layers
     from splatseg.tasks import bench as bench
     from splatseg.tasks import describe as describe
@@ -102,16 +104,20 @@ if TYPE_CHECKING:
     from splatseg.tasks import export_scene as export_scene
     from splatseg.tasks import fit_capture as fit_capture
     from splatseg.tasks import import_scene as import_scene
+    from splatseg.tasks import label_scans as label_scans
     from splatseg.tasks import make_demo as make_demo
+    from splatseg.tasks import open_drive as open_drive
     from splatseg.tasks import open_selector as open_selector
     from splatseg.tasks import query as query
     from splatseg.tasks import render_truth as render_truth
     from splatseg.tasks import render_views as render_views
     from splatseg.tasks import save_segmentation as save_segmentation
+    from splatseg.tasks import save_street_field as save_street_field
     from splatseg.tasks import see as see
     from splatseg.tasks import segment as segment
     from splatseg.tasks import select as select
     from splatseg.tasks import sharpen_scene as sharpen_scene
+    from splatseg.tasks import street_field as street_field
 
 # What the block above says to type checkers, for the interpreter; a test holds the two equal.
 _HOMES = {
@@ -132,11 +138,12 @@ _HOMES = {
     "splatseg.tasks": (
         "AttachLayersOptions BenchOptions CheckpointOptions DemoOptions EditOptions "
         "EvaluationOptions ExportOptions ImportOptions MakeSceneOptions QueryOptions "
-        "RenderingOptions SeeOptions SegmentOptions SelectOptions SharpenSceneOptions "
+        "RenderingOptions ScanLabelOptions SeeOptions SegmentOptions SelectOptions "
+        "SharpenSceneOptions StreetOptions "
         "attach_layers bench describe edit_scene "
-        "evaluate_scene examine_capture export_scene fit_capture import_scene make_demo "
-        "open_selector query render_truth render_views save_segmentation see segment select "
-        "sharpen_scene"
+        "evaluate_scene examine_capture export_scene fit_capture import_scene "
+        "label_scans make_demo open_drive open_selector query render_truth render_views "
+        "save_segmentation save_street_field see segment select sharpen_scene street_field"
     ),
 }
 _PACKAGES = frozenset(

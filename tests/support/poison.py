@@ -442,6 +442,13 @@ def special(world: World, by_type: dict[type, Any]) -> dict[str, Any]:
         "io.export.write_object_splats.folder": world.folder / "objects",
         "io.export.label_columns.layer": world.labels,
         "io.export.label_columns.kind": "class",
+        "io.export.write_scan_points.path": world.folder / "scan.ply",
+        "io.export.write_scan_points.columns": {},
+        "io.export.write_scan_labels.found": (),
+        "io.export.write_scan_labels.folder": world.folder / "scan_labels",
+        "neighbours.ball_means.index": NeighbourIndex(torch.rand(3, 3)),
+        "neighbours.ball_means.values": torch.ones(3, 2),
+        "neighbours.ball_means.queries": torch.rand(5, 3),
     }
 
 

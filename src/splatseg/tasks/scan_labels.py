@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 from splatseg._check import check_choice
 from splatseg.core import Labels, Layer, PointLabels, Renderable, Scan, ScanSource, Scene
@@ -14,6 +14,7 @@ from splatseg.io.scans import Scans, read_scans
 from splatseg.io.scene import load_scene_layer, scene_layer_names
 from splatseg.lift.points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
+from splatseg.street.blocks import ScanLabeller
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import gaussian_field
 
@@ -22,17 +23,8 @@ LabelBy = Literal["gaussians", "mesh"]
 the mesh field around it, eq. 9."""
 
 
-_LABEL_FILES = ("semantic-kitti", "kitti-raw", "kitti-odometry")
+_LABEL_FILES = ("semantic-kitti", "kitti-raw", "kitti-odometry", "kitti360")
 """Formats whose points come as ``.bin``, for which SemanticKITTI has a form of labels."""
-
-
-@runtime_checkable
-class ScanLabeller(Protocol):
-    """A field that labels many scans better than one after the other."""
-
-    def labels_of_scans(self, scans: ScanSource, layer: str) -> Iterator[tuple[str, PointLabels]]:
-        """Labels of the points of every scan, by its name, in the order of the source."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

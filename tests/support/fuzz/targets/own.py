@@ -30,6 +30,7 @@ from splatseg.io.tensors import read_tensors
 from splatseg.lift.training import _state as training
 from splatseg.pose import _saved as saved
 from splatseg.pose._report import LeftOut, Lens, MapperTry, PoseReport
+from splatseg.street.files import load_mesh_field, save_mesh_field
 from splatseg.tasks._figures import read_points, read_scores
 from support.fuzz.targets.base import (
     Target,
@@ -39,6 +40,7 @@ from support.fuzz.targets.base import (
     view_of,
     whole,
 )
+from support.mesh_fields import balls, random_field
 
 
 def _scene(name: str, file: str) -> None:
@@ -111,6 +113,14 @@ _layer("layer-labels", _labels)
 _layer("layer-tree", _tree)
 _layer("layer-features", lambda: Features(values=torch.rand(4, 3), weights=torch.ones(4)))
 _layer("layer-selection", lambda: Selection(mask=torch.tensor([True, False, True, False])))
+
+
+@target("mesh-field")
+def mesh_field(folder: Path) -> Target:
+    """A field of one primitive."""
+    file = folder / "field.safetensors"
+    save_mesh_field(random_field(balls([[0, 0, 2]])), file)
+    return Target(file=file, read=lambda: load_mesh_field(file))
 
 
 @target("safetensors")
