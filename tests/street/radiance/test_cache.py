@@ -38,7 +38,7 @@ def refuse() -> Iterator[MeshHits]:
 
 def test_hits_come_back_ray_by_ray_within_a_step_of_their_weights() -> None:
     parts = found()
-    kept = cached_hits(parts, memory=1 << 20, folder=None, identity="a")
+    kept = cached_hits(parts, memory=1 << 20, folder=None, triangles=160, identity="a")
     rays = torch.tensor([80, 3, 3, 41])
     places, faces, weights = kept.of(rays, 4)
     all_faces = torch.cat([part.faces for part in parts])[rays].reshape(-1)
@@ -53,9 +53,13 @@ def test_hits_come_back_ray_by_ray_within_a_step_of_their_weights() -> None:
 
 @pytest.mark.parametrize("memory", [0, 500])
 def test_in_files_they_are_the_same_as_in_memory(tmp_path: Path, memory: int) -> None:
-    in_memory = cached_hits(found(), memory=1 << 20, folder=None, identity="a")
-    in_files = cached_hits(found(), memory=memory, folder=tmp_path / "hits", identity="a")
-    again = cached_hits(refuse(), memory=memory, folder=tmp_path / "hits", identity="a")
+    in_memory = cached_hits(found(), memory=1 << 20, folder=None, triangles=160, identity="a")
+    in_files = cached_hits(
+        found(), memory=memory, folder=tmp_path / "hits", triangles=160, identity="a"
+    )
+    again = cached_hits(
+        refuse(), memory=memory, folder=tmp_path / "hits", triangles=160, identity="a"
+    )
     assert in_files.folder == again.folder == tmp_path / "hits"
     assert same(in_memory, in_files)
     assert same(in_memory, again)
@@ -64,7 +68,7 @@ def test_in_files_they_are_the_same_as_in_memory(tmp_path: Path, memory: int) ->
 
 
 def test_temporary_files_go_with_it() -> None:
-    kept = cached_hits(found(), memory=0, folder=None, identity="a")
+    kept = cached_hits(found(), memory=0, folder=None, triangles=160, identity="a")
     assert kept.folder is not None
     assert kept.folder.is_dir()
     kept.close()
@@ -73,40 +77,48 @@ def test_temporary_files_go_with_it() -> None:
 
 
 def test_hits_of_something_else_are_found_again(tmp_path: Path) -> None:
-    cached_hits(found()[:1], memory=0, folder=tmp_path / "hits", identity="a")
+    cached_hits(found()[:1], memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     with pytest.raises(FileFormatError, match="hits of these rays"):
-        read_hits(tmp_path / "hits", identity="b")
-    other = cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="b")
-    assert same(other, cached_hits(found(), memory=1 << 20, folder=None, identity="b"))
+        read_hits(tmp_path / "hits", triangles=160, identity="b")
+    other = cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="b")
+    assert same(
+        other, cached_hits(found(), memory=1 << 20, folder=None, triangles=160, identity="b")
+    )
 
 
 @pytest.mark.parametrize("name", ["counts.bin", "faces.bin", "weights.bin"])
 def test_half_a_file_is_refused_and_found_again(tmp_path: Path, name: str) -> None:
-    whole = cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+    whole = cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     path = tmp_path / "hits" / name
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(FileFormatError, match=name):
-        read_hits(tmp_path / "hits", identity="a")
-    again = cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+        read_hits(tmp_path / "hits", triangles=160, identity="a")
+    again = cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     assert again.hits == whole.hits
-    assert read_hits(tmp_path / "hits", identity="a").hits == whole.hits
+    assert read_hits(tmp_path / "hits", triangles=160, identity="a").hits == whole.hits
 
 
 @pytest.mark.parametrize("change", [{"rays": -1}, {"rays": "9"}, {"hits": None}, {"version": 2}])
 def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
-    cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+    cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     header = tmp_path / "hits" / "cache.json"
     header.write_text(json.dumps(json.loads(header.read_text()) | change))
     with pytest.raises(FileFormatError):
-        read_hits(tmp_path / "hits", identity="a")
+        read_hits(tmp_path / "hits", triangles=160, identity="a")
+
+
+def test_triangles_that_there_are_not_are_refused(tmp_path: Path) -> None:
+    cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
+    with pytest.raises(FileFormatError, match="expected 80 triangles"):
+        read_hits(tmp_path / "hits", triangles=80, identity="a")
 
 
 def test_counts_that_do_not_add_up_are_refused(tmp_path: Path) -> None:
-    cached_hits(found(), memory=0, folder=tmp_path / "hits", identity="a")
+    cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     path = tmp_path / "hits" / "counts.bin"
     path.write_bytes(bytes(len(path.read_bytes())))
     with pytest.raises(FileFormatError, match="counts"):
-        read_hits(tmp_path / "hits", identity="a")
+        read_hits(tmp_path / "hits", triangles=160, identity="a")
 
 
 def test_an_interrupted_search_leaves_nothing(tmp_path: Path) -> None:
@@ -115,12 +127,12 @@ def test_an_interrupted_search_leaves_nothing(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        cached_hits(broken(), memory=0, folder=tmp_path / "hits", identity="a")
+        cached_hits(broken(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="cache_folder"):
-        cached_hits(found(), memory=0, folder=tmp_path, identity="a")
+        cached_hits(found(), memory=0, folder=tmp_path, triangles=160, identity="a")
     assert (tmp_path / "mine.txt").read_text() == "mine"

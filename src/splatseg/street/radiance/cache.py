@@ -28,7 +28,7 @@ from torch import Tensor
 
 from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.atomic import atomic_folder, is_vacant
-from splatseg.io.json_files import json_text, parse_object
+from splatseg.io.json_files import json_text, read_json
 from splatseg.street.hits import MeshHits
 
 FORMAT = "splatseg.street.ray-hits"
@@ -96,12 +96,18 @@ class CachedHits:
 
 
 def cached_hits(
-    parts: Iterable[MeshHits], *, memory: int, folder: Path | None, identity: str
+    parts: Iterable[MeshHits],
+    *,
+    triangles: int,
+    memory: int,
+    folder: Path | None,
+    identity: str,
 ) -> CachedHits:
     """Hits as they are found, kept in memory or, beyond `memory` bytes, in files.
 
     Args:
         parts: Hits of rays in their order; not asked for where the folder holds them already.
+        triangles: How many there are.
         memory: Bytes.
         folder: Where files are kept; its parent exists. None is a temporary place, removed by
             `CachedHits.close`.
@@ -115,7 +121,7 @@ def cached_hits(
         if not (folder / _HEADER).is_file():
             raise InputError(f"cache_folder: expected a folder of hits or none, got {folder}.")
         try:
-            return read_hits(folder, identity=identity)
+            return read_hits(folder, triangles=triangles, identity=identity)
         except FileFormatError:  # of something else or damaged: found again
             shutil.rmtree(folder)
     with ExitStack() as stack:
@@ -128,7 +134,8 @@ def cached_hits(
         if kept is not None:
             return kept
         stack.pop_all()
-    return replace(read_hits(target, identity=identity), temporary=temporary)
+    found = read_hits(target, triangles=triangles, identity=identity)
+    return replace(found, temporary=temporary)
 
 
 def _gathered(
@@ -157,10 +164,10 @@ def _gathered(
             text = json_text(_HEADER, about | {"rays": rays, "hits": hits})
             (Path(files["counts"].name).parent / _HEADER).write_text(text, encoding="utf-8")
             return None
-    joined = {
-        name: np.concatenate(arrays[name]) if arrays[name] else np.zeros(_EMPTY[name], dtype)
-        for name, dtype in _TYPES.items()
-    }
+    joined: dict[str, NDArray[Any]] = {}
+    for name, dtype in _TYPES.items():
+        parted = arrays.pop(name)
+        joined[name] = np.concatenate(parted) if parted else np.zeros(_EMPTY[name], dtype)
     return CachedHits(
         starts=_starts(joined["counts"]), faces=joined["faces"], weights=joined["weights"]
     )
@@ -176,16 +183,13 @@ def _packed(hits: MeshHits) -> dict[str, NDArray[Any]]:
     }
 
 
-def read_hits(folder: Path, *, identity: str) -> CachedHits:
+def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
     """Hits that `cached_hits` left in a folder; their pages are read when they are looked at.
 
     Raises:
         FileFormatError: If they are of something else, or damaged, or not complete.
     """
-    header = parse_object(
-        (folder / _HEADER).read_text(encoding="utf-8", errors="replace"),
-        where=str(folder / _HEADER),
-    )
+    header = read_json(folder / _HEADER)
     wanted = {"format": FORMAT, "version": VERSION, "identity": identity}
     found = {name: header.get(name) for name in wanted}
     if found != wanted:
@@ -208,9 +212,13 @@ def read_hits(folder: Path, *, identity: str) -> CachedHits:
     starts = _starts(arrays["counts"])
     if int(starts[-1]) != hits:
         raise FileFormatError(f"{folder}: expected {hits} hits, got counts of {int(starts[-1])}.")
-    return CachedHits(
-        starts=starts, faces=arrays["faces"], weights=arrays["weights"], folder=folder
-    )
+    faces = arrays["faces"]
+    if hits and not 0 <= int(faces.min()) <= int(faces.max()) < triangles:
+        raise FileFormatError(
+            f"{folder}: expected {triangles} triangles, got [{int(faces.min())}, "
+            f"{int(faces.max())}]."
+        )
+    return CachedHits(starts=starts, faces=faces, weights=arrays["weights"], folder=folder)
 
 
 def _starts(counts: NDArray[np.uint8]) -> Int64[Tensor, "n"]:

@@ -168,7 +168,11 @@ def _hits(
     limits = (options.max_hits, options.fine_hits, options.coarse_hits, options.order)
     digest.update(repr(limits).encode())
     return cached_hits(
-        parts(), memory=options.cache_memory, folder=folder, identity=digest.hexdigest()
+        parts(),
+        triangles=len(mesh.faces),
+        memory=options.cache_memory,
+        folder=folder,
+        identity=digest.hexdigest(),
     )
 
 
