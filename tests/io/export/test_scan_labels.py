@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from splatseg.core import PointLabels, Scan
-from splatseg.errors import InputError, ShapeError
-from splatseg.io.export import write_scan_labels
+from splatseg.errors import InputError, RangeError, ShapeError
+from splatseg.io.export import write_scan_labels, write_scan_points
 from splatseg.io.ply import read_ply_header, read_ply_tables
 
 
@@ -90,3 +90,14 @@ def test_a_label_too_few_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ShapeError, match="^labels: "):
         write_scan_labels([(Scan(name="b", points=torch.zeros(4, 3)), short)], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_points_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(ShapeError, match="^points: "):
+        write_scan_points(torch.zeros(3), tmp_path / "a.ply", columns={})
+    with pytest.raises(RangeError, match="^points: "):
+        write_scan_points(torch.full((1, 3), torch.nan), tmp_path / "a.ply", columns={})
+    with pytest.raises(InputError, match=r"^columns\['a'\]: expected 1 values"):
+        write_scan_points(torch.zeros(1, 3), tmp_path / "a.ply", columns={"a": torch.zeros(2)})
+    with pytest.raises(InputError, match="to end in .ply, .las or .laz"):
+        write_scan_points(torch.zeros(1, 3), tmp_path / "a.txt", columns={})

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg._check import check_finite, check_shape
 from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingPackageError, RangeError
@@ -92,10 +93,14 @@ def write_scan_points(
         The classification of each class id in a LAS file, see `write_points`.
 
     Raises:
+        ShapeError: If the points are not (n, 3).
+        RangeError: If a point is not finite.
         InputError: If the name ends otherwise, or a column has another number of rows.
         MissingPackageError: If laspy is not installed and LAS is asked for.
         MissingFileError: If the folder of `path` does not exist.
     """
+    check_shape("points", points, (None, 3))
+    check_finite("points", points)
     arrays = {name: _plain(name, column) for name, column in columns.items()}
     for name, array in arrays.items():
         if array.shape != (len(points),):
