@@ -70,7 +70,7 @@ class MeshCaster:
         >>> ball = PrimitiveMesh(vertices=vertices, levels=torch.zeros(1), sizes=(1.0,))
         >>> hits = MeshCaster(ball).hits(torch.tensor([-2.0, 0, 0]), torch.tensor([[1.0, 0, 0]]))
         >>> [round(float(t), 2) for t in hits.distances[0, :3]]
-        [1.05, 2.95, inf]
+        [1.0, 3.0, inf]
     """
 
     @boundary
