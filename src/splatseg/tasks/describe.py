@@ -43,6 +43,7 @@ _CAPTURE_FILES = (
     "cameras.npz",
     "traj_w_c.txt",
 )
+_CAPTURE_SUFFIXES = (".parquet", ".tfrecord")
 _SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".gltf", ".glb")
 
 
@@ -67,7 +68,7 @@ def describe(path: Path, *, format: str = "auto") -> dict[str, Any]:
         raise MissingFileError(f"{path}: there is no such file or folder.")
     if path.is_dir():
         return _describe_folder(path, format)
-    if path.name in _CAPTURE_FILES:
+    if path.name in _CAPTURE_FILES or path.suffix in _CAPTURE_SUFFIXES:
         return _capture_facts(read_capture(path, format=format))
     if path.suffix == ".npz":
         layer = load_layer(path)

@@ -16,6 +16,7 @@ from splatseg.errors import (
     OutputError,
 )
 from splatseg.io.captures import find_formats, read_capture
+from splatseg.tasks.describe import describe
 from support.waymo_files import (
     CAMERA_PLACE,
     CONTEXT,
@@ -215,3 +216,9 @@ def test_without_pyarrow(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingPackageError, match=r"pip install 'splatseg\[waymo\]'"):
         read_capture(tmp_path)
+
+
+def test_a_file_of_a_segment_is_described(tmp_path) -> None:
+    write_segment(tmp_path)
+    found = describe(tmp_path / "lidar" / f"{CONTEXT}.parquet")
+    assert (found["kind"], found["format"]) == ("capture", "waymo")
