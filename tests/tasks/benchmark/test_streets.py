@@ -40,7 +40,7 @@ class Set:
 
 @pytest.fixture(scope="module")
 def sets(generated_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Set]:
-    """The drive in a layout, with a Gaussian at every point of the truth; not to be changed."""
+    """The drive in a layout, a Gaussian at every second point of the truth; not to be changed."""
     made: dict[str, Set] = {}
 
     def of(layout: str) -> Set:
@@ -66,7 +66,7 @@ def sets(generated_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Cal
 
 def gaussians_of(scene: BenchmarkScene) -> Gaussians:
     assert scene.points is not None
-    means = scene.points.points.float()
+    means = scene.points.points.float()[::2]
     gaps = torch.cdist(means, means).topk(4, largest=False).values[:, 3:]
     return Gaussians(
         means=means,
@@ -79,13 +79,11 @@ def gaussians_of(scene: BenchmarkScene) -> Gaussians:
 
 @pytest.fixture
 def run(sets: Callable[[str], Set], tmp_path: Path) -> Callable[..., BenchRun]:
-    """Runs uplift on a copy of the fit; what it found."""
+    """Runs uplift on a copy of the fit, beside it for its photographs; what it found."""
 
     def go(layout: str, *switches: str, **options: Any) -> BenchRun:
         data = sets(layout)
-        fit = tmp_path / "fit"
-        if not fit.exists():
-            shutil.copytree(data.fit, fit)
+        fit = copied(data, tmp_path)
         given: dict[str, Any] = {
             "models": (str(data.fit.parent / "evidence" / NAME),),
             "fitted": str(fit),
@@ -94,6 +92,14 @@ def run(sets: Callable[[str], Set], tmp_path: Path) -> Callable[..., BenchRun]:
         return bench(layout, data.folder, tmp_path / "out", options=BenchOptions(**given | options))
 
     return go
+
+
+def copied(data: Set, tmp_path: Path) -> Path:
+    """The fit, which gets evidence and fields of a test."""
+    fit = data.fit.parent / tmp_path.name
+    if not fit.exists():
+        shutil.copytree(data.fit, fit)
+    return fit
 
 
 def only(run: BenchRun, row: str) -> dict[str, float]:
@@ -180,16 +186,16 @@ def test_segments_are_no_classes(run) -> None:
         run("waymo", methods=("associate",))
 
 
-def test_a_mesh_field_is_its_own_row(run, tmp_path) -> None:
+def test_a_mesh_field_is_its_own_row(run, sets, tmp_path) -> None:
     """Points by eq. 9, and by what its views show; the field is kept in the scene."""
-    few = ("geometry_iterations=4", "iterations=12", "rays=128")
+    few = ("geometry_iterations=2", "iterations=4", "rays=64", "voxels=1.0,2.0")
     done = run("waymo", "points=field,views", methods=("dnmp",), method_options=few)
     assert [one.method for one in done.methods] == ["dnmp-field", "dnmp-views"]
     field, views = (one.scores for one in done.methods)
     assert field["undefined"] > 0
     assert field["miou"] != views["miou"]
     assert field["psnr"] == views["psnr"]
-    kept = scene_field(load_scene(tmp_path / "fit"), "dnmp")
+    kept = scene_field(load_scene(copied(sets("waymo"), tmp_path)), "dnmp")
     assert kept.layer_names == ("layer",)
 
 
@@ -233,8 +239,7 @@ def test_truth_without_points_is_scored_in_views_alone(sets, tmp_path, monkeypat
     data = sets("waymo")
     bare = replace(data.scene, points=None)
     monkeypatch.setattr("splatseg.tasks.benchmark.scenes.read_benchmark", lambda *_, **__: (bare,))
-    fit = tmp_path / "fit"
-    shutil.copytree(data.fit, fit)
+    fit = copied(data, tmp_path)
     options = BenchOptions(models=(str(data.fit.parent / "evidence" / NAME),), fitted=str(fit))
     done = bench("waymo", data.folder, tmp_path / "out", options=options)
     assert [one.method for one in done.methods] == ["uplift-views"]
