@@ -132,6 +132,10 @@ RUNS = (
     Run(protocol="cosseg-scannet-panoptic", layout="scannet", scene="office",
         methods=("uplift", "associate", "cosseg"), companions=_BESIDES,
         evidence=(_TRACKED, _PANOPTIC), switches=_ANY),
+    Run(protocol="kitti360", layout="kitti360", scene="street",
+        methods=("uplift", "vote", "dnmp"), evidence=(_CLASSES,)),
+    Run(protocol="waymo", layout="waymo", scene="street", methods=("uplift", "vote", "dnmp"),
+        evidence=(_CLASSES,)),
 )  # fmt: skip
 
 
