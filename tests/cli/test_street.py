@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.ply import write_ply
+
 FAST = ("--voxels", "2.0", "4.0", "--geometry-iterations", "1", "--iterations", "3", "--rays", "64")
 
 
@@ -115,6 +117,36 @@ def test_damaged_scans_are_one_sentence(made, generated_drive, splatseg, tmp_pat
     poses = arrays["lidar_to_world"].copy()
     poses[0, 0, 3] = np.nan
     assert "scan 0" in refused(lidar_to_world=poses)
-    near = np.where(arrays["range_2mm"] > 0, 5, 0).astype(np.uint16)
-    assert "scans" in refused(range_2mm=near) or "points" in refused(range_2mm=near)
     assert not (made / "fields/b.safetensors").exists()
+
+
+def test_points_that_are_none_or_in_one_place_are_one_sentence(
+    generated_drive, splatseg, tmp_path
+) -> None:
+    capture = shutil.copytree(generated_drive, tmp_path / "capture")
+
+    def refused() -> str:
+        words = ("--scene", tmp_path / "scene", *FAST, "--quiet")
+        status, out, err = splatseg("street", capture, *words)
+        assert (status, out, err.count("\n")) == (2, "", 1), err
+        return err
+
+    (capture / "points3D.ply").unlink()
+    content = json.loads((capture / "transforms.json").read_text())
+    named = content.pop("ply_file_path")
+    (capture / "transforms.json").write_text(json.dumps(content))
+    assert "points: expected points to put primitives at" in refused()
+    (capture / "transforms.json").write_text(json.dumps(content | {"ply_file_path": named}))
+    write_ply({"vertex": [("float", axis, [0.1, 0.2, 0.3]) for axis in "xyz"]}, capture / named)
+    assert "points: expected points in several voxels of 2 m, got 3 in one" in refused()
+
+
+def test_labels_that_the_table_lacks_are_one_sentence(generated_drive, splatseg, tmp_path) -> None:
+    capture = shutil.copytree(generated_drive, tmp_path / "capture")
+    content = json.loads((capture / "metadata.json").read_text())
+    content["classes"] = content["classes"][:3]
+    (capture / "metadata.json").write_text(json.dumps(content))
+    words = ("--scene", tmp_path / "scene", *FAST, "--quiet")
+    status, out, err = splatseg("street", capture, *words)
+    assert (status, out, err.count("\n")) == (2, "", 1), err
+    assert "labels_semantic: expected ids of (1, 2, 3), got" in err

