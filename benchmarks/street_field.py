@@ -105,7 +105,7 @@ def miou(model: RadianceModel, caster: MeshCaster, views: list[View], data: Path
             capture_output=True, text=True, check=True,
         )  # fmt: skip
     scores = {key: float(np.mean(values)) for key, values in found.items()}
-    return scores | {"miou": json.loads(said.stdout)["miou"]}
+    return scores | {"miou": json.loads(said.stdout)["mIoU"]}
 
 
 def main() -> None:
