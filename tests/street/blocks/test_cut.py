@@ -87,6 +87,16 @@ def test_weights_are_a_function_of_the_point(rng):
     assert torch.equal(torch.cat([dense(drive, part) for part in points.split(7)]), whole)
 
 
+@pytest.mark.parametrize("name", LINES)
+def test_points_where_a_block_counts_are_those_of_its_weight(name, rng):
+    drive = cut_drive(LINES[name], options=DriveBlockOptions(length=60.0, overlap=20.0))
+    low, high = LINES[name].amin(0) - 40, LINES[name].amax(0) + 40
+    points = low + (high - low) * torch.from_numpy(rng.random((400, 3)))
+    weights = dense(drive, points)
+    for block in drive.blocks:
+        assert torch.equal(drive.counts(block, points), weights[:, block.index] > 0)
+
+
 def test_where_a_drive_crosses_itself_all_passes_count():
     drive = cut_drive(LINES["crossing"], options=DriveBlockOptions(length=60, overlap=20))
     assert len(drive) > 6

@@ -191,11 +191,22 @@ class Drive:
 
     @boundary
     def counts(self, block: DriveBlock, points: Float[Tensor, "p 3"]) -> Bool[Tensor, "p"]:
-        """At which points a block counts anything."""
-        out = torch.zeros(len(points), dtype=torch.bool)
-        for share in self.shares(points):
+        """At which points a block counts anything; they may be spread over all of the drive."""
+        check_shape("points", points, (None, 3))
+        check_finite("points", points)
+        at = points.detach().cpu().double()
+        rows = torch.arange(len(at))
+        # What a block's neighbours are nearer to by half an overlap is none of its points; few
+        # are left to be asked about with all blocks.
+        for index in (block.index - 1, block.index + 1):
+            if 0 <= index < len(self):
+                own = distances(at[rows], block.piece)
+                other = distances(at[rows], self.blocks[index].piece)
+                rows = rows[own < other + self.overlap / 2]
+        out = torch.zeros(len(at), dtype=torch.bool)
+        for share in self.shares(at[rows]):
             if share.block == block.index:
-                out[share.rows] = True
+                out[rows[share.rows]] = True
         return out
 
     @boundary
@@ -205,9 +216,7 @@ class Drive:
         check_finite("points", points)
         if len(self) == 1:
             return torch.ones(len(points), dtype=torch.bool)
-        at = points.detach().cpu().double()
-        parts = [distances(part, block.span) <= self.reach for part in at.split(_POINTS)]
-        return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.bool)
+        return distances(points.detach().cpu().double(), block.span) <= self.reach
 
     def _weights(self, points: Float[Tensor, "n 3"]) -> Iterator[tuple[int, Float[Tensor, "n"]]]:
         """Blocks that may count at some points, with their weights there."""

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_POINTS = 16384
+
 
 def thinned(places: Float[Tensor, "n 3"], step: float) -> Float[Tensor, "m 3"]:
     """The first place, each that is a step from the last one kept, and the last."""
@@ -66,6 +68,11 @@ def distances(points: Float[Tensor, "n 3"], line: Float[Tensor, "m 3"]) -> Float
 
     Nothing but operations on single numbers, so that a point has the same bits in any company.
     """
+    parts = [_distances(part, line) for part in points.split(_POINTS)]
+    return torch.cat(parts) if parts else points.new_zeros(0)
+
+
+def _distances(points: Float[Tensor, "n 3"], line: Float[Tensor, "m 3"]) -> Float[Tensor, "n"]:
     start = line[:1] if len(line) == 1 else line[:-1]
     way = torch.zeros_like(start) if len(line) == 1 else line[1:] - line[:-1]
     squared = _sum(way * way)
