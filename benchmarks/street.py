@@ -24,8 +24,9 @@ label is wrong. Rows, each a field (`splatseg.core.Renderable`) and a layer of i
   `splatseg street` makes these fields; their rows need --field or --published-field.
 
 `mIoU` is over all classes with points, `big` over those with 1 000 points or more, with 95 %
-intervals of a bootstrap over scans. The columns of classes are the paper's 13: bus counts as
-others. `test` and `novel` are mIoU of label maps, PSNR and SSIM those of the test views.
+intervals of a bootstrap over scans. The columns of classes are the paper's 13, nan where the truth
+has none: bus counts as others. `test` and `novel` are mIoU of label maps, PSNR and SSIM those of
+the test views.
 """
 
 import argparse
@@ -232,12 +233,14 @@ def points_score(bench: Bench, ids: np.ndarray, work: Path) -> dict[str, Any]:
     again = [counts[rng.integers(0, len(counts), len(counts))].sum(0) for _ in range(1000)]
     own = {name: id for id, name in bench.classes.items()}
     merged = counts.sum(0)
-    for axis in (0, 1):
-        merged = np.moveaxis(merged, axis, 0)
-        merged[own["other"]] += merged[own[OTHERS]]
-        merged[own[OTHERS]] = 0
-        merged = np.moveaxis(merged, 0, axis)
-    column = iou(merged)
+    if OTHERS in own and "other" in own:
+        for axis in (0, 1):
+            merged = np.moveaxis(merged, axis, 0)
+            merged[own["other"]] += merged[own[OTHERS]]
+            merged[own[OTHERS]] = 0
+            merged = np.moveaxis(merged, 0, axis)
+    column = np.where(merged.sum(1) > 0, iou(merged), np.nan)
+    of_table = {name: float(column[own[name]]) if name in own else np.nan for name in TABLE}
     return {
         "points": said["mIoU"],
         "points_interval": interval([mean_iou(c) for c in again]),
@@ -245,8 +248,8 @@ def points_score(bench: Bench, ids: np.ndarray, work: Path) -> dict[str, Any]:
         "big_interval": interval([mean_iou(c, big) for c in again]),
         "undefined": said["unlabelled"],
         "accuracy": said["accuracy"],
-        "per_class": {name: float(column[own[name]]) for name in TABLE},
-        "table_1": float(np.mean([column[own[name]] for name in TABLE])),
+        "per_class": of_table,
+        "table_1": float(np.nanmean(list(of_table.values()))),
     }
 
 
