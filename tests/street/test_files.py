@@ -1,4 +1,4 @@
-"""Files of mesh fields: the same after a round trip, the same bytes, and one sentence for damage."""
+"""Files of mesh fields: the same after a round trip, the same bytes, one sentence for damage."""
 
 import json
 from dataclasses import asdict
