@@ -139,6 +139,11 @@ def test_the_form_is_that_of_the_scans_unless_one_is_asked_for(scene, tmp_path) 
         options=ScanLabelOptions(form="label"),
     )  # fmt: skip
     assert (tmp_path / "out/cloud.label").read_bytes() == np.array([BALL] * 2, "<u4").tobytes()
+    with pytest.raises(InputError, match="expected .*las"):
+        label_scans(
+            scene, tmp_path / "cloud.ply", tmp_path / "las", field=Halves(),
+            options=ScanLabelOptions(scan_format="las"),
+        )  # fmt: skip
     with pytest.raises(InputError, match="^form: expected one of"):
         ScanLabelOptions(form="txt")  # pyright: ignore[reportArgumentType]
 

@@ -16,7 +16,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatseg._check import check_finite, check_shape
 from splatseg.core import Camera, View
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.fit._options import FitOptions
 from splatseg.io.depths import depth_kind, load_depth
@@ -160,6 +162,7 @@ class DepthMaps:
         return (inverse, float(1 / known.median())) if len(known) else None
 
 
+@boundary
 def aligned_inverse(
     values: Float[Tensor, "rows columns"], camera: Camera, points: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "rows columns"] | None:
@@ -169,7 +172,15 @@ def aligned_inverse(
     and refined by ten rounds of least squares over the half of the points with the smallest
     residuals, because the others may be occluded. None where fewer than 20 points are in view,
     or the map is constant.
+
+    Raises:
+        ShapeError: If the map is not an image, or points are not (n, 3).
+        RangeError: If a value of the map or a point is not finite.
     """
+    check_shape("values", values, (None, None))
+    check_shape("points", points, (None, 3))
+    check_finite("values", values)
+    check_finite("points", points)
     straight = undistorted_camera(camera)
     pixels, z = straight.project(points.double())
     size = pixels.new_tensor([straight.width, straight.height])

@@ -247,8 +247,9 @@ def test_distance_power_divides_errors() -> None:
     assert divided == pytest.approx(plain / 25)
 
 
-@pytest.mark.parametrize("name", ["normal", "laplacian", "edge"])
-def test_regularisers_smooth_what_is_hit(name: str) -> None:
+@pytest.mark.parametrize("option", ["normal_weight", "laplacian_weight", "edge_weight"])
+def test_regularisers_smooth_what_is_hit(option: str) -> None:
+    name = option.removesuffix("_weight")
     _, faces = template()
 
     def rough(**options: float) -> float:
@@ -256,7 +257,7 @@ def test_regularisers_smooth_what_is_hit(name: str) -> None:
         vertices = found.mesh(shipped()).vertices.view(-1, 42, 3) / found.scales[:, None, None]
         return getattr(mesh_regularisers(vertices, faces), name).mean().item()
 
-    assert rough(**{f"{name}_weight": 100.0}) < 0.99 * rough()
+    assert rough(**{option: 100.0}) < 0.99 * rough()
 
 
 def test_depth_weight_is_of_depth_beside_regularisers() -> None:
