@@ -208,7 +208,7 @@ def test_options_of_another_method_are_refused_in_python(small) -> None:
 
 def test_ours_come_first_and_cannot_be_replaced(installed) -> None:
     installed(uplift="json:loads", other="splatseg.methods.vote:METHOD")
-    assert method_names() == (*_registry._OWN, "other")
+    assert method_names() == (*_registry._OWN, *_registry._ABOVE, "other")
     assert find_method("uplift").name == "uplift"
 
 

@@ -18,7 +18,7 @@ from splatseg.io.scene import load_scene_layer
 CLI = Path(cli.__file__).parent
 MAKE = {
     "attach", "bench", "demo", "edit", "evaluate", "export", "fit", "import", "query", "render",
-    "see", "segment", "select", "sharpen",
+    "see", "segment", "select", "sharpen", "street",
 }  # fmt: skip
 TELL = {"doctor", "info"}
 SHARED = {

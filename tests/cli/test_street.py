@@ -18,7 +18,7 @@ def made(generated_drive, tmp_path_factory) -> Path:
     from splatseg.cli import main
 
     root = tmp_path_factory.mktemp("street") / "scene"
-    words = ("street", generated_drive, "--scene", root, "--scans", generated_drive, *FAST)
+    words = ("street", generated_drive, "--new-scene", root, "--scans", generated_drive, *FAST)
     assert main([str(word) for word in (*words, "--quiet")]) == 0
     return root
 
@@ -81,7 +81,7 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path
     assert "expected mesh for a scene without Gaussians" in refused(
         made, "--label-scans", generated_drive, "-o", out, "--layer", "a"
     )
-    assert "--scene: expected a scene folder to write" in refused(generated_drive)
+    assert "--new-scene: expected a scene folder to write" in refused(generated_drive)
     assert "there is no such capture" in refused(tmp_path / "none")
     assert "there is no such folder or file of scans" in refused(
         made, "--label-scans", tmp_path / "none", "-o", out, "--by", "mesh"
@@ -126,7 +126,7 @@ def test_points_that_are_none_or_in_one_place_are_one_sentence(
     capture = shutil.copytree(generated_drive, tmp_path / "capture")
 
     def refused() -> str:
-        words = ("--scene", tmp_path / "scene", *FAST, "--quiet")
+        words = ("--new-scene", tmp_path / "scene", *FAST, "--quiet")
         status, out, err = splatseg("street", capture, *words)
         assert (status, out, err.count("\n")) == (2, "", 1), err
         return err
@@ -146,7 +146,7 @@ def test_labels_that_the_table_lacks_are_one_sentence(generated_drive, splatseg,
     content = json.loads((capture / "metadata.json").read_text())
     content["classes"] = content["classes"][:3]
     (capture / "metadata.json").write_text(json.dumps(content))
-    words = ("--scene", tmp_path / "scene", *FAST, "--quiet")
+    words = ("--new-scene", tmp_path / "scene", *FAST, "--quiet")
     status, out, err = splatseg("street", capture, *words)
     assert (status, out, err.count("\n")) == (2, "", 1), err
     assert "labels_semantic: expected ids of (1, 2, 3), got" in err

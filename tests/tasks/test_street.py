@@ -33,7 +33,7 @@ EVIDENCE = StreetOptions(evidence="labels_semantic")
 @pytest.fixture(scope="module")
 def drive(generated_drive, tmp_path_factory) -> Scene:
     """A scene without Gaussians; not to be changed."""
-    return open_drive(generated_drive, scene=tmp_path_factory.mktemp("drive") / "scene")
+    return open_drive(generated_drive, new_scene=tmp_path_factory.mktemp("drive") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -190,19 +190,19 @@ def test_what_is_refused(drive, generated_drive, tmp_path) -> None:
         make(unnamed)
     with pytest.raises(InputError, match="^field: expected a name of letters"):
         StreetOptions(field="../up")
-    with pytest.raises(InputError, match="^scene: expected a scene folder to write"):
+    with pytest.raises(InputError, match="^new_scene: expected a scene folder to write"):
         open_drive(generated_drive)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken/file").write_text("mine")
     with pytest.raises(InputError, match="expected a new folder, got one that is there"):
-        open_drive(generated_drive, scene=tmp_path / "taken")
-    with pytest.raises(InputError, match="^scene: expected none with"):
-        open_drive(drive.root, scene=tmp_path / "new")
+        open_drive(generated_drive, new_scene=tmp_path / "taken")
+    with pytest.raises(InputError, match="^new_scene: expected none with"):
+        open_drive(drive.root, new_scene=tmp_path / "new")
 
 
 def test_a_capture_opens_the_scene_that_was_made_of_it(generated_drive, tmp_path) -> None:
-    first = open_drive(generated_drive, scene=tmp_path / "scene")
-    again = open_drive(generated_drive, scene=tmp_path / "scene")
+    first = open_drive(generated_drive, new_scene=tmp_path / "scene")
+    again = open_drive(generated_drive, new_scene=tmp_path / "scene")
     assert again.root == first.root
     assert len(again.gaussians) == 0
     assert open_drive(tmp_path / "scene").root == first.root

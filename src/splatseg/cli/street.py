@@ -49,15 +49,15 @@ class Command:
 
     splatseg street drive --scans lidar --evidence labels_semantic
 
-    splatseg street capture --scene drive --published
+    splatseg street capture --new-scene drive --published
 
     splatseg street drive --label-scans lidar -o labels --layer labels_semantic
     """
 
     drive: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE_OR_CAPTURE")]
-    """A scene folder, or a capture with --scene."""
+    """A scene folder, or a capture with --new-scene."""
 
-    scene: Annotated[Path | None, tyro.conf.arg(metavar="NEW")] = None
+    new_scene: Annotated[Path | None, tyro.conf.arg(metavar="NEW")] = None
     """With a capture: the scene folder to write, without Gaussians."""
 
     inputs: tyro.conf.OmitArgPrefixes[_Street] = field(default_factory=_Street)
@@ -145,10 +145,10 @@ def _check(command: Command) -> None:
 
 def _scene(command: Command) -> tuple[Scene, Path]:
     """The scene, and its folder."""
-    if is_scene(command.drive) and command.scene is None:
+    if is_scene(command.drive) and command.new_scene is None:
         return open_scene(command.drive, command.data), command.drive
-    scene = open_drive(command.drive, scene=command.scene, data=command.data)
-    return scene, command.scene or command.drive
+    scene = open_drive(command.drive, new_scene=command.new_scene, data=command.data)
+    return scene, command.new_scene or command.drive
 
 
 def _field(

@@ -128,12 +128,12 @@ class StreetField:
 
 
 @boundary
-def open_drive(path: Path, *, scene: Path | None = None, data: Path | None = None) -> Scene:
+def open_drive(path: Path, *, new_scene: Path | None = None, data: Path | None = None) -> Scene:
     """The scene of a drive: one that is there, or a new one without Gaussians of a capture.
 
     Args:
         path: A scene folder, or that of a capture.
-        scene: With a capture, the scene folder to write; one without Gaussians that an earlier
+        new_scene: With a capture, the scene folder to write; one without Gaussians that an earlier
             call wrote of it is opened.
         data: With a scene, the capture's folder, where it was moved.
 
@@ -142,25 +142,27 @@ def open_drive(path: Path, *, scene: Path | None = None, data: Path | None = Non
         MissingFileError: If there is nothing at the path.
     """
     if is_scene(path):
-        if scene is not None:
-            raise InputError(f"scene: expected none with {path}, which is a scene, got {scene}.")
+        if new_scene is not None:
+            raise InputError(
+                f"new_scene: expected none with {path}, which is a scene, got {new_scene}."
+            )
         return load_scene(path, data=data)
     capture = read_capture(path)
-    if scene is None:
+    if new_scene is None:
         raise InputError(
-            f"scene: expected a scene folder to write the field of {path} to, which is a capture, "
+            f"new_scene: expected a scene folder to write the field of {path} to, a capture, "
             "got none."
         )
-    if is_scene(scene):
-        there = load_scene(scene)
+    if is_scene(new_scene):
+        there = load_scene(new_scene)
         if len(there.gaussians) or there.source is None or not _same(there.source, path):
             raise InputError(
-                f"{scene}: expected a new folder or a scene without Gaussians of {path}, got "
+                f"{new_scene}: expected a new folder or a scene without Gaussians of {path}, got "
                 "another scene; give that scene instead of the capture."
             )
         return there
-    check_new_folder(scene)
-    return save_scene(_without_gaussians(capture), scene)
+    check_new_folder(new_scene)
+    return save_scene(_without_gaussians(capture), new_scene)
 
 
 @boundary
