@@ -12,7 +12,7 @@ from splatseg.street.primitives import CoarseRule, StartShape
 from splatseg.street.radiance import PUBLISHED_RADIANCE, RadianceOptions
 
 Setting = Literal["fast", "published"]
-"""fast: networks and rates that fit a drive of 56 m on two cores in a quarter of an hour.
+"""fast: networks and rates that are sized for two cores.
 published: those of the papers and of DNMP's public code."""
 
 
