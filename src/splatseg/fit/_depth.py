@@ -19,7 +19,7 @@ from torch import Tensor
 from splatseg._check import check_finite, check_shape
 from splatseg.core import Camera, View
 from splatseg.core.boundary import boundary
-from splatseg.errors import InputError
+from splatseg.errors import InputError, ShapeError
 from splatseg.fit._options import FitOptions
 from splatseg.io.depths import depth_kind, load_depth
 from splatseg.render.warp import Warp, undistorted_camera
@@ -174,10 +174,12 @@ def aligned_inverse(
     or the map is constant.
 
     Raises:
-        ShapeError: If the map is not an image, or points are not (n, 3).
+        ShapeError: If the map is no image of a pixel or more, or points are not (n, 3).
         RangeError: If a value of the map or a point is not finite.
     """
     check_shape("values", values, (None, None))
+    if not values.numel():
+        raise ShapeError(f"values: expected a map with pixels, got {tuple(values.shape)}.")
     check_shape("points", points, (None, 3))
     check_finite("values", values)
     check_finite("points", points)

@@ -84,10 +84,36 @@ def read_npy(path: Path, *, mapped: bool = False) -> NDArray[Any]:
         size = path.stat().st_size
         header = read_header(file, size=size, where=path)
         if mapped and header.nbytes:
-            return np.memmap(
-                path, header.dtype, "c", header.offset, header.shape, order=header.order
-            )
+            return _mapped(path, header, offset=header.offset)
         return filled(file, header)
+
+
+def map_values(path: Path, *, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Values of a file without a header, left in it: pages are read when they are looked at.
+
+    Args:
+        path: The file.
+        dtype: Type of a value, with its byte order.
+        shape: Of the array that the file holds and nothing else.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is shorter or longer than these values.
+    """
+    header = ArrayHeader(shape=shape, dtype=np.dtype(dtype), order="C", offset=0)
+    with reading(path, "values of NumPy"):
+        size = path.stat().st_size
+        if size != header.nbytes:
+            raise FileFormatError(
+                f"{path}: expected {header.nbytes} bytes, {shape} values of {header.dtype}, "
+                f"got {size}."
+            )
+        return _mapped(path, header, offset=0) if size else np.zeros(shape, header.dtype)
+
+
+def _mapped(path: Path, header: ArrayHeader, *, offset: int) -> NDArray[Any]:
+    """What is written to it stays in memory (copy on write)."""
+    return np.memmap(path, header.dtype, "c", offset, header.shape, order=header.order)
 
 
 def filled(file: IO[bytes], header: ArrayHeader) -> NDArray[Any]:

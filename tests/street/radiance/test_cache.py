@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatseg.errors import FileFormatError, InputError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.street.hits import MeshCaster, MeshHits
 from splatseg.street.radiance.cache import CachedHits, cached_hits, read_hits
 from street.radiance.scene import two_balls
@@ -95,6 +95,10 @@ def test_half_a_file_is_refused_and_found_again(tmp_path: Path, name: str) -> No
         read_hits(tmp_path / "hits", triangles=160, identity="a")
     again = cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     assert again.hits == whole.hits
+    path.unlink()
+    with pytest.raises(MissingFileError, match=name):
+        read_hits(tmp_path / "hits", triangles=160, identity="a")
+    cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     assert read_hits(tmp_path / "hits", triangles=160, identity="a").hits == whole.hits
 
 

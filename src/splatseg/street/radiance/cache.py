@@ -26,9 +26,10 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.errors import FileFormatError, InputError, quoted
+from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.json_files import json_text, read_json
+from splatseg.io.npy import map_values
 from splatseg.street.hits import MeshHits
 
 FORMAT = "splatseg.street.ray-hits"
@@ -122,7 +123,7 @@ def cached_hits(
             raise InputError(f"cache_folder: expected a folder of hits or none, got {folder}.")
         try:
             return read_hits(folder, triangles=triangles, identity=identity)
-        except FileFormatError:  # of something else or damaged: found again
+        except (FileFormatError, MissingFileError):  # of something else or damaged: found again
             shutil.rmtree(folder)
     with ExitStack() as stack:
         temporary, target = None, folder
@@ -187,7 +188,8 @@ def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
     """Hits that `cached_hits` left in a folder; their pages are read when they are looked at.
 
     Raises:
-        FileFormatError: If they are of something else, or damaged, or not complete.
+        FileFormatError: If they are of something else, or damaged.
+        MissingFileError: If a file of them is not there.
     """
     header = read_json(folder / _HEADER)
     wanted = {"format": FORMAT, "version": VERSION, "identity": identity}
@@ -201,14 +203,10 @@ def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
     if not isinstance(rays, int) or not isinstance(hits, int) or min(rays, hits) < 0:
         raise FileFormatError(f"{folder}: expected numbers of rays and hits, got {quoted(header)}.")
     shapes = {"counts": (rays,), "faces": (hits,), "weights": (hits, 2)}
-    arrays: dict[str, NDArray[Any]] = {}
-    for name, shape in shapes.items():
-        path = folder / f"{name}.bin"
-        dtype = np.dtype(_TYPES[name])
-        size = path.stat().st_size if path.is_file() else -1
-        if size != int(np.prod(shape)) * dtype.itemsize:
-            raise FileFormatError(f"{path}: expected {shape} values of {dtype}, got {size} bytes.")
-        arrays[name] = np.memmap(path, dtype, "r", shape=shape) if size else np.zeros(shape, dtype)
+    arrays = {
+        name: map_values(folder / f"{name}.bin", dtype=_TYPES[name], shape=shape)
+        for name, shape in shapes.items()
+    }
     starts = _starts(arrays["counts"])
     if int(starts[-1]) != hits:
         raise FileFormatError(f"{folder}: expected {hits} hits, got counts of {int(starts[-1])}.")
