@@ -243,6 +243,11 @@ def test_truth_without_points_is_scored_in_views_alone(sets, tmp_path, monkeypat
     options = BenchOptions(models=(str(data.fit.parent / "evidence" / NAME),), fitted=str(fit))
     done = bench("waymo", data.folder, tmp_path / "out", options=options)
     assert [one.method for one in done.methods] == ["uplift-views"]
+    said = "there are no scans beside the photographs"
+    assert not any(said in note for note in done.methods[0].scenes[0].notes)
+    monkeypatch.setattr("splatseg.tasks.benchmark.fits.scan_formats", lambda _: ())
+    again = bench("waymo", data.folder, tmp_path / "again", options=options)
+    assert any(said in note for note in again.methods[0].scenes[0].notes)
     assert set(done.methods[0].scores) == {"view_miou", "psnr", "ssim"}
 
 

@@ -89,7 +89,13 @@ def find_scans(path: Path) -> str:
     Raises:
         InputError: If it has none of them.
     """
-    for name, (found, _) in _READERS.items():
-        if found(path):
-            return name
+    known = scan_formats(path)
+    if known:
+        return known[0]
     raise InputError(f"{path}: expected scans of a laser ({', '.join(FORMATS)}), got none of them.")
+
+
+@boundary
+def scan_formats(path: Path) -> tuple[str, ...]:
+    """Layouts of scans that a folder or file has, the one that would be read first; none is ()."""
+    return tuple(name for name, (found, _) in _READERS.items() if found(path))

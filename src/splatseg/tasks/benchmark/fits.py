@@ -21,7 +21,7 @@ from splatseg.io.benchmarks.replica import LAYOUT as REPLICA
 from splatseg.io.benchmarks.replica import SEQUENCES
 from splatseg.io.captures.replica import TRAIN_EVERY
 from splatseg.io.paths import path_inside
-from splatseg.io.scans import find_scans
+from splatseg.io.scans import scan_formats
 from splatseg.io.scene import load_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene
 from splatseg.render import BackendName
@@ -121,11 +121,7 @@ def scans_of(bench: BenchmarkScene, protocol: Protocol) -> Path | None:
     path = bench.capture.path
     if not (isinstance(protocol.switches, StreetSwitches) and protocol.switches.scans):
         return None
-    try:
-        find_scans(path)
-    except InputError:  # of no layout that is known: the drive has photographs alone
-        return None
-    return path
+    return path if scan_formats(path) else None
 
 
 def gaussians_digest(scene: Scene) -> str:

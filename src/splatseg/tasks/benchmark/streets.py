@@ -181,9 +181,12 @@ class Drive:
 
     @property
     def _notes(self) -> list[str]:
+        notes: list[str] = []
         if self._found_table is None:
-            return ["ids of classes are taken as they are: the evidence has no names."]
-        return []
+            notes.append("ids of classes are taken as they are: the evidence has no names.")
+        if self._switches.scans and scans_of(self._job.bench, self._job.protocol) is None:
+            notes.append("there are no scans beside the photographs, so that none were used.")
+        return notes
 
     def _points(self, job: Job, truth: TruePoints) -> Scores:
         """Scores of the points of lasers by one rule."""
