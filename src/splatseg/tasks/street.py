@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import Capture, Gaussians, Scene, View
+from splatseg.core import Scene, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
@@ -29,6 +29,7 @@ from splatseg.street.options import PUBLISHED, DnmpOptions
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._street_sources import capture_points, drive_sources
 from splatseg.tasks.new_scene import check_new_folder
+from splatseg.tasks.render_truth import scene_of_views
 from splatseg.tasks.scene_parts import views_asked, views_recorded
 
 _CELLS = 5
@@ -162,7 +163,7 @@ def open_drive(path: Path, *, new_scene: Path | None = None, data: Path | None =
             )
         return there
     check_new_folder(new_scene)
-    return save_scene(_without_gaussians(capture), new_scene)
+    return save_scene(replace(scene_of_views(capture), provenance={"command": "street"}), new_scene)
 
 
 @boundary
@@ -339,22 +340,3 @@ def _views(
 
 def _same(one: Path, other: Path) -> bool:
     return one.resolve() == other.resolve()
-
-
-def _without_gaussians(capture: Capture) -> Scene:
-    none = torch.zeros(0, 3)
-    return Scene(
-        gaussians=Gaussians(
-            means=none,
-            rotations=torch.zeros(0, 4),
-            scales=none,
-            opacities=torch.zeros(0),
-            sh=torch.zeros(0, 1, 3),
-        ),
-        views=capture.views,
-        classes=capture.classes,
-        up=capture.up,
-        metres_per_unit=capture.metres_per_unit,
-        source=capture.path,
-        provenance={"command": "street"},
-    )
