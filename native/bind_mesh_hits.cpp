@@ -22,7 +22,7 @@ void expect(bool holds, const char* what) {
 
 void hits(const PrimitiveTree& self, const Array<const double, 2>& origins,
           const Array<const double, 2>& directions, const Array<int64_t, 2>& faces,
-          const Array<double, 2>& distances, const Array<float, 3>& weights) {
+          const Array<double, 2>& distances, const Array<float, 3>& weights, bool front) {
   const size_t rays = directions.shape(0);
   expect(directions.shape(1) == 3 && origins.shape(1) == 3 &&
              (origins.shape(0) == 1 || origins.shape(0) == rays),
@@ -41,7 +41,7 @@ void hits(const PrimitiveTree& self, const Array<const double, 2>& origins,
   }
   nb::gil_scoped_release released;
   self.hits(origins.data(), origins.shape(0) == 1, directions.data(), static_cast<int64_t>(rays),
-            static_cast<int>(limit), faces.data(), distances.data(), weights.data());
+            static_cast<int>(limit), front, faces.data(), distances.data(), weights.data());
 }
 
 }  // namespace
@@ -64,7 +64,7 @@ void register_mesh_hits(nb::module_& m) {
            })
       .def_prop_ro("nbytes", &PrimitiveTree::bytes)
       .def("hits", &hits, nb::arg("origins"), nb::arg("directions"), nb::arg("faces"),
-           nb::arg("distances"), nb::arg("weights"));
+           nb::arg("distances"), nb::arg("weights"), nb::arg("front"));
 }
 
 }  // namespace splatseg

@@ -61,6 +61,7 @@ bool passes_left(double cross, double ax, double ay, double bx, double by) {
 
 struct PrimitiveTree::Found {
   int limit, size = 0;
+  bool front;
   int64_t* faces;
   double* distances;
   float* weights;
@@ -209,6 +210,8 @@ void PrimitiveTree::meet(int32_t primitive, const double* origin, const double* 
     double weight[3] = {x[b] * y[c] - y[b] * x[c], x[c] * y[a] - y[c] * x[a],
                         x[a] * y[b] - y[a] * x[b]};
     const bool one = passes_left(weight[0], x[b], y[b], x[c], y[c]);
+    // Seen along the ray, what is counter-clockwise from outside turns to the right.
+    if (found.front && one) continue;
     if (passes_left(weight[1], x[c], y[c], x[a], y[a]) != one ||
         passes_left(weight[2], x[a], y[a], x[b], y[b]) != one)
       continue;
@@ -220,11 +223,11 @@ void PrimitiveTree::meet(int32_t primitive, const double* origin, const double* 
 }
 
 void PrimitiveTree::hits(const double* origins, bool one_origin, const double* directions,
-                         int64_t rays, int limit, int64_t* faces, double* distances,
+                         int64_t rays, int limit, bool front, int64_t* faces, double* distances,
                          float* weights) const {
   parallel_for(rays, kRays, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
-      Found found{limit, 0, faces + i * limit, distances + i * limit, weights + 3 * i * limit};
+      Found found{limit, 0, front, faces + i * limit, distances + i * limit, weights + 3 * i * limit};
       const double* origin = origins + (one_origin ? 0 : 3 * i);
       const double* d = directions + 3 * i;
       const double squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];

@@ -28,9 +28,10 @@ class PrimitiveTree {
   int64_t bytes() const;
 
   // The first `limit` triangles that each ray meets at t >= 0, nearest first, of equal distances
-  // that with the smaller number: numbers (-1: none), t, and weights of the corners.
+  // that with the smaller number: numbers (-1: none), t, and weights of the corners. With `front`
+  // only those that it meets from outside, where faces are counter-clockwise.
   void hits(const double* origins, bool one_origin, const double* directions, int64_t rays,
-            int limit, int64_t* faces, double* distances, float* weights) const;
+            int limit, bool front, int64_t* faces, double* distances, float* weights) const;
 
  private:
   struct Node {

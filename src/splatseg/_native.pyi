@@ -335,6 +335,7 @@ class PrimitiveTree:
         faces: Tensor,
         distances: Tensor,
         weights: Tensor,
+        front: bool,
     ) -> None: ...
 
 class VoxelGrid:

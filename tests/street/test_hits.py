@@ -47,6 +47,8 @@ def rays(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         {"max_hits": 6, "fine_hits": 4, "coarse_hits": 2},
         {"max_hits": 3, "fine_hits": 0},
         {"max_hits": 8, "coarse_hits": 0},
+        {"sides": "front"},
+        {"max_hits": 3, "fine_hits": 2, "coarse_hits": 1, "sides": "front"},
     ],
 )
 def test_hits_are_those_of_trying_every_triangle(limits) -> None:
@@ -89,6 +91,18 @@ def test_a_ray_through_a_ball_meets_it_twice_and_from_within_once() -> None:
     assert [int(one.valid.sum()) for one in (through, within, beyond)] == [2, 1, 0]
     assert math.isinf(float(beyond.distances[0, 0]))
     assert float(beyond.weights.abs().sum()) == 0
+
+
+def test_fronts_are_met_on_entering_alone() -> None:
+    caster = MeshCaster(balls((0, 0, 0), (4, 0, 0)))
+    before = torch.tensor([-3.0, 0.1, 0.2])
+    ahead = torch.tensor([[1.0, 0, 0]])
+    all_four = caster.hits(before, ahead)
+    fronts = caster.hits(before, ahead, sides="front")
+    assert int(fronts.valid.sum()) == 2
+    assert torch.equal(fronts.faces[:, :2], all_four.faces[:, [0, 2]])
+    within = caster.hits(torch.tensor([0.0, 0.1, 0.2]), ahead, sides="front")
+    assert (within.faces[within.valid] // FACES).tolist() == [1]
 
 
 def test_rays_exactly_through_vertices_and_edges_meet_the_surface_twice() -> None:
@@ -160,6 +174,7 @@ def test_no_primitives_and_no_rays_give_no_hits() -> None:
         (torch.zeros(3), torch.ones(1, 3), {"max_hits": MAX_HITS + 1}, RangeError, "max_hits"),
         (torch.zeros(3), torch.ones(1, 3), {"fine_hits": -1}, RangeError, "fine_hits"),
         (torch.zeros(3), torch.ones(1, 3), {"coarse_hits": 65}, RangeError, "coarse_hits"),
+        (torch.zeros(3), torch.ones(1, 3), {"sides": "back"}, InputError, "sides"),
         (
             torch.zeros(3),
             torch.ones(1, 3),

@@ -12,18 +12,23 @@ primitive that wraps fine ones could use up what a ray may have.
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg import _native
-from splatseg._check import check_finite, check_range, check_shape
+from splatseg._check import check_choice, check_finite, check_range, check_shape
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError, RangeError
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.shapes.template import FACES, VERTICES, template
+
+Sides = Literal["both", "front"]
+"""both: triangles are met from outside and from inside their primitive, as published. front: from
+outside alone, of which a ray that enters a primitive has one where both are two."""
 
 MAX_HITS = 64
 """Triangles that a ray may keep."""
@@ -60,7 +65,7 @@ class MeshHits:
 class MeshCaster:
     """Primitives, arranged so that rays find all triangles that they meet.
 
-    Triangles are met from both sides. Bits do not depend on the number of threads.
+    Bits do not depend on the number of threads.
 
     Args:
         mesh: The primitives; there may be none.
@@ -104,6 +109,7 @@ class MeshCaster:
         max_hits: int = 8,
         fine_hits: int | None = None,
         coarse_hits: int | None = None,
+        sides: Sides = "both",
     ) -> MeshHits:
         """The triangles that each ray meets, those of all levels together.
 
@@ -114,6 +120,7 @@ class MeshCaster:
             fine_hits: The nearest of the finest level that are kept; None is `max_hits`. 0 leaves
                 the level out.
             coarse_hits: The nearest of each other level that are kept; None is `max_hits`.
+            sides: From which sides triangles are met.
 
         Returns:
             ``max_hits`` columns, or fewer where the levels together give fewer.
@@ -121,8 +128,9 @@ class MeshCaster:
         Raises:
             ShapeError: If there is not one origin, or as many as directions.
             RangeError: If a value is not finite, a direction is 0, or a limit is out of range.
-            InputError: If no level gives a triangle.
+            InputError: If no level gives a triangle, or the sides are not known.
         """
+        check_choice("sides", sides, get_args(Sides))
         check_shape("directions", directions, (None, 3))
         check_shape("origins", origins, (3,) if origins.ndim < 2 else (len(directions), 3))
         check_finite("origins", origins)
@@ -144,7 +152,7 @@ class MeshCaster:
                 part = slice(begin, begin + _RAYS)
                 own = starts if len(starts) == 1 else starts[part]
                 found = [
-                    level.hits(own, rays[part], limit)
+                    level.hits(own, rays[part], limit, front=sides == "front")
                     for level, limit in zip(self._levels, limits, strict=True)
                     if limit
                 ]
@@ -185,12 +193,12 @@ class _Level:
     tree: _native.PrimitiveTree
     primitives: Int64[Tensor, "m"]
 
-    def hits(self, origins: Tensor, directions: Tensor, limit: int) -> MeshHits:
+    def hits(self, origins: Tensor, directions: Tensor, limit: int, *, front: bool) -> MeshHits:
         count = len(directions)
         faces = torch.empty(count, limit, dtype=torch.int64)
         distances = torch.empty(count, limit, dtype=torch.float64)
         weights = torch.empty(count, limit, 3)
-        self.tree.hits(origins, directions, faces, distances, weights)
+        self.tree.hits(origins, directions, faces, distances, weights, front)
         if len(self.primitives):
             own = faces.clamp_min(0)
             world = FACES * self.primitives[own // FACES] + own % FACES

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.raycast import through_triangles
-from splatseg.street.hits import MeshHits
+from splatseg.street.hits import MeshHits, Sides
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.shapes.template import FACES
 
@@ -20,6 +20,7 @@ def mesh_hits(
     max_hits: int = 8,
     fine_hits: int | None = None,
     coarse_hits: int | None = None,
+    sides: Sides = "both",
 ) -> MeshHits:
     """What `MeshCaster.hits` finds, but for rays exactly through edges, which meet both sides.
 
@@ -30,12 +31,16 @@ def mesh_hits(
         max_hits: The nearest that are kept.
         fine_hits: Of level 0; None is `max_hits`.
         coarse_hits: Of each other level; None is `max_hits`.
+        sides: From which sides triangles are met.
     """
     corners = mesh.vertices.double()[mesh.faces]
     rays = directions.double()[:, None]
     start = origins.double().expand_as(directions)[:, None]
     t, weights = through_triangles(start, rays, corners.expand(len(rays), -1, -1, -1))
     inside = (weights >= 0).all(dim=-1) & (t >= 0)
+    if sides == "front":
+        a, b, c = corners.unbind(1)
+        inside &= directions.double() @ torch.linalg.cross(b - a, c - a).T < 0
     t = torch.where(inside, t, math.inf)
     level = mesh.levels.repeat_interleave(FACES)
     for each in range(len(mesh.sizes)):

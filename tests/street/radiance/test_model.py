@@ -164,6 +164,7 @@ def test_the_published_field_has_the_published_sizes() -> None:
         {"view_encoding": "normals"},
         {"background": "sky"},
         {"order": "depth"},
+        {"sides": "back"},
         {"max_hits": 0},
         {"fine_hits": 65},
         {"fine_hits": 0, "coarse_hits": 0},

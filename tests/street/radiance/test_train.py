@@ -102,6 +102,7 @@ CHANGES = {
     "max_hits": 1,
     "fine_hits": 1,
     "coarse_hits": 1,
+    "sides": "front",
     "rays": 32,
     "iterations": 4,
     "rate": 1e-2,

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 from splatseg._check import check_choice, check_range
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
-from splatseg.street.hits import MAX_HITS
+from splatseg.street.hits import MAX_HITS, Sides
 
 ViewEncoding = Literal["normal_view", "view", "none"]
 Background = Literal["network", "constant", "none"]
@@ -82,6 +82,9 @@ class RadianceOptions:
     coarse_hits: int | None = 2
     """Triangles of each other level that are kept; None is `max_hits`."""
 
+    sides: Sides = "both"
+    """Whether a ray has triangles that it meets from inside their primitive."""
+
     rays: int = 4096
     """Rays of a step."""
 
@@ -125,6 +128,7 @@ class RadianceOptions:
         check_choice("view_encoding", self.view_encoding, get_args(ViewEncoding))
         check_choice("background", self.background, get_args(Background))
         check_choice("order", self.order, get_args(Order))
+        check_choice("sides", self.sides, get_args(Sides))
         check_range("max_hits", self.max_hits, 1, MAX_HITS)
         for name in ("fine_hits", "coarse_hits"):
             limit: int | None = getattr(self, name)

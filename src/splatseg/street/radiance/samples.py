@@ -89,5 +89,6 @@ class Surface:
             max_hits=options.max_hits,
             fine_hits=options.fine_hits,
             coarse_hits=options.coarse_hits,
+            sides=options.sides,
         )
         return self.ordered(hits, options)
