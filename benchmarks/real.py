@@ -1,16 +1,16 @@
 """Labels of real photographs, lifted and scored by the independent scorer.
 
-    python benchmarks/real.py camvid SCENE ../shared/data/real/camvid
+    python benchmarks/real.py camvid SCENE ../shared/data/real/camvid [--fields street ...]
     python benchmarks/real.py dtu SCENE ../shared/data/real/dtu_scan37
     python benchmarks/real.py replica SCENE ../shared/data/real/replica_office0 --masks masks
 
 `camvid`: a network's class maps of single frames, lifted from all frames and drawn into the same,
-and lifted from the train views and drawn into the held-out ones; pooled mean IoU over the eight
-static classes and over all eleven. `dtu`: the object masks of three views, lifted and drawn into
-all others; the scene must have been fitted without masks (`fit --masks off`). `replica`: masks
-that need no weights, as they come (painted smallest last, with ids of each view's own) and
-associated (the layer that `segment --method associate` made), against the reference's instances,
-which are predictions too.
+and lifted from the train views and drawn into the held-out ones, as are mesh fields of the scene
+(`splatseg street`); pooled mean IoU over the eight static classes and over all eleven. `dtu`: the
+object masks of three views, lifted and drawn into all others; the scene must have been fitted
+without masks (`fit --masks off`). `replica`: masks that need no weights, as they come (painted
+smallest last, with ids of each view's own) and associated (the layer that `segment --method
+associate` made), against the reference's instances, which are predictions too.
 """
 
 import argparse
@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatseg.core import InstanceTree, LabelMap, Labels, Scene, View
+from splatseg.core import InstanceTree, LabelMap, Labels, Renderable, Scene, View
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import (
@@ -40,6 +40,7 @@ from splatseg.lift import (
     uplift,
 )
 from splatseg.methods.cosseg import CossegOptions
+from splatseg.tasks.scene_parts import scene_field
 from splatseg.tasks.segment import SegmentOptions, segment
 
 _SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
@@ -54,6 +55,7 @@ class Job:
     work: Path
     masks: str
     cosseg: Sequence[str] = ()
+    fields: Sequence[str] = ()
 
     def draw(self, labels: Labels, views: Sequence[View], name: str, *, binary: int = 0) -> Path:
         """Label maps of views as PNG; with `binary` masks of that id."""
@@ -65,6 +67,17 @@ class Job:
             else:
                 image = Image.fromarray(ids.clamp_min(0).numpy().astype(np.uint16))
             image.save(folder / f"{view.name}.png")
+        return folder
+
+    def draw_field(self, field: Renderable, views: Sequence[View], name: str) -> Path:
+        """Label maps of views of a field with one layer."""
+        folder = _fresh(self.work / name)
+        for view in views:
+            with field.view(view.camera) as shown:
+                ids = shown.label_map(field.layer_names[0]).ids
+            Image.fromarray(ids.clamp_min(0).numpy().astype(np.uint16)).save(
+                folder / f"{view.name}.png"
+            )
         return folder
 
 
@@ -95,6 +108,9 @@ def camvid(job: Job) -> None:
         drawn = job.draw(labels, held, "cosseg")
         said = _score("semantic", drawn, truth)
         _classes(f"held-out frames, cosseg {words}", said, time.monotonic() - begin)
+    for name in job.fields:
+        drawn = job.draw_field(scene_field(job.scene, name), held, "field")
+        _classes(f"held-out frames, field {name}", _score("semantic", drawn, truth))
 
 
 def _cosseg(job: Job, words: str) -> Labels:
@@ -246,6 +262,7 @@ def main() -> None:
         metavar="OPTIONS",
         help='camvid: also this method, such as "masks=masks features=classical_features"',
     )
+    parser.add_argument("--fields", nargs="*", default=[], help="camvid: also these of the scene")
     parser.add_argument("--work", type=Path, help="keep label maps here")
     arguments = parser.parse_args()
     temporary = None if arguments.work else tempfile.mkdtemp()
@@ -256,6 +273,7 @@ def main() -> None:
             work=arguments.work or Path(temporary or ""),
             masks=arguments.masks,
             cosseg=arguments.cosseg,
+            fields=arguments.fields,
         )
         {"camvid": camvid, "dtu": dtu, "replica": replica}[arguments.what](job)
     finally:

@@ -2,6 +2,7 @@
 
     python benchmarks/street_field.py ../shared/data/street [--geometry 1000] \
         [--iterations 300 1000 3000] [--set width=128 order=levels ...] [--published] [--json FILE]
+        [--save FIELD]
 
 Primitives are put at the points of all scans, fitted to their depth (`--geometry` steps; 0 leaves
 near spheres), and the field is trained for each number of steps from the start, as rates fall over
@@ -34,6 +35,8 @@ from splatseg.evaluate.metrics import psnr, ssim
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scans import read_scans
+from splatseg.street.field import MeshField
+from splatseg.street.files import save_mesh_field
 from splatseg.street.geometry import GeometryOptions, fit_geometry, scan_views
 from splatseg.street.hits import MeshCaster
 from splatseg.street.mesh import PrimitiveMesh
@@ -117,6 +120,7 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="OPTION=VALUE")
     parser.add_argument("--published", action="store_true")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--save", type=Path, help="the last field, for benchmarks/street.py")
     args = parser.parse_args()
     capture = read_capture(args.data)
     evidence = open_evidence(args.data / "labels_semantic")
@@ -190,6 +194,8 @@ def main() -> None:
         )
         if args.json is not None:
             args.json.write_text(json.dumps({"options": args.set, "rows": rows}, indent=1))
+        if args.save is not None:
+            save_mesh_field(MeshField(mesh, fit.model), args.save)
 
 
 if __name__ == "__main__":
