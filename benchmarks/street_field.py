@@ -2,15 +2,15 @@
 
     python benchmarks/street_field.py ../shared/data/street [--geometry 1000] \
         [--iterations 300 1000 3000] [--set width=128 order=levels ...] [--published] [--json FILE]
-        [--save FIELD]
+        [--scene SCENE] [--depth auto] [--mesh FILE] [--save FIELD]
 
-Primitives are put at the points of all scans, fitted to their depth (`--geometry` steps; 0 leaves
-near spheres), and the field is trained for each number of steps from the start, as rates fall over
-all of them. `labels_semantic` of training views teach classes. PSNR and SSIM are means over the
-views of `test`; mIoU is pooled over all views of `test` and of `test_novel`, by the independent
-scorer. `s` and `rays/s` are of the steps alone, wall clock; `cpu ms` is the processor time of a
-step, of all threads: on a machine that others use it says more. `peak` is the share of the
-products of matrices, 6 flops a weight and sample, of what a product of two 2048 x 2048 matrices
+Primitives are put where `splatseg street` puts them and fitted to depth (`--geometry` steps; 0
+leaves near spheres), and the field is trained for each number of steps from the start, as rates
+fall over all of them. `labels_semantic` of training views teach classes. PSNR and SSIM are means
+over the views of `test`; mIoU is pooled over all views of `test` and of `test_novel`, by the
+independent scorer. `s` and `rays/s` are of the steps alone, wall clock; `cpu ms` is the processor
+time of a step, of all threads: on a machine that others use it says more. `peak` is the share of
+the products of matrices, 6 flops a weight and sample, of what a product of two 2048 x 2048 matrices
 reaches a second of processor time.
 """
 
@@ -30,16 +30,18 @@ from PIL import Image
 from scored import _SCORE
 from torch import nn
 
-from splatseg.core import View
+from splatseg.core import Scene, View
 from splatseg.evaluate.metrics import psnr, ssim
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scans import read_scans
+from splatseg.io.scene import load_scene
 from splatseg.street.field import MeshField
 from splatseg.street.files import save_mesh_field
-from splatseg.street.geometry import GeometryOptions, fit_geometry, scan_views
+from splatseg.street.geometry import fit_geometry
 from splatseg.street.hits import MeshCaster
 from splatseg.street.mesh import PrimitiveMesh
+from splatseg.street.options import DnmpOptions
 from splatseg.street.primitives import voxel_primitives
 from splatseg.street.radiance import (
     PUBLISHED_RADIANCE,
@@ -51,17 +53,29 @@ from splatseg.street.radiance import (
     train_radiance,
 )
 from splatseg.street.shapes import load_shapes
+from splatseg.tasks._street_sources import capture_points, drive_sources
+from splatseg.tasks.render_truth import scene_of_views
 
 
-def fitted_mesh(data: Path, views: tuple[View, ...], steps: int) -> PrimitiveMesh:
-    scans = read_scans(data)
+def fitted_mesh(scene: Scene, views: tuple[View, ...], depth: str, steps: int) -> PrimitiveMesh:
     shapes = load_shapes()
-    points = torch.cat([scans.scan(name).points for name in scans.scan_names]).float()
-    primitives = voxel_primitives(points, shapes=shapes)
+    sources = drive_sources(
+        scene, views, depth=depth, scans=read_scans(scene.source), cell=0.1, backend="cpu",
+        points=capture_points(scene.source),
+    )  # fmt: skip
+    primitives = voxel_primitives(sources.points, shapes=shapes)
+    print(f"{sources.said}; primitives by level {torch.bincount(primitives.levels).tolist()}")
     if steps:
-        depths = scan_views(scans, [view.camera for view in views])
-        options = replace(GeometryOptions(), iterations=steps)
-        primitives = fit_geometry(primitives, shapes, depths, options=options).primitives
+        options = replace(DnmpOptions().geometry, iterations=steps)
+        begun = time.process_time()
+        fit = fit_geometry(primitives, shapes, sources.depths(), options=options)
+        primitives = fit.primitives
+        print(
+            f"fitted in {time.process_time() - begun:.0f} s of CPU; error "
+            f"{fit.records[0].loss:.3f} to {fit.records[-1].loss:.3f}; {fit.carved} carved, "
+            f"{fit.enclosing} around cameras",
+            flush=True,
+        )
     return primitives.mesh(shapes)
 
 
@@ -114,6 +128,8 @@ def miou(model: RadianceModel, caster: MeshCaster, views: list[View], data: Path
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
+    parser.add_argument("--scene", type=Path, help="Gaussians of the drive, for their depth")
+    parser.add_argument("--depth", default="auto", help="as splatseg street has it")
     parser.add_argument("--geometry", type=int, default=1000)
     parser.add_argument("--mesh", type=Path, help="where fitted primitives are kept (.npz)")
     parser.add_argument("--iterations", type=int, nargs="+", default=[300, 1000, 3000])
@@ -132,7 +148,9 @@ def main() -> None:
                 sizes=tuple(kept["sizes"].tolist()),
             )
     else:
-        mesh = fitted_mesh(args.data, capture.train_views, args.geometry)
+        scene = scene_of_views(capture) if args.scene is None else load_scene(args.scene)
+        scene = replace(scene, source=args.data.resolve())
+        mesh = fitted_mesh(scene, capture.train_views, args.depth, args.geometry)
         if args.mesh is not None:
             np.savez(args.mesh, vertices=mesh.vertices, levels=mesh.levels, sizes=mesh.sizes)
     caster = MeshCaster(mesh)

@@ -119,22 +119,33 @@ def test_depth_comes_from_what_is_there(drive, generated_drive) -> None:
     full = replace(drive, gaussians=sparse_gaussians(scans))
     bare = tuple(replace(view, depth=None, depth_unit=None) for view in views)
     found = {
-        "scans": drive_sources(full, bare, depth="auto", scans=scans, points=some, **asked),
-        "gaussians": drive_sources(full, bare, depth="auto", scans=None, points=some, **asked),
+        "scans": drive_sources(drive, bare, depth="auto", scans=scans, points=some, **asked),
+        "scans, and of the Gaussians where no laser looked": drive_sources(
+            full, bare, depth="auto", scans=scans, points=some, **asked
+        ),
+        "the Gaussians": drive_sources(full, bare, depth="auto", scans=None, points=some, **asked),
         "points": drive_sources(drive, bare, depth="auto", scans=None, points=some, **asked),
     }
+    known: dict[str, list[torch.Tensor]] = {}
     for kind, sources in found.items():
-        assert sources.said.endswith(f"depth of {'the Gaussians' if kind == 'gaussians' else kind}")
+        assert sources.said.endswith(f"depth of {kind}")
         depths = list(sources.depths())
         assert [d.camera for d in depths] == [view.camera for view in bare]
         assert len(list(sources.depths())) == 2
+        known[kind] = [view.depth for view in depths]
     assert len(found["scans"].points) > len(found["points"].points) == 200
-    centres = drive_sources(full, bare, depth="gaussians", scans=None, points=None, **asked)
+    assert len(found["the Gaussians"].points) > 200
+    measured, both, shown = (known[kind] for kind in list(found)[:3])
+    for one, filled, other in zip(measured, both, shown, strict=True):
+        assert torch.equal(filled, torch.where(one > 0, one, other))
+    assert any(not torch.equal(one, filled) for one, filled in zip(measured, both, strict=True))
+    centres = drive_sources(full, bare, depth="points", scans=None, points=None, **asked)
     assert "centres of Gaussians" in centres.said
     for kind, words in {
         "scans": "expected scans to be given",
         "maps": "expected maps of the 2 views",
         "gaussians": "expected a scene with Gaussians",
+        "scans+gaussians": "expected a scene with Gaussians",
         "labels_semantic": "or evidence of depth, got 'labels_semantic' of labels",
     }.items():
         with pytest.raises(InputError, match=f"^depth: .*{words}"):
@@ -152,7 +163,7 @@ def test_maps_of_the_capture_give_depth_and_points(drive, tmp_path) -> None:
         drive, [mapped], depth="auto", scans=None, points=None, cell=0.5, backend="cpu"
     )
     assert sources.said.endswith("depth maps of the capture")
-    assert "points of depth maps" in sources.said
+    assert "points of depth" in sources.said
     _, z = view.camera.project(sources.points)
     torch.testing.assert_close(z, torch.full_like(z, 3.0), atol=0.3, rtol=0)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,12 +20,13 @@ from splatseg.street.geometry import (
     capture_views,
     evidence_views,
     field_views,
+    filled_views,
     point_views,
     scan_views,
 )
 from splatseg.street.sources import depth_points, gaussian_points, scan_points
 
-DEPTHS = ("auto", "scans", "maps", "gaussians", "points")
+DEPTHS = ("auto", "scans", "scans+gaussians", "maps", "gaussians", "points")
 """Where depth may come from; another word is the name of evidence of depth."""
 
 MAX_DEPTH = 50.0
@@ -57,14 +59,16 @@ def drive_sources(
 ) -> DriveSources:
     """Points and depth of a drive.
 
-    Points are those of scans and of the capture together; where there are none, those of depth
-    maps, or else the centres of Gaussians.
+    Points are those of scans and of the capture together. Where depth is dense (of Gaussians,
+    maps, a model) its points are added: lasers see no roofs, and structure from motion no walls
+    without texture. Where there are none at all, they are the centres of Gaussians.
 
     Args:
         scene: The scene.
         views: Those that are learned from.
         depth: One of `DEPTHS`, or the name of evidence of depth. auto takes the first that is
-            there.
+            there: scans, and what the Gaussians show where no laser looked; maps; gaussians;
+            points.
         scans: In the world of the scene.
         points: The capture's, world, scene units.
         cell: Side of the cells of which each gives one point, scene units.
@@ -87,9 +91,10 @@ def drive_sources(
     kind = _first(scene, views, scans) if depth == "auto" else depth
     depths = _depths(scene, views, kind, scans=scans, points=sparse, backend=backend)
     cloud = sparse
-    if not len(cloud) and kind not in ("points", "gaussians"):
-        cloud = depth_points(depths(), cell, max_depth=MAX_DEPTH / metres)
-        words.append(f"{len(cloud):,} points of depth maps")
+    if kind != "points" and (kind != "scans" or not len(cloud)):
+        dense = depth_points(depths(), cell, max_depth=MAX_DEPTH / metres)
+        words.append(f"{len(dense):,} points of depth")
+        cloud = torch.cat((cloud, dense))
     if not len(cloud) and len(scene.gaussians):
         cloud = gaussian_points(scene.gaussians, cell)
         words.append(f"{len(cloud):,} centres of Gaussians")
@@ -100,7 +105,11 @@ def drive_sources(
         )
     if kind == "points" and not len(sparse):
         depths = _of_points(cloud, cameras, metres)
-    said = {"maps": "depth maps of the capture", "gaussians": "depth of the Gaussians"}
+    said = {
+        "maps": "depth maps of the capture",
+        "gaussians": "depth of the Gaussians",
+        "scans+gaussians": "depth of scans, and of the Gaussians where no laser looked",
+    }
     words.append(said.get(kind, f"depth of {kind}"))
     return DriveSources(points=cloud, depths=depths, said=", ".join(words))
 
@@ -116,7 +125,7 @@ def capture_points(source: Capture | Path | None) -> Float[Tensor, "n 3"] | None
 
 def _first(scene: Scene, views: Sequence[View], scans: ScanSource | None) -> str:
     if scans is not None:
-        return "scans"
+        return "scans+gaussians" if len(scene.gaussians) else "scans"
     if any(view.depth is not None for view in views):
         return "maps"
     return "gaussians" if len(scene.gaussians) else "points"
@@ -133,19 +142,24 @@ def _depths(
 ) -> Callable[[], Iterable[DepthView]]:
     metres = scene.metres_per_unit or 1.0
     cameras = [view.camera for view in views]
+    if "gaussians" in kind.split("+") and not len(scene.gaussians):
+        raise InputError("depth: expected a scene with Gaussians, got one without.")
+
+    def shown() -> Iterable[DepthView]:
+        return field_views(GaussianField(scene.gaussians, backend=backend), cameras)
+
     match kind:
-        case "scans":
+        case "scans" | "scans+gaussians":
             if scans is None:
                 raise InputError("depth: expected scans to be given with scans, got none.")
-            return lambda: scan_views(scans, cameras, metres_per_unit=metres)
+            measured = partial(scan_views, scans, cameras, metres_per_unit=metres)
+            return measured if kind == "scans" else lambda: filled_views(measured(), shown())
         case "maps":
             if all(view.depth is None for view in views):
                 raise InputError(f"depth: expected maps of the {len(views)} views, got none.")
             return lambda: capture_views(views)
         case "gaussians":
-            if not len(scene.gaussians):
-                raise InputError("depth: expected a scene with Gaussians, got one without.")
-            return lambda: field_views(GaussianField(scene.gaussians, backend=backend), cameras)
+            return shown
         case "points":
             return _of_points(points, cameras, metres)
         case name:

@@ -64,8 +64,9 @@ class StreetOptions:
     none."""
 
     depth: str = "auto"
-    """Where depth comes from: scans, maps of the capture, gaussians, points, or the name of
-    evidence of depth. auto takes the first of these that is there."""
+    """Where depth comes from: scans, scans+gaussians (what Gaussians show where no laser looked),
+    maps of the capture, gaussians, points, or the name of evidence of depth. auto takes the most
+    that is there, scans before maps before gaussians before points."""
 
     published: bool = False
     """The setting of the papers: networks, rates, 5 000 and 50 000 iterations."""

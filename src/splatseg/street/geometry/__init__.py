@@ -4,6 +4,7 @@ from splatseg.street.geometry.depth_sources import DepthSource as DepthSource
 from splatseg.street.geometry.depth_sources import capture_views as capture_views
 from splatseg.street.geometry.depth_sources import evidence_views as evidence_views
 from splatseg.street.geometry.depth_sources import field_views as field_views
+from splatseg.street.geometry.depth_sources import filled_views as filled_views
 from splatseg.street.geometry.depth_sources import point_views as point_views
 from splatseg.street.geometry.depth_sources import scan_views as scan_views
 from splatseg.street.geometry.depth_views import DepthView as DepthView

@@ -167,6 +167,22 @@ def field_views(
         yield DepthView(camera=camera, depth=torch.where(seen, depth, 0.0))
 
 
+def filled_views(first: Iterable[DepthView], other: Iterable[DepthView]) -> Iterator[DepthView]:
+    """Depth of the same views from two sources: the first's, and the other's where it has none.
+
+    Args:
+        first: Depth of views.
+        other: Of the same, in the same order and size.
+
+    Raises:
+        ShapeError: If two maps of a view differ in size.
+        ValueError: If one source has more views than the other.
+    """
+    for one, two in zip(first, other, strict=True):
+        check_shape("other: depth", two.depth, tuple(one.depth.shape))
+        yield DepthView(camera=one.camera, depth=torch.where(one.depth > 0, one.depth, two.depth))
+
+
 def _resized(camera: Camera, depth: Tensor) -> DepthView:
     height, width = depth.shape
     return DepthView(camera=camera.resized(width, height), depth=depth)

@@ -165,7 +165,13 @@ def _hits(
     digest = hashlib.sha256(rays.fingerprint.encode())
     digest.update(mesh.vertices.detach().cpu().numpy().tobytes())
     digest.update(mesh.levels.cpu().numpy().tobytes())
-    limits = (options.max_hits, options.fine_hits, options.coarse_hits, options.order, options.sides)
+    limits = (
+        options.max_hits,
+        options.fine_hits,
+        options.coarse_hits,
+        options.order,
+        options.sides,
+    )
     digest.update(repr(limits).encode())
     return cached_hits(
         parts(),
