@@ -1,19 +1,24 @@
-"""Fields of a scene that are no Gaussians: ``SCENE/fields/NAME.safetensors``.
+"""Fields of a scene that are no Gaussians: ``SCENE/fields/NAME.safetensors`` or ``.../NAME/``.
 
-What is in a file is the business of who makes such fields (`splatseg.street.files`); here is where
-they are, and how they are called.
+A field is a file, or the folder of a drive in blocks, which has a ``drive.json``. What is in them
+is the business of who makes such fields (`splatseg.street.files`, `splatseg.street.blocks`); here
+is where they are, and how they are called.
 """
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path
+from splatseg.io.write_errors import named_write_failures
 
 FOLDER = "fields"
 SUFFIX = ".safetensors"
+DRIVE_FILE = "drive.json"
+"""What makes a folder that of a drive in blocks."""
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 
@@ -21,13 +26,15 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 @boundary
 def scene_field_names(root: Path) -> tuple[str, ...]:
     """Names of the fields of a scene folder, sorted. Other files in their folder are none."""
-    names = (path.name.removesuffix(SUFFIX) for path in (root / FOLDER).glob(f"*{SUFFIX}"))
-    return tuple(sorted(name for name in names if _NAME.fullmatch(name)))
+    folder = root / FOLDER
+    files = {p.name.removesuffix(SUFFIX) for p in folder.glob(f"*{SUFFIX}") if p.is_file()}
+    drives = {path.parent.name for path in folder.glob(f"*/{DRIVE_FILE}")}
+    return tuple(sorted(name for name in files | drives if _NAME.fullmatch(name)))
 
 
 @boundary
-def scene_field_file(root: Path, name: str) -> Path:
-    """The file of a field that a scene has.
+def scene_field_path(root: Path, name: str) -> Path:
+    """The file of a field that a scene has, or the folder of a drive in blocks.
 
     Raises:
         InputError: If it has none of this name.
@@ -36,7 +43,8 @@ def scene_field_file(root: Path, name: str) -> Path:
     if name not in names:
         known = ", ".join(names) if names else "it has none; `splatseg street` makes one"
         raise InputError(f"field: expected one of {root} ({known}), got {name!r:.80}.")
-    return root / FOLDER / f"{name}{SUFFIX}"
+    file = root / FOLDER / f"{name}{SUFFIX}"
+    return file if file.is_file() else root / FOLDER / name
 
 
 @boundary
@@ -49,3 +57,49 @@ def new_field_file(root: Path, name: str) -> Path:
     """
     check_name("field", name)
     return scene_path(root, FOLDER, f"{name}{SUFFIX}")
+
+
+@boundary
+def new_field_folder(root: Path, name: str) -> Path:
+    """The folder of a field in blocks, which is made where it is not there.
+
+    Raises:
+        InputError: If the name cannot be a folder's, or a link leads out of the scene.
+        OutputError: If the folder cannot be made.
+    """
+    check_name("field", name)
+    return scene_path(root, FOLDER, name, DRIVE_FILE).parent
+
+
+@boundary
+def remove_field_file(root: Path, name: str) -> None:
+    """Remove a field that is a file, where there is one.
+
+    Raises:
+        InputError: If a link leads out of the scene.
+        OutputError: If it cannot be removed.
+    """
+    path = new_field_file(root, name)
+    with named_write_failures(path):
+        path.unlink(missing_ok=True)
+
+
+@boundary
+def remove_field_folder(root: Path, name: str) -> None:
+    """Remove a field in blocks, where there is one; what else its folder holds stays.
+
+    Raises:
+        InputError: If a link leads out of the scene.
+        OutputError: If it cannot be removed.
+    """
+    check_name("field", name)
+    if not (root / FOLDER / name).is_dir():
+        return
+    folder = new_field_folder(root, name)
+    with named_write_failures(folder):
+        # The table first: without it the rest is no field.
+        (folder / DRIVE_FILE).unlink(missing_ok=True)
+        for block in folder.glob(f"[0-9]*{SUFFIX}"):
+            block.unlink()
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()

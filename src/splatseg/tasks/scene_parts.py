@@ -16,7 +16,7 @@ from splatseg.errors import InputError
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.evidence import Evidence
 from splatseg.io.scene import load_scene_layer, scene_layer_names
-from splatseg.io.scene_fields import scene_field_file
+from splatseg.io.scene_fields import scene_field_path
 from splatseg.lift import GaussianField, PointLabelOptions
 from splatseg.render import BackendName
 from splatseg.tasks._film import path_views
@@ -129,17 +129,23 @@ def gaussian_field(
 
 
 def scene_field(scene: Scene, name: str) -> Renderable:
-    """A field of the scene that is no Gaussians, by name: what `tasks.street_field` made.
+    """A field of the scene that is no Gaussians, by name: what `tasks.make_street_field` made.
+
+    Of a drive in blocks few are held; they are read when they are asked for.
 
     Raises:
         InputError: If the scene has none of this name.
+        MissingFileError: If it is a drive in blocks that was stopped.
         FileFormatError: If its file is damaged.
     """
-    from splatseg.street.files import load_mesh_field  # here: most commands need no street
+    # Here, as most commands need no street.
+    from splatseg.street.blocks import open_blocks
+    from splatseg.street.files import load_mesh_field
 
     if scene.root is None:
         raise InputError(f"field {name!r:.80}: the scene has no folder to read it from.")
-    return load_mesh_field(scene_field_file(scene.root, name))
+    path = scene_field_path(scene.root, name)
+    return open_blocks(path) if path.is_dir() else load_mesh_field(path)
 
 
 def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:

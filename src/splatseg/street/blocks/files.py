@@ -18,13 +18,13 @@ from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, read_json, write_json
 from splatseg.io.paths import path_inside
+from splatseg.io.scene_fields import DRIVE_FILE
 from splatseg.io.write_errors import named_write_failures
 from splatseg.street.blocks.cut import Drive, DriveBlock
 from splatseg.street.blocks.field import DriveField
 from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field, save_mesh_field
 
-DRIVE_FILE = "drive.json"
 FORMAT = "splatseg.street.drive"
 VERSION = 1
 
@@ -56,21 +56,69 @@ def build_blocks(
         OutputError: If a file cannot be written.
     """
     path = path_inside(folder, DRIVE_FILE)
-    content = _content(drive, about or {})
-    as_written = json_text(path.name, content, indent=1).encode() + b"\n"
-    if not path.is_file() or path.read_bytes() != as_written:
+    if not goes_on(drive, folder, about=about):
         # The table goes first: without it what is left of another drive is not gone on with.
         with named_write_failures(folder):
             path.unlink(missing_ok=True)
             for old in sorted(folder.glob("[0-9]*.safetensors")):
                 old.unlink()
-        write_json(content, path)
+        save_drive(drive, path, about=about)
     for block in drive.blocks:
-        file = _file(folder, block.index)
+        file = block_file(folder, block.index)
         if not file.is_file():
             save_mesh_field(make(block), file)
         if progress is not None:
             progress(block.index + 1, len(drive))
+
+
+@boundary
+def goes_on(drive: Drive, folder: Path, *, about: Mapping[str, Any] | None = None) -> bool:
+    """Whether `build_blocks` of the same would go on with what a folder holds.
+
+    Raises:
+        InputError: If `about` holds what JSON has no word for.
+    """
+    path = path_inside(folder, DRIVE_FILE, make=False)
+    as_written = json_text(path.name, _content(drive, about or {}), indent=1).encode() + b"\n"
+    return path.is_file() and path.read_bytes() == as_written
+
+
+@boundary
+def drive_about(folder: Path) -> Mapping[str, Any]:
+    """What the blocks of a folder are made from, as `build_blocks` was told.
+
+    Raises:
+        MissingFileError: If there is no drive.
+        FileFormatError: If drive.json is broken.
+    """
+    about = read_json(folder / DRIVE_FILE).get("about")
+    if not isinstance(about, dict):
+        raise FileFormatError(
+            f"{folder / DRIVE_FILE}: expected an object as about, got {quoted(about)}."
+        )
+    return cast("dict[str, Any]", about)
+
+
+@boundary
+def missing_blocks(folder: Path) -> tuple[int, ...]:
+    """Numbers of the blocks of a drive that have no field yet.
+
+    Raises:
+        MissingFileError: If there is no drive.
+        FileFormatError: If drive.json is broken.
+    """
+    drive = load_drive(folder / DRIVE_FILE)
+    return tuple(b.index for b in drive.blocks if not block_file(folder, b.index).is_file())
+
+
+@boundary
+def block_file(folder: Path, index: int) -> Path:
+    """Where the field of a block lies.
+
+    Raises:
+        InputError: If a link leads out of the folder.
+    """
+    return path_inside(folder, f"{index:04d}.safetensors", make=False)
 
 
 @boundary
@@ -86,14 +134,19 @@ def open_blocks(folder: Path, *, max_open: int = 2) -> DriveField:
         FileFormatError: If drive.json is broken.
     """
     drive = load_drive(folder / DRIVE_FILE)
-    lacking = [block.index for block in drive.blocks if not _file(folder, block.index).is_file()]
+    lacking = missing_blocks(folder)
     if lacking:
+        first = block_file(folder, lacking[0]).name
         raise MissingFileError(
             f"{folder}: expected fields of all {len(drive)} blocks of the drive, "
-            f"{len(lacking)} lack, the first {_file(folder, lacking[0]).name}; the command that "
-            "made the others makes these too."
+            f"{len(lacking)} lack, the first {first}; the command that made the others makes these "
+            "too."
         )
-    return DriveField(drive, lambda b: load_mesh_field(_file(folder, b.index)), max_open=max_open)
+
+    def read(block: DriveBlock) -> MeshField:
+        return load_mesh_field(block_file(folder, block.index))
+
+    return DriveField(drive, read, max_open=max_open)
 
 
 @boundary
@@ -175,7 +228,3 @@ def _line(value: object, *, where: str) -> Float[Tensor, "n 3"]:
         raise FileFormatError(f"{where}: expected places of three numbers, got {quoted(value)}.")
     numbers = [[json_number(x, where=where) for x in place] for place in places]
     return torch.tensor(numbers, dtype=torch.float64)
-
-
-def _file(folder: Path, index: int) -> Path:
-    return path_inside(folder, f"{index:04d}.safetensors", make=False)
