@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg.core import Camera, Capture, ScanSource, Scene, View
+from splatseg.core import Capture, ScanSource, Scene, View
 from splatseg.errors import InputError
 from splatseg.io.captures import find_formats, read_capture
 from splatseg.io.evidence import DepthEvidence, find_evidence, open_evidence
@@ -25,6 +25,7 @@ from splatseg.street.geometry import (
     scan_views,
 )
 from splatseg.street.sources import depth_points, gaussian_points, scan_points
+from splatseg.tasks._street_masks import masked_depths, masked_depths_of
 
 DEPTHS = ("auto", "scans", "scans+gaussians", "maps", "gaussians", "points")
 """Where depth may come from; another word is the name of evidence of depth."""
@@ -61,7 +62,8 @@ def drive_sources(
 
     Points are those of scans and of the capture together. Where depth is dense (of Gaussians,
     maps, a model) its points are added: lasers see no roofs, and structure from motion no walls
-    without texture. Where there are none at all, they are the centres of Gaussians.
+    without texture. Where there are none at all, they are the centres of Gaussians. Pixels that
+    masks of views leave out have no depth.
 
     Args:
         scene: The scene.
@@ -78,7 +80,6 @@ def drive_sources(
         InputError: If what is asked for is not there, or there are no points at all.
     """
     metres = scene.metres_per_unit or 1.0
-    cameras = [view.camera for view in views]
     clouds: list[Tensor] = []
     words: list[str] = []
     if scans is not None:
@@ -104,7 +105,7 @@ def drive_sources(
             "maps, or centres of opaque Gaussians), got none."
         )
     if kind == "points" and not len(sparse):
-        depths = _of_points(cloud, cameras, metres)
+        depths = _of_points(cloud, views, metres)
     said = {
         "maps": "depth maps of the capture",
         "gaussians": "depth of the Gaussians",
@@ -153,15 +154,17 @@ def _depths(
             if scans is None:
                 raise InputError("depth: expected scans to be given with scans, got none.")
             measured = partial(scan_views, scans, cameras, metres_per_unit=metres)
-            return measured if kind == "scans" else lambda: filled_views(measured(), shown())
+            if kind == "scans":
+                return lambda: masked_depths(views, measured())
+            return lambda: masked_depths(views, filled_views(measured(), shown()))
         case "maps":
             if all(view.depth is None for view in views):
                 raise InputError(f"depth: expected maps of the {len(views)} views, got none.")
-            return lambda: capture_views(views)
+            return lambda: masked_depths_of(views, lambda view: capture_views([view]))
         case "gaussians":
-            return shown
+            return lambda: masked_depths(views, shown())
         case "points":
-            return _of_points(points, cameras, metres)
+            return _of_points(points, views, metres)
         case name:
             folders = [folder for folder in (scene.root, scene.source) if folder is not None]
             found = open_evidence(find_evidence(folders, name))
@@ -171,10 +174,15 @@ def _depths(
                     f"of {found.kind}."
                 )
             known = [view for view in views if view.name in found.files]
-            return lambda: evidence_views(found, known, points=points, metres_per_unit=metres)
+
+            def told(view: View) -> Iterable[DepthView]:
+                return evidence_views(found, [view], points=points, metres_per_unit=metres)
+
+            return lambda: masked_depths_of(known, told)
 
 
 def _of_points(
-    points: Tensor, cameras: Sequence[Camera], metres: float
+    points: Tensor, views: Sequence[View], metres: float
 ) -> Callable[[], Iterable[DepthView]]:
-    return lambda: point_views(points, cameras, metres_per_unit=metres)
+    cameras = [view.camera for view in views]
+    return lambda: masked_depths(views, point_views(points, cameras, metres_per_unit=metres))
