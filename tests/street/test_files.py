@@ -12,7 +12,7 @@ from splatseg.io.tensors import read_safetensors
 from splatseg.io.tensors_writing import write_tensors
 from splatseg.street.field import MeshField
 from splatseg.street.files import FORMAT, load_mesh_field, save_mesh_field
-from support.mesh_fields import balls, random_field, told_field
+from support.mesh_fields import SMALL, balls, random_field, told_field
 
 
 @pytest.fixture
@@ -103,7 +103,14 @@ def test_no_file_and_other_files(tmp_path: Path) -> None:
         ({"layer": "a@b"}, "layer: expected a name without @"),
         ({"info": []}, r"expected an object as info, got \[\]"),
         ({"info": {"version": 9}}, "record of version 1 or less, got version 9"),
-        ({"options": {}}, r"options: expected .* got \{\}"),
+        ({"options": 3}, "expected an object as options, got 3"),
+        ({"options": {}}, "options: expected feature_size, .*, got none"),
+        ({"options": asdict(SMALL) | {"colour": 3}}, "of this splatseg, got 'colour'; a later"),
+        ({"options": asdict(SMALL) | {"width": "16"}}, "width"),
+        ({"options": asdict(SMALL) | {"width": 16.5}}, "width"),
+        ({"options": asdict(SMALL) | {"width": True}}, "width"),
+        ({"options": asdict(SMALL) | {"sides": "back"}}, "sides"),
+        ({"options": asdict(SMALL) | {"rate": [1]}}, "rate"),
         ({"vertices": None}, "expected a tensor vertices, got none"),
         ({"vertices": torch.zeros(42, 3)}, "expected 42 vertices for each of 2 primitives"),
         ({"vertices": torch.full((84, 3), torch.nan)}, "vertices: .* not finite"),
@@ -112,6 +119,8 @@ def test_no_file_and_other_files(tmp_path: Path) -> None:
         ({"model__features": None}, "expected a tensor model.features, got none"),
         ({"model__features": torch.full((84, 4), torch.inf)}, "features: .* not finite"),
         ({"model__features": torch.zeros(84, 4).int()}, "got torch.int32 of shape"),
+        ({"model__scale": torch.tensor(0.0)}, "model.scale: expected a positive length, got 0"),
+        ({"model__scale": torch.tensor(torch.nan)}, "model.scale: expected .*, got nan"),
         ({"model__other": torch.zeros(1)}, "got others"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
@@ -134,6 +143,11 @@ def test_options_that_ask_for_all_memory_are_refused_before_it_is_taken(saved: P
         load_mesh_field(changed(saved, options=options))
     with pytest.raises(FileFormatError, match="width"):
         load_mesh_field(changed(saved, options=options | {"width": 10**12}))
+
+
+def test_files_of_before_sides_were_an_option_met_both(saved: Path) -> None:
+    options = {name: value for name, value in asdict(SMALL).items() if name != "sides"}
+    assert load_mesh_field(changed(saved, options=options)).model.options.sides == "both"
 
 
 def test_a_file_cut_anywhere_is_one_sentence(saved: Path) -> None:

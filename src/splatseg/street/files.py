@@ -34,6 +34,9 @@ _MODEL = "model."
 _KEYS = ("sizes", "ids", "layer", "radius", "options", "info")
 _MAX_ID = 2**31 - 1
 
+_ADDED: Mapping[str, object] = {"sides": "both"}
+"""Options that the first files of this version lack, and what these were made with."""
+
 
 @boundary
 def save_mesh_field(field: MeshField, path: Path) -> None:
@@ -139,13 +142,22 @@ def _mesh(tensors: Mapping[str, Tensor], about: Mapping[str, Any], path: Path) -
 
 
 def _options(about: Mapping[str, Any], path: Path) -> RadianceOptions:
-    given = about["options"]
-    names = {field.name for field in fields(RadianceOptions)}
-    if not isinstance(given, dict) or set(given) != names:
+    if not isinstance(about["options"], dict):
         raise FileFormatError(
-            f"{path}: options: expected {', '.join(sorted(names))}, got {quoted(given)}."
+            f"{path}: expected an object as options, got {quoted(about['options'])}."
         )
-    return RadianceOptions(**cast("dict[str, Any]", given))
+    given: dict[str, Any] = {**_ADDED, **cast("dict[str, Any]", about["options"])}
+    names = [field.name for field in fields(RadianceOptions)]
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise FileFormatError(f"{path}: options: expected {', '.join(missing)}, got none.")
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise FileFormatError(
+            f"{path}: options: expected those of this splatseg, got {quoted(unknown[0])}; a later "
+            "splatseg may have written it."
+        )
+    return RadianceOptions(**given)
 
 
 def _model(
@@ -173,6 +185,10 @@ def _model(
                 f"{path}: {_MODEL}{name}: expected floating-point numbers of shape {shape} as the "
                 f"options ask for, got {tensor.dtype} of shape {tuple(tensor.shape)}."
             )
+    if not float(state["scale"]) > 0:
+        raise FileFormatError(
+            f"{path}: {_MODEL}scale: expected a positive length, got {float(state['scale']):g}."
+        )
     return RadianceModel.with_state(mesh, ids, options, state)
 
 

@@ -1,8 +1,11 @@
 """Hits that are kept: compressed within the step, in files as in memory, and never half of them."""
 
 import json
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.street.hits import MeshCaster, MeshHits
 from splatseg.street.radiance.cache import CachedHits, cached_hits, read_hits
 from street.radiance.scene import two_balls
+from support.fuzz.mutations import mutate
 
 
 def found() -> list[MeshHits]:
@@ -29,6 +33,12 @@ def same(one: CachedHits, two: CachedHits) -> bool:
         and np.array_equal(one.faces, two.faces)
         and np.array_equal(one.weights, two.weights)
     )
+
+
+def kept_in(folder: Path) -> CachedHits:
+    """Hits that lie in a folder, found if they are not there or damaged, as copies in memory."""
+    kept = cached_hits(found(), memory=0, folder=folder, triangles=160, identity="a")
+    return replace(kept, faces=np.array(kept.faces), weights=np.array(kept.weights))
 
 
 def refuse() -> Iterator[MeshHits]:
@@ -102,7 +112,17 @@ def test_half_a_file_is_refused_and_found_again(tmp_path: Path, name: str) -> No
     assert read_hits(tmp_path / "hits", triangles=160, identity="a").hits == whole.hits
 
 
-@pytest.mark.parametrize("change", [{"rays": -1}, {"rays": "9"}, {"hits": None}, {"version": 2}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rays": -1}, {"rays": "9"}, {"rays": True}, {"rays": 90.5}, {"rays": 89},
+        {"rays": 10**400}, {"hits": None}, {"hits": float("nan")}, {"hits": 2**63}, {"hits": [3]},
+        {"hits": -8},
+        {"version": 2}, {"version": "1"}, {"version": None}, {"identity": ["a"]}, {"format": "b"},
+        {"rays": 2**62, "hits": 2**62},
+    ],
+    ids=lambda change: ", ".join(change),
+)  # fmt: skip
 def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     header = tmp_path / "hits" / "cache.json"
@@ -111,10 +131,72 @@ def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: dict[str, ob
         read_hits(tmp_path / "hits", triangles=160, identity="a")
 
 
+@pytest.mark.parametrize("text", ["", "[]", "{", '"a"', "\ufeff", "null", "{}", "\0" * 90])
+def test_a_header_that_is_none_is_refused_and_found_again(tmp_path: Path, text: str) -> None:
+    whole = kept_in(tmp_path / "hits")
+    (tmp_path / "hits" / "cache.json").write_text(text)
+    with pytest.raises(FileFormatError, match=str(tmp_path)):
+        read_hits(tmp_path / "hits", triangles=160, identity="a")
+    assert same(kept_in(tmp_path / "hits"), whole)
+
+
+@pytest.mark.parametrize("value", [-1, 160, 2**31 - 1, -(2**31)])
+def test_a_triangle_out_of_range_is_refused_and_found_again(tmp_path: Path, value: int) -> None:
+    whole = kept_in(tmp_path / "hits")
+    path = tmp_path / "hits" / "faces.bin"
+    faces = np.frombuffer(path.read_bytes(), "<i4").copy()
+    faces[3] = value
+    path.write_bytes(faces.tobytes())
+    with pytest.raises(FileFormatError, match="expected 160 triangles"):
+        read_hits(tmp_path / "hits", triangles=160, identity="a")
+    assert same(kept_in(tmp_path / "hits"), whole)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("counts", "faces"),
+        ("counts", "weights"),
+        ("faces", "weights"),  # of one size: what else they are is told by their values
+    ],
+)
+def test_swapped_files_are_refused_and_found_again(tmp_path: Path, one: str, other: str) -> None:
+    folder = tmp_path / "hits"
+    whole = kept_in(folder)
+    first, second = (folder / f"{name}.bin" for name in (one, other))
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+    with pytest.raises(FileFormatError):
+        read_hits(folder, triangles=160, identity="a")
+    assert same(kept_in(folder), whole)
+
+
 def test_triangles_that_there_are_not_are_refused(tmp_path: Path) -> None:
     cached_hits(found(), memory=0, folder=tmp_path / "hits", triangles=160, identity="a")
     with pytest.raises(FileFormatError, match="expected 80 triangles"):
         read_hits(tmp_path / "hits", triangles=80, identity="a")
+
+
+def test_damage_at_random_is_refused_or_stays_within_the_primitives(tmp_path: Path) -> None:
+    """Values that could be true are not told from true ones: there is no check sum."""
+    sound = tmp_path / "sound"
+    whole = cached_hits(found(), memory=0, folder=sound, triangles=160, identity="a")
+    random = Random(0)
+    for i in range(240):
+        folder = tmp_path / str(i)
+        shutil.copytree(sound, folder)
+        name = ("cache.json", "counts.bin", "faces.bin", "weights.bin")[i % 4]
+        _, damaged = mutate(random, (sound / name).read_bytes())
+        (folder / name).write_bytes(damaged)
+        try:
+            kept = read_hits(folder, triangles=160, identity="a")
+        except (FileFormatError, MissingFileError):
+            continue
+        assert len(kept.starts) == len(whole.starts)
+        _, faces, weights = kept.of(torch.arange(90), 4)
+        assert 0 <= int(faces.min()) <= int(faces.max()) < 160
+        assert bool(((weights >= 0) & (weights <= 1)).all())
 
 
 def test_counts_that_do_not_add_up_are_refused(tmp_path: Path) -> None:

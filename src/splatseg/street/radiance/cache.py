@@ -26,6 +26,7 @@ from jaxtyping import Float, Int64
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatseg.core.json_numbers import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.json_files import json_text, read_json
@@ -199,9 +200,7 @@ def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
             f"{folder}: expected hits of these rays and primitives ({quoted(identity)}), "
             f"got {quoted(header.get('identity'))}."
         )
-    rays, hits = header.get("rays"), header.get("hits")
-    if not isinstance(rays, int) or not isinstance(hits, int) or min(rays, hits) < 0:
-        raise FileFormatError(f"{folder}: expected numbers of rays and hits, got {quoted(header)}.")
+    rays, hits = (json_integer(header.get(n), where=f"{folder}: {n}") for n in ("rays", "hits"))
     shapes = {"counts": (rays,), "faces": (hits,), "weights": (hits, 2)}
     arrays = {
         name: map_values(folder / f"{name}.bin", dtype=_TYPES[name], shape=shape)

@@ -31,6 +31,8 @@ from splatseg.lift.training import _state as training
 from splatseg.pose import _saved as saved
 from splatseg.pose._report import LeftOut, Lens, MapperTry, PoseReport
 from splatseg.street.files import load_mesh_field, save_mesh_field
+from splatseg.street.hits import MeshCaster
+from splatseg.street.radiance.cache import cached_hits, read_hits
 from splatseg.tasks._figures import read_points, read_scores
 from support.fuzz.targets.base import (
     Target,
@@ -121,6 +123,20 @@ def mesh_field(folder: Path) -> Target:
     file = folder / "field.safetensors"
     save_mesh_field(random_field(balls([[0, 0, 2]])), file)
     return Target(file=file, read=lambda: load_mesh_field(file))
+
+
+def _hits(name: str) -> None:
+    @target(f"hits-{name}")
+    def make(folder: Path) -> Target:
+        kept, file = folder / "hits", folder / "hits" / name
+        directions = torch.tensor([[x / 40, 0.01, 1.0] for x in range(-9, 10)])
+        hits = MeshCaster(balls([[0, 0, 2]])).hits(torch.zeros(3), directions, max_hits=4)
+        cached_hits([hits], memory=0, folder=kept, triangles=80, identity="a")
+        return Target(file=file, read=lambda: read_hits(kept, triangles=80, identity="a"))
+
+
+for _name in ("cache.json", "counts.bin", "faces.bin", "weights.bin"):
+    _hits(_name)
 
 
 @target("safetensors")

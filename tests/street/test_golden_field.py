@@ -1,0 +1,123 @@
+"""The golden mesh field: read, shown and written as when it was made."""
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+from splatseg.io.tensors import read_safetensors
+from splatseg.street.files import load_mesh_field, save_mesh_field
+
+
+@pytest.fixture(scope="module")
+def golden(project_root: Path) -> ModuleType:
+    """The script that made the golden files, as a module."""
+    path = project_root / "tests/golden/make_fields.py"
+    spec = importlib.util.spec_from_file_location("make_fields", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def version_1(project_root: Path) -> Path:
+    return project_root / "tests/golden/field-v1"
+
+
+def test_values_come_back(golden: ModuleType, version_1: Path) -> None:
+    made, found = golden.golden_field(), load_mesh_field(version_1 / golden.FIELD)
+    assert torch.equal(found.mesh.vertices, made.mesh.vertices)
+    assert found.mesh.levels.tolist() == [0, 0, 1]
+    assert found.mesh.sizes == (0.5, 1.0)
+    assert found.model.ids == golden.IDS
+    assert found.model.options == golden.OPTIONS
+    assert (found.layer_names, found.radius) == ((golden.LAYER,), 0.625)
+    assert found.info == made.info
+    assert set(found.model.state) == set(made.model.state)
+    for name, tensor in made.model.state.items():
+        assert torch.equal(found.model.state[name], tensor), name
+
+
+def test_views_and_points_are_as_recorded(golden: ModuleType, version_1: Path) -> None:
+    recorded: dict[str, Any] = json.loads((version_1 / golden.SHOWN).read_text())
+    shown = golden.shown_of(load_mesh_field(version_1 / golden.FIELD))
+    assert set(shown) == set(recorded)
+    for name, values in recorded.items():
+        exact = name in ("label_map", "point_ids")
+        assert torch.allclose(
+            torch.tensor(shown[name]), torch.tensor(values), rtol=0, atol=0 if exact else 1e-5
+        ), name
+    # What is recorded is worth comparing: all classes, cover in part, a point without a label.
+    assert {id for row in recorded["label_map"] for id in row} == set(golden.IDS)
+    assert set(recorded["point_ids"]) == {*golden.IDS, -1}
+    alpha = torch.tensor(recorded["alpha"])
+    assert bool(((alpha > 0.5) & (alpha < 0.97)).any())
+
+
+def test_it_is_written_to_the_same_bytes(
+    golden: ModuleType, version_1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    committed = version_1 / golden.FIELD
+    again = tmp_path / "again.safetensors"
+    save_mesh_field(load_mesh_field(committed), again)
+    assert again.read_bytes() == committed.read_bytes()
+    monkeypatch.setattr(golden, "ROOT", tmp_path / "field-v1")
+    golden.main()
+    assert (tmp_path / "field-v1" / golden.FIELD).read_bytes() == committed.read_bytes()
+    assert (tmp_path / "field-v1" / golden.SHOWN).is_file()
+
+
+def test_the_file_is_as_the_page_of_formats_says(golden: ModuleType, version_1: Path) -> None:
+    """Byte for byte by hand: length, header, numbers without gaps in its order."""
+    content = (version_1 / golden.FIELD).read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    assert length % 8 == 0
+    header: dict[str, Any] = json.loads(content[8 : 8 + length])
+    metadata = header.pop("__metadata__")
+    assert list(metadata) == ["format", "version", "about"]
+    assert (metadata["format"], metadata["version"]) == ("splatseg.street.field", "1")
+    about = json.loads(metadata["about"])
+    assert list(about) == ["sizes", "ids", "layer", "radius", "options", "info"]
+    assert about["options"]["sides"] == "both"
+    names = ["vertices", "levels", "model.features", "model.centre", "model.scale"]
+    assert list(header)[:5] == names
+    assert header["vertices"]["dtype"] == "F32"
+    assert header["levels"]["dtype"] == "U8"
+    assert header["model.features"] == {
+        "dtype": "F16", "shape": [126, 3], "data_offsets": [1515, 2271]
+    }  # fmt: skip
+    end = 0
+    widths = {"F32": 4, "F16": 2, "U8": 1}
+    for row in header.values():
+        begin, end_of_it = row["data_offsets"]
+        count = torch.Size(row["shape"]).numel()
+        assert (begin, end_of_it - begin) == (end, widths[row["dtype"]] * count)
+        end = end_of_it
+    assert 8 + length + end == len(content)
+    tensors, _ = read_safetensors(version_1 / golden.FIELD)
+    at = 8 + length + header["model.features"]["data_offsets"][0]
+    values = torch.frombuffer(bytearray(content[at : at + 756]), dtype=torch.float16)
+    assert torch.equal(values.view(126, 3), tensors["model.features"])
+
+
+def test_the_page_of_formats_lists_what_is_written(
+    golden: ModuleType, version_1: Path, project_root: Path
+) -> None:
+    page = (project_root / "docs/formats.md").read_text()
+    start = page.index("## fields/NAME.safetensors")
+    section = page[start : page.index("\n## ", start)]
+    tensors, metadata = read_safetensors(version_1 / golden.FIELD)
+    about = json.loads(metadata["about"])
+    for name in tensors:
+        parts = name.split(".")
+        told = f"`{name}`" in section or f"`{'.'.join(parts[:-2])}.J." in section
+        told |= f"`{'.'.join(parts[:-1])}.weight` `.bias`" in section
+        assert told, name
+    for key in (*about, *about["options"]):
+        assert f"`{key}`" in section, key
