@@ -74,7 +74,7 @@ from splatseg.tasks.sharpen import SharpenedScene as SharpenedScene
 from splatseg.tasks.sharpen import SharpenSceneOptions as SharpenSceneOptions
 from splatseg.tasks.sharpen import sharpen_scene as sharpen_scene
 from splatseg.tasks.street import StreetField as StreetField
-from splatseg.tasks.street import StreetOptions as StreetOptions
 from splatseg.tasks.street import open_drive as open_drive
 from splatseg.tasks.street import save_street_field as save_street_field
 from splatseg.tasks.street import street_field as street_field
+from splatseg.tasks.street_options import StreetOptions as StreetOptions

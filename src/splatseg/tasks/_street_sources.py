@@ -115,12 +115,17 @@ def drive_sources(
     return DriveSources(points=cloud, depths=depths, said=", ".join(words))
 
 
+def source_capture(source: Path | None) -> Capture | None:
+    """The capture in a folder; None where there is none."""
+    if source is None or not source.is_dir() or not find_formats(source):
+        return None
+    return read_capture(source)
+
+
 def capture_points(source: Capture | Path | None) -> Float[Tensor, "n 3"] | None:
     """The start points of a capture, or of the capture in a folder; None where it has none."""
     if isinstance(source, Path):
-        if not source.is_dir() or not find_formats(source):
-            return None
-        source = read_capture(source)
+        source = source_capture(source)
     return None if source is None or source.points is None else source.points.points
 
 

@@ -45,7 +45,8 @@ from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.maps import Scores, TrueMapSource, class_scores, keep_map
 from splatseg.tasks.benchmark.points import read_by_words, read_in_words
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
-from splatseg.tasks.street import StreetOptions, save_street_field, street_field
+from splatseg.tasks.street import save_street_field, street_field
+from splatseg.tasks.street_options import StreetOptions
 
 _LAYER = "layer"
 _OF_GAUSSIANS = ("views", "density", "region", "fair")
