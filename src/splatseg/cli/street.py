@@ -11,19 +11,18 @@ from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, Seed
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result
 from splatseg.core import Renderable, Scene
 from splatseg.errors import InputError
-from splatseg.io.scene_fields import scene_field_names
-from splatseg.io.scene_folder import is_scene, work_on_scene
+from splatseg.io.scene_fields import scene_field_path
+from splatseg.io.scene_folder import is_scene
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import (
     LabelBy,
     ScanLabelOptions,
     StreetOptions,
     label_scans,
+    made_street_field,
+    make_street_field,
     open_drive,
-    save_street_field,
-    street_field,
 )
-from splatseg.tasks.scene_parts import scene_field
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 
@@ -39,7 +38,9 @@ class Command:
 
     A mesh field is made of deformable neural mesh primitives with semantics: small meshes at the
     surfaces of the drive, fitted to depth, that learn colours and classes from photographs and
-    label maps. It is written to SCENE/fields; render and evaluate take it with --field.
+    label maps. It is written to SCENE/fields; render and evaluate take it with --field. With
+    --block-length a long drive is made in overlapping blocks, of which few are in memory; stopped
+    by Ctrl-C, the same command goes on.
 
     With --label-scans every point of laser scans gets a label: from what the views of the scene's
     Gaussians show at it, or, with --by mesh, from the vertices of the mesh field around it. Points
@@ -50,6 +51,8 @@ class Command:
     splatseg street drive --scans lidar --evidence labels_semantic
 
     splatseg street capture --new-scene drive --published
+
+    splatseg street drive --scans lidar --block-length 80 --moving boxes.json
 
     splatseg street drive --label-scans lidar -o labels --layer labels_semantic
     """
@@ -161,28 +164,27 @@ def _field(
     lines: list[str],
 ) -> Renderable:
     """The field of this name: read, where points are to be labelled by it, or made."""
-    name = command.inputs.field
-    there = name in scene_field_names(root)
-    if there and not command.overwrite:
-        if command.label_scans is not None:
-            return scene_field(scene, name)
-        raise InputError(
-            f"field: {root} has one called {name!r}; give another name, or --overwrite."
-        )
-    with work_on_scene(root, "street", writes=["fields"]):
-        made = street_field(
-            scene,
-            options=command.inputs,
-            field_options=command.primitives,
-            backend=command.backend,
-            observer=observer,
-        )
-        path = save_street_field(made, root)
-    facts |= made.facts | {"file": path}
-    seconds = sum(made.timings.values())
+    if command.label_scans is not None and not command.overwrite:
+        there = made_street_field(scene, options=command.inputs)
+        if there is not None:
+            return there
+    made = make_street_field(
+        scene,
+        options=command.inputs,
+        field_options=command.primitives,
+        overwrite=command.overwrite,
+        backend=command.backend,
+        observer=observer,
+    )
+    path = scene_field_path(root, made.name)
+    figures = made.facts
+    facts |= figures | {"file": path}
+    blocks = f"{figures['blocks']} blocks with " if "blocks" in figures else ""
+    if made.moving is not None:
+        lines.append(made.moving.sentence)
     lines += [
-        f"{len(made.field.mesh)} primitives with {len(made.field.model.ids)} classes, from "
-        f"{len(made.views)} views in {seconds:.1f} s; layer {made.layer}",
+        f"{blocks}{figures['primitives']} primitives with {figures['classes']} classes, from "
+        f"{figures['views']} views in {sum(made.timings.values()):.1f} s; layer {made.layer}",
         str(path),
     ]
     return made.field

@@ -32,6 +32,8 @@ from splatseg.tasks.import_scene import import_scene as import_scene
 from splatseg.tasks.make_scene import MadeScene as MadeScene
 from splatseg.tasks.make_scene import MakeSceneOptions as MakeSceneOptions
 from splatseg.tasks.make_scene import fit_capture as fit_capture
+from splatseg.tasks.make_street import made_street_field as made_street_field
+from splatseg.tasks.make_street import make_street_field as make_street_field
 from splatseg.tasks.outputs import check_layer_exports as check_layer_exports
 from splatseg.tasks.outputs import export_layer as export_layer
 from splatseg.tasks.outputs import report_layer as report_layer
@@ -77,4 +79,6 @@ from splatseg.tasks.street import StreetField as StreetField
 from splatseg.tasks.street import open_drive as open_drive
 from splatseg.tasks.street import save_street_field as save_street_field
 from splatseg.tasks.street import street_field as street_field
+from splatseg.tasks.street_drive import StreetDrive as StreetDrive
+from splatseg.tasks.street_drive import street_drive as street_drive
 from splatseg.tasks.street_options import StreetOptions as StreetOptions

@@ -68,20 +68,20 @@ def moving_things(
     """What moves, as options say it; None where they say nothing.
 
     Args:
-        boxes: The option ``moving``: a file of boxes.
+        boxes: The option ``moving``: a file of boxes, or a data set that has some.
         classes: The option ``moving_classes``.
         clock: The option ``moving_clock``.
 
     Raises:
         InputError: If there is a clock without boxes.
         MissingFileError: If there is no such file.
-        FileFormatError: If it is no file of boxes.
+        FileFormatError: If it has no boxes.
     """
     if boxes is None and clock != "recorded":
         raise InputError(f"moving_clock: expected boxes with it (`moving`), got {clock} alone.")
     if boxes is None and not classes:
         return None
-    found = () if boxes is None else read_moving(boxes)
+    found = () if boxes is None else read_moving(boxes, clock=clock)
     return MovingThings(boxes=found, classes=tuple(classes), clock=clock)
 
 

@@ -77,7 +77,8 @@ def drive_inputs(
             views, left_out = _static_views(
                 scene, views, things, Path(folder), evidence=evidence, capture=capture
             )
-            observer.info(left_out.sentence)
+            if not left_out.views:
+                observer.note(left_out.sentence)
         if scans is not None:
             scans = without_moving_points(scans, things, metres_per_unit=metres)
         yield DriveInputs(

@@ -147,7 +147,6 @@ def street_field(
 
     Raises:
         InputError: If evidence, photographs, points or depth are not there, or do not fit together.
-        MissingPackageError: If embreex is not installed.
     """
     options = options or StreetOptions()
     if options.block_length is not None:

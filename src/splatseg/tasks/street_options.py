@@ -55,7 +55,8 @@ class StreetOptions:
     """What two blocks that follow each other share, metres. None is a quarter of a block."""
 
     moving: Path | None = None
-    """Boxes of moving things, a JSON file: they are left out of views and scans."""
+    """Boxes of moving things, which are left out of views and scans: a JSON file, a drive of
+    KITTI-360 or a segment of Waymo."""
 
     moving_classes: tuple[str, ...] = ()
     """Classes of the evidence whose things move, such as car pedestrian: they are left out of

@@ -3,6 +3,7 @@
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -76,7 +77,10 @@ class DriveField:
         return tuple(self._known())
 
     def layer(self, layer: str) -> RenderableLayer:
-        """What there is to know of a layer: ids are those of any block, the rest the first's."""
+        """What there is to know of a layer: ids, their names and views are those of all blocks.
+
+        The rest of its record is the first block's.
+        """
         known = self._known()
         if layer not in known:
             shown = ", ".join(known) or "none"
@@ -182,9 +186,13 @@ def _labels_of(
 def _both(first: RenderableLayer | None, second: RenderableLayer) -> RenderableLayer:
     if first is None:
         return second
+    one, other = first.info, second.info
+    views = None
+    if one.views is not None and other.views is not None:
+        views = tuple(dict.fromkeys((*one.views, *other.views)))
     return RenderableLayer(
         kind=first.kind,
         ids=tuple(sorted({*first.ids, *second.ids})),
         background=first.background,
-        info=first.info,
+        info=replace(one, views=views, names={**other.names, **one.names}),
     )

@@ -1,0 +1,172 @@
+"""What blocks of a drive depend on, as digests: blocks of the same are gone on with, no others."""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatseg.core import Camera, Scan, ScanSource, Scene
+from splatseg.io.class_tables import class_rows
+from splatseg.io.evidence import DepthEvidence, LabelEvidence, find_evidence, open_evidence
+from splatseg.street.options import DnmpOptions
+from splatseg.tasks._street_build import versions
+from splatseg.tasks._street_inputs import DriveInputs
+from splatseg.tasks._street_sources import DEPTHS
+from splatseg.tasks.street_options import StreetOptions
+
+_FILE_HEAD = 65_536
+"""Files are told apart by their sizes and so many of their first bytes."""
+
+_NAMES_AND_PATHS = ("field", "scans", "moving")
+"""Options that are no part of a field: data may move."""
+
+
+class DigestedScans:
+    """Scans of which digests are taken as they are read first; a `core.ScanSource`.
+
+    Args:
+        scans: The scans.
+    """
+
+    def __init__(self, scans: ScanSource) -> None:
+        self._scans = scans
+        self._digests: dict[str, str] = {}
+
+    @property
+    def scan_names(self) -> Sequence[str]:
+        """All scans."""
+        return self._scans.scan_names
+
+    def scan(self, name: str) -> Scan:
+        """One of them.
+
+        Raises:
+            InputError: If there is none of that name, or its file is broken.
+        """
+        scan = self._scans.scan(name)
+        if name not in self._digests:
+            origin = torch.zeros(0) if scan.origin is None else scan.origin
+            self._digests[name] = _digest([_bytes(scan.points), _bytes(origin)])
+        return scan
+
+    @property
+    def digest(self) -> str:
+        """Of all scans that were read."""
+        return _digest(sorted(self._digests.items()))
+
+
+def drive_identity(
+    scene: Scene,
+    inputs: DriveInputs,
+    *,
+    options: StreetOptions,
+    field_options: DnmpOptions,
+    layer: str,
+    scans: DigestedScans | None,
+    points: Tensor | None,
+) -> dict[str, Any]:
+    """All that the fields of a drive's blocks depend on, in values that JSON holds.
+
+    Args:
+        scene: The scene.
+        inputs: What is learned from.
+        options: What the fields are made from.
+        field_options: How.
+        layer: Name of their layer.
+        scans: All of them read already.
+        points: Of the capture.
+    """
+    views = inputs.views
+    classes = inputs.evidence.classes or scene.classes
+    gaussians = scene.gaussians
+    boxes = () if inputs.moving is None else inputs.moving.things.boxes
+    asked = {k: v for k, v in asdict(options).items() if k not in _NAMES_AND_PATHS}
+    return {
+        "options": asked | {"layer": layer, "evidence": inputs.name},
+        "field_options": asdict(field_options),
+        "versions": versions(),
+        "inputs": {
+            "metres_per_unit": inputs.metres,
+            "views": _digest(view.name for view in views),
+            "cameras": _digest(_numbers(view.camera) for view in views),
+            "photographs": _digest(_file(view.image) for view in views),
+            "masks": _digest(_file(view.mask) for view in views),
+            "depth maps": _digest((_file(view.depth), view.depth_unit) for view in views),
+            "label maps": _label_maps(inputs),
+            "depth evidence": _depth_evidence(scene, options.depth),
+            "classes": _digest([None if classes is None else class_rows(classes)]),
+            "points": _digest([None if points is None else _bytes(points)]),
+            "scans": "none" if scans is None else scans.digest,
+            "boxes": _digest(
+                (b.centre.tolist(), b.size, b.rotation.tolist(), b.start, b.end) for b in boxes
+            ),
+            "gaussians": _digest(
+                _bytes(t) for t in (gaussians.means, gaussians.scales, gaussians.opacities)
+            ),
+        },
+    }
+
+
+def differences(recorded: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """Names of what is not the same in two identities, in order.
+
+    Args:
+        recorded: As JSON gives it back.
+        wanted: Likewise.
+    """
+    found: list[str] = []
+    for group in ("options", "field_options", "inputs", "versions"):
+        one, other = _object(recorded.get(group)), _object(wanted.get(group))
+        found += [name for name in sorted({*one, *other}) if one.get(name) != other.get(name)]
+    return found
+
+
+def _object(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}  # pyright: ignore[reportUnknownVariableType]
+
+
+def _label_maps(inputs: DriveInputs) -> str:
+    evidence = inputs.evidence
+    files = evidence.files if isinstance(evidence, LabelEvidence) else {}
+    return _digest(_file(files.get(view.name)) for view in inputs.views)
+
+
+def _depth_evidence(scene: Scene, depth: str) -> str:
+    if depth in DEPTHS:
+        return "none"
+    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+    found = open_evidence(find_evidence(folders, depth))
+    files = found.files if isinstance(found, DepthEvidence) else {}
+    return _digest((name, _file(path)) for name, path in sorted(files.items()))
+
+
+def _digest(values: Iterable[object]) -> str:
+    digest = hashlib.sha256()
+    for value in values:
+        digest.update(repr(value).encode())
+        digest.update(b"\n")
+    return digest.hexdigest()[:16]
+
+
+def _bytes(tensor: Tensor) -> str:
+    return hashlib.sha256(tensor.detach().cpu().contiguous().numpy().tobytes()).hexdigest()
+
+
+def _numbers(camera: Camera) -> tuple[object, ...]:
+    shape = (camera.width, camera.height, camera.model)
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
+    return (*shape, *(float(number) for number in lens), camera.cam_from_world.tolist())
+
+
+def _file(path: Path | None) -> tuple[int, str] | None:
+    if path is None:
+        return None
+    if not path.is_file():
+        return (0, "")
+    with path.open("rb") as file:
+        head = file.read(_FILE_HEAD)
+    return (path.stat().st_size, hashlib.sha256(head).hexdigest())
