@@ -90,10 +90,13 @@ def drive_sources(
         words.append(f"{len(points):,} points of the capture")
     sparse = torch.cat(clouds) if clouds else torch.zeros(0, 3, dtype=torch.float64)
     kind = _first(scene, views, scans) if depth == "auto" else depth
-    depths = _depths(scene, views, kind, scans=scans, points=sparse, backend=backend)
+    found = partial(_depths, scene, views, scans=scans, points=sparse, backend=backend)
+    depths = found(kind)
     cloud = sparse
-    if kind != "points" and (kind != "scans" or not len(cloud)):
-        dense = depth_points(depths(), cell, max_depth=MAX_DEPTH / metres)
+    if kind not in ("points", "scans"):
+        # Points of scans are there already.
+        shown = found(kind.removeprefix("scans+"))
+        dense = depth_points(shown(), cell, max_depth=MAX_DEPTH / metres)
         words.append(f"{len(dense):,} points of depth")
         cloud = torch.cat((cloud, dense))
     if not len(cloud) and len(scene.gaussians):

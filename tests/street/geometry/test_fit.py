@@ -9,7 +9,6 @@ import torch
 
 from splatseg.core import Camera
 from splatseg.errors import InputError, RangeError, ShapeError
-from splatseg.raycast import RayCaster
 from splatseg.street.geometry import (
     PUBLISHED_GEOMETRY,
     DepthView,
@@ -19,6 +18,7 @@ from splatseg.street.geometry import (
     fit_geometry,
     mesh_depth,
 )
+from splatseg.street.hits import MeshCaster
 from splatseg.street.primitives import Primitives, voxel_primitives
 from splatseg.street.shapes import ShapeConfig, mesh_regularisers, new_shapes, template
 from support.primitives import shipped, sphere, spheres
@@ -176,13 +176,15 @@ def test_hits_are_searched_for_so_often(
     options: dict[str, int], casts: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts: list[int] = []
-    cast: Callable[..., Any] = RayCaster.cast
+    cast: Callable[..., Any] = MeshCaster.hits
 
-    def counted(self: RayCaster, origins: torch.Tensor, directions: torch.Tensor) -> Any:
+    def counted(
+        self: MeshCaster, origins: torch.Tensor, directions: torch.Tensor, **limits: int
+    ) -> Any:
         counts.append(len(directions))
-        return cast(self, origins, directions)
+        return cast(self, origins, directions, **limits)
 
-    monkeypatch.setattr(RayCaster, "cast", counted)
+    monkeypatch.setattr(MeshCaster, "hits", counted)
     fitted(ahead(), iterations=10, **options)
     assert counts == casts
 

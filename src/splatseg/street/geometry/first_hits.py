@@ -7,8 +7,9 @@ from torch import Tensor
 from splatseg.core import Camera
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
-from splatseg.raycast import RayCaster, RayHits
+from splatseg.raycast import RayHits
 from splatseg.street.geometry.depth_views import axis_cosines
+from splatseg.street.hits import MeshCaster
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.shapes.template import FACES
 
@@ -21,19 +22,14 @@ class PrimitiveCaster:
 
     Raises:
         InputError: If it has none.
-        MissingPackageError: If embreex is not installed.
     """
 
     @boundary
     def __init__(self, mesh: PrimitiveMesh) -> None:
         if not len(mesh):
             raise InputError("mesh: expected at least one primitive, got none.")
-        self._levels: list[tuple[Tensor, RayCaster]] = []
-        faces = mesh.faces
-        for level in torch.unique(mesh.levels).tolist():
-            rows = (mesh.levels == level).nonzero()[:, 0]
-            own = (FACES * rows[:, None] + torch.arange(FACES)).flatten()
-            self._levels.append((own, RayCaster(mesh.vertices, faces[own])))
+        self._levels = mesh.levels.cpu()
+        self._caster = MeshCaster(mesh)
 
     @boundary
     def first(self, origins: Float[Tensor, "*n 3"], directions: Float[Tensor, "n 3"]) -> RayHits:
@@ -46,24 +42,15 @@ class PrimitiveCaster:
         Returns:
             Hits, their faces those of the mesh.
         """
-        found: RayHits | None = None
-        for faces, caster in self._levels:
-            hits = caster.cast(origins, directions)
-            own = torch.where(hits.faces >= 0, faces[hits.faces.clamp_min(0)], -1)
-            hits = RayHits(faces=own, distances=hits.distances, weights=hits.weights)
-            found = hits if found is None else _over(found, hits)
-        if found is None:
-            raise InputError("mesh: expected at least one primitive, got none.")
-        return found
-
-
-def _over(fine: RayHits, coarse: RayHits) -> RayHits:
-    met = fine.faces >= 0
-    return RayHits(
-        faces=torch.where(met, fine.faces, coarse.faces),
-        distances=torch.where(met, fine.distances, coarse.distances),
-        weights=torch.where(met[:, None], fine.weights, coarse.weights),
-    )
+        levels = len(self._caster.mesh.sizes)
+        hits = self._caster.hits(origins, directions, max_hits=levels, fine_hits=1, coarse_hits=1)
+        level = torch.where(hits.valid, self._levels[hits.faces.clamp_min(0) // FACES], levels)
+        finest = level.argmin(dim=1, keepdim=True)
+        return RayHits(
+            faces=hits.faces.gather(1, finest)[:, 0],
+            distances=hits.distances.gather(1, finest)[:, 0],
+            weights=hits.weights.gather(1, finest[..., None].expand(-1, -1, 3))[:, 0].double(),
+        )
 
 
 @boundary

@@ -93,7 +93,6 @@ def fit_geometry(
             primitive and primitives are not carved, or all of them would be removed.
         ShapeError: If codes have not the size of the shapes' codes.
         RangeError: If a depth is NaN.
-        MissingPackageError: If embreex is not installed.
     """
     options = GeometryOptions() if options is None else options
     if not len(primitives):
