@@ -67,6 +67,43 @@ def car_pose(frame: int) -> np.ndarray:
     return pose
 
 
+def stored_matrix(name: str, values: Any) -> str:
+    """A matrix as OpenCV stores it."""
+    rows = np.asarray(values, np.float64)
+    return (
+        f'<{name} type_id="opencv-matrix"><rows>{rows.shape[0]}</rows><cols>{rows.shape[1]}</cols>'
+        f"<dt>f</dt><data>{numbers(rows)} </data></{name}>\n"
+    )
+
+
+CUBE = 0.5 * np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)])
+"""Vertices of all boxes of KITTI-360; lengths are those of the transform."""
+
+
+def stored_box(number: int, transform: Any, timestamp: int, /, **changes: str) -> str:
+    """An object of data_3d_bboxes."""
+    texts = {
+        "index": str(number), "label": "car", "semanticId_orig": "13", "semanticId": "13",
+        "instanceId": "7", "category": "car", "timestamp": str(timestamp),
+        "dynamic": str(int(timestamp >= 0)), "start_frame": "0", "end_frame": "6",
+    }  # fmt: skip
+    matrices = {"transform": stored_matrix("transform", transform)}
+    matrices["vertices"] = stored_matrix("vertices", CUBE)
+    matrices["faces"] = stored_matrix("faces", [[0, 2, 1], [2, 3, 1]])
+    words = {name: f"<{name}>{text}</{name}>\n" for name, text in texts.items()} | matrices
+    body = "".join((words | changes).values())
+    return f"<object{number}>\n{body}</object{number}>\n"
+
+
+def write_boxes(
+    root: Path, *boxes: str, drive: str = DRIVE, split: str = "train", head: str = ""
+) -> Path:
+    """A file of boxes."""
+    content = f'<?xml version="1.0"?>\n{head}<opencv_storage>\n<version>1</version>\n'
+    path = root / "data_3d_bboxes" / split / f"{drive}.xml"
+    return write(path, content + "".join(boxes) + "</opencv_storage>\n")
+
+
 def write_calibration(root: Path) -> None:
     folder = root / "calibration"
     right = CAR_FROM_CAMERA.copy()

@@ -81,6 +81,14 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = {
         {"extrinsic.transform": _TRANSFORM, "beam_inclination.min": _DOUBLE,
          "beam_inclination.max": _DOUBLE, "beam_inclination.values": pa.list_(_DOUBLE)},
     ),
+    "lidar_box": _KEY | _TIME | {"key.laser_object_id": pa.string()} | _prefixed(
+        "LiDARBoxComponent",
+        {**{f"box.{part}.{a}": _DOUBLE for part in ("center", "size") for a in "xyz"},
+         "box.heading": _DOUBLE, "type": pa.int8(), "num_lidar_points_in_box": pa.int64(),
+         "num_top_lidar_points_in_box": pa.int64(),
+         **{f"{part}.{a}": _DOUBLE for part in ("speed", "acceleration") for a in "xyz"},
+         **{f"difficulty_level.{part}": pa.int8() for part in ("detection", "tracking")}},
+    ),
     "lidar_pose": _KEY | _TIME | _LASER | _returns("LiDARPoseComponent", _FLOAT, 1),
     "lidar_segmentation": _KEY | _TIME | _LASER
     | _returns("LiDARSegmentationLabelComponent", pa.int32(), 2),
@@ -173,8 +181,24 @@ def driven(number: int) -> list[float]:
     return pose_of((PLACE[0] + number, *PLACE[1:]))
 
 
+def box_row(
+    number: int, id: str, place: Sequence[float], *, speed: Sequence[float] | None, **rest: Any
+) -> dict[str, Any]:
+    """A box of 4 x 2 x 1.5 m in the axes of the vehicle."""
+    row: dict[str, Any] = frame(number) | {"key.laser_object_id": id}
+    row |= {f"box.center.{a}": v for a, v in zip("xyz", place, strict=True)}
+    row |= {f"box.size.{a}": v for a, v in zip("xyz", (4.0, 2.0, 1.5), strict=True)}
+    row |= {"box.heading": 0.0, "type": 1}
+    if speed is not None:
+        row |= {f"speed.{a}": v for a, v in zip("xyz", speed, strict=True)}
+    return row | rest
+
+
 def tiny_rows() -> Rows:
     """Six frames of two cameras that look ahead and to the left, and one scan of two lasers.
+
+    A car 10 m ahead waits in frame 0 and drives in frame 1; another one stands beside the road in
+    both, and so does a sign whose speed is not known.
 
     The top laser is turned by a quarter on the vehicle and has two rows, level and 30 degrees
     down, of four columns at 135, 45, -45 and -135 degrees of the vehicle; the left one has one
@@ -216,6 +240,15 @@ def tiny_rows() -> Rows:
             | beams
             | top,
             {"key.laser_name": 3, "extrinsic.transform": pose_of((0, 1, 1))} | beams,
+        ],
+        "lidar_box": [
+            row
+            for n in (0, 1)
+            for row in (
+                box_row(n, "car", (10, 0, 0.75), speed=(3.0 * n, 4.0 * n, 0)),
+                box_row(n, "parked", (5, 4, 0.75), speed=(0.1, 0, 0), **{"box.heading": 0.5}),
+                box_row(n, "sign", (9, -4, 2), speed=None, type=3),
+            )
         ],
         "lidar_pose": [frame(0, laser=1) | image(moments)],
         "lidar_segmentation": [frame(0, laser=1) | image(labels)],

@@ -69,6 +69,17 @@ def matrix(row: dict[str, Any]) -> bytes:
     return zlib.compress(field(1, data) + field(2, sides))
 
 
+def label_of(row: dict[str, Any]) -> bytes:
+    """What lasers saw of a thing."""
+    numbers = {"center.x": 1, "center.y": 2, "center.z": 3, "size.y": 4, "size.x": 5, "size.z": 6}
+    box = b"".join(doubles(n, [row[f"box.{name}"]]) for name, n in numbers.items())
+    label = field(1, box + doubles(7, [row["box.heading"]]))
+    if "speed.x" in row:
+        speeds = (("x", 1), ("y", 2), ("z", 5))
+        label += field(2, b"".join(doubles(n, [row[f"speed.{a}"]]) for a, n in speeds))
+    return label + field(3, row["type"]) + field(4, row["key.laser_object_id"].encode())
+
+
 def frames_of(rows: Rows) -> list[bytes]:
     """The frames whose components are these rows."""
     time, camera, laser = "key.frame_timestamp_micros", "key.camera_name", "key.laser_name"
@@ -106,6 +117,9 @@ def frames_of(rows: Rows) -> list[bytes]:
                         if (one[time], one[laser]) == (now, row[laser]):
                             first += field(number, matrix(one))
                 frame += field(5, field(1, row[laser]) + field(2, first))
+        for row in rows["lidar_box"]:
+            if row[time] == now:
+                frame += field(6, label_of(row))
         frames.append(frame)
     return frames
 

@@ -27,9 +27,12 @@ from splatseg.io.parquet import Row, integer_of, list_of, read_rows
 
 IMAGES = "camera_image"
 LIDAR = "lidar"
+BOXES = "lidar_box"
 VEHICLE_POSES = "vehicle_pose"
 SUFFIX = ".parquet"
 TIMESTAMP = "key.frame_timestamp_micros"
+MICROSECOND = 1e-6
+"""Seconds of the unit of timestamps: scans, views and boxes have their times by one product."""
 
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
 LASERS = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}

@@ -34,6 +34,11 @@ _LASER = {"key.laser_name": "int64"}
 _CAMERA_LENS = "[CameraCalibrationComponent]"
 _LASER_LENS = "[LiDARCalibrationComponent]"
 _LABEL = "[CameraSegmentationLabelComponent]"
+_BOX = "[LiDARBoxComponent]"
+_BOX_FIELDS = {"center.x": 1, "center.y": 2, "center.z": 3, "size.x": 5, "size.y": 4, "size.z": 6}
+_SPEED_FIELDS = {"x": 1, "y": 2, "z": 5}
+_WRITTEN = 2
+"""Grows with what is taken out of frames: folders that lack some of it are written again."""
 
 
 def _image(prefix: str, kind: str) -> dict[str, str]:
@@ -52,6 +57,11 @@ _COMPONENTS: Mapping[str, Mapping[str, str]] = {
     | {f"{_CAMERA_LENS}.extrinsic.transform": "list double"},
     "camera_segmentation": _FRAME | _CAMERA
     | {f"{_LABEL}.panoptic_label_divisor": "int64", f"{_LABEL}.panoptic_label": "binary"},
+    "lidar_box": _FRAME
+    | {"key.laser_object_id": "string"}
+    | {f"{_BOX}.box.{part}.{axis}": "double" for part in ("center", "size") for axis in "xyz"}
+    | {f"{_BOX}.box.heading": "double", f"{_BOX}.type": "int64"}
+    | {f"{_BOX}.speed.{axis}": "double" for axis in "xyz"},
     "vehicle_pose": _FRAME | {"[VehiclePoseComponent].world_from_vehicle.transform": "list double"},
     "lidar": _FRAME | _LASER | _image("LiDARComponent", "float"),
     "lidar_calibration": _LASER
@@ -102,16 +112,17 @@ def unpack_components(path: Path) -> Path:
     folder = components_folder(path)
     with reading(path, "a TFRecord file"):
         size = path.stat().st_size
+    record = {"bytes": size, "version": _WRITTEN}
     try:
-        made: object = read_json(folder / _RECORD).get("bytes")
+        made: object = read_json(folder / _RECORD)
     except SplatsegError:
         made = None
-    if made == size:
+    if made == record:
         return folder
     sweep(folder.parent)
     with atomic_folder(folder) as temporary:
         _write(path, temporary, size)
-        write_json({"bytes": size}, temporary / _RECORD)
+        write_json(record, temporary / _RECORD)
     return folder
 
 
@@ -162,7 +173,30 @@ def _frame_rows(frame: Message, path: Path, size: int, where: str) -> _Rows:
                     name = f"[{prefix}].range_image_return1"
                     columns = {f"{name}.values": values[0], f"{name}.shape": values[1]}
                     rows[component].append(key | columns)
+    for label in _messages(frame, 6, where):
+        found = _box_row(label, where)
+        if found is not None:
+            rows["lidar_box"].append(time | found)
     return rows
+
+
+def _box_row(label: Message, where: str) -> dict[str, Any] | None:
+    """The box of a label of what lasers saw; None where it has none."""
+    boxes, told = _messages(label, 1, where), _messages(label, 2, where)
+    if not boxes:
+        return None
+    name = label.get(4, [b""])[-1]
+    row: dict[str, Any] = {f"{_BOX}.type": _integer(label, 3, where) if 3 in label else 0}
+    row["key.laser_object_id"] = name.decode(errors="replace") if isinstance(name, bytes) else ""
+    for part, number in _BOX_FIELDS.items():
+        row[f"{_BOX}.box.{part}"] = _double(boxes[-1], number, where)
+    row[f"{_BOX}.box.heading"] = _double(boxes[-1], 7, where)
+    if told:
+        # The third of the speed came later; without it a thing is level.
+        speed = {axis: _double(told[-1], n, where) for axis, n in _SPEED_FIELDS.items()}
+        known = speed["x"] is not None and speed["y"] is not None
+        row |= {f"{_BOX}.speed.{axis}": v or 0.0 for axis, v in speed.items() if known}
+    return row
 
 
 def _calibrations(frame: Message, where: str) -> _Rows:
@@ -240,6 +274,12 @@ def _doubles(message: Message, number: int, where: str) -> NDArray[np.float64]:
     if len(data) % 8:
         raise FileFormatError(f"{where}: expected numbers of 8 bytes, got {len(data)} bytes.")
     return np.frombuffer(data, "<f8").astype(np.float64)
+
+
+def _double(message: Message, number: int, where: str) -> float | None:
+    """A number of 8 bytes; None where there is none."""
+    values = _doubles(message, number, where)
+    return float(values[-1]) if len(values) else None
 
 
 def _integers(message: Message, number: int, where: str) -> NDArray[np.int64]:

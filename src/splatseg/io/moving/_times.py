@@ -9,8 +9,11 @@ from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import is_json_number
 from splatseg.core.view_names import frame_number
 from splatseg.errors import InputError
+from splatseg.io.captures.kitti360_drive import SCANS, VELODYNE, find_drive
 from splatseg.io.captures.nerfstudio import FILE
+from splatseg.io.captures.waymo_segment import MICROSECOND
 from splatseg.io.json_files import read_json
+from splatseg.io.timestamps import frame_time, read_times
 
 Clock = Literal["recorded", "frames"]
 """What times are. recorded: what the data set has, such as seconds, else frames. frames: the last
@@ -23,14 +26,18 @@ CLOCKS = ("recorded", "frames")
 def view_times(capture: Capture, *, clock: Clock = "recorded") -> Mapping[str, float]:
     """The time of each view by its name.
 
-    It is ``time`` of the view's frame in transforms.json where all frames have one, unless
-    `clock` says frames, else the last number in the view's name, which counts the frames.
+    It is ``time`` of the view's frame in transforms.json where all frames have one; of Waymo the
+    seconds of the frame; of KITTI-360 those of ``timestamps.txt`` of the turning laser, as its
+    scans have them. Where there is none of these, or `clock` says frames, it is the last number in
+    the view's name, which counts the frames.
 
     Raises:
         InputError: If a view has neither.
-        FileFormatError: If transforms.json is broken.
+        FileFormatError: If transforms.json or timestamps.txt is broken.
     """
     check_choice("clock", clock, CLOCKS)
+    if clock == "recorded" and capture.format in ("kitti360", "waymo"):
+        return _of_data_set(capture)
     known = clock == "recorded" and capture.format == "nerfstudio"
     recorded = _recorded(capture) if known else {}
     times: dict[str, float] = {}
@@ -48,6 +55,17 @@ def view_times(capture: Capture, *, clock: Clock = "recorded") -> Mapping[str, f
                 "transforms.json, or number the views as their frames."
             )
     return times
+
+
+def _of_data_set(capture: Capture) -> Mapping[str, float]:
+    """Times of views of KITTI-360 or Waymo on the clock of their scans."""
+    numbers = view_times(capture, clock="frames")
+    if capture.format == "waymo":
+        return {name: int(number) * MICROSECOND for name, number in numbers.items()}
+    drive = find_drive(capture.path)
+    path = None if drive is None else drive.of(SCANS, VELODYNE, "timestamps.txt")
+    times = None if path is None else read_times(path)
+    return {name: frame_time(times, int(number)) for name, number in numbers.items()}
 
 
 def scan_time(scan: Scan, clock: Clock) -> float:

@@ -1,17 +1,13 @@
 """What KITTI's data sets share: numbered files of points, and a scanner that turns as it drives."""
 
-import math
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from splatseg.errors import FileFormatError, quoted
-from splatseg.io.foreign import read_lines
 from splatseg.io.scans._records import read_records
 
 COLUMNS = 4
@@ -36,23 +32,6 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """
     rows = read_records(path, COLUMNS)
     return rows[:, :3].astype(np.float64), rows[:, 3]
-
-
-def read_times(path: Path) -> NDArray[np.float64] | None:
-    """Seconds of each row of ``timestamps.txt`` on one clock; None where there is no such file.
-
-    Rows are ``2013-05-28 08:46:02.904000000``; an empty one, or one of other words, is NaN.
-
-    Raises:
-        FileFormatError: If no row is a time.
-    """
-    if not path.is_file():
-        return None
-    lines = read_lines(path, "dates and times")
-    times = np.array([_seconds(line) for line in lines])
-    if len(times) and np.isnan(times).all():
-        raise FileFormatError(f"{path}: expected dates and times, got {quoted(lines[0])}.")
-    return times
 
 
 def unrolled(
@@ -83,10 +62,3 @@ def skipped(names: Sequence[str], posed: Sequence[str]) -> tuple[str, ...]:
     if not lacking:
         return ()
     return (f"left out: {lacking} of {len(names)} scans that have no pose",)
-
-
-def _seconds(line: str) -> float:
-    try:
-        return datetime.fromisoformat(line).replace(tzinfo=UTC).timestamp()
-    except ValueError:
-        return math.nan

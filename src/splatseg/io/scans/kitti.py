@@ -18,7 +18,8 @@ from splatseg.io.captures.build import checked_pose
 from splatseg.io.foreign import read_lines
 from splatseg.io.keyed_numbers import keyed_matrix, read_keyed_numbers, rigid
 from splatseg.io.scans._source import RawScan, Scans, only_one
-from splatseg.io.scans._velodyne import numbered_files, read_points, read_times, skipped
+from splatseg.io.scans._velodyne import numbered_files, read_points, skipped
+from splatseg.io.timestamps import read_times
 
 EARTH_RADIUS = 6378137.0
 """Metres, at the equator."""

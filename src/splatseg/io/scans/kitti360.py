@@ -38,10 +38,10 @@ from splatseg.io.scans._source import RawScan, Scans
 from splatseg.io.scans._velodyne import (
     numbered_files,
     read_points,
-    read_times,
     skipped,
     unrolled,
 )
+from splatseg.io.timestamps import read_times
 
 _MAX_GAP = 3
 """Frames between two poses, beyond which nobody knows how the car went from one to the other."""

@@ -24,6 +24,7 @@ from splatseg.io.captures.waymo_segment import (
     LASERS,
     LIDAR,
     LIDAR_CLASSES,
+    MICROSECOND,
     TIMESTAMP,
     VEHICLE_POSES,
     WaymoSegment,
@@ -44,7 +45,6 @@ _CALIBRATION = "[LiDARCalibrationComponent]"
 _RANGES = "[LiDARComponent].range_image_return1"
 _PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
 _LABELS = "[LiDARSegmentationLabelComponent].range_image_return1"
-_MICROSECOND = 1e-6
 
 
 class Key(NamedTuple):
@@ -235,7 +235,7 @@ def _raw(
         missing=missing.reshape(-1),
         intensity=image[..., 1].reshape(-1),
         labels=labels,
-        time=key.time * _MICROSECOND,
+        time=key.time * MICROSECOND,
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.captures import read_capture
+from splatseg.io.moving import read_moving
 from splatseg.io.scans import read_scans
 from support.benchmark_layouts.kitti360 import write_window
 from support.fuzz.targets.base import Target, target
@@ -16,8 +17,10 @@ from support.kitti import (
     WIDTH,
     numbers,
     picture,
+    stored_box,
     write,
     write_bin,
+    write_boxes,
     write_drive,
 )
 
@@ -100,6 +103,15 @@ _of_kitti360("window.ply", _STATIC, lambda folder: _scanned(folder, "kitti360-po
 _of_kitti360("window-truth.ply", _STATIC, _truth)
 for _kind in ("semantic", "confidence", "instance"):
     _of_kitti360(f"{_kind}.png", f"{_MAPS}/{_kind}/0000000001.png", _truth)
+
+
+@target("kitti360-boxes.xml")
+def boxes(folder: Path) -> Target:
+    """A car that drives and one that stands."""
+    _drive(folder)
+    place = np.diag([4.0, 2.0, 1.5, 1.0])
+    file = write_boxes(folder, stored_box(1, place, 1), stored_box(2, place, -1))
+    return Target(file=file, read=lambda: read_moving(file))
 
 
 def _of_sequence(name: str, file: str) -> None:

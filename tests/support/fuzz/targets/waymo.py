@@ -7,6 +7,7 @@ from pathlib import Path
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.benchmarks.waymo import read_waymo_scenes
 from splatseg.io.captures import read_capture
+from splatseg.io.moving import read_moving
 from splatseg.io.scans import read_scans
 from support.fuzz.targets.base import Target, target
 from support.waymo_files import CONTEXT, SCHEMAS, tiny_rows, write_segment
@@ -27,6 +28,7 @@ def _of_waymo(component: str) -> None:
             scans = read_scans(folder)
             for name in scans.scan_names:
                 scans.scan(name)
+            read_moving(folder)
 
         return Target(file=folder / component / f"{CONTEXT}.parquet", read=read)
 
@@ -45,6 +47,7 @@ def tfrecord(folder: Path) -> Target:
         scans = read_scans(file)
         for name in scans.scan_names:
             scans.scan(name)
+        read_moving(file)
 
     return Target(file=file, read=read)
 
@@ -59,6 +62,7 @@ def frame(folder: Path) -> Target:
         framed_file.write_bytes(framed(file.read_bytes()))
         try:
             read_scans(framed_file)
+            read_moving(framed_file)
         except InputError as error:  # of another file than the one that is damaged
             raise FileFormatError(f"{file}: {error}") from error
 

@@ -26,8 +26,7 @@ _KEYS = ("centre", "size", "rotation", "start", "end", "time", "name")
 _UPRIGHT = [1.0, 0.0, 0.0, 0.0]
 
 
-@boundary
-def read_moving(path: Path) -> tuple[MovingBox, ...]:
+def read_json_boxes(path: Path) -> tuple[MovingBox, ...]:
     """The boxes of a file, in its order.
 
     Raises:

@@ -1,0 +1,184 @@
+"""XML as OpenCV's FileStorage writes it, an object at a time.
+
+    <?xml version="1.0"?>
+    <opencv_storage>
+    <object1>
+      <label>car</label>
+      <transform type_id="opencv-matrix">
+        <rows>4</rows><cols>4</cols><dt>f</dt><data>1. 0. ...</data>
+      </transform>
+    </object1>
+    ...
+
+Expat reads it piece by piece, and what is not asked for is not kept. A document type is refused:
+entities are declared there, and with them a few bytes may stand for gigabytes, or for other files.
+"""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.errors import FileFormatError, quoted, reason
+from splatseg.io.foreign import reading
+
+_KIND = "XML of OpenCV"
+_ROOT = "opencv_storage"
+_CHUNK = 1 << 16
+_DEEPEST = 8
+"""Elements within each other; four are used."""
+
+_LONGEST = 1 << 22
+"""Characters of what is kept of one object."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredObject:
+    """One object: text by the names of its elements, those within each other joined by dots."""
+
+    where: str
+    """The file and the object; starts messages."""
+
+    texts: dict[str, str]
+
+    def has(self, name: str) -> bool:
+        """Whether it has an element, or one within it."""
+        return any(key == name or key.startswith(f"{name}.") for key in self.texts)
+
+    def text(self, name: str) -> str:
+        """The text of an element, empty where it has none."""
+        return self.texts.get(name, "").strip().strip('"')
+
+    def whole(self, name: str) -> int:
+        """The whole number of an element.
+
+        Raises:
+            FileFormatError: If there is none.
+        """
+        word = self.text(name)
+        try:
+            value = int(word) if len(word) <= 18 else None
+        except ValueError:
+            value = None
+        if value is None:
+            raise FileFormatError(
+                f"{self.where}: {name}: expected a whole number, got {quoted(word)}."
+            )
+        return value
+
+    def matrix(self, name: str) -> NDArray[np.float64]:
+        """The matrix of an element.
+
+        Raises:
+            FileFormatError: If there is none, it has more or fewer numbers than its rows and
+                columns say, or one of them is NaN or infinite.
+        """
+        rows, columns = self.whole(f"{name}.rows"), self.whole(f"{name}.cols")
+        words = self.texts.get(f"{name}.data", "").split()
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError as error:
+            raise FileFormatError(f"{self.where}: {name}: {reason(error)}.") from error
+        if min(rows, columns) < 1 or len(values) != rows * columns:
+            raise FileFormatError(
+                f"{self.where}: {name}: expected {rows} x {columns} numbers, got {len(values)}."
+            )
+        if not (np.abs(values) <= MAX_NUMBER).all():
+            raise FileFormatError(
+                f"{self.where}: {name}: expected finite numbers up to {MAX_NUMBER:g}, got others."
+            )
+        return values.reshape(rows, columns)
+
+
+def stored_objects(path: Path, wanted: Collection[str]) -> Iterator[StoredObject]:
+    """The objects of a file in their order, one in memory.
+
+    Args:
+        path: The file.
+        wanted: Names of elements of objects whose text is kept, such as ``transform.data``.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no such XML, ends early, has a document type, or an object is
+            too large.
+    """
+    with reading(path, _KIND):
+        stream = path.open("rb")
+    found = _Found(path, wanted)
+    with stream:
+        while True:
+            with reading(path, _KIND):
+                piece = stream.read(_CHUNK)
+            try:
+                found.parser.Parse(piece, not piece)
+            except expat.ExpatError as error:
+                raise FileFormatError(
+                    f"{path}: expected {_KIND}, but it cannot be read ({reason(error)})."
+                ) from error
+            yield from found.taken()
+            if not piece:
+                return
+
+
+class _Found:
+    """What Expat tells of a file, gathered into objects."""
+
+    def __init__(self, path: Path, wanted: Collection[str]) -> None:
+        self._path, self._wanted = path, wanted
+        self._names: list[str] = []
+        self._key: str | None = None
+        self._texts: dict[str, list[str]] = {}
+        self._kept = 0
+        self._objects: list[StoredObject] = []
+        self.parser = expat.ParserCreate()
+        self.parser.buffer_text = True
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.CharacterDataHandler = self._text
+        self.parser.StartDoctypeDeclHandler = self._refuse
+
+    def taken(self) -> list[StoredObject]:
+        """The objects that ended since this was last asked."""
+        objects, self._objects = self._objects, []
+        return objects
+
+    @property
+    def _where(self) -> str:
+        return f"{self._path}: {quoted(self._names[1])}" if self._names[1:] else str(self._path)
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self._names.append(name)
+        if self._names[0] != _ROOT or len(self._names) > _DEEPEST:
+            raise FileFormatError(f"{self._where}: expected {_KIND}, got other elements.")
+        if len(self._names) == 2:
+            self._texts, self._kept = {}, 0
+        key = ".".join(self._names[2:])
+        if key in self._texts:
+            raise FileFormatError(f"{self._where}: expected {key} once, got it twice.")
+        self._key = key if key in self._wanted else None
+        if self._key is not None:
+            self._texts[key] = []
+
+    def _text(self, text: str) -> None:
+        if self._key is None:
+            return
+        self._kept += len(text)
+        if self._kept > _LONGEST:
+            raise FileFormatError(
+                f"{self._where}: expected at most {_LONGEST} characters of an object, got more."
+            )
+        self._texts[self._key].append(text)
+
+    def _end(self, name: str) -> None:
+        if len(self._names) == 2:
+            texts = {key: "".join(parts) for key, parts in self._texts.items()}
+            self._objects.append(StoredObject(where=self._where, texts=texts))
+        self._key = None
+        self._names.pop()
+
+    def _refuse(self, name: str, system: str | None, public: str | None, subset: bool) -> None:
+        raise FileFormatError(f"{self._path}: expected XML without a document type, got one.")
