@@ -122,6 +122,22 @@ class Command:
     """Laser scans of the drive: the fit starts at their points and learns their depth, as with
     --depth metric. For streets, whose far and thin things photographs alone place badly."""
 
+    moving: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Boxes of moving things, which are left out of training views and of scans: a JSON file, a
+    drive of KITTI-360 or a segment of Waymo."""
+
+    moving_classes: tuple[str, ...] = ()
+    """Classes of label maps whose things move, such as car pedestrian: they are left out of
+    training views."""
+
+    moving_evidence: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_NAME")] = None
+    """The label maps of --moving-classes: a folder, or its name in DATA or in a scene that SCENE
+    replaces. None takes the only evidence there is."""
+
+    moving_clock: Literal["recorded", "frames"] = _SCENE.moving_clock
+    """What the times of boxes are. recorded: what the data set has, such as seconds. frames: the
+    last number in the name of a view or scan."""
+
     refine_poses: bool = _DEFAULT.refine_poses
     """Correct the poses of training views while fitting."""
 
@@ -166,6 +182,10 @@ def run(command: Command) -> None:
             preset=command.preset,
             depth_evidence=command.depth_evidence,
             scans=command.scans,
+            moving=command.moving,
+            moving_classes=command.moving_classes,
+            moving_evidence=command.moving_evidence,
+            moving_clock=command.moving_clock,
         ),
         fit_options=_options(command),
         backend=command.backend,
@@ -213,6 +233,7 @@ def _facts(made: MadeScene) -> dict[str, Any]:
         "train_views": len(made.capture.train_views),
         "test_views": len(made.capture.test_views),
         "held_out_views": made.held_out,
+        **({} if made.moving is None else {"moving": made.moving.record}),
         "scored_views": 0 if scores is None else len(scores.views),
         "psnr": None if scores is None else scores.psnr,
         "ssim": None if scores is None else scores.ssim,

@@ -22,13 +22,16 @@ TRAINING_FOLDER = "training"
 POSES_FOLDER = "capture"
 """Where `fit` keeps the poses that it found for bare photographs."""
 
+MASKS_FOLDER = "masks"
+"""Where `fit` keeps masks of views that it made, such as those without moving things."""
+
 FOLDERS = ("cameras", "evidence", "layers", "reports")
 """Folders that every scene has."""
 
 PENDING = f"{TEMPORARY}pending"
 """Folder of files of a new scene that count already, but are not in their places yet."""
 
-_WORK_FOLDERS = (*FOLDERS, "exports", "fields", "fit", TRAINING_FOLDER)
+_WORK_FOLDERS = (*FOLDERS, "exports", "fields", "fit", MASKS_FOLDER, TRAINING_FOLDER)
 _POSES_ENTRIES = (
     "poses.json", "sparse", "frames", "frames.txt", "work", "aligned.npz", "pointmaps",
 )  # fmt: skip
@@ -46,7 +49,7 @@ def is_unfinished(path: Path) -> bool:
     checkpoint, poses = path / CHECKPOINT_FILE, path / POSES_FOLDER
     if is_scene(path) or not (checkpoint.parent.is_dir() or poses.is_dir()):
         return False
-    own = (checkpoint.parent.name, poses.name, GAUSSIANS_FILE, *FOLDERS)
+    own = (checkpoint.parent.name, poses.name, GAUSSIANS_FILE, MASKS_FOLDER, *FOLDERS)
     return (
         _holds_only(path, own)
         and _holds_only(checkpoint.parent, (checkpoint.name, f"{checkpoint.name}.new"))

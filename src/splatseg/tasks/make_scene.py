@@ -31,7 +31,9 @@ from splatseg.pose.pointmaps import PointmapReport
 from splatseg.render import BackendName
 from splatseg.report.fit_verdict import FitVerdict
 from splatseg.tasks._depth_evidence import with_depth_evidence
+from splatseg.tasks._fit_moving import capture_without_moving
 from splatseg.tasks._fit_report import score_and_report
+from splatseg.tasks._moving import LeftOut, MovingClock, moving_things, without_moving_points
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._photographs import Poses, capture_of
 from splatseg.tasks._scan_depth import with_scans
@@ -75,6 +77,22 @@ class MakeSceneOptions(CheckpointOptions):
     the capture: their points are where the fit starts, and the depth that it learns with the
     metric depth option. None uses none."""
 
+    moving: Path | None = None
+    """Boxes of moving things, which are left out of training views and of scans: a JSON file, a
+    drive of KITTI-360 or a segment of Waymo."""
+
+    moving_classes: tuple[str, ...] = ()
+    """Classes of label maps whose things move, such as car pedestrian: they are left out of
+    training views."""
+
+    moving_evidence: str | None = None
+    """The label maps of `moving_classes`: a folder, or its name in the capture or in the scene that
+    is replaced. None takes the only evidence there is."""
+
+    moving_clock: MovingClock = "recorded"
+    """What the times of boxes are. recorded: what the data set has, such as seconds. frames: the
+    last number in the name of a view or scan."""
+
     def __post_init__(self) -> None:
         convert_fields(self)
         CheckpointOptions.__post_init__(self)
@@ -105,6 +123,9 @@ class MadeScene:
 
     poses: PoseReport | PointmapReport | None
     """How poses were found; None where they came with the capture."""
+
+    moving: LeftOut | None
+    """What was left out with moving things; None where nothing was to be."""
 
     verdict: FitVerdict
     """What the fit is good for."""
@@ -152,7 +173,7 @@ def fit_capture(
     onwards = check_fit_output(folder, options)
     with fit_folder(folder):
         began = time.monotonic()
-        capture, poses = _capture(data, folder, options, fit_options, observer)
+        capture, poses, moving = _capture(data, folder, options, fit_options, observer)
         timings = {"photographs and poses": time.monotonic() - began}
         checkpoints = options.checkpoints(
             folder / CHECKPOINT_FILE,
@@ -164,7 +185,13 @@ def fit_capture(
             observer.info(f"{folder}: nothing to go on from, beginning")
         began = time.monotonic()
         result, stopped = _fitted(
-            capture, folder, options, fit_options, checkpoints, backend=backend, observer=observer
+            capture,
+            folder,
+            fit_options,
+            checkpoints,
+            record=_record(options, moving),
+            backend=backend,
+            observer=observer,
         )
         # What was done before a fit was resumed counts as optimisation.
         timings["optimisation"] = result.seconds
@@ -194,6 +221,7 @@ def fit_capture(
         held_out=sum(view.image is not None for view in capture.test_views),
         report=done.report,
         poses=poses,
+        moving=moving,
         verdict=done.verdict,
         timings=done.timings,
     )
@@ -205,8 +233,9 @@ def _capture(
     options: MakeSceneOptions,
     fit_options: FitOptions,
     observer: Observer,
-) -> tuple[Capture, PoseReport | PointmapReport | None]:
-    """The capture with its poses; the observer is told what it is."""
+) -> tuple[Capture, PoseReport | PointmapReport | None, LeftOut | None]:
+    """The capture with its poses, without moving things; the observer is told what it is."""
+    things = moving_things(options.moving, options.moving_classes, options.moving_clock)
     if isinstance(data, Capture):
         capture, poses = data, None
     else:
@@ -236,21 +265,33 @@ def _capture(
         if options.depth_evidence is not None:
             raise InputError("depth_evidence: expected none with scans, which tell depths too.")
         observer.info("scans become depth maps")
-        capture = with_scans(capture, read_scans(options.scans), scene=folder, report=observer.note)
+        scans = without_moving_points(
+            read_scans(options.scans), things, metres_per_unit=capture.metres_per_unit or 1.0
+        )
+        capture = with_scans(capture, scans, scene=folder, report=observer.note)
+    left_out: LeftOut | None = None
+    if things is not None:
+        capture, left_out = capture_without_moving(
+            capture, things, scene=folder, evidence=options.moving_evidence,
+            masks=fit_options.masks,
+        )  # fmt: skip
+        observer.note(left_out.sentence)
+    elif options.moving_evidence is not None:
+        raise InputError("moving_evidence: expected classes with it (`moving_classes`), got none.")
     for note in (*capture.notes, reduction_note(capture.train_views, longest=fit_options.longest)):
         if note is not None:
             observer.note(note)
     observer.info(_beginning(capture, fit_options))
-    return capture, poses
+    return capture, poses, left_out
 
 
 def _fitted(
     capture: Capture,
     folder: Path,
-    options: MakeSceneOptions,
     fit_options: FitOptions,
     checkpoints: Checkpoints,
     *,
+    record: Mapping[str, Any],
     backend: BackendName,
     observer: Observer,
 ) -> tuple[FitResult, bool]:
@@ -264,7 +305,7 @@ def _fitted(
                 progress=step,
                 checkpoints=checkpoints,
             )
-        provenance = _provenance(options, fit_options, backend, result)
+        provenance = _provenance(record, fit_options, backend, result)
         _save(folder, capture, result, provenance)
     return result, interrupts.requested or result.interrupted
 
@@ -295,8 +336,18 @@ def _beginning(capture: Capture, options: FitOptions) -> str:
     )
 
 
+def _record(options: MakeSceneOptions, moving: LeftOut | None) -> dict[str, Any]:
+    """What the scene remembers of what is around the fit."""
+    return {
+        "preset": options.preset,
+        **({} if options.depth_evidence is None else {"depth_evidence": options.depth_evidence}),
+        **({} if options.scans is None else {"scans": str(options.scans)}),
+        **({} if moving is None else {"moving": moving.record}),
+    }
+
+
 def _provenance(
-    options: MakeSceneOptions, fit_options: FitOptions, backend: str, result: FitResult
+    record: Mapping[str, Any], fit_options: FitOptions, backend: str, result: FitResult
 ) -> dict[str, Any]:
     return {
         "command": "fit",
@@ -304,9 +355,7 @@ def _provenance(
         "seconds": round(result.seconds, 3),
         "interrupted": result.interrupted,
         "seed": fit_options.seed,
-        "preset": options.preset,
-        **({} if options.depth_evidence is None else {"depth_evidence": options.depth_evidence}),
-        **({} if options.scans is None else {"scans": str(options.scans)}),
+        **record,
         "backend": backend,
         "options": asdict(fit_options),
         **({EXPOSURES: exposures_record(result.exposures)} if result.exposures else {}),

@@ -1,12 +1,13 @@
 """Fits that were stopped: where, and whether they can go on."""
 
+import shutil
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
 from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
-from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, work_on_scene
+from splatseg.io.scene_folder import CHECKPOINT_FILE, MASKS_FOLDER, is_scene, work_on_scene
 from splatseg.io.write_errors import named_write_failures
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.new_scene import check_replaceable_scene
@@ -60,6 +61,9 @@ def fit_folder(root: Path) -> Generator[None]:
                 checkpoints.mkdir(exist_ok=True)
             yield
     finally:
+        if not is_scene(root) and not (root / CHECKPOINT_FILE).is_file():
+            # Nothing goes on from here that could want them.
+            shutil.rmtree(root / MASKS_FOLDER, ignore_errors=True)
         for folder in (checkpoints, root):
             with suppress(OSError):  # it is not empty
                 folder.rmdir()
