@@ -1,5 +1,6 @@
 """Protocols of streets end to end on a tiny drive in the layouts of KITTI-360 and Waymo."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -168,6 +169,47 @@ def test_own_classes_have_their_own_names(run) -> None:
     assert not names & {"traffic sign", "others"}
     assert not set(TABLE_1) & set(own.methods[0].scores)
     assert "traffic sign" in merged.methods[0].scores
+
+
+@pytest.mark.parametrize("classes", ["table-1", "own"])
+@pytest.mark.parametrize(
+    ("layout", "names"),
+    [
+        ("kitti360", {"traffic sign": "Sign", "terrain": "ground", "pole": "pole"}),
+        ("waymo", {"traffic sign": "sign", "wall": "building", "terrain": "walkable"}),
+    ],
+)
+def test_maps_of_other_names_score_the_same(layout, names, classes, run, sets, tmp_path) -> None:
+    """Evidence of the same classes, called as another data set does."""
+    evidence = sets(layout).fit.parent / "evidence"
+    other = tmp_path / "renamed"
+    shutil.copytree(evidence, other)
+    (other / "metadata.json").unlink()
+    content = json.loads((evidence / "metadata.json").read_text())
+    for row in content["classes"]:
+        row["name"] = names.get(row["name"], row["name"])
+    (other / "metadata.json").write_text(json.dumps(content))
+    switches = ("points=density", f"classes={classes}")
+    usual = run(layout, *switches, fitted=str(fresh(sets(layout), tmp_path, "usual")))
+    renamed = run(
+        layout,
+        *switches,
+        models=(str(other / NAME),),
+        fitted=str(fresh(sets(layout), tmp_path, "renamed-fit")),
+    )
+    ours, theirs = (dict(one.methods[0].scores) for one in (usual, renamed))
+    assert theirs == ours
+    notes = [note for note in renamed.methods[0].scenes[0].notes if "by other names" in note]
+    if layout == "kitti360":
+        assert [note.partition(":")[0] for note in notes] == ["points", "views"]
+        assert all("Sign is traffic sign, ground is terrain" in note for note in notes)
+    else:
+        assert "walkable is ground" in notes[1]
+
+
+def fresh(data: Set, tmp_path: Path, name: str) -> Path:
+    """A copy of the fit without evidence."""
+    return Path(shutil.copytree(data.fit, data.fit.parent / f"{tmp_path.name}-{name}"))
 
 
 def test_a_method_has_at_least_one_of_the_rules(run) -> None:

@@ -12,6 +12,7 @@ from splatseg.evaluate.protocols._protocol import switch_value as switch_value
 from splatseg.evaluate.protocols._published import PublishedFigure as PublishedFigure
 from splatseg.evaluate.protocols._scene_lists import SCENE_LISTS as SCENE_LISTS
 from splatseg.evaluate.protocols._scene_lists import SceneList as SceneList
+from splatseg.evaluate.protocols._street_names import street_class as street_class
 from splatseg.evaluate.protocols._streets import SKY as SKY
 from splatseg.evaluate.protocols._streets import TABLE_1 as TABLE_1
 from splatseg.evaluate.protocols._streets import merged_name as merged_name

@@ -30,6 +30,7 @@ from splatseg.evaluate.protocols import (
     Protocol,
     StreetSwitches,
     merged_name,
+    street_class,
 )
 from splatseg.io.atomic import atomic_file
 from splatseg.io.evidence import open_evidence
@@ -214,7 +215,7 @@ class Drive:
         if self._switches.classes == "table-1":
             scores |= {row["name"]: row["iou"] for row in rows}
         scores |= {"accuracy": score.accuracy, "undefined": int(undefined.sum()) / max(known, 1)}
-        return scores, rows, []
+        return scores, rows, [f"points: {columns.note}."] if columns.note else []
 
     def _labels_at(self, rule: str, points: Float[Tensor, "p 3"]) -> PointLabels:
         """Labels of all points, in ids of the layer."""
@@ -271,6 +272,7 @@ class Drive:
         of_classes, rows = class_scores(known, confusions)
         lacking = len(views) - len(known)
         notes = [f"{lacking} of {len(views)} held-out views have no truth."] if lacking else []
+        notes += [f"views: {columns.note}."] if columns.note else []
         return {"view_miou": of_classes["miou"], **scores}, rows, notes
 
     def _columns(self, table: ClassTable | None, *, sky: bool) -> "_Columns":
@@ -284,16 +286,13 @@ class Drive:
         if merged:
             names = {column: name for name, column in _COLUMNS.items()}
             true = _merged(table)
-            mapping = _merged(table if found is None else found)
         else:
             true = {row.id: row.id for row in table.rows}
             names = {row.id: row.name for row in table.rows}
-            ids = {row.name.lower(): row.id for row in table.rows}
-            rows = table.rows if found is None else found.rows
-            mapping = {row.id: ids[row.name.lower()] for row in rows if row.name.lower() in ids}
+        mapping, note = (true, "") if found is None else _matched(found, table, true, merged=merged)
         if not sky:
             true = {id: column for id, column in true.items() if names[column].lower() != SKY}
-        return _Columns(true=true, found=mapping, names=names)
+        return _Columns(true=true, found=mapping, names=names, note=note)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -307,6 +306,37 @@ class _Columns:
     """By id of the layer."""
 
     names: Mapping[int, str]
+
+    note: str
+    """Which classes of the layer the truth calls otherwise, or lacks; empty where none."""
+
+
+def _matched(
+    found: ClassTable, table: ClassTable, true: Mapping[int, int], *, merged: bool
+) -> tuple[dict[int, int], str]:
+    """Column by id of the layer: that of the truth's class, by its name or another of its names.
+
+    What the truth has no class for is of Table 1's column of its own name, or of none.
+    """
+    ids = {row.name: row.id for row in table.rows}
+    own = [row.name for row in found.rows]
+    columns: dict[int, int] = {}
+    otherwise: list[str] = []
+    lacking: list[str] = []
+    for row in found.rows:
+        name = street_class(row.name, ids, own)
+        if name is None:
+            lacking.append(row.name)
+            column = merged_name(row.name) if merged else None
+            if column is not None:
+                columns[row.id] = _COLUMNS[column]
+            continue
+        if name.lower() != row.name.lower():
+            otherwise.append(f"{row.name} is {name}")
+        if ids[name] in true:
+            columns[row.id] = true[ids[name]]
+    told = (("by other names", otherwise), ("the truth has no class for", lacking))
+    return columns, "; ".join(f"{words}: {', '.join(names)}" for words, names in told if names)
 
 
 def _merged(table: ClassTable) -> dict[int, int]:
