@@ -102,10 +102,19 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
         )
         made.append((field.name, annotated, spec))
     shown = dataclasses.make_dataclass(
-        command.__name__, made, bases=(command,), frozen=True, kw_only=True
+        command.__name__,
+        made,
+        bases=(command,),
+        namespace={"__post_init__": _unchecked},
+        frozen=True,
+        kw_only=True,
     )
     shown.__doc__ = flowing(command.__doc__ or "")
     return shown
+
+
+def _unchecked(_: object) -> None:
+    """Options check themselves when they are copied back: tyro would make a box of the sentence."""
 
 
 def _original(value: object, kind: type[Any]) -> object:
