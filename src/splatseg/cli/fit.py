@@ -132,7 +132,7 @@ class Command:
 
     moving_evidence: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_NAME")] = None
     """The label maps of --moving-classes: a folder, or its name in DATA or in a scene that SCENE
-    replaces. None takes the only evidence there is."""
+    replaces. None takes the only label maps there are."""
 
     moving_clock: Literal["recorded", "frames"] = _SCENE.moving_clock
     """What the times of boxes are. recorded: what the data set has, such as seconds. frames: the

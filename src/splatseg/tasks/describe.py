@@ -28,7 +28,7 @@ from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import load_layer
 from splatseg.io.lock import lock_owner
 from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
-from splatseg.io.scene_fields import scene_field_names
+from splatseg.io.scene_fields import DRIVE_FILE, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished, training_files
 from splatseg.io.splats import SplatWarning, read_splats, splat_format
 from splatseg.tasks.stopped_fit import where_it_stopped
@@ -209,11 +209,34 @@ def _stopped_notes(root: Path) -> list[str]:
         stopped = where_it_stopped(root / CHECKPOINT_FILE)
         if stopped is not None:
             notes.append(f"its fit {stopped}; fit --resume continues it")
-    return notes + [
+    notes += [
         f"the training of layer {file.stem} {where_training_stopped(file)}; segment --resume "
         "continues it"
         for file in training_files(root)
     ]
+    return [*notes, *_field_notes(root)]
+
+
+def _field_notes(root: Path) -> list[str]:
+    """What lacks of fields of drives in blocks."""
+    from splatseg.street.blocks import load_drive, missing_blocks  # here: most scenes have none
+
+    notes: list[str] = []
+    for name in scene_field_names(root):
+        folder = scene_field_path(root, name)
+        if not folder.is_dir():
+            continue
+        try:
+            lacking, blocks = missing_blocks(folder), len(load_drive(folder / DRIVE_FILE))
+        except FileFormatError as error:
+            notes.append(str(error).removesuffix("."))
+            continue
+        if lacking:
+            notes.append(
+                f"{len(lacking)} of {blocks} blocks of field {name} lack; the street command that "
+                "began it continues it"
+            )
+    return notes
 
 
 def _layer_kind(layer: Layer) -> str:

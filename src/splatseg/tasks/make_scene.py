@@ -87,7 +87,7 @@ class MakeSceneOptions(CheckpointOptions):
 
     moving_evidence: str | None = None
     """The label maps of `moving_classes`: a folder, or its name in the capture or in the scene that
-    is replaced. None takes the only evidence there is."""
+    is replaced. None takes the only label maps there are."""
 
     moving_clock: MovingClock = "recorded"
     """What the times of boxes are. recorded: what the data set has, such as seconds. frames: the

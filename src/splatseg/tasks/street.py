@@ -119,7 +119,9 @@ def open_drive(path: Path, *, new_scene: Path | None = None, data: Path | None =
             )
         return there
     check_new_folder(new_scene)
-    return save_scene(replace(scene_of_views(capture), provenance={"command": "street"}), new_scene)
+    save_scene(replace(scene_of_views(capture), provenance={"command": "street"}), new_scene)
+    # As later calls see it: matrices of a file are those of the capture but for the last bits.
+    return load_scene(new_scene)
 
 
 @boundary

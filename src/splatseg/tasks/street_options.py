@@ -7,7 +7,7 @@ from typing import Literal
 
 from splatseg._check import check_choice
 from splatseg.core.boundary import convert_fields
-from splatseg.errors import InputError, RangeError
+from splatseg.errors import InputError
 from splatseg.io.scene import check_name
 from splatseg.street.blocks import DriveBlockOptions
 
@@ -85,9 +85,9 @@ class StreetOptions:
             )
         for name, value in (("block_length", length), ("block_overlap", overlap)):
             if value is not None and not (math.isfinite(value) and value > 0):
-                raise RangeError(f"{name}: expected a positive number of metres, got {value}.")
+                raise InputError(f"{name}: expected a positive number of metres, got {value}.")
         if length is not None and overlap is not None and overlap >= length:
-            raise RangeError(
+            raise InputError(
                 f"block_overlap: expected less than a block of {length:g} m, got {overlap:g} m."
             )
 
