@@ -18,8 +18,14 @@ import tyro
 
 from splatseg.cli._words import names_as_flags, option_names
 from splatseg.core.typed_text import REPEATED
+from splatseg.errors import InputError, quoted
 
-_LISTS: dict[Any, type[str] | type[int]] = {tuple[str, ...]: str, tuple[int, ...]: int}
+_LISTS: dict[Any, type[str] | type[int] | type[float]] = {
+    tuple[str, ...]: str,
+    tuple[int, ...]: int,
+    tuple[float, ...]: float,
+}
+_ITEMS = {str: "names", int: "whole numbers", float: "numbers"}
 _PLACEHOLDERS: dict[Any, str] = {str: "NAME", int: "N", float: "X", Path: "PATH"}
 
 
@@ -30,9 +36,18 @@ def parse(
 
     Raises:
         SystemExit: After the help (status 0), or after words that cannot be used (2).
+        InputError: If an item of a list is no number, or options refuse their values.
     """
     shown = _readable(command, option_names(command))
-    return _original(tyro.cli(shown, prog=prog, args=list(words), config=config), command)
+    try:
+        made = tyro.cli(shown, prog=prog, args=list(words), config=config)
+    except _UnreadableError as error:
+        raise InputError(str(error)) from error
+    return _original(made, command)
+
+
+class _UnreadableError(Exception):
+    """A word that is no item of a list; no `ValueError`, of which tyro would make a box."""
 
 
 def flowing(text: str) -> str:
@@ -89,7 +104,7 @@ def _readable(command: type[Any], names: Collection[str]) -> type[Any]:
             others.append(tyro.conf.UseAppendAction)
         # A flag that is given again and again has one item each time, commas and all.
         if kind in _LISTS and tyro.conf.UseAppendAction not in others:
-            others.append(_list_of(_LISTS[kind]))
+            others.append(_list_of(_LISTS[kind], field.name))
         annotated: Any = Annotated[kind, argument]
         for note in others:
             annotated = Annotated[annotated, note]
@@ -143,12 +158,20 @@ def _copied(value: Any, kind: type[Any]) -> Any:
     return kind(**values)
 
 
-def _list_of(kind: type[str] | type[int]) -> Any:
+def _list_of(kind: type[str] | type[int] | type[float], name: str) -> Any:
     """How a list is read: its items by comma, by space, or both."""
 
     def read(words: list[str]) -> tuple[Any, ...]:
         items = (item.strip() for word in words for item in word.split(","))
-        return tuple(kind(item) for item in items if item)
+        return tuple(read_item(item) for item in items if item)
+
+    def read_item(item: str) -> Any:
+        try:
+            return kind(item)
+        except ValueError as error:
+            raise _UnreadableError(
+                f"{name}: expected {_ITEMS[kind]}, got {quoted(item)}."
+            ) from error
 
     def written(values: tuple[Any, ...]) -> list[str]:
         return [str(value) for value in values]
