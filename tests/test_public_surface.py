@@ -66,6 +66,7 @@ SURFACE = {
     "load_scene",
     "load_scene_layer",
     "make_demo",
+    "make_street_field",
     "open_drive",
     "open_evidence",
     "open_selector",

@@ -106,6 +106,7 @@ if TYPE_CHECKING:
     from splatseg.tasks import import_scene as import_scene
     from splatseg.tasks import label_scans as label_scans
     from splatseg.tasks import make_demo as make_demo
+    from splatseg.tasks import make_street_field as make_street_field
     from splatseg.tasks import open_drive as open_drive
     from splatseg.tasks import open_selector as open_selector
     from splatseg.tasks import query as query
@@ -142,8 +143,9 @@ _HOMES = {
         "SharpenSceneOptions StreetOptions "
         "attach_layers bench describe edit_scene "
         "evaluate_scene examine_capture export_scene fit_capture import_scene "
-        "label_scans make_demo open_drive open_selector query render_truth render_views "
-        "save_segmentation save_street_field see segment select sharpen_scene street_field"
+        "label_scans make_demo make_street_field open_drive open_selector query render_truth "
+        "render_views save_segmentation save_street_field see segment select sharpen_scene "
+        "street_field"
     ),
 }
 _PACKAGES = frozenset(

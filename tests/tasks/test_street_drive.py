@@ -26,10 +26,10 @@ from splatseg.tasks import (
     made_street_field,
     make_street_field,
     open_drive,
-    street_drive,
     street_field,
 )
 from splatseg.tasks.scene_parts import scene_field
+from splatseg.tasks.street_drive import street_drive
 from support.observers import Stopping
 
 LEARNING = DnmpOptions(voxels=(2.0,), geometry_iterations=3, iterations=200, rays=256)

@@ -80,5 +80,4 @@ from splatseg.tasks.street import open_drive as open_drive
 from splatseg.tasks.street import save_street_field as save_street_field
 from splatseg.tasks.street import street_field as street_field
 from splatseg.tasks.street_drive import StreetDrive as StreetDrive
-from splatseg.tasks.street_drive import street_drive as street_drive
 from splatseg.tasks.street_options import StreetOptions as StreetOptions
