@@ -30,6 +30,7 @@ from splatseg.io.tensors import read_tensors
 from splatseg.lift.training import _state as training
 from splatseg.pose import _saved as saved
 from splatseg.pose._report import LeftOut, Lens, MapperTry, PoseReport
+from splatseg.street.blocks import DriveBlockOptions, cut_drive, load_drive, save_drive
 from splatseg.street.files import load_mesh_field, save_mesh_field
 from splatseg.street.hits import MeshCaster
 from splatseg.street.radiance.cache import cached_hits, read_hits
@@ -123,6 +124,16 @@ def mesh_field(folder: Path) -> Target:
     file = folder / "field.safetensors"
     save_mesh_field(random_field(balls([[0, 0, 2]])), file)
     return Target(file=file, read=lambda: load_mesh_field(file))
+
+
+@target("drive")
+def drive_in_blocks(folder: Path) -> Target:
+    """How a drive of two blocks was cut."""
+    file = folder / "drive.json"
+    road = torch.tensor([[3.0 * i, 0.1 * i * i, 0.0] for i in range(12)], dtype=torch.float64)
+    drive = cut_drive(road, options=DriveBlockOptions(length=25.0, overlap=5.0))
+    save_drive(drive, file, about={"seed": 1})
+    return Target(file=file, read=lambda: load_drive(file))
 
 
 def _hits(name: str) -> None:
