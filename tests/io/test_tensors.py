@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.tensors import read_tensors
+from splatseg.io.tensors import read_safetensors, read_safetensors_words, read_tensors
 
 
 def test_safetensors_as_its_own_library_writes_them(tmp_path) -> None:
@@ -90,3 +90,31 @@ def test_cut_off_or_not_there(tmp_path) -> None:
     path.rename(tmp_path / "w.txt")
     with pytest.raises(InputError, match="got .txt"):
         read_tensors(tmp_path / "w.txt")
+
+
+def test_the_words_of_a_header_are_read_alone(tmp_path) -> None:
+    path = tmp_path / "w.safetensors"
+    save_file({"a": torch.zeros(9)}, path, metadata={"format": "pt", "about": "it"})
+    assert (
+        read_safetensors_words(path)
+        == read_safetensors(path)[1]
+        == {
+            "format": "pt",
+            "about": "it",
+        }
+    )
+    save_file({"a": torch.zeros(9)}, tmp_path / "bare.safetensors")
+    assert read_safetensors_words(tmp_path / "bare.safetensors") == {}
+    data = path.read_bytes()
+    for damaged, words in (
+        (data[:4], "its header is cut off"),
+        (data[:40], "its header is cut off"),
+        (b"\xff" * 8 + data[8:], "its header is cut off"),
+        (data[:8] + b"x" + data[9:], "header"),
+        (len(text := b'{"__metadata__": 3}').to_bytes(8, "little") + text, "text in __metadata__"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match=words):
+            read_safetensors_words(path)
+    with pytest.raises(MissingFileError, match="there is no such file"):
+        read_safetensors_words(tmp_path / "none.safetensors")

@@ -11,7 +11,12 @@ from splatseg.errors import FileFormatError, InputError, MissingFileError, Splat
 from splatseg.io.tensors import read_safetensors
 from splatseg.io.tensors_writing import write_tensors
 from splatseg.street.field import MeshField
-from splatseg.street.files import FORMAT, load_mesh_field, save_mesh_field
+from splatseg.street.files import (
+    FORMAT,
+    load_mesh_field,
+    load_mesh_field_layer,
+    save_mesh_field,
+)
 from support.mesh_fields import SMALL, balls, random_field, told_field
 
 
@@ -135,6 +140,36 @@ def test_every_key_is_checked(saved: Path, values: dict[str, object], words: str
         load_mesh_field(saved)
     assert str(error.value).startswith(str(saved))
     assert str(error.value).count("\n") == 0
+
+
+def test_what_is_known_of_the_layer_is_in_the_header(saved: Path) -> None:
+    """Of a file whose numbers are gone as well."""
+    field = load_mesh_field(saved)
+    name = field.layer_names[0]
+    expected = repr((name, field.layer(name)))
+    assert repr(load_mesh_field_layer(saved)) == expected
+    length = 8 + int.from_bytes(saved.read_bytes()[:8], "little")
+    saved.write_bytes(saved.read_bytes()[:length])
+    assert repr(load_mesh_field_layer(saved)) == expected
+    saved.write_bytes(saved.read_bytes()[: length - 1])
+    with pytest.raises(FileFormatError, match="its header is cut off"):
+        load_mesh_field_layer(saved)
+    with pytest.raises(MissingFileError, match="none"):
+        load_mesh_field_layer(saved.with_name("none.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"version": "2"}, "of version 1, got version '2'; a later splatseg wrote it"),
+        ({"ids": [0, 3, 5]}, "ids: expected a whole number in"),
+        ({"layer": 3}, "expected a name as layer, got 3"),
+        ({"info": []}, r"expected an object as info, got \[\]"),
+    ],
+)
+def test_the_header_is_checked_by_itself(saved: Path, values: dict[str, object], words) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        load_mesh_field_layer(changed(saved, **values))
 
 
 def test_options_that_ask_for_all_memory_are_refused_before_it_is_taken(saved: Path) -> None:

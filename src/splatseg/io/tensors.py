@@ -84,11 +84,30 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise FileFormatError(f"{path}: expected a safetensors file, its header is cut off.")
     header = parse_object(data[8 : 8 + length], where=f"{path}: header")
     body = memoryview(data)[8 + length :]
-    words = header.pop("__metadata__", {})
+    words = _words(path, header.pop("__metadata__", {}))
+    tensors = {name: _tensor(path, name, entry, body) for name, entry in header.items()}
+    return tensors, words
+
+
+def read_safetensors_words(path: Path) -> dict[str, str]:
+    """The words that the header of a ``.safetensors`` file has; its tensors are not read.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If its header is damaged.
+    """
+    with reading(path, "a safetensors file"), path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        text = file.read(length) if length <= _MAX_HEADER else b""
+    if len(text) != length:
+        raise FileFormatError(f"{path}: expected a safetensors file, its header is cut off.")
+    return _words(path, parse_object(text, where=f"{path}: header").get("__metadata__", {}))
+
+
+def _words(path: Path, words: object) -> dict[str, str]:
     if not isinstance(words, dict) or not all(isinstance(text, str) for text in words.values()):  # pyright: ignore[reportUnknownVariableType]
         raise FileFormatError(f"{path}: expected text in __metadata__, got {quoted(words)}.")
-    tensors = {name: _tensor(path, name, entry, body) for name, entry in header.items()}
-    return tensors, cast("dict[str, str]", words)
+    return cast("dict[str, str]", words)
 
 
 def _tensor(path: Path, name: str, entry: Any, body: memoryview) -> Tensor:

@@ -12,13 +12,13 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from splatseg.core import layer_info_from_json, layer_info_to_json
+from splatseg.core import LayerInfo, RenderableLayer, layer_info_from_json, layer_info_to_json
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.io.tensors import read_safetensors
+from splatseg.io.tensors import read_safetensors, read_safetensors_words
 from splatseg.io.tensors_writing import write_tensors
 from splatseg.street.field import MeshField
 from splatseg.street.mesh import PrimitiveMesh
@@ -77,6 +77,54 @@ def load_mesh_field(path: Path) -> MeshField:
         FileFormatError: If it is damaged, cut short, no such field, or of a later version.
     """
     tensors, metadata = read_safetensors(path)
+    about = _about(metadata, path)
+    ids = _ids(about, path)
+    with made_from(path):
+        mesh = _mesh(tensors, about, path)
+        model = _model(tensors, mesh, ids, _options(about, path), path)
+        return MeshField(
+            mesh,
+            model,
+            layer=_layer_name(about, path),
+            info=_info(about, path),
+            radius=json_number(about["radius"], where=f"{path}: radius"),
+        )
+
+
+@boundary
+def load_mesh_field_layer(path: Path) -> tuple[str, RenderableLayer]:
+    """Name of the layer of a field, and what there is to know of it; its numbers are not read.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If its header is damaged, or that of no such field.
+    """
+    about = _about(read_safetensors_words(path), path)
+    layer = RenderableLayer(ids=tuple(sorted(_ids(about, path))), info=_info(about, path))
+    return _layer_name(about, path), layer
+
+
+def _ids(about: Mapping[str, Any], path: Path) -> tuple[int, ...]:
+    return tuple(
+        json_integer(id, where=f"{path}: ids", low=1, high=_MAX_ID)
+        for id in _list(about, "ids", path)
+    )
+
+
+def _layer_name(about: Mapping[str, Any], path: Path) -> str:
+    if not isinstance(about["layer"], str):
+        raise FileFormatError(f"{path}: expected a name as layer, got {quoted(about['layer'])}.")
+    return about["layer"]
+
+
+def _info(about: Mapping[str, Any], path: Path) -> LayerInfo:
+    info = about["info"]
+    if not isinstance(info, dict):
+        raise FileFormatError(f"{path}: expected an object as info, got {quoted(info)}.")
+    return layer_info_from_json(cast("dict[str, Any]", info), where=f"{path}: info")
+
+
+def _about(metadata: Mapping[str, str], path: Path) -> dict[str, Any]:
     if metadata.get("format") != FORMAT:
         raise FileFormatError(
             f"{path}: expected a mesh field, got {quoted(metadata.get('format'))}."
@@ -86,31 +134,7 @@ def load_mesh_field(path: Path) -> MeshField:
             f"{path}: expected a mesh field of version {VERSION}, got version "
             f"{quoted(metadata.get('version'))}; a later splatseg wrote it."
         )
-    about = _about(metadata.get("about", ""), path)
-    info = about["info"]
-    if not isinstance(info, dict):
-        raise FileFormatError(f"{path}: expected an object as info, got {quoted(info)}.")
-    record = layer_info_from_json(cast("dict[str, Any]", info), where=f"{path}: info")
-    ids = tuple(
-        json_integer(id, where=f"{path}: ids", low=1, high=_MAX_ID)
-        for id in _list(about, "ids", path)
-    )
-    if not isinstance(about["layer"], str):
-        raise FileFormatError(f"{path}: expected a name as layer, got {quoted(about['layer'])}.")
-    with made_from(path):
-        mesh = _mesh(tensors, about, path)
-        model = _model(tensors, mesh, ids, _options(about, path), path)
-        return MeshField(
-            mesh,
-            model,
-            layer=about["layer"],
-            info=record,
-            radius=json_number(about["radius"], where=f"{path}: radius"),
-        )
-
-
-def _about(text: str, path: Path) -> dict[str, Any]:
-    about = parse_object(text, where=f"{path}: about")
+    about = parse_object(metadata.get("about", ""), where=f"{path}: about")
     missing = [key for key in _KEYS if key not in about]
     if missing:
         raise FileFormatError(f"{path}: about: expected {', '.join(missing)}, got none.")

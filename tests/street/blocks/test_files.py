@@ -12,9 +12,14 @@ from splatseg.street.blocks import (
     Drive,
     DriveBlock,
     DriveBlockOptions,
+    block_file,
     build_blocks,
     cut_drive,
+    drive_about,
+    files,
+    goes_on,
     load_drive,
+    missing_blocks,
     open_blocks,
     save_drive,
 )
@@ -62,6 +67,32 @@ def test_blocks_are_made_once_and_read_when_asked_for(tmp_path):
     assert field.layer("semantic").kind == "labels"
     points = torch.tensor([[10.3, 0.1, 0], [75.2, 0, 0], [140.1, 0, 0], [75, 30, 0]])
     assert field.labels_at(points, "semantic").ids.tolist() == [*IDS, -1]
+
+
+def test_layers_are_known_before_a_block_is_read(tmp_path, monkeypatch):
+    build_blocks(cut_drive(ALONG), tmp_path / "f", Make())
+    monkeypatch.setattr(files, "load_mesh_field", None)
+    field = open_blocks(tmp_path / "f")
+    assert field.layer_names == ("semantic",)
+    assert field.layer("semantic").ids == tuple(sorted(IDS))
+    assert field.layer("semantic").info.names == {3: "road", 5: "sky", 8: "car"}
+
+
+def test_a_folder_tells_what_it_is_made_of_and_what_lacks(tmp_path):
+    drive, folder = cut_drive(ALONG), tmp_path / "f"
+    with pytest.raises(KeyboardInterrupt):
+        build_blocks(drive, folder, Make(stop_at=1), about={"seed": 1, "sizes": (2, 3)})
+    assert drive_about(folder) == {"seed": 1, "sizes": [2, 3]}
+    assert missing_blocks(folder) == (1, 2)
+    assert block_file(folder, 0).is_file()
+    assert goes_on(drive, folder, about={"seed": 1, "sizes": (2, 3)})
+    assert not goes_on(drive, folder, about={"seed": 2, "sizes": (2, 3)})
+    assert not goes_on(cut_drive(straight(90.0)), folder, about={"seed": 1, "sizes": (2, 3)})
+    assert not goes_on(drive, tmp_path / "none")
+    table = folder / "drive.json"
+    table.write_text(json.dumps(json.loads(table.read_text()) | {"about": 3}))
+    with pytest.raises(FileFormatError, match="expected an object as about, got 3"):
+        drive_about(folder)
 
 
 def test_what_was_stopped_is_gone_on_with(tmp_path):

@@ -2,7 +2,7 @@
 
 import tempfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -164,13 +164,24 @@ class DriveField:
 
     def _known(self) -> Mapping[str, RenderableLayer]:
         if self._layers is None:
-            found: dict[str, RenderableLayer] = {}
-            for block in self._drive.blocks:
-                field = self._field(block.index)
-                for name in field.layer_names:
-                    found[name] = _both(found.get(name), field.layer(name))
-            self._layers = found
+            fields = (self._field(block.index) for block in self._drive.blocks)
+            self._layers = joined_layers(
+                (name, field.layer(name)) for field in fields for name in field.layer_names
+            )
         return self._layers
+
+
+def joined_layers(layers: Iterable[tuple[str, RenderableLayer]]) -> dict[str, RenderableLayer]:
+    """What blocks know of layers, as one: of each name the ids, their names and views of all.
+
+    Args:
+        layers: With their names, those of one block after those of another. What else a layer
+            tells is that of the first.
+    """
+    found: dict[str, RenderableLayer] = {}
+    for name, layer in layers:
+        found[name] = _both(found.get(name), layer)
+    return found
 
 
 def _labels_of(

@@ -21,9 +21,9 @@ from splatseg.io.paths import path_inside
 from splatseg.io.scene_fields import DRIVE_FILE
 from splatseg.io.write_errors import named_write_failures
 from splatseg.street.blocks.cut import Drive, DriveBlock
-from splatseg.street.blocks.field import DriveField
+from splatseg.street.blocks.field import DriveField, joined_layers
 from splatseg.street.field import MeshField
-from splatseg.street.files import load_mesh_field, save_mesh_field
+from splatseg.street.files import load_mesh_field, load_mesh_field_layer, save_mesh_field
 
 FORMAT = "splatseg.street.drive"
 VERSION = 1
@@ -125,13 +125,15 @@ def block_file(folder: Path, index: int) -> Path:
 def open_blocks(folder: Path, *, max_open: int = 2) -> DriveField:
     """The drive of a folder as one field; blocks are read when they are asked for.
 
+    Of each no more than the header of its file is read before.
+
     Args:
         folder: What `build_blocks` wrote.
         max_open: Blocks that are held in memory.
 
     Raises:
         MissingFileError: If there is none, or a block lacks.
-        FileFormatError: If drive.json is broken.
+        FileFormatError: If drive.json or the header of a block is broken.
     """
     drive = load_drive(folder / DRIVE_FILE)
     lacking = missing_blocks(folder)
@@ -146,7 +148,8 @@ def open_blocks(folder: Path, *, max_open: int = 2) -> DriveField:
     def read(block: DriveBlock) -> MeshField:
         return load_mesh_field(block_file(folder, block.index))
 
-    return DriveField(drive, read, max_open=max_open)
+    headers = (load_mesh_field_layer(block_file(folder, b.index)) for b in drive.blocks)
+    return DriveField(drive, read, max_open=max_open, layers=joined_layers(headers))
 
 
 @boundary
