@@ -34,8 +34,8 @@ class MeshFieldFit:
 
     field: MeshField
 
-    started: int
-    """Primitives that voxels gave, of all levels."""
+    start: Primitives
+    """Primitives as voxels gave them, of all levels."""
 
     geometry: GeometryFit
     radiance: RadianceFit
@@ -141,7 +141,7 @@ def build_mesh_field(
     radius = None if options.radius is None else options.radius / metres_per_unit
     return MeshFieldFit(
         field=MeshField(mesh, model, layer=layer, info=info, radius=radius),
-        started=len(primitives),
+        start=primitives,
         geometry=shaped,
         radiance=trained,
     )

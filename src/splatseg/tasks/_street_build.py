@@ -16,6 +16,7 @@ from splatseg.street.build import MeshFieldFit, build_mesh_field
 from splatseg.street.field import MeshField
 from splatseg.street.options import PUBLISHED, DnmpOptions
 from splatseg.tasks._observer import Observer
+from splatseg.tasks._street_depths import DepthSample, KeptDepths
 from splatseg.tasks._street_inputs import DriveInputs
 from splatseg.tasks._street_sources import drive_sources
 from splatseg.tasks.scene_parts import views_recorded
@@ -33,6 +34,9 @@ class BuiltField:
     fit: MeshFieldFit
     sources: str
     """Where points and depth came from, in words."""
+
+    depths: tuple[DepthSample, ...]
+    """Depth of a few of the views."""
 
 
 class FieldBuilder:
@@ -101,10 +105,11 @@ class FieldBuilder:
         observer.info(f"from {sources.said}")
         cloud = sources.points if near is None else sources.points[near(sources.points)]
         self._took("points", time.monotonic() - began)
+        depths = KeptDepths(sources.depths(), views)
         with _Stages(observer, self._took) as stages:
             made = build_mesh_field(
                 cloud,
-                sources.depths(),
+                depths,
                 views,
                 inputs.evidence,
                 options=self.chosen,
@@ -129,7 +134,7 @@ class FieldBuilder:
             ),
             radius=made.field.radius,
         )
-        return BuiltField(field=field, fit=made, sources=sources.said)
+        return BuiltField(field=field, fit=made, sources=sources.said, depths=tuple(depths.samples))
 
     def _took(self, stage: str, seconds: float) -> None:
         self.timings[stage] = self.timings.get(stage, 0.0) + seconds

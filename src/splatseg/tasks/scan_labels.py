@@ -66,6 +66,7 @@ def label_scans(
     options: ScanLabelOptions | None = None,
     points: ViewedPointOptions | None = None,
     layers: Mapping[str, Layer] | None = None,
+    seen: Callable[[Scan, PointLabels], None] | None = None,
     backend: BackendName = "auto",
     observer: Observer = SILENT,
 ) -> ScanLabels:
@@ -80,6 +81,7 @@ def label_scans(
         options: Of which layer, and in which form.
         points: How points take labels from Gaussians; with a field none.
         layers: Layers at hand; others are read from the scene's folder.
+        seen: Is given every scan with its labels.
         backend: Who renders the Gaussians.
         observer: Is told of the progress.
 
@@ -105,7 +107,7 @@ def label_scans(
     form = _form(scans) if options.form == "auto" else options.form
     with observer.stage("label scans") as step:
         counts = write_scan_labels(
-            _labelled(field, scans, layer, step),
+            _told(_labelled(field, scans, layer, step), seen),
             folder,
             form=form,
             array_shape=scans.array_shape if form == "npz" else None,
@@ -116,6 +118,16 @@ def label_scans(
             },
         )
     return ScanLabels(folder=folder, form=form, layer=layer, counts=counts)
+
+
+def _told(
+    found: Iterator[tuple[Scan, PointLabels]], seen: Callable[[Scan, PointLabels], None] | None
+) -> Iterator[tuple[Scan, PointLabels]]:
+    """The same scans, of which someone else hears too."""
+    for scan, labels in found:
+        if seen is not None:
+            seen(scan, labels)
+        yield scan, labels
 
 
 class _Kept:

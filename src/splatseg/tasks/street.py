@@ -25,6 +25,7 @@ from splatseg.street.options import DnmpOptions
 from splatseg.tasks._moving import LeftOut
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._street_build import FieldBuilder
+from splatseg.tasks._street_depths import DepthSample
 from splatseg.tasks._street_inputs import drive_inputs
 from splatseg.tasks._street_sources import capture_points
 from splatseg.tasks.new_scene import check_new_folder
@@ -46,6 +47,9 @@ class StreetField:
     evidence: Evidence
     sources: str
     """Where points and depth came from, in words."""
+
+    depths: tuple[DepthSample, ...] = ()
+    """Depth of a few of the views, to measure shapes by."""
 
     moving: LeftOut | None = None
     """What was left out with moving things; None where nothing was to be."""
@@ -179,6 +183,7 @@ def street_field(
         views=tuple(scene.view(view.name) for view in inputs.views),
         evidence=inputs.evidence,
         sources=made.sources,
+        depths=made.depths,
         moving=inputs.moving,
         timings=builder.timings,
     )

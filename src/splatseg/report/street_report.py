@@ -1,0 +1,314 @@
+"""The page of a mesh field of a drive: what was built, how it went, and what it shows."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from splatseg.core import ClassTable
+from splatseg.report._common import environment
+from splatseg.report.chart import Chart, Line
+from splatseg.report.html import Block, Curves, Figure, Legend, Notice, Report, Table
+from splatseg.report.images import Gallery
+from splatseg.report.words import count_text, counted
+from splatseg.street.geometry import GeometryRecord
+from splatseg.street.radiance import RadianceRecord
+
+_BINS = 200
+"""Points of a curve of training: means of as many steps each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelFacts:
+    """The primitives of one level."""
+
+    side: float
+    """Of its voxels, metres."""
+
+    started: int
+    """Primitives that voxels gave."""
+
+    kept: int
+    """Of these, after those were removed that stood before surfaces or around cameras."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthError:
+    """How far first hits of the rays of a view are from its known depth."""
+
+    view: str
+    rays: int
+    """Whose depth is known."""
+
+    before: float | None
+    """Median over the rays that meet a primitive, metres, before shapes were fitted; None where
+    no ray meets one."""
+
+    after: float | None
+    """The same once the field was made."""
+
+    met_before: float
+    """Share of the rays that meet a primitive, in [0, 1]."""
+
+    met_after: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointCounts:
+    """Points of laser scans that were labelled."""
+
+    folder: str
+    """Where the labels are."""
+
+    by: str
+    """Who labelled them."""
+
+    scans: int
+    points: int
+    unlabelled: int
+    ids: Mapping[int, int]
+    """How many points have each id, by id."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StreetReportData:
+    """Everything that the page tells but its pictures."""
+
+    scene: str
+    """What the scene is called."""
+
+    layer: str
+    classes: ClassTable
+    """Names and colours of its ids."""
+
+    name: str = ""
+    """Of the field; empty where none was made."""
+
+    primitives: int = 0
+    blocks: int = 0
+    """Of a drive in blocks; 0 where it is one field."""
+
+    levels: tuple[LevelFacts, ...] = ()
+    depth: tuple[DepthError, ...] = ()
+    shaping: tuple[GeometryRecord, ...] = ()
+    training: tuple[RadianceRecord, ...] = ()
+    metres_per_unit: float = 1.0
+    psnr: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Of the views that are shown, decibels."""
+
+    points: PointCounts | None = None
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Seconds by stage."""
+
+    notices: tuple[Notice, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """More of how it was made."""
+
+    command: str = ""
+    """The words that started it."""
+
+
+def street_report(
+    data: StreetReportData, *, views: Gallery | None = None, above: Gallery | None = None
+) -> Report:
+    """The page.
+
+    Args:
+        data: What is told.
+        views: Photographs, renders, depth and label maps of some views.
+        above: Labelled points from above.
+    """
+    blocks: list[Block] = [] if views is None else [views]
+    legend = Legend(classes=data.classes)
+    if views is not None and data.classes.rows:
+        blocks.append(legend)
+    if above is not None:
+        blocks.append(above)
+        blocks += [legend] if views is None and data.classes.rows else []
+    blocks += [] if data.points is None else [_point_table(data, data.points)]
+    blocks += [_levels(data)] if data.levels else []
+    blocks += [_depths(data)] if data.depth else []
+    charts = _charts(data)
+    if charts:
+        blocks.append(
+            Curves(
+                title="How it went",
+                charts=charts,
+                note="Shapes are fitted to depth level by level, then colours and classes are "
+                f"learned. Means of at most {_BINS} parts of the training each.",
+            )
+        )
+    blocks += [_times(data)] if data.timings else []
+    return Report(
+        title=f"Street {data.scene}",
+        summary=_summary(data),
+        command=data.command,
+        notices=data.notices,
+        figures=_figures(data),
+        blocks=tuple(blocks),
+        facts={**data.facts, **environment()},
+    )
+
+
+def street_record(data: StreetReportData) -> dict[str, Any]:
+    """The same as values that JSON holds."""
+    record: dict[str, Any] = {
+        "made_by": "splatseg street",
+        "command": data.command,
+        "scene": data.scene,
+        "field": data.name or None,
+        "layer": data.layer,
+        "primitives": data.primitives,
+        "blocks": data.blocks,
+        "levels": [asdict(level) for level in data.levels],
+        "depth": [asdict(row) for row in data.depth],
+        "depth_error": dict(zip(("before", "after"), _medians(data.depth), strict=True)),
+        "psnr": dict(data.psnr),
+        "training": [
+            {"iteration": at, "colour_loss": colour, "semantic_loss": semantic}
+            for at, colour, semantic in _thinned(data.training)
+        ],
+        "seconds": {name: round(spent, 3) for name, spent in data.timings.items()},
+        "classes": {str(row.id): row.name for row in data.classes.rows},
+    }
+    if data.points is not None:
+        ids = {str(id): count for id, count in data.points.ids.items()}
+        record["points"] = asdict(data.points) | {"ids": ids}
+    return record
+
+
+def _summary(data: StreetReportData) -> str:
+    said: list[str] = []
+    if data.name:
+        of = f" in {counted(data.blocks, 'block')}" if data.blocks else ""
+        count = len(data.classes.rows)
+        classes = "1 class" if count == 1 else f"{count} classes"
+        said.append(
+            f"Field {data.name}: {counted(data.primitives, 'primitive')}{of} with {classes}."
+        )
+    if data.points is not None:
+        said.append(
+            f"{counted(data.points.points, 'point')} of {counted(data.points.scans, 'scan')} "
+            f"labelled by {data.points.by}."
+        )
+    return " ".join(said)
+
+
+def _figures(data: StreetReportData) -> tuple[Figure, ...]:
+    figures: list[Figure] = []
+    if data.name:
+        figures.append(Figure(value=count_text(data.primitives), label="primitives"))
+    before, after = _medians(data.depth)
+    if after is not None:
+        note = "" if before is None else f"median; {before:.2f} m before shapes were fitted"
+        figures.append(Figure(value=f"{after:.2f} m", label="error of depth", note=note))
+    if data.psnr:
+        mean = math.fsum(data.psnr.values()) / len(data.psnr)
+        figures.append(
+            Figure(
+                value=f"{mean:.1f} dB",
+                label="PSNR",
+                note=f"of the {counted(len(data.psnr), 'training view')} shown",
+            )
+        )
+    if data.points is not None and data.points.points:
+        share = 1 - data.points.unlabelled / data.points.points
+        figures.append(Figure(value=f"{share:.1%}", label="points with a label"))
+    return tuple(figures)
+
+
+def _medians(rows: Sequence[DepthError]) -> tuple[float | None, float | None]:
+    """Medians over views of the errors before and after."""
+    return _median([row.before for row in rows]), _median([row.after for row in rows])
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = sorted(value for value in values if value is not None)
+    if not known:
+        return None
+    half = len(known) // 2
+    return known[half] if len(known) % 2 else (known[half - 1] + known[half]) / 2
+
+
+def _levels(data: StreetReportData) -> Table:
+    return Table(
+        title="Primitives",
+        columns=("level", "side of voxels, m", "of voxels", "kept"),
+        rows=tuple(
+            (i, f"{level.side:g}", level.started, level.kept) for i, level in enumerate(data.levels)
+        ),
+        note="0 is the finest level. What stood before measured surfaces or around a camera was "
+        "removed.",
+    )
+
+
+def _depths(data: StreetReportData) -> Table:
+    rows = [
+        (row.view, row.rays, row.before, row.after, row.met_before, row.met_after)
+        for row in data.depth
+    ]
+    return Table(
+        title="Error of depth",
+        columns=("view", "rays", "before, m", "after, m", "met before", "met after"),
+        rows=tuple(rows),
+        note="Median distance between where rays first meet a primitive and their known depth, "
+        "before shapes were fitted and after, over the rays that meet one, and the share of these. "
+        "Views that were learned from; primitives around cameras are left out.",
+    )
+
+
+def _point_table(data: StreetReportData, points: PointCounts) -> Table:
+    names = {row.id: row.name for row in data.classes.rows}
+    total = max(points.points, 1)
+    ordered = sorted(points.ids.items(), key=lambda item: (-item[1], item[0]))
+    rows: list[tuple[str, int | None, int, float]] = [
+        (names.get(id, ""), id, count, count / total) for id, count in ordered
+    ]
+    rows.append(("without a label", None, points.unlabelled, points.unlabelled / total))
+    return Table(
+        title="Points by class",
+        columns=("class", "id", "points", "share"),
+        rows=tuple(rows),
+        note=f"Of {counted(points.scans, 'scan')}; the labels are in {points.folder}.",
+    )
+
+
+def _charts(data: StreetReportData) -> tuple[Chart, ...]:
+    charts: list[Chart] = []
+    shaped = [record for record in data.shaping if math.isfinite(record.loss)]
+    if shaped:
+        by_level: dict[int, list[tuple[float, float]]] = {}
+        for record in shaped:
+            loss = record.loss * data.metres_per_unit
+            by_level.setdefault(record.level, []).append((float(record.step), loss))
+        lines = tuple(
+            Line(name=f"level {level}", points=tuple(points)) for level, points in by_level.items()
+        )
+        charts.append(Chart(title="Error of depth, m", across="steps of a level", lines=lines))
+    learned = _thinned(data.training)
+    for title, column in (("Squared error of colours", 1), ("Cross-entropy of classes", 2)):
+        points = tuple((row[0], row[column]) for row in learned if math.isfinite(row[column]))
+        if points:
+            line = Line(name=title, points=points)
+            charts.append(Chart(title=title, across="steps", lines=(line,)))
+    return tuple(charts)
+
+
+def _thinned(records: Sequence[RadianceRecord]) -> list[tuple[float, float, float]]:
+    """Step, and means of both losses, of equal parts of the training."""
+    size = max(1, -(-len(records) // _BINS))
+    parts = [records[start : start + size] for start in range(0, len(records), size)]
+    return [
+        (
+            float(part[-1].iteration),
+            math.fsum(record.colour_loss for record in part) / len(part),
+            math.fsum(record.semantic_loss for record in part) / len(part),
+        )
+        for part in parts
+    ]
+
+
+def _times(data: StreetReportData) -> Table:
+    rows = [(name, round(spent, 1)) for name, spent in data.timings.items()]
+    rows.append(("together", round(math.fsum(data.timings.values()), 1)))
+    return Table(title="Time", columns=("stage", "seconds"), rows=tuple(rows))

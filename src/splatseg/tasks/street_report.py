@@ -1,0 +1,231 @@
+"""The page of a drive: its mesh field, and the points of laser scans that were labelled."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatseg.core import ClassTable, Renderable, Scene, View
+from splatseg.core.boundary import boundary
+from splatseg.errors import InputError
+from splatseg.evaluate.held_out import label_map_in
+from splatseg.evaluate.metrics import psnr
+from splatseg.io.atomic import atomic_file
+from splatseg.io.images import image_camera, load_image
+from splatseg.io.json_files import write_json
+from splatseg.io.scene_folder import scene_path, work_on_scene
+from splatseg.report.html import Notice, report_html
+from splatseg.report.images import Gallery, GalleryImage, colour_depth
+from splatseg.report.layer_colours import layer_colours
+from splatseg.report.legend import colour_labels
+from splatseg.report.point_map import LabelledPoints, point_map
+from splatseg.report.street_report import (
+    LevelFacts,
+    PointCounts,
+    StreetReportData,
+    street_record,
+    street_report,
+)
+from splatseg.street.geometry import enclosing
+from splatseg.street.shapes import load_shapes
+from splatseg.tasks._street_depths import depth_errors, spread_views
+from splatseg.tasks.outputs import REPORTS_FOLDER
+from splatseg.tasks.scan_labels import LabelBy, ScanLabels
+from splatseg.tasks.street import StreetField
+from splatseg.tasks.street_drive import StreetDrive
+
+_VIEWS = 4
+_LONGEST = 720
+"""Of the pictures of a page, pixels."""
+
+_BY = {"gaussians": "the views of the Gaussians", "mesh": "the vertices of the mesh field"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LabelledScans:
+    """Laser scans that were labelled, as a page shows them."""
+
+    made: ScanLabels
+    by: LabelBy
+
+    points: LabelledPoints
+    """Some of their points."""
+
+
+@boundary
+def write_street_report(
+    scene: Scene,
+    field: Renderable,
+    *,
+    layer: str,
+    made: StreetField | StreetDrive | None = None,
+    scans: LabelledScans | None = None,
+    name: str = "street",
+    command: str = "",
+) -> Path:
+    """Write SCENE/reports/NAME.html, and NAME.json beside it; gives the path of the page.
+
+    It shows a few training views as the field has them, and what `made` and `scans` tell.
+
+    Args:
+        scene: The scene, with its folder.
+        field: What views are drawn of.
+        layer: Its layer of classes.
+        made: How a field was made; None where it was there.
+        scans: Points that were labelled.
+        name: What the page is called.
+        command: The words that started it; may be empty.
+
+    Raises:
+        InputError: If the scene has no folder, or the layer has no labels.
+        OutputError: If it cannot be written.
+    """
+    root = scene.root
+    if root is None:
+        raise InputError("scene: expected one with a folder to write a report to, got none.")
+    summary = field.layer(layer)
+    if summary.kind != "labels":
+        raise InputError(f"layer: expected labels, {layer!r:.80} holds {summary.kind}.")
+    classes = layer_colours(summary, scene.classes)
+    with work_on_scene(root, "street", writes=[REPORTS_FOLDER]):
+        views, likeness = _views(scene, field, layer, classes)
+        data = StreetReportData(
+            scene=root.name,
+            layer=layer,
+            classes=classes,
+            metres_per_unit=scene.metres_per_unit or 1.0,
+            psnr=likeness,
+            points=None if scans is None else _counts(scans, root),
+            command=command,
+            **_told(made, scene),
+        )
+        page = street_report(data, views=views, above=_above(scans, scene, classes))
+        path = scene_path(root, REPORTS_FOLDER, f"{name}.html")
+        with atomic_file(path) as temporary:
+            temporary.write_text(report_html(page), encoding="utf-8", newline="\n")
+        write_json(street_record(data), path.with_suffix(".json"))
+    return path
+
+
+def _told(made: StreetField | StreetDrive | None, scene: Scene) -> dict[str, Any]:
+    """What is known of how a field was made."""
+    if made is None:
+        return {}
+    facts: dict[str, Any] = {"layer": made.layer, "views learned from": made.facts["views"]}
+    notices: list[Notice] = []
+    if made.moving is not None:
+        sentence = f"{made.moving.sentence[0].upper()}{made.moving.sentence[1:]}."
+        notices.append(Notice(verdict="Moving things", sentence=sentence))
+    told: dict[str, Any] = {
+        "name": made.name,
+        "primitives": made.facts["primitives"],
+        "timings": made.timings,
+        "notices": tuple(notices),
+        "facts": facts,
+    }
+    if isinstance(made, StreetDrive):
+        return told | {"blocks": made.blocks}
+    metres = scene.metres_per_unit or 1.0
+    facts |= {
+        "points and depth": made.sources,
+        "evidence": str(made.evidence.folder.name),
+        "radius of points, m": round(made.field.radius * metres, 4),
+        "rays": made.facts["rays"],
+        "seed": made.field.info.seed,
+    }
+    start, mesh = made.fit.start, made.field.mesh
+    levels = tuple(
+        LevelFacts(
+            side=round(side * metres, 6),
+            started=int((start.levels == level).sum()),
+            kept=int((mesh.levels == level).sum()),
+        )
+        for level, side in enumerate(mesh.sizes)
+    )
+    before = start.mesh(load_shapes())
+    # Those around cameras are removed before the fit: they say nothing of shapes.
+    eyes = torch.stack([view.camera.centre for view in made.views])
+    around = enclosing(before, eyes)
+    if not bool(around.all()):
+        before = start.subset(~around).mesh(load_shapes())
+    errors = depth_errors(made.depths, before, mesh, metres_per_unit=metres)
+    return told | {
+        "levels": levels,
+        "depth": errors,
+        "shaping": made.fit.geometry.records,
+        "training": made.fit.radiance.records,
+    }
+
+
+def _views(
+    scene: Scene, field: Renderable, layer: str, classes: ClassTable
+) -> tuple[Gallery | None, dict[str, float]]:
+    """Some training views as photographed and as the field has them, and how like they are."""
+    known = [view for view in scene.train_views if view.image is not None and view.image.is_file()]
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
+    likeness: dict[str, float] = {}
+    for view in spread_views(known, _VIEWS):
+        pictures, decibels = _pictures(view, field, layer, classes)
+        likeness[view.name] = decibels
+        rows.append((view.name, pictures))
+    if not rows:
+        return None, {}
+    gallery = Gallery(
+        title="Training views",
+        columns=("photograph", "rendered", "depth", "classes"),
+        rows=tuple(rows),
+        note="Views that were learned from. Depth is light where it is near, and nearly black "
+        "where nothing stands.",
+    )
+    return gallery, likeness
+
+
+def _pictures(
+    view: View, field: Renderable, layer: str, classes: ClassTable
+) -> tuple[tuple[GalleryImage, ...], float]:
+    photograph = load_image(view, longest=_LONGEST)
+    camera = image_camera(view, _LONGEST)
+    with field.view(camera) as looked_at:
+        shown = looked_at.signals()
+        ids = label_map_in(looked_at, layer, camera).ids
+    if shown.colour is None:
+        raise InputError("field: expected colours of a view, got none.")
+    rendered = (shown.colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    depth = shown.depth if shown.median_depth is None else shown.median_depth
+    decibels = psnr(rendered, photograph)
+    pictures = (
+        GalleryImage(image=photograph),
+        GalleryImage(image=rendered, caption=f"{decibels:.1f} dB"),
+        GalleryImage(image=colour_depth(depth)),
+        GalleryImage(image=colour_labels(ids, classes), kind="chart"),
+    )
+    return pictures, decibels
+
+
+def _counts(scans: LabelledScans, root: Path) -> PointCounts:
+    counts, folder = scans.made.counts, scans.made.folder
+    inside = folder.is_relative_to(root)
+    return PointCounts(
+        folder=str(folder.relative_to(root) if inside else folder),
+        by=_BY[scans.by],
+        scans=counts.scans,
+        points=counts.points,
+        unlabelled=counts.unlabelled,
+        ids=dict(counts.ids),
+    )
+
+
+def _above(scans: LabelledScans | None, scene: Scene, classes: ClassTable) -> Gallery | None:
+    if scans is None or not len(scans.points.ids):
+        return None
+    up = scene.up or (0.0, 0.0, 1.0)
+    image = point_map(scans.points.points, scans.points.ids, classes, up=up)
+    kept = len(scans.points.ids)
+    of = "" if kept == scans.made.counts.points else f" {kept} of them, evenly."
+    return Gallery(
+        title="Labelled points from above",
+        columns=("",),
+        rows=(("", (GalleryImage(image=image, caption="points by class", kind="chart"),)),),
+        note=f"Higher points lie over lower ones; those without a label are grey.{of}",
+    )

@@ -1,0 +1,163 @@
+"""The page of a drive: of a field that was made, of blocks, and of points that were labelled."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatseg.core import Camera, Scene, View
+from splatseg.errors import InputError
+from splatseg.io.scans import read_scans
+from splatseg.report.point_map import LabelledPoints
+from splatseg.street.geometry import DepthView
+from splatseg.street.options import DnmpOptions
+from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
+from splatseg.tasks._street_depths import KeptDepths, depth_errors, spread_views
+from splatseg.tasks.street_report import LabelledScans, write_street_report
+from support.analytic import BallOverFloor
+from support.mesh_fields import balls
+
+QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=4, iterations=3, rays=64)
+
+
+@pytest.fixture(scope="module")
+def drive(generated_drive, tmp_path_factory) -> Scene:
+    return open_drive(generated_drive, new_scene=tmp_path_factory.mktemp("drive") / "scene")
+
+
+@pytest.fixture(scope="module")
+def made(drive, generated_drive):
+    options = StreetOptions(evidence="labels_semantic", scans=generated_drive, layer="classes")
+    return street_field(drive, options=options, field_options=QUICK)
+
+
+@pytest.fixture
+def scene(drive, tmp_path) -> Scene:
+    """Its scene in a folder of the test."""
+    return replace(drive, root=Path(shutil.copytree(drive.root, tmp_path / "scene")))
+
+
+def test_a_field_and_its_points(made, scene, generated_drive, tmp_path) -> None:
+    kept = LabelledPoints()
+    labels = label_scans(
+        scene, generated_drive, tmp_path / "labels", field=made.field,
+        seen=lambda scan, found: kept.add(scan.points, found.ids),
+    )  # fmt: skip
+    assert len(kept.ids) == labels.counts.points
+    assert int((kept.ids < 0).sum()) == labels.counts.unlabelled
+    path = write_street_report(
+        scene, made.field, layer="classes", made=made, command="splatseg street x --report",
+        scans=LabelledScans(made=labels, by="mesh", points=kept),
+    )  # fmt: skip
+    assert path == scene.root / "reports/street.html"
+    page = path.read_text()
+    for words in (
+        "Training views", "Labelled points from above", "Points by class", "Primitives",
+        "Error of depth", "How it went", "Squared error of colours", "road",
+        "splatseg street x", "points of scans",
+    ):  # fmt: skip
+        assert words in page, words
+    record = json.loads((scene.root / "reports/street.json").read_text())
+    assert record["field"] == "street"
+    assert [row["kept"] for row in record["levels"]] == made.facts["primitives_by_level"]
+    assert [row["side"] for row in record["levels"]] == [2.0, 4.0]
+    assert all(row["started"] >= row["kept"] > 0 for row in record["levels"])
+    assert record["depth_error"]["after"] < record["depth_error"]["before"]
+    assert set(record["psnr"]) <= {view.name for view in scene.train_views}
+    assert len(record["psnr"]) == min(4, len(scene.train_views))
+    assert record["points"]["points"] == labels.counts.points
+    assert record["training"][-1]["iteration"] == 3
+
+
+def test_a_field_that_was_there(made, scene) -> None:
+    path = write_street_report(scene, made.field, layer="classes", name="other")
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert path.name == "other.html"
+    assert (record["field"], record["levels"], record["depth"]) == (None, [], [])
+    assert record["psnr"]
+
+
+def test_views_without_photographs_are_not_shown(made, scene) -> None:
+    bare = replace(scene, views=tuple(replace(view, image=None) for view in scene.views))
+    path = write_street_report(bare, made.field, layer="classes", made=made)
+    assert "Training views" not in path.read_text()
+    assert json.loads(path.with_suffix(".json").read_text())["psnr"] == {}
+
+
+def test_what_cannot_be_told(made, scene) -> None:
+    with pytest.raises(InputError, match="scene: expected one with a folder"):
+        write_street_report(replace(scene, root=None), made.field, layer="classes")
+    with pytest.raises(InputError, match="layer: expected classes"):
+        write_street_report(scene, made.field, layer="other")
+
+
+def test_a_scan_is_told_once_and_labels_are_the_same(scene, generated_drive, tmp_path) -> None:
+    field = BallOverFloor()
+    asked = ScanLabelOptions(layer=field.layer_names[0])
+    told: list[str] = []
+    label_scans(
+        scene, generated_drive, tmp_path / "a", field=field, options=asked,
+        seen=lambda scan, _: told.append(scan.name),
+    )  # fmt: skip
+    label_scans(scene, generated_drive, tmp_path / "b", field=field, options=asked)
+    assert told == list(read_scans(generated_drive).scan_names)
+    for path in (tmp_path / "a").glob("*.npz"):
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+
+
+def camera(x: float) -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 3] = -x
+    return Camera(width=40, height=30, fx=40.0, fy=40.0, cx=20, cy=15, cam_from_world=pose)
+
+
+def wall(x: float, distance: float, *, scale: int = 1) -> DepthView:
+    """A wall before a camera, seen in a part of its pixels."""
+    depth = torch.full((30 // scale, 40 // scale), distance)
+    depth[:, 0] = 0
+    return DepthView(camera=camera(x).resized(40 // scale, 30 // scale), depth=depth)
+
+
+def test_depth_of_a_few_views_is_kept_as_it_goes_by() -> None:
+    views = [View(name=f"v{i}", camera=camera(i)) for i in range(12)]
+    depths = [wall(i, 4.0, scale=2) for i in range(12) if i != 4]
+    kept = KeptDepths(iter(depths), views)
+    assert list(kept) == depths, "none is changed"
+    assert [sample.view for sample in kept.samples] == ["v0", "v2", "v6", "v8", "v10"]
+    sample = kept.samples[1]
+    assert sample.origin.tolist() == [2, 0, 0]
+    assert len(sample.distances) == 15 * 19
+    ends = sample.origin + sample.directions.double() * sample.distances[:, None]
+    torch.testing.assert_close(ends[:, 2], torch.full((285,), 4.0).double(), atol=1e-5, rtol=0)
+    nothing = DepthView(camera=camera(0), depth=torch.zeros(30, 40))
+    empty = KeptDepths([nothing], views)
+    assert len(list(empty)) == 1
+    assert empty.samples == []
+
+
+def test_errors_are_medians_over_what_rays_meet() -> None:
+    """A ball of radius 1 m whose front is 3 m away, then 3.5 m; the wall is at 4 m."""
+    views = [View(name="v", camera=camera(0))]
+    kept = KeptDepths([wall(0, 2.0)], views)
+    list(kept)
+    near, far = balls([[0, 0, 2.0]], radius=0.5), balls([[0, 0, 2.25]], radius=0.5)
+    (row,) = depth_errors(kept.samples, near, far, metres_per_unit=2.0)
+    assert (row.view, row.rays) == ("v", 30 * 39)
+    assert 0 < row.met_after < row.met_before < 0.5
+    assert 0.5 < row.before < 1.0, "0.5 units before the wall in the middle, less at the rim"
+    assert row.after < row.before
+    (none,) = depth_errors(kept.samples, balls([]), far, metres_per_unit=1.0)
+    assert (none.before, none.met_before) == (None, 0)
+    assert none.after is not None
+    assert math.isfinite(none.after)
+
+
+def test_views_are_spread() -> None:
+    views = [View(name=str(i), camera=camera(i)) for i in range(10)]
+    assert [view.name for view in spread_views(views, 4)] == ["0", "2", "5", "7"]
+    assert len(spread_views(views[:2], 4)) == 2
+    assert spread_views([], 4) == ()
