@@ -13,6 +13,7 @@ from splatseg.core import Renderable, Scene
 from splatseg.errors import InputError
 from splatseg.io.scene_fields import scene_field_path
 from splatseg.io.scene_folder import is_scene
+from splatseg.report.words import counted
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import (
     LabelBy,
@@ -179,7 +180,7 @@ def _field(
     path = scene_field_path(root, made.name)
     figures = made.facts
     facts |= figures | {"file": path}
-    blocks = f"{figures['blocks']} blocks with " if "blocks" in figures else ""
+    blocks = f"{counted(figures['blocks'], 'block')} with " if "blocks" in figures else ""
     if made.moving is not None:
         lines.append(made.moving.sentence)
     lines += [
