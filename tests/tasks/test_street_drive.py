@@ -14,7 +14,8 @@ from splatseg.core import Renderable, Scene
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.scans import read_scans
 from splatseg.io.scene_fields import scene_field_names
-from splatseg.street.blocks import DriveField, load_drive
+from splatseg.street.blocks import DriveBlockOptions, DriveField, load_drive
+from splatseg.street.blocks.line import distances
 from splatseg.street.field import MeshField
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import (
@@ -126,6 +127,20 @@ def test_each_block_has_its_own_views_and_points(both) -> None:
         assert 0 < len(centres) < len(scene.train_views)
         assert bool(drive.counts(block, centres).all())
         assert len(part.mesh) < len(one.mesh) < made.primitives
+
+
+def test_blocks_have_no_primitives_out_of_their_reach(scene, options, quick, monkeypatch) -> None:
+    near = DriveBlockOptions(length=20.0, overlap=6.0, reach=6.0)
+    monkeypatch.setattr(StreetOptions, "blocks", near)
+    made = make_street_field(scene, options=options, field_options=QUICK)
+    drive = load_drive(made.folder / "drive.json")
+    far = scene_field(open_drive(quick), "street")
+    for block in drive.blocks:
+        off = []
+        for field in (made.field, far):
+            vertices = field._field(block.index).mesh.vertices.reshape(-1, 42, 3)
+            off.append(float(distances(vertices.mean(dim=1).double(), block.span).max()))
+        assert off[0] < 6.0 + 2.0 < off[1]
 
 
 def test_there_is_no_seam(both, generated_drive) -> None:
