@@ -1,5 +1,6 @@
 """``splatseg street``: a drive becomes a mesh field, and points of laser scans get labels."""
 
+import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,22 +9,28 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, Seed
-from splatseg.cli._work import ConsoleObserver, open_scene, print_result
+from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import Renderable, Scene
 from splatseg.errors import InputError
 from splatseg.io.scene_fields import scene_field_path
 from splatseg.io.scene_folder import is_scene
+from splatseg.report.point_map import LabelledPoints
 from splatseg.report.words import counted
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import (
     LabelBy,
+    LabelledScans,
     ScanLabelOptions,
+    StreetDrive,
+    StreetField,
     StreetOptions,
     label_scans,
     made_street_field,
     make_street_field,
     open_drive,
+    write_street_report,
 )
+from splatseg.tasks.scene_parts import gaussian_field
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
 
@@ -87,6 +94,10 @@ class Command:
     """Of the files of labels. npz: semantic and confidence, a value for each of the scan's file.
     label: SemanticKITTI's. ply, las: points with columns. auto: what the scans came as."""
 
+    report: bool = False
+    """Also write SCENE/reports/FIELD.html and FIELD.json: what was built, how it went, training
+    views, and, with --label-scans, the points from above and counts by class."""
+
     backend: Backend = "auto"
     data: Data = None
     json: Json = False
@@ -101,21 +112,27 @@ def run(command: Command) -> None:
     scene, root = _scene(command)
     facts: dict[str, Any] = {"scene": root}
     lines: list[str] = []
-    found: Renderable | None = None
+    found: _Found | None = None
+    labelled: LabelledScans | None = None
     if command.label_scans is None or command.by == "mesh":
         found = _field(command, scene, root, observer, facts=facts, lines=lines)
     if command.label_scans is not None and command.output is not None:
+        kept = LabelledPoints()
         made = label_scans(
             scene,
             command.label_scans,
             command.output,
-            field=found,
+            field=None if found is None else found.field,
             options=ScanLabelOptions(
                 layer=command.inputs.layer if found is None else None, form=command.form
             ),
+            seen=(lambda scan, labels: kept.add(scan.points, labels.ids))
+            if command.report
+            else None,
             backend=command.backend,
             observer=observer,
         )
+        labelled = LabelledScans(made=made, by=command.by, points=kept)
         counts = made.counts
         share = 100 * counts.unlabelled / max(counts.points, 1)
         facts["labels"] = {
@@ -133,8 +150,31 @@ def run(command: Command) -> None:
             f"scans labelled, {counts.unlabelled} ({share:.1f} %) without a label; in "
             f"{made.folder}"
         )
+    if command.report:
+        facts["report"] = _report(command, scene, found, labelled)
+        lines.append(f"report: {facts['report']}")
     facts["seconds"] = round(time.monotonic() - started, 3)
     print_result(facts, lines, json=command.json)
+
+
+def _report(
+    command: Command, scene: Scene, found: "_Found | None", labelled: LabelledScans | None
+) -> Path:
+    """The page of the field, or of the Gaussians that labelled scans."""
+    layer = "" if labelled is None else labelled.made.layer
+    if found is None:
+        field = gaussian_field(scene, [layer], backend=command.backend)
+    else:
+        field, layer = found.field, next(iter(found.field.layer_names))
+    return write_street_report(
+        scene,
+        field,
+        layer=layer,
+        made=None if found is None else found.made,
+        scans=labelled,
+        name=command.inputs.field,
+        command=typed(sys.argv),
+    )
 
 
 def _check(command: Command) -> None:
@@ -163,12 +203,12 @@ def _field(
     *,
     facts: dict[str, Any],
     lines: list[str],
-) -> Renderable:
+) -> "_Found":
     """The field of this name: read, where points are to be labelled by it, or made."""
     if command.label_scans is not None and not command.overwrite:
         there = made_street_field(scene, options=command.inputs)
         if there is not None:
-            return there
+            return _Found(field=there, made=None)
     made = make_street_field(
         scene,
         options=command.inputs,
@@ -188,4 +228,12 @@ def _field(
         f"{figures['views']} views in {sum(made.timings.values()):.1f} s; layer {made.layer}",
         str(path),
     ]
-    return made.field
+    return _Found(field=made.field, made=made)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Found:
+    """A field, and how it was made; None where it was there."""
+
+    field: Renderable
+    made: StreetField | StreetDrive | None
