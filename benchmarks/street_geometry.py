@@ -53,6 +53,10 @@ ROWS = {
     "truncation": replace(DEFAULT, truncation=2.0),
     "distance": replace(DEFAULT, distance_power=1.0),
     "carve": replace(DEFAULT, carve=0.9),
+    "short": replace(DEFAULT, iterations=200),
+    "long": replace(DEFAULT, iterations=1000),
+    "fresh": replace(DEFAULT, iterations=1000, refresh=10, reuse=2),
+    "fresh_long": replace(DEFAULT, iterations=3000, refresh=10, reuse=2, rays=16384),
     "no_offsets": replace(DEFAULT, offset_rate=0.0),
 }
 

@@ -96,14 +96,14 @@ def test_options_check_themselves(values: dict[str, object], words: str) -> None
 
 def test_every_option_reaches_the_stage_that_it_is_of() -> None:
     given = DnmpOptions(
-        geometry_iterations=7, carve=0.9, iterations=11, rays=33, semantic_weight=0.4, memory=99
+        geometry_iterations=7, carve=0.7, iterations=11, rays=33, semantic_weight=0.4, memory=99
     )
-    assert (given.geometry.iterations, given.geometry.carve) == (7, 0.9)
+    assert (given.geometry.iterations, given.geometry.carve) == (7, 0.7)
     radiance = given.radiance
     assert (radiance.iterations, radiance.rays, radiance.semantic_weight) == (11, 33, 0.4)
     assert radiance.cache_memory == 99
     fast, published = DnmpOptions(), DnmpOptions(setting="published")
-    assert fast.geometry.carve == 0.5
+    assert fast.geometry.carve == 0.9
     assert published.geometry.carve > 1
     assert published.radiance.width == 256 > fast.radiance.width
     assert replace(published, iterations=5).radiance.iterations == 5

@@ -40,7 +40,7 @@ class DnmpOptions:
 
     carve: float | None = None
     """Primitives are removed through which this share of their rays sees further than a voxel; and
-    those with a camera inside, which are refused without. None is 0.5, or none with published."""
+    those with a camera inside, which are refused without. None is 0.9, or none with published."""
 
     iterations: int | None = None
     """Steps of the training of colours and classes. None is the setting's."""
@@ -97,7 +97,7 @@ class DnmpOptions:
         return replace(options, cache_memory=self.memory, **given)
 
 
-_CARVE = 0.5
+_CARVE = 0.9
 
 
 def _given(**values: Any) -> dict[str, Any]:

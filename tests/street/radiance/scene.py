@@ -18,6 +18,10 @@ IDS = (RED, GREEN, SKY)
 COLOURS = torch.tensor([[0.8, 0.2, 0.2], [0.2, 0.8, 0.2], [0.2, 0.2, 0.8]])
 
 SMALL = RadianceOptions(
+    max_hits=6,
+    fine_hits=4,
+    coarse_hits=2,
+    sides="both",
     feature_size=4,
     width=16,
     depth=2,

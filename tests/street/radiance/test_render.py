@@ -99,6 +99,12 @@ def test_a_camera_inside_a_primitive_sees_its_wall() -> None:
     assert 0.8 < float(seen.distance) <= 1.0
 
 
+def test_a_camera_inside_a_primitive_whose_fronts_alone_are_met_sees_what_is_beyond() -> None:
+    caster = MeshCaster(two_balls())
+    seen = render_rays(model(bias=20.0, sides="front"), caster, torch.zeros(3), AHEAD)
+    assert float(seen.distance) > 1.0
+
+
 def test_views_are_rays_and_depths_are_along_the_axis() -> None:
     field, caster = model(bias=3.0), MeshCaster(two_balls())
     where = camera(1)

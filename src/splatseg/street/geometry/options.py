@@ -17,7 +17,7 @@ plane of the triangle, |t - d| times the cosine between ray and normal."""
 class GeometryOptions:
     """How primitives are fitted to depth (eq. 2). Lengths are metres."""
 
-    iterations: int = 200
+    iterations: int = 1000
     """Steps of the optimiser, 0 or more."""
 
     rays: int = 32768

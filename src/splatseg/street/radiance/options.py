@@ -73,17 +73,18 @@ class RadianceOptions:
     """How the triangles of a ray stand behind each other: nearest first, or all of a finer level
     before those of a coarser one, as the public code of DNMP has it."""
 
-    max_hits: int = 6
+    max_hits: int = 4
     """L, triangles of a ray that are kept."""
 
-    fine_hits: int | None = 4
+    fine_hits: int | None = 3
     """Triangles of the finest level that are kept; None is `max_hits`."""
 
-    coarse_hits: int | None = 2
+    coarse_hits: int | None = 1
     """Triangles of each other level that are kept; None is `max_hits`."""
 
-    sides: Sides = "both"
-    """Whether a ray has triangles that it meets from inside their primitive."""
+    sides: Sides = "front"
+    """Whether a ray has triangles that it meets from inside their primitive, as published: what is
+    behind a wall is then reached by half as many of its hits."""
 
     rays: int = 4096
     """Rays of a step."""
@@ -160,6 +161,11 @@ PUBLISHED_RADIANCE = RadianceOptions(
     colour_widths=(256, 256),
     background_widths=(256, 256),
     order="levels",
+    max_hits=6,
+    fine_hits=4,
+    coarse_hits=2,
+    sides="both",
+    semantic_weight=0.1,
     iterations=50_000,
     rate=5e-4,
     feature_rate=5e-4,
