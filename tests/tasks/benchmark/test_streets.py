@@ -230,7 +230,7 @@ def test_segments_are_no_classes(run) -> None:
 
 def test_a_mesh_field_is_its_own_row(run, sets, tmp_path) -> None:
     """Points by eq. 9, and by what its views show; the field is kept in the scene."""
-    few = ("geometry_iterations=2", "iterations=4", "rays=64", "voxels=1.0,2.0")
+    few = ("geometry_iterations=2", "iterations=4", "rays=64", "voxels=1.0,2.0", "radius=0.1")
     done = run("waymo", "points=field,views", methods=("dnmp",), method_options=few)
     assert [one.method for one in done.methods] == ["dnmp-field", "dnmp-views"]
     field, views = (one.scores for one in done.methods)
