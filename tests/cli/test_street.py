@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatseg.io.scans import read_scans
+from splatseg.street.files import load_mesh_field
 from support.ply import write_ply
 
 FAST = ("--voxels", "2.0", "4.0", "--geometry-iterations", "1", "--iterations", "3", "--rays", "64")
@@ -64,6 +66,18 @@ def test_scans_are_labelled_by_the_field(made, generated_drive, splatseg, tmp_pa
     assert status == 0
     assert f"of {facts['points']} points of 3 scans labelled, {facts['unlabelled']} (" in out
     assert (tmp_path / "out/0001.label").is_file()
+    found = {}
+    for by in ("mesh", "vertices"):
+        words = ("street", made, "--label-scans", generated_drive, "-o", tmp_path / by, "--by", by)
+        status, out, _ = splatseg(*words, "--json", "--quiet")
+        assert (status, json.loads(out)["labels"]["by"]) == (0, by)
+        found[by] = np.load(tmp_path / by / "labels.npz")["semantic"]
+    assert not np.array_equal(found["mesh"], found["vertices"])
+    field = load_mesh_field(made / "fields/street.safetensors")
+    scans = read_scans(generated_drive)
+    first = scans.scan(scans.scan_names[0])
+    ids = field.labels_at(first.points, "labels_semantic").ids
+    assert (found["vertices"][0] > 0).sum() == int((ids > 0).sum())
 
 
 def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path) -> None:

@@ -28,6 +28,7 @@ from splatseg.tasks import (
     made_street_field,
     make_street_field,
     open_drive,
+    viewed_points,
     write_street_report,
 )
 from splatseg.tasks.scene_parts import gaussian_field
@@ -51,8 +52,8 @@ class Command:
     by Ctrl-C, the same command goes on.
 
     With --label-scans every point of laser scans gets a label: from what the views of the scene's
-    Gaussians show at it, or, with --by mesh, from the vertices of the mesh field around it. Points
-    about which nothing can be said have none, and are counted.
+    Gaussians show at it, those of the mesh field (--by mesh), or the vertices of that (--by
+    vertices). Points about which nothing can be said have none, and are counted.
 
     For example:
 
@@ -88,7 +89,8 @@ class Command:
 
     by: LabelBy = "gaussians"
     """Who labels points. gaussians: what views of the Gaussians show there, and shapes. mesh: the
-    field, which is made first where it is not there."""
+    same of the mesh field, which is made first where it is not there. vertices: those of the field
+    around a point, as published (eq. 9)."""
 
     form: Literal["auto", "npz", "label", "ply", "las"] = "auto"
     """Of the files of labels. npz: semantic and confidence, a value for each of the scan's file.
@@ -114,7 +116,7 @@ def run(command: Command) -> None:
     lines: list[str] = []
     found: _Found | None = None
     labelled: LabelledScans | None = None
-    if command.label_scans is None or command.by == "mesh":
+    if command.label_scans is None or command.by != "gaussians":
         found = _field(command, scene, root, observer, facts=facts, lines=lines)
     if command.label_scans is not None and command.output is not None:
         kept = LabelledPoints()
@@ -122,7 +124,7 @@ def run(command: Command) -> None:
             scene,
             command.label_scans,
             command.output,
-            field=None if found is None else found.field,
+            field=None if found is None else _labeller(command, scene, found.field),
             options=ScanLabelOptions(
                 layer=command.inputs.layer if found is None else None, form=command.form
             ),
@@ -155,6 +157,11 @@ def run(command: Command) -> None:
         lines.append(f"report: {facts['report']}")
     facts["seconds"] = round(time.monotonic() - started, 3)
     print_result(facts, lines, json=command.json)
+
+
+def _labeller(command: Command, scene: Scene, field: Renderable) -> Renderable:
+    """The mesh field as points are to take its labels."""
+    return field if command.by == "vertices" else viewed_points(scene, field)
 
 
 def _report(

@@ -18,9 +18,9 @@ from splatseg.street.blocks import ScanLabeller
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import gaussian_field
 
-LabelBy = Literal["gaussians", "mesh"]
-"""gaussians: what the views of the Gaussians show at a point, and its shape. mesh: the vertices of
-the mesh field around it, eq. 9."""
+LabelBy = Literal["gaussians", "mesh", "vertices"]
+"""gaussians: what views of the Gaussians show at a point, and its shape. mesh: the same of the mesh
+field. vertices: the vertices of the mesh field around it, eq. 9, as published."""
 
 
 _LABEL_FILES = ("semantic-kitti", "kitti-raw", "kitti-odometry", "kitti360")
@@ -76,10 +76,10 @@ def label_scans(
         scene: The scene.
         scans: Scans in the world of the scene, in any layout that `read_scans` reads, or these.
         folder: What to write, see `io.export.write_scan_labels`; it appears whole or not at all.
-        field: Whose `labels_at` the points take, or `labels_of_scans` where it has it. None is
-            the scene's Gaussians, as `lift.points.ViewedPoints` of the training views.
+        field: Whose `labels_at` the points take, or `labels_of_scans` where it has it, such as
+            `viewed_points` of a mesh field. None is `viewed_points` of the scene's Gaussians.
         options: Of which layer, and in which form.
-        points: How points take labels from Gaussians; with a field none.
+        points: How points take labels from views of the Gaussians; with a field none.
         layers: Layers at hand; others are read from the scene's folder.
         seen: Is given every scan with its labels.
         backend: Who renders the Gaussians.
@@ -94,7 +94,7 @@ def label_scans(
         scans = read_scans(scans, format=options.scan_format)
     if field is None:
         layer = options.layer or _only_layer(scene, layers)
-        field = _viewed(scene, layer, points, layers, backend)
+        field = _viewed_gaussians(scene, layer, points, layers, backend)
         if scene.metres_per_unit is None:
             observer.note("the scene does not say how long its unit is; a metre is assumed")
     else:
@@ -164,7 +164,27 @@ def _labelled(
         step(done, len(names))
 
 
-def _viewed(
+@boundary
+def viewed_points(
+    scene: Scene, field: Renderable, *, options: ViewedPointOptions | None = None
+) -> ViewedPoints:
+    """A field of a scene whose points take what its views show at them, and their own shapes.
+
+    Args:
+        scene: Whose training views are looked from, or all where none is for training.
+        field: Gaussians, a mesh field, or any other.
+        options: How points take labels.
+    """
+    return ViewedPoints(
+        field,
+        [view.camera for view in scene.train_views or scene.views],
+        options=options,
+        up=scene.up or (0.0, 0.0, 1.0),
+        metres_per_unit=scene.metres_per_unit or 1.0,
+    )
+
+
+def _viewed_gaussians(
     scene: Scene,
     layer: str,
     points: ViewedPointOptions | None,
@@ -176,14 +196,8 @@ def _viewed(
             "by: expected mesh for a scene without Gaussians, got gaussians; `splatseg fit` makes "
             "a scene with them."
         )
-    cameras = [view.camera for view in scene.train_views or scene.views]
-    return ViewedPoints(
-        gaussian_field(scene, [layer], layers, backend=backend),
-        cameras,
-        options=points,
-        up=scene.up or (0.0, 0.0, 1.0),
-        metres_per_unit=scene.metres_per_unit or 1.0,
-    )
+    field = gaussian_field(scene, [layer], layers, backend=backend)
+    return viewed_points(scene, field, options=points)
 
 
 def _only_layer(scene: Scene, layers: Mapping[str, Layer] | None) -> str:

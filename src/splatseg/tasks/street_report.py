@@ -39,7 +39,11 @@ _VIEWS = 4
 _LONGEST = 720
 """Of the pictures of a page, pixels."""
 
-_BY = {"gaussians": "the views of the Gaussians", "mesh": "the vertices of the mesh field"}
+_BY = {
+    "gaussians": "the views of the Gaussians",
+    "mesh": "the views of the mesh field",
+    "vertices": "the vertices of the mesh field",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

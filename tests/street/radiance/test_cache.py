@@ -222,3 +222,20 @@ def test_a_folder_of_something_else_stays(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cache_folder"):
         cached_hits(found(), memory=0, folder=tmp_path, triangles=160, identity="a")
     assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["counts", "faces", "weights"])
+def test_files_that_changed_since_are_not_read(tmp_path: Path, name: str) -> None:
+    caster = MeshCaster(two_balls())
+    directions = torch.tensor([[0.0, 0.0, 1.0], [0.05, 0.0, 1.0]])
+    hits = [caster.hits(torch.tensor([0.0, 0, -5]), directions, max_hits=4)]
+    cached_hits(hits, triangles=160, memory=0, folder=tmp_path / "hits", identity="a")
+    file = tmp_path / "hits" / f"{name}.bin"
+    content = bytearray(file.read_bytes())
+    # As likely as what was there: one triangle less or more, or two rays' counts exchanged.
+    content[0] ^= 1
+    if name == "counts":
+        content[1] ^= 1
+    file.write_bytes(bytes(content))
+    with pytest.raises(FileFormatError, match="check sums"):
+        read_hits(tmp_path / "hits", triangles=160, identity="a")

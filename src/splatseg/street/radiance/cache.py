@@ -4,7 +4,7 @@ A hit is the number of its triangle (int32) and two of its three weights (uint16
 1/65535), 8 bytes; a ray is how many it has (uint8). Where the hits exceed the memory given, they
 lie in a folder of
 
-    cache.json      format, version, identity, rays, hits
+    cache.json      format, version, identity, rays, hits, checks (CRC-32 of each file)
     counts.bin      uint8 [rays]
     faces.bin       int32 [hits], little-endian
     weights.bin     uint16 [hits, 2], little-endian
@@ -14,6 +14,7 @@ that takes its name when it is complete. Kept, it serves the next training with 
 
 import shutil
 import tempfile
+import zlib
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -34,11 +35,12 @@ from splatseg.io.npy import map_values
 from splatseg.street.hits import MeshHits
 
 FORMAT = "splatseg.street.ray-hits"
-VERSION = 1
+VERSION = 2
 
 _STEPS = 65535
 _HEADER = "cache.json"
 _TYPES = {"counts": "u1", "faces": "<i4", "weights": "<u2"}
+_BLOCK = 1 << 24
 _EMPTY = {"counts": (0,), "faces": (0,), "weights": (0, 2)}
 
 
@@ -146,6 +148,7 @@ def _gathered(
     """The hits, or None if they are too many and lie in the target folder."""
     arrays: dict[str, list[NDArray[Any]]] = {name: [] for name in _TYPES}
     rays = hits = 0
+    checks = dict.fromkeys(_TYPES, 0)
     with ExitStack() as stack:
         files: dict[str, IO[bytes]] = {}
         for part in parts:
@@ -159,11 +162,13 @@ def _gathered(
                 files = {n: stack.enter_context((writing / f"{n}.bin").open("wb")) for n in _TYPES}
             for name, file in files.items():
                 for array in arrays[name]:
-                    file.write(array.tobytes())
+                    content = array.tobytes()
+                    checks[name] = zlib.crc32(content, checks[name])
+                    file.write(content)
                 arrays[name].clear()
         if files:
             about = {"format": FORMAT, "version": VERSION, "identity": identity}
-            text = json_text(_HEADER, about | {"rays": rays, "hits": hits})
+            text = json_text(_HEADER, about | {"rays": rays, "hits": hits, "checks": checks})
             (Path(files["counts"].name).parent / _HEADER).write_text(text, encoding="utf-8")
             return None
     joined: dict[str, NDArray[Any]] = {}
@@ -206,6 +211,11 @@ def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
         name: map_values(folder / f"{name}.bin", dtype=_TYPES[name], shape=shape)
         for name, shape in shapes.items()
     }
+    checks = {name: _check_sum(array) for name, array in arrays.items()}
+    if header.get("checks") != checks:
+        raise FileFormatError(
+            f"{folder}: expected the check sums of {_HEADER}, got others; the files are damaged."
+        )
     starts = _starts(arrays["counts"])
     if int(starts[-1]) != hits:
         raise FileFormatError(f"{folder}: expected {hits} hits, got counts of {int(starts[-1])}.")
@@ -216,6 +226,14 @@ def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
             f"{int(faces.max())}]."
         )
     return CachedHits(starts=starts, faces=faces, weights=arrays["weights"], folder=folder)
+
+
+def _check_sum(array: NDArray[Any]) -> int:
+    """CRC-32 of the bytes of a file, a block in memory."""
+    flat, value = array.reshape(-1).view(np.uint8), 0
+    for start in range(0, len(flat), _BLOCK):
+        value = zlib.crc32(flat[start : start + _BLOCK].tobytes(), value)
+    return value
 
 
 def _starts(counts: NDArray[np.uint8]) -> Int64[Tensor, "n"]:

@@ -37,7 +37,7 @@ from splatseg.io.evidence import open_evidence
 from splatseg.io.npz_writing import save_arrays
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
-from splatseg.lift.points import RegionOptions, ViewedPoints, region_labels
+from splatseg.lift.points import RegionOptions, region_labels
 from splatseg.methods import Method
 from splatseg.street.build import METHOD_NAME
 from splatseg.street.field import MeshField
@@ -46,6 +46,7 @@ from splatseg.tasks.benchmark.job import Job
 from splatseg.tasks.benchmark.maps import Scores, TrueMapSource, class_scores, keep_map
 from splatseg.tasks.benchmark.points import read_by_words, read_in_words
 from splatseg.tasks.benchmark.sight import Seen, evidence_wanted
+from splatseg.tasks.scan_labels import viewed_points
 from splatseg.tasks.street import save_street_field, street_field
 from splatseg.tasks.street_options import StreetOptions
 
@@ -226,10 +227,7 @@ class Drive:
         if rule == "density":
             return self._gaussians.labels_at(points, _LAYER)
         if rule == "views":
-            cameras = [view.camera for view in scene.train_views]
-            up = scene.up or (0.0, 0.0, 1.0)
-            seen = ViewedPoints(self._shown, cameras, up=up, metres_per_unit=unit)
-            return seen.labels_at(points, _LAYER)
+            return viewed_points(scene, self._shown).labels_at(points, _LAYER)
         labels = self._gaussians.labels(_LAYER)
         return region_labels(
             scene.gaussians,
