@@ -118,7 +118,7 @@ def test_half_a_file_is_refused_and_found_again(tmp_path: Path, name: str) -> No
         {"rays": -1}, {"rays": "9"}, {"rays": True}, {"rays": 90.5}, {"rays": 89},
         {"rays": 10**400}, {"hits": None}, {"hits": float("nan")}, {"hits": 2**63}, {"hits": [3]},
         {"hits": -8},
-        {"version": 2}, {"version": "1"}, {"version": None}, {"identity": ["a"]}, {"format": "b"},
+        {"version": 3}, {"version": "1"}, {"version": None}, {"identity": ["a"]}, {"format": "b"},
         {"rays": 2**62, "hits": 2**62},
     ],
     ids=lambda change: ", ".join(change),
