@@ -211,11 +211,6 @@ def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
         name: map_values(folder / f"{name}.bin", dtype=_TYPES[name], shape=shape)
         for name, shape in shapes.items()
     }
-    checks = {name: _check_sum(array) for name, array in arrays.items()}
-    if header.get("checks") != checks:
-        raise FileFormatError(
-            f"{folder}: expected the check sums of {_HEADER}, got others; the files are damaged."
-        )
     starts = _starts(arrays["counts"])
     if int(starts[-1]) != hits:
         raise FileFormatError(f"{folder}: expected {hits} hits, got counts of {int(starts[-1])}.")
@@ -224,6 +219,11 @@ def read_hits(folder: Path, *, triangles: int, identity: str) -> CachedHits:
         raise FileFormatError(
             f"{folder}: expected {triangles} triangles, got [{int(faces.min())}, "
             f"{int(faces.max())}]."
+        )
+    checks = {name: _check_sum(array) for name, array in arrays.items()}
+    if header.get("checks") != checks:
+        raise FileFormatError(
+            f"{folder}: expected the check sums of {_HEADER}, got others; the files are damaged."
         )
     return CachedHits(starts=starts, faces=faces, weights=arrays["weights"], folder=folder)
 
