@@ -23,7 +23,7 @@ MAX_FREQUENCIES = 16
 class RadianceOptions:
     """Sizes of the networks, what a ray is made of, and how training goes.
 
-    The defaults are sized for two cores, 80 to 95 ms of CPU a step, and not tuned on long runs;
+    The defaults are sized for two cores, about 65 ms of CPU a step (docs/decisions/0045);
     `PUBLISHED_RADIANCE` are those of the papers.
     """
 
@@ -101,8 +101,9 @@ class RadianceOptions:
     final_rate: float = 0.1
     """Share of the rates that is left at the last step; they fall exponentially."""
 
-    semantic_weight: float = 0.1
-    """w, weight of the cross-entropy beside the squared colour error (eq. 8)."""
+    semantic_weight: float = 0.3
+    """w, weight of the cross-entropy beside the squared colour error (eq. 8); published 0.1, with
+    which labels of small things come late."""
 
     longest: int = 1600
     """Longest side of photographs, pixels; larger ones are reduced."""
