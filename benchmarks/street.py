@@ -138,7 +138,14 @@ class Bench:
         return self._meshes[name]
 
     def _renamed(self, found: MeshField) -> MeshField:
-        return MeshField(found.mesh, found.model, layer=LAYER, info=found.info, radius=found.radius)
+        return MeshField(
+            found.mesh,
+            found.model,
+            layer=LAYER,
+            info=found.info,
+            radius=found.radius,
+            seen=found.seen,
+        )
 
     def _made(self, name: str) -> Labels:
         if name in ("sam", "panoptic"):

@@ -10,6 +10,7 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.street import reference
 from splatseg.street.field import MeshField
 from splatseg.street.hits_reference import mesh_hits
+from splatseg.street.point_query import BallQuery
 from splatseg.street.radiance.model import RadianceModel
 from support.mesh_fields import IDS, SMALL, balls, random_field, told_field
 
@@ -177,3 +178,20 @@ def test_what_is_refused() -> None:
     with pytest.raises(InputError, match="^info: "):
         MeshField(mesh, model, info="mine")  # pyright: ignore[reportArgumentType]
     assert LayerInfo() == field.info
+
+
+def test_vertices_that_no_ray_saw_count_a_hundredth() -> None:
+    field = random_field()
+    opacity, probabilities = field.model.vertex_outputs(field.mesh)
+    seen = torch.linspace(0, 1, len(opacity))
+    weighed = MeshField(field.mesh, field.model, seen=seen, radius=field.radius)
+    points = field.mesh.vertices[::7] + 0.01
+    expected = BallQuery(
+        field.mesh.vertices, opacity * seen.clamp_min(0.01), probabilities, radius=field.radius
+    )
+    assert torch.equal(weighed.query.scores(points), expected.scores(points))
+    assert not torch.equal(weighed.query.scores(points), field.query.scores(points))
+    with pytest.raises(ShapeError, match="seen"):
+        MeshField(field.mesh, field.model, seen=seen[1:])
+    with pytest.raises(RangeError, match="seen"):
+        MeshField(field.mesh, field.model, seen=seen * 2)

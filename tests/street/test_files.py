@@ -191,3 +191,21 @@ def test_a_file_cut_anywhere_is_one_sentence(saved: Path) -> None:
         saved.write_bytes(whole[:end])
         with pytest.raises(SplatsegError):
             load_mesh_field(saved)
+
+
+def test_what_training_saw_comes_back(tmp_path: Path) -> None:
+    field = random_field()
+    seen = torch.linspace(0, 1, len(field.mesh.vertices)).half().float()
+    path = tmp_path / "seen.safetensors"
+    save_mesh_field(MeshField(field.mesh, field.model, seen=seen, layer="x"), path)
+    tensors, metadata = read_safetensors(path)
+    assert tensors["seen"].dtype == torch.float16
+    assert torch.equal(load_mesh_field(path).seen, seen)
+    for wrong, words in (
+        (seen[1:], "seen: expected shape"),
+        (2 * seen, "seen: expected values"),
+        (torch.ones(len(seen), dtype=torch.int32), "seen: expected floating-point numbers"),
+    ):
+        write_tensors(tensors | {"seen": wrong}, path, metadata=metadata)
+        with pytest.raises(FileFormatError, match=words):
+            load_mesh_field(path)

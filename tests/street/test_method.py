@@ -104,6 +104,8 @@ def test_every_option_reaches_the_stage_that_it_is_of() -> None:
     assert radiance.cache_memory == 99
     fast, published = DnmpOptions(), DnmpOptions(setting="published")
     assert fast.geometry.carve == 0.9
+    assert (fast.weighs_seen, published.weighs_seen) == (True, False)
+    assert replace(published, weigh_seen=True).weighs_seen
     assert published.geometry.carve > 1
     assert published.radiance.width == 256 > fast.radiance.width
     assert replace(published, iterations=5).radiance.iterations == 5

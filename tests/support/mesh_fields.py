@@ -10,6 +10,10 @@ from splatseg.street.radiance.options import RadianceOptions
 from splatseg.street.shapes.template import template
 
 SMALL = RadianceOptions(
+    max_hits=6,
+    fine_hits=4,
+    coarse_hits=2,
+    sides="both",
     feature_size=4,
     position_frequencies=2,
     view_frequencies=1,
@@ -53,6 +57,10 @@ def told_field(
     Features are the classes themselves, and the networks read them; colour j is 1 in channel j.
     """
     options = RadianceOptions(
+        max_hits=6,
+        fine_hits=4,
+        coarse_hits=2,
+        sides="both",
         feature_size=3, position_frequencies=0, view_encoding="none", width=3, depth=1,
         semantic_width=0, colour_widths=(), background="constant", background_widths=(),
     )  # fmt: skip

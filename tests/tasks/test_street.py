@@ -172,6 +172,10 @@ def test_options_count(drive, generated_drive) -> None:
     scans = StreetOptions(evidence="labels_semantic", scans=generated_drive)
     one = street_field(drive, options=replace(scans, views=("train_0000",)), field_options=QUICK)
     assert len(one.views) == 1
+    assert one.field.seen is not None
+    assert 0 < float(one.field.seen.max()) <= 1
+    plain = street_field(drive, options=scans, field_options=replace(QUICK, weigh_seen=False))
+    assert plain.field.seen is None
     coarse = street_field(
         drive, options=scans, field_options=replace(QUICK, voxels=(4.0,), radius=1.5)
     )

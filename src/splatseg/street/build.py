@@ -24,6 +24,9 @@ METHOD_NAME = "dnmp"
 Stage = Callable[[str, int, int], None]
 """Told of a stage (``geometry``, ``field``), steps done, and all there are."""
 
+_ENOUGH = 10.0
+"""Rays that saw a vertex which counts half."""
+
 _STEPS = 1000
 """What the progress of the geometry is told in."""
 
@@ -140,11 +143,23 @@ def build_mesh_field(
     )
     radius = None if options.radius is None else options.radius / metres_per_unit
     return MeshFieldFit(
-        field=MeshField(mesh, model, layer=layer, info=info, radius=radius),
+        field=MeshField(
+            mesh,
+            model,
+            layer=layer,
+            info=info,
+            radius=radius,
+            seen=seen_shares(trained.seen) if options.weighs_seen else None,
+        ),
         start=primitives,
         geometry=shaped,
         radiance=trained,
     )
+
+
+def seen_shares(seen: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+    """What vertices that so many rays saw count in eq. 9, in [0, 1], as float16 holds it."""
+    return (seen / (seen + _ENOUGH)).half().float()
 
 
 def _check_several(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_shape, check_values
 from splatseg.core import (
     UNLABELLED,
     Camera,
@@ -36,6 +36,11 @@ _COVERED = 0.5
 """Sum of probabilities that a pixel needs for a label."""
 
 
+_LEAST_SEEN = 0.01
+"""What a vertex counts at least: far from all that was seen, the network's guess is better than
+nothing."""
+
+
 class MeshField:
     """Deformable neural mesh primitives with semantics, a `splatseg.core.Renderable`.
 
@@ -48,10 +53,13 @@ class MeshField:
         layer: Name of its layer.
         info: How it was made, and what ids are called.
         radius: Of the ball of eq. 9, scene units; None is the side of the finest voxels.
+        seen: How well training knows each vertex, in [0, 1]: sigma of eq. 9 is multiplied by it, or
+            by 0.01 where that is more. Most vertices are inside walls or behind others, where no
+            ray taught the network what it says. None is 1 for all, as published.
 
     Raises:
-        ShapeError: If the model has not one row of features a vertex.
-        RangeError: If the radius is not positive.
+        ShapeError: If the model has not one row of features a vertex, or `seen` not one number.
+        RangeError: If the radius is not positive, or a value of `seen` is not in [0, 1].
         InputError: If an id of the model is not 1 or more.
     """
 
@@ -64,6 +72,7 @@ class MeshField:
         layer: str = "semantic",
         info: LayerInfo | None = None,
         radius: float | None = None,
+        seen: Float[Tensor, "v"] | None = None,
     ) -> None:
         check_shape("model.features", model.features, (len(mesh.vertices), None))
         if min(model.ids) < 1:
@@ -73,6 +82,10 @@ class MeshField:
             raise RangeError(f"radius: expected a positive length, got {radius}.")
         if not layer or "@" in layer:
             raise InputError(f"layer: expected a name without @, got {layer!r:.80}.")
+        if seen is not None:
+            check_shape("seen", seen, (len(mesh.vertices),))
+            check_values("seen", seen, 0.0, 1.0)
+        self._seen = None if seen is None else seen.detach().cpu().float()
         self._mesh, self._model = mesh, model.eval().requires_grad_(requires_grad=False)
         self._layer, self._radius = layer, radius
         self._info = LayerInfo() if info is None else info
@@ -97,6 +110,11 @@ class MeshField:
     def radius(self) -> float:
         """Of the ball of eq. 9, scene units."""
         return self._radius
+
+    @property
+    def seen(self) -> Float[Tensor, "v"] | None:
+        """How well training knows each vertex; None where that is not asked."""
+        return self._seen
 
     @property
     def info(self) -> LayerInfo:
@@ -147,6 +165,8 @@ class MeshField:
     def query(self) -> BallQuery:
         """Its vertices with opacities and probabilities, made when first asked for."""
         opacity, probabilities = self._model.vertex_outputs(self._mesh)
+        if self._seen is not None:
+            opacity = opacity * self._seen.clamp_min(_LEAST_SEEN)
         return BallQuery(self._mesh.vertices, opacity, probabilities, radius=self._radius)
 
     @cached_property

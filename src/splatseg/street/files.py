@@ -55,6 +55,8 @@ def save_mesh_field(field: MeshField, path: Path) -> None:
     """
     mesh = field.mesh
     tensors = {"vertices": mesh.vertices.float(), "levels": mesh.levels.to(torch.uint8)}
+    if field.seen is not None:
+        tensors["seen"] = _narrow(field.seen)
     tensors |= {f"{_MODEL}{name}": _narrow(tensor) for name, tensor in field.model.state.items()}
     about = {
         "sizes": list(mesh.sizes),
@@ -88,6 +90,7 @@ def load_mesh_field(path: Path) -> MeshField:
             layer=_layer_name(about, path),
             info=_info(about, path),
             radius=json_number(about["radius"], where=f"{path}: radius"),
+            seen=_seen(tensors, path),
         )
 
 
@@ -163,6 +166,13 @@ def _mesh(tensors: Mapping[str, Tensor], about: Mapping[str, Any], path: Path) -
             f"shape {tuple(vertices.shape)}."
         )
     return PrimitiveMesh(vertices=vertices, levels=levels.long(), sizes=tuple(sizes))
+
+
+def _seen(tensors: Mapping[str, Tensor], path: Path) -> Tensor | None:
+    seen = tensors.get("seen")
+    if seen is not None and not seen.is_floating_point():
+        raise FileFormatError(f"{path}: seen: expected floating-point numbers, got {seen.dtype}.")
+    return None if seen is None else seen.float()
 
 
 def _options(about: Mapping[str, Any], path: Path) -> RadianceOptions:

@@ -56,6 +56,10 @@ class DnmpOptions:
     """Of the ball around a point, metres, whose vertices label it. None is the side of the finest
     voxels."""
 
+    weigh_seen: bool | None = None
+    """In that ball, vertices that no training ray saw count nearly nothing. None is yes, or no with
+    published."""
+
     memory: int = 1 << 30
     """Bytes of hits of training rays that are kept in memory; more lie in files."""
 
@@ -96,6 +100,11 @@ class DnmpOptions:
             iterations=self.iterations, rays=self.rays, semantic_weight=self.semantic_weight
         )
         return replace(options, cache_memory=self.memory, **given)
+
+    @property
+    def weighs_seen(self) -> bool:
+        """Whether vertices that no ray saw count less in eq. 9."""
+        return self.setting == "fast" if self.weigh_seen is None else self.weigh_seen
 
 
 _CARVE = 0.9

@@ -133,6 +133,7 @@ class FieldBuilder:
                 details={**made.field.info.details, **more},
             ),
             radius=made.field.radius,
+            seen=made.field.seen,
         )
         return BuiltField(field=field, fit=made, sources=sources.said, depths=tuple(depths.samples))
 

@@ -251,3 +251,16 @@ def test_photographs_and_label_maps_of_files_are_read(tmp_path: Path) -> None:
     files = train_radiance(two_balls(), seen, evidence, options=SMALL)
     given = train_radiance(two_balls(), seen, evidence, options=SMALL, read=photograph)
     assert same(files, given)
+
+
+def test_what_rays_saw_is_their_weights(tmp_path: Path) -> None:
+    """Opaque balls: what is behind the first triangle is seen by none, and each ray by one."""
+    fit = trained(replace(SMALL, iterations=40, order="distance"), tmp_path)
+    assert fit.seen.shape == (len(two_balls().vertices),)
+    assert bool((fit.seen >= 0).all())
+    assert 0 < float(fit.seen.sum()) <= fit.rays * (1 + 1e-5)
+    centre = views()[0].camera.centre.float()
+    vertices = two_balls().vertices
+    ahead = vertices[:42, 2] < -0.5
+    assert centre[2] < 0
+    assert float(fit.seen[:42][ahead].mean()) > float(fit.seen[:42][~ahead].mean())

@@ -73,6 +73,12 @@ class StepWorker:
         count = len(model.features)
         self._met = torch.zeros(count, dtype=torch.bool)
         self._place = torch.zeros(count, dtype=torch.int64)
+        self._seen = torch.zeros(count)
+
+    @property
+    def seen(self) -> Float[Tensor, "v"]:
+        """What rays of all steps so far saw of each vertex: their weights of eq. 5 there."""
+        return self._seen
 
     def step(self, drawn: Int64[Tensor, "b"]) -> StepGradients:
         """Losses and gradients of a batch of rays."""
@@ -102,11 +108,13 @@ class StepWorker:
         rows = self._met.nonzero()[:, 0]
         self._met.index_fill_(0, rows, value=False)
         self._place.index_copy_(0, rows, torch.arange(len(rows)))
-        sums = torch.zeros(len(rows), gradients.shape[1])
+        shown = torch.cat([one.shown for one in found])
+        sums, seen = torch.zeros(len(rows), gradients.shape[1]), torch.zeros(len(rows))
         for k in range(3):
-            sums.index_add_(
-                0, self._place.index_select(0, corners[:, k]), weights[:, k, None] * gradients
-            )
+            at = self._place.index_select(0, corners[:, k])
+            sums.index_add_(0, at, weights[:, k, None] * gradients)
+            seen.index_add_(0, at, weights[:, k] * shown)
+        self._seen[rows] += seen
         return rows, sums
 
     def _share(self, drawn: Int64[Tensor, "b"], total: int) -> "_Share":
@@ -146,6 +154,7 @@ class StepWorker:
             parameters=list(gradients[:-1]),
             corners=samples.corners,
             weights=samples.weights,
+            shown=each.detach(),
             features=gradients[-1],
         )
 
@@ -159,6 +168,7 @@ class _Share:
     parameters: list[Tensor]
     corners: Tensor
     weights: Tensor
+    shown: Tensor
     features: Tensor
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import View
@@ -74,6 +75,10 @@ class RadianceFit:
 
     in_files: bool
     """Whether they were in files."""
+
+    seen: Float[Tensor, "v"]
+    """How many of these rays saw each vertex of the mesh, by their weights of eq. 5, estimated
+    from those that were drawn."""
 
 
 @boundary
@@ -145,6 +150,7 @@ def train_radiance(
             hits=hits.hits,
             cache_bytes=hits.nbytes,
             in_files=hits.folder is not None,
+            seen=worker.seen * (len(rays) / (options.iterations * options.rays)),
         )
 
 
