@@ -17,7 +17,7 @@ from splatseg.street.geometry import DepthView
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
 from splatseg.tasks._street_depths import KeptDepths, depth_errors, spread_views
-from splatseg.tasks.street_report import LabelledScans, write_street_report
+from splatseg.tasks.street_report import LabelledScans, report_street
 from support.analytic import BallOverFloor
 from support.mesh_fields import balls
 
@@ -49,7 +49,7 @@ def test_a_field_and_its_points(made, scene, generated_drive, tmp_path) -> None:
     )  # fmt: skip
     assert len(kept.ids) == labels.counts.points
     assert int((kept.ids < 0).sum()) == labels.counts.unlabelled
-    path = write_street_report(
+    path = report_street(
         scene, made.field, layer="classes", made=made, command="splatseg street x --report",
         scans=LabelledScans(made=labels, by="mesh", points=kept),
     )  # fmt: skip
@@ -74,7 +74,7 @@ def test_a_field_and_its_points(made, scene, generated_drive, tmp_path) -> None:
 
 
 def test_a_field_that_was_there(made, scene) -> None:
-    path = write_street_report(scene, made.field, layer="classes", name="other")
+    path = report_street(scene, made.field, layer="classes", name="other")
     record = json.loads(path.with_suffix(".json").read_text())
     assert path.name == "other.html"
     assert (record["field"], record["levels"], record["depth"]) == (None, [], [])
@@ -83,16 +83,16 @@ def test_a_field_that_was_there(made, scene) -> None:
 
 def test_views_without_photographs_are_not_shown(made, scene) -> None:
     bare = replace(scene, views=tuple(replace(view, image=None) for view in scene.views))
-    path = write_street_report(bare, made.field, layer="classes", made=made)
+    path = report_street(bare, made.field, layer="classes", made=made)
     assert "Training views" not in path.read_text()
     assert json.loads(path.with_suffix(".json").read_text())["psnr"] == {}
 
 
 def test_what_cannot_be_told(made, scene) -> None:
     with pytest.raises(InputError, match="scene: expected one with a folder"):
-        write_street_report(replace(scene, root=None), made.field, layer="classes")
+        report_street(replace(scene, root=None), made.field, layer="classes")
     with pytest.raises(InputError, match="layer: expected classes"):
-        write_street_report(scene, made.field, layer="other")
+        report_street(scene, made.field, layer="other")
 
 
 def test_a_scan_is_told_once_and_labels_are_the_same(scene, generated_drive, tmp_path) -> None:

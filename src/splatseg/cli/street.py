@@ -28,8 +28,8 @@ from splatseg.tasks import (
     made_street_field,
     make_street_field,
     open_drive,
+    report_street,
     viewed_points,
-    write_street_report,
 )
 from splatseg.tasks.scene_parts import gaussian_field
 
@@ -173,7 +173,7 @@ def _report(
         field = gaussian_field(scene, [layer], backend=command.backend)
     else:
         field, layer = found.field, next(iter(found.field.layer_names))
-    return write_street_report(
+    return report_street(
         scene,
         field,
         layer=layer,

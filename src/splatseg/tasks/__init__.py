@@ -83,4 +83,4 @@ from splatseg.tasks.street import street_field as street_field
 from splatseg.tasks.street_drive import StreetDrive as StreetDrive
 from splatseg.tasks.street_options import StreetOptions as StreetOptions
 from splatseg.tasks.street_report import LabelledScans as LabelledScans
-from splatseg.tasks.street_report import write_street_report as write_street_report
+from splatseg.tasks.street_report import report_street as report_street

@@ -58,7 +58,7 @@ class LabelledScans:
 
 
 @boundary
-def write_street_report(
+def report_street(
     scene: Scene,
     field: Renderable,
     *,
