@@ -7,18 +7,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from splatseg.core import Camera, Capture, View
+from splatseg.core import Capture, View
 from splatseg.core.recorded_options import DIFFERENCES, differing_names, option_differences
 from splatseg.errors import InputError, brief
 from splatseg.fit._options import FitOptions
+from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.json_files import parse_object
 
 # The length may differ: a fit can be resumed with another one. The number of Gaussians depends on
 # the length, and may differ with it.
 _LENGTH = {"minutes", "steps"}
 _WITH_LENGTH = "max_gaussians"
-# Files are identified by their size and this many of their first bytes.
-_FILE_HEAD = 65_536
 
 
 def fit_identity(
@@ -38,11 +37,11 @@ def fit_identity(
     views = tuple(views)
     names = [view.name for view in views]
     data = {
-        "training views": _digest(names),
-        "cameras": _digest(_numbers(view.camera) for view in views),
-        "photographs": _digest(_file(view.image) for view in views),
-        "masks": _digest(_file(view.mask) for view in views),
-        "depth maps": _digest([*map(_depth, views)]),
+        "training views": digest(names),
+        "cameras": digest(camera_numbers(view.camera) for view in views),
+        "photographs": digest(file_mark(view.image) for view in views),
+        "masks": digest(file_mark(view.mask) for view in views),
+        "depth maps": digest([*map(_depth, views)]),
         "start points": _points(capture),
     }
     return {
@@ -101,40 +100,15 @@ def _of(identity: Mapping[str, Any], group: str) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}  # pyright: ignore[reportUnknownVariableType]
 
 
-def _digest(values: Iterable[object]) -> str:
-    digest = hashlib.sha256()
-    for value in values:
-        digest.update(repr(value).encode())
-        digest.update(b"\n")
-    return digest.hexdigest()[:16]
-
-
-def _numbers(camera: Camera) -> tuple[object, ...]:
-    pose = camera.cam_from_world.tolist()
-    shape = (camera.width, camera.height, camera.model)
-    lens = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
-    return (*shape, *(float(number) for number in lens), pose)
-
-
-def _file(path: Path | None) -> tuple[int, str] | None:
-    if path is None:
-        return None
-    if not path.is_file():
-        return (0, "")
-    with path.open("rb") as file:
-        head = file.read(_FILE_HEAD)
-    return (path.stat().st_size, hashlib.sha256(head).hexdigest())
-
-
 def _depth(view: View) -> object:
-    return (_file(view.depth), view.depth_unit)
+    return (file_mark(view.depth), view.depth_unit)
 
 
 def _points(capture: Capture) -> str:
     cloud = capture.points
     if cloud is None:
         return "none"
-    digest = hashlib.sha256(cloud.points.contiguous().numpy().tobytes())
+    found = hashlib.sha256(cloud.points.contiguous().numpy().tobytes())
     if cloud.colours is not None:
-        digest.update(cloud.colours.contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]
+        found.update(cloud.colours.contiguous().numpy().tobytes())
+    return found.hexdigest()[:16]

@@ -1,25 +1,22 @@
 """What blocks of a drive depend on, as digests: blocks of the same are gone on with, no others."""
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from splatseg.core import Camera, Scan, ScanSource, Scene
+from splatseg.core import Scan, ScanSource, Scene
 from splatseg.io.class_tables import class_rows
+from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.evidence import DepthEvidence, LabelEvidence, find_evidence, open_evidence
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks._street_build import versions
 from splatseg.tasks._street_inputs import DriveInputs
 from splatseg.tasks._street_sources import DEPTHS
 from splatseg.tasks.street_options import StreetOptions
-
-_FILE_HEAD = 65_536
-"""Files are told apart by their sizes and so many of their first bytes."""
 
 _NAMES_AND_PATHS = ("field", "scans", "moving")
 """Options that are no part of a field: data may move."""
@@ -50,13 +47,13 @@ class DigestedScans:
         scan = self._scans.scan(name)
         if name not in self._digests:
             origin = torch.zeros(0) if scan.origin is None else scan.origin
-            self._digests[name] = _digest([_bytes(scan.points), _bytes(origin)])
+            self._digests[name] = digest([_bytes(scan.points), _bytes(origin)])
         return scan
 
     @property
     def digest(self) -> str:
         """Of all scans that were read."""
-        return _digest(sorted(self._digests.items()))
+        return digest(sorted(self._digests.items()))
 
 
 def drive_identity(
@@ -91,20 +88,20 @@ def drive_identity(
         "versions": versions(),
         "inputs": {
             "metres_per_unit": inputs.metres,
-            "views": _digest(view.name for view in views),
-            "cameras": _digest(_numbers(view.camera) for view in views),
-            "photographs": _digest(_file(view.image) for view in views),
-            "masks": _digest(_file(view.mask) for view in views),
-            "depth maps": _digest((_file(view.depth), view.depth_unit) for view in views),
+            "views": digest(view.name for view in views),
+            "cameras": digest(camera_numbers(view.camera) for view in views),
+            "photographs": digest(file_mark(view.image) for view in views),
+            "masks": digest(file_mark(view.mask) for view in views),
+            "depth maps": digest((file_mark(view.depth), view.depth_unit) for view in views),
             "label maps": _label_maps(inputs),
             "depth evidence": _depth_evidence(scene, options.depth),
-            "classes": _digest([None if classes is None else class_rows(classes)]),
-            "points": _digest([None if points is None else _bytes(points)]),
+            "classes": digest([None if classes is None else class_rows(classes)]),
+            "points": digest([None if points is None else _bytes(points)]),
             "scans": "none" if scans is None else scans.digest,
-            "boxes": _digest(
+            "boxes": digest(
                 (b.centre.tolist(), b.size, b.rotation.tolist(), b.start, b.end) for b in boxes
             ),
-            "gaussians": _digest(
+            "gaussians": digest(
                 _bytes(t) for t in (gaussians.means, gaussians.scales, gaussians.opacities)
             ),
         },
@@ -132,7 +129,7 @@ def _object(value: object) -> Mapping[str, Any]:
 def _label_maps(inputs: DriveInputs) -> str:
     evidence = inputs.evidence
     files = evidence.files if isinstance(evidence, LabelEvidence) else {}
-    return _digest(_file(files.get(view.name)) for view in inputs.views)
+    return digest(file_mark(files.get(view.name)) for view in inputs.views)
 
 
 def _depth_evidence(scene: Scene, depth: str) -> str:
@@ -141,32 +138,8 @@ def _depth_evidence(scene: Scene, depth: str) -> str:
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
     found = open_evidence(find_evidence(folders, depth))
     files = found.files if isinstance(found, DepthEvidence) else {}
-    return _digest((name, _file(path)) for name, path in sorted(files.items()))
-
-
-def _digest(values: Iterable[object]) -> str:
-    digest = hashlib.sha256()
-    for value in values:
-        digest.update(repr(value).encode())
-        digest.update(b"\n")
-    return digest.hexdigest()[:16]
+    return digest((name, file_mark(path)) for name, path in sorted(files.items()))
 
 
 def _bytes(tensor: Tensor) -> str:
     return hashlib.sha256(tensor.detach().cpu().contiguous().numpy().tobytes()).hexdigest()
-
-
-def _numbers(camera: Camera) -> tuple[object, ...]:
-    shape = (camera.width, camera.height, camera.model)
-    lens = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
-    return (*shape, *(float(number) for number in lens), camera.cam_from_world.tolist())
-
-
-def _file(path: Path | None) -> tuple[int, str] | None:
-    if path is None:
-        return None
-    if not path.is_file():
-        return (0, "")
-    with path.open("rb") as file:
-        head = file.read(_FILE_HEAD)
-    return (path.stat().st_size, hashlib.sha256(head).hexdigest())
