@@ -40,7 +40,6 @@ def make_street_field(
     Raises:
         InputError: If there is a field of this name, or something asked for cannot be used.
         FileFormatError: If a file is damaged.
-        MissingPackageError: If embreex is not installed.
     """
     options = options or StreetOptions()
     root = scene.root

@@ -116,7 +116,6 @@ def street_drive(
         InputError: If there is a field of this name, what was stopped was made from something
             else, or evidence, photographs, points or depth cannot be used.
         KeyboardInterrupt: With a sentence on how to go on, if it was interrupted.
-        MissingPackageError: If embreex is not installed.
     """
     cut = options.blocks
     if cut is None:
