@@ -134,18 +134,8 @@ class Bench:
         if path is None:
             raise SystemExit(f"row {name}: expected a mesh field, see --help; got none")
         if name not in self._meshes:
-            self._meshes[name] = self._renamed(load_mesh_field(path))
+            self._meshes[name] = load_mesh_field(path).with_layer(LAYER)
         return self._meshes[name]
-
-    def _renamed(self, found: MeshField) -> MeshField:
-        return MeshField(
-            found.mesh,
-            found.model,
-            layer=LAYER,
-            info=found.info,
-            radius=found.radius,
-            seen=found.seen,
-        )
 
     def _made(self, name: str) -> Labels:
         if name in ("sam", "panoptic"):

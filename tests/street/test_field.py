@@ -195,3 +195,21 @@ def test_vertices_that_no_ray_saw_count_a_hundredth() -> None:
         MeshField(field.mesh, field.model, seen=seen[1:])
     with pytest.raises(RangeError, match="seen"):
         MeshField(field.mesh, field.model, seen=seen * 2)
+
+
+def test_another_name_and_record_leave_the_rest() -> None:
+    made = random_field()
+    seen = torch.linspace(0, 1, len(made.mesh.vertices))
+    field = MeshField(made.mesh, made.model, seen=seen, radius=0.7, layer="classes", info=made.info)
+    renamed = field.with_layer("street")
+    assert (renamed.layer_names, renamed.info, renamed.radius) == (("street",), made.info, 0.7)
+    assert renamed.seen is not None
+    assert torch.equal(renamed.seen, seen)
+    told = field.with_layer(info=LayerInfo(evidence="maps"))
+    assert (told.layer_names, told.info.evidence, told.radius) == (("classes",), "maps", 0.7)
+    points = field.mesh.vertices[::7] + 0.05
+    assert torch.equal(
+        renamed.labels_at(points, "street").ids, field.labels_at(points, "classes").ids
+    )
+    with pytest.raises(InputError, match="^layer: expected a name without @"):
+        field.with_layer("a@part")

@@ -136,6 +136,22 @@ class MeshField:
             raise InputError(f"layer: expected {self._layer}, got {layer!r:.80}.")
         return RenderableLayer(ids=tuple(sorted(self._model.ids)), info=self._info)
 
+    @boundary
+    def with_layer(self, layer: str | None = None, *, info: LayerInfo | None = None) -> "MeshField":
+        """The same field with another name of its layer, or another record; None keeps it.
+
+        Raises:
+            InputError: If the name is empty or has an @.
+        """
+        return MeshField(
+            self._mesh,
+            self._model,
+            layer=self._layer if layer is None else layer,
+            info=self._info if info is None else info,
+            radius=self._radius,
+            seen=self._seen,
+        )
+
     def view(self, camera: Camera) -> "MeshFieldView":
         """What it shows through a camera."""
         return MeshFieldView(self, camera)

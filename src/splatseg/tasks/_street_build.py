@@ -121,20 +121,14 @@ class FieldBuilder:
             )
         left_out = {} if inputs.moving is None else {"moving": inputs.moving.record}
         more = {"sources": sources.said, **left_out, **(details or {})}
-        field = MeshField(
-            made.field.mesh,
-            made.field.model,
-            layer=made.field.layer_names[0],
-            info=replace(
-                made.field.info,
-                evidence=inputs.name,
-                views_asked=views_recorded(self._options.views),
-                versions=versions(),
-                details={**made.field.info.details, **more},
-            ),
-            radius=made.field.radius,
-            seen=made.field.seen,
+        info = replace(
+            made.field.info,
+            evidence=inputs.name,
+            views_asked=views_recorded(self._options.views),
+            versions=versions(),
+            details={**made.field.info.details, **more},
         )
+        field = made.field.with_layer(info=info)
         return BuiltField(field=field, fit=made, sources=sources.said, depths=tuple(depths.samples))
 
     def _took(self, stage: str, seconds: float) -> None:
