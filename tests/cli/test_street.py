@@ -103,6 +103,16 @@ def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path
     assert "evidence: expected one of those at hand" in refused(
         made, "--field", "b", "--evidence", "none"
     )
+    # What is to be labelled, and where to, is looked at before a field is made for it.
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken/mine.txt").write_text("mine")
+    unmade = ("--field", "b", "--by", "mesh", *FAST)
+    assert "got one with other files; choose another" in refused(
+        made, "--label-scans", generated_drive, "-o", tmp_path / "taken", *unmade
+    )
+    (tmp_path / "lidar.npz").write_bytes(b"half")
+    assert "lidar.npz" in refused(made, "--label-scans", tmp_path, "-o", out, *unmade)
+    assert not (made / "fields/b.safetensors").exists()
     # Half a file, as a disk that was full would leave it.
     root = shutil.copytree(made, tmp_path / "half")
     file = root / "fields/street.safetensors"

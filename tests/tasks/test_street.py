@@ -147,6 +147,7 @@ def test_depth_comes_from_what_is_there(drive, generated_drive) -> None:
         "gaussians": "expected a scene with Gaussians",
         "scans+gaussians": "expected a scene with Gaussians",
         "labels_semantic": "or evidence of depth, got 'labels_semantic' of labels",
+        "nothing": "expected one of those at hand .*got 'nothing'",
     }.items():
         with pytest.raises(InputError, match=f"^depth: .*{words}"):
             drive_sources(drive, bare, depth=kind, scans=None, points=some, **asked)

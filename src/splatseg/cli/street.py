@@ -2,7 +2,7 @@
 
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,6 +12,7 @@ from splatseg.cli._types import Backend, Data, Json, Overwrite, Quiet, Seed
 from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import Renderable, Scene
 from splatseg.errors import InputError
+from splatseg.io.scans import Scans
 from splatseg.io.scene_fields import scene_field_path
 from splatseg.io.scene_folder import is_scene
 from splatseg.report.point_map import LabelledPoints
@@ -29,6 +30,7 @@ from splatseg.tasks import (
     make_street_field,
     open_drive,
     report_street,
+    scans_to_label,
     viewed_points,
 )
 from splatseg.tasks.scene_parts import gaussian_field
@@ -111,23 +113,26 @@ def run(command: Command) -> None:
     started = time.monotonic()
     observer = ConsoleObserver(quiet=command.quiet, json=command.json)
     _check(command)
+    scans: Scans | None = None
+    options = ScanLabelOptions(form=command.form)
+    if command.label_scans is not None and command.output is not None:
+        # Before a field is made, which takes minutes.
+        scans = scans_to_label(command.label_scans, command.output, options=options)
     scene, root = _scene(command)
     facts: dict[str, Any] = {"scene": root}
     lines: list[str] = []
     found: _Found | None = None
     labelled: LabelledScans | None = None
-    if command.label_scans is None or command.by != "gaussians":
+    if scans is None or command.by != "gaussians":
         found = _field(command, scene, root, observer, facts=facts, lines=lines)
-    if command.label_scans is not None and command.output is not None:
+    if scans is not None and command.output is not None:
         kept = LabelledPoints()
         made = label_scans(
             scene,
-            command.label_scans,
+            scans,
             command.output,
             field=None if found is None else _labeller(command, scene, found.field),
-            options=ScanLabelOptions(
-                layer=command.inputs.layer if found is None else None, form=command.form
-            ),
+            options=replace(options, layer=command.inputs.layer if found is None else None),
             seen=(lambda scan, labels: kept.add(scan.points, labels.ids))
             if command.report
             else None,

@@ -53,6 +53,7 @@ from splatseg.tasks.scan_labels import LabelBy as LabelBy
 from splatseg.tasks.scan_labels import ScanLabelOptions as ScanLabelOptions
 from splatseg.tasks.scan_labels import ScanLabels as ScanLabels
 from splatseg.tasks.scan_labels import label_scans as label_scans
+from splatseg.tasks.scan_labels import scans_to_label as scans_to_label
 from splatseg.tasks.scan_labels import viewed_points as viewed_points
 from splatseg.tasks.see import SeeOptions as SeeOptions
 from splatseg.tasks.see import see as see

@@ -136,7 +136,7 @@ def _depth_evidence(scene: Scene, depth: str) -> str:
     if depth in DEPTHS:
         return "none"
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    found = open_evidence(find_evidence(folders, depth))
+    found = open_evidence(find_evidence(folders, depth, option="depth"))
     files = found.files if isinstance(found, DepthEvidence) else {}
     return digest((name, file_mark(path)) for name, path in sorted(files.items()))
 

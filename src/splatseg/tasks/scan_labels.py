@@ -9,7 +9,13 @@ from splatseg._check import check_choice
 from splatseg.core import Labels, Layer, PointLabels, Renderable, Scan, ScanSource, Scene
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
-from splatseg.io.export import FORMS, ScanLabelCounts, ScanLabelForm, write_scan_labels
+from splatseg.io.export import (
+    FORMS,
+    ScanLabelCounts,
+    ScanLabelForm,
+    check_replaceable,
+    write_scan_labels,
+)
 from splatseg.io.scans import Scans, read_scans
 from splatseg.io.scene import load_scene_layer, scene_layer_names
 from splatseg.lift.points import ViewedPointOptions, ViewedPoints
@@ -57,6 +63,24 @@ class ScanLabels:
 
 
 @boundary
+def scans_to_label(path: Path, folder: Path, *, options: ScanLabelOptions | None = None) -> Scans:
+    """Scans whose labels are to be written to a folder, refused before anything long is done.
+
+    Args:
+        path: Scans in any layout that `read_scans` reads.
+        folder: Where `label_scans` is to write.
+        options: How scans are read.
+
+    Raises:
+        MissingFileError: If there are no scans.
+        InputError: If they cannot be read, or the folder holds something other than labels.
+    """
+    options = options or ScanLabelOptions()
+    check_replaceable(folder, "labels.json")
+    return read_scans(path, format=options.scan_format)
+
+
+@boundary
 def label_scans(
     scene: Scene,
     scans: Path | Scans,
@@ -91,7 +115,7 @@ def label_scans(
     """
     options = options or ScanLabelOptions()
     if isinstance(scans, Path):
-        scans = read_scans(scans, format=options.scan_format)
+        scans = scans_to_label(scans, folder, options=options)
     if field is None:
         layer = options.layer or _only_layer(scene, layers)
         field = _viewed_gaussians(scene, layer, points, layers, backend)

@@ -27,6 +27,7 @@ from splatseg.report.street_report import (
     street_record,
     street_report,
 )
+from splatseg.report.words import count_text
 from splatseg.street.geometry import enclosing
 from splatseg.street.shapes import load_shapes
 from splatseg.tasks._street_depths import depth_errors, spread_views
@@ -226,7 +227,7 @@ def _above(scans: LabelledScans | None, scene: Scene, classes: ClassTable) -> Ga
     up = scene.up or (0.0, 0.0, 1.0)
     image = point_map(scans.points.points, scans.points.ids, classes, up=up)
     kept = len(scans.points.ids)
-    of = "" if kept == scans.made.counts.points else f" {kept} of them, evenly."
+    of = "" if kept == scans.made.counts.points else f" {count_text(kept)} of them, evenly."
     return Gallery(
         title="Labelled points from above",
         columns=("",),

@@ -191,12 +191,13 @@ def evidence_header(folder: Path | str) -> dict[str, Any] | None:
 
 
 @boundary
-def find_evidence(folders: Iterable[Path], name: str | None) -> Path:
+def find_evidence(folders: Iterable[Path], name: str | None, *, option: str = "evidence") -> Path:
     """The folder of evidence of this name: in a scene's ``evidence``, or in a capture.
 
     Args:
         folders: Folders of scenes and captures, the one to prefer first.
         name: The folder's name, such as ``labels_semantic``. None takes the only one.
+        option: What names it, for messages.
 
     Raises:
         InputError: If there is none, or no name and not just one; the message lists those that
@@ -207,13 +208,13 @@ def find_evidence(folders: Iterable[Path], name: str | None) -> Path:
     known = ", ".join(names) or "there is none; `splatseg see` makes some"
     if name is None:
         if len(names) != 1:
-            raise InputError(f"evidence: expected a name ({known}), got none.")
+            raise InputError(f"{option}: expected a name ({known}), got none.")
         name = names[0]
     for parent in folders:
         for folder in (parent / "evidence" / name, parent / name):
             if folder.is_dir():
                 return folder
-    raise InputError(f"evidence: expected one of those at hand ({known}), got {name!r}.")
+    raise InputError(f"{option}: expected one of those at hand ({known}), got {name!r}.")
 
 
 @boundary
