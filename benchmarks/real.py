@@ -41,7 +41,8 @@ from splatseg.lift import (
 )
 from splatseg.methods.cosseg import CossegOptions
 from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.segment import segment
+from splatseg.tasks.segment_options import SegmentOptions
 
 _SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 

@@ -61,7 +61,8 @@ from splatseg.lift.points import (
 from splatseg.methods import find_method
 from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field
-from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.segment import segment
+from splatseg.tasks.segment_options import SegmentOptions
 
 LAYER = "street"
 BIG = 1000

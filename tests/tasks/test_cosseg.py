@@ -12,7 +12,8 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.methods.cosseg import CossegOptions
-from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.segment import segment
+from splatseg.tasks.segment_options import SegmentOptions
 
 LABELS = SegmentOptions(evidence="labels_semantic")
 TRACKS = SegmentOptions(evidence="labels_tracked")

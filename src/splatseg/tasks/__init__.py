@@ -58,9 +58,9 @@ from splatseg.tasks.scan_labels import viewed_points as viewed_points
 from splatseg.tasks.see import SeeOptions as SeeOptions
 from splatseg.tasks.see import see as see
 from splatseg.tasks.segment import Segmentation as Segmentation
-from splatseg.tasks.segment import SegmentOptions as SegmentOptions
 from splatseg.tasks.segment import save_segmentation as save_segmentation
 from splatseg.tasks.segment import segment as segment
+from splatseg.tasks.segment_options import SegmentOptions as SegmentOptions
 from splatseg.tasks.select import open_selector as open_selector
 from splatseg.tasks.select import select as select
 from splatseg.tasks.select_options import SelectMode as SelectMode

@@ -23,7 +23,8 @@ from splatseg.tasks._last_layers import in_word_space, last_layers
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.query_options import QueryOptions
 from splatseg.tasks.scene_parts import whole_layer
-from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.segment import segment
+from splatseg.tasks.segment_options import SegmentOptions
 
 _ANSWERING = ("objects", "voxels", "features")
 """Methods whose layers answer, the best first."""

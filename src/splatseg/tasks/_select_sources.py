@@ -25,7 +25,8 @@ from splatseg.prompting.view_cache import ViewCache
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.scene_parts import whole_layer
-from splatseg.tasks.segment import SegmentOptions, segment
+from splatseg.tasks.segment import segment
+from splatseg.tasks.segment_options import SegmentOptions
 from splatseg.tasks.select_options import SelectOptions
 
 

@@ -31,7 +31,8 @@ from splatseg.tasks.new_scene import check_parent
 from splatseg.tasks.outputs import export_layer, report_layer
 from splatseg.tasks.render import RenderingOptions, render_views
 from splatseg.tasks.see import see
-from splatseg.tasks.segment import Segmentation, SegmentOptions, segment
+from splatseg.tasks.segment import Segmentation, segment
+from splatseg.tasks.segment_options import SegmentOptions
 
 _RECORD = "demo.json"
 _MADE_BY = "splatseg demo"

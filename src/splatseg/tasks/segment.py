@@ -20,7 +20,7 @@ from splatseg.core import (
     View,
     with_info,
 )
-from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.boundary import boundary
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -29,6 +29,7 @@ from splatseg.io.evidence import (
     check_map_sizes,
     find_evidence,
     open_evidence,
+    without_masked,
 )
 from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scene import check_name, save_scene_layer
@@ -42,46 +43,8 @@ from splatseg.tasks._segment_inputs import named_companions, named_models, train
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.fit_quality import fit_quality
 from splatseg.tasks.scene_parts import layer_of, views_asked, views_recorded
+from splatseg.tasks.segment_options import SegmentOptions
 from splatseg.tasks.stopped_training import told_how_to_resume, training_checkpoints
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SegmentOptions:
-    """What every method shares."""
-
-    evidence: str | None = None
-    """Name of the evidence: a folder of the scene's or of its capture, such as labels_semantic.
-    None takes the only one there is."""
-
-    layer: str | None = None
-    """Name of the layer. None names it like the evidence."""
-
-    zero_is_class: bool = False
-    """The id 0 of the evidence's files is a class and not void: ids grow by 1, and the layer
-    records what they were."""
-
-    void: int | None = None
-    """A further id of the evidence's files that means none, such as 255."""
-
-    views: tuple[str, ...] = ("train",)
-    """Which views may be used: train, all, or names by comma or by space. What is asked for
-    is recorded in the layer."""
-
-    published: bool = False
-    """The method as its authors published it: their options, and no completion."""
-
-    complete: bool = True
-    """Label Gaussians that no view explains by their neighbours; they are marked as inferred."""
-
-    classes: str | None = None
-    """With instances: name of a layer of classes to merge them with. Instances take their class
-    from it, and what is no thing becomes one segment a class: the layer is panoptic."""
-
-    seed: int = 0
-    """Seed of random choices, recorded in the layer."""
-
-    def __post_init__(self) -> None:
-        convert_fields(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -169,9 +132,12 @@ def segment(
     evidence_name, evidence = _evidence(scene, method, options, trained)
     merged = _classes_to_merge(scene, options, evidence, layers)
     check_name("layer", name := options.layer or evidence_name)
+    views = _views(scene, evidence, options.views, observer)
+    if options.view_masks == "ignore":
+        evidence = without_masked(evidence, views)
     inputs = MethodInputs(
         gaussians=scene.gaussians,
-        views=_views(scene, evidence, options.views, observer),
+        views=views,
         evidence=evidence,
         prompt_views=scene.views,
         companions=named_companions(scene, method, chosen),

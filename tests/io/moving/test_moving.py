@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from splatseg.core import Camera, Capture, LabelMap, LabelSource, ScanSource, View
+from splatseg.core import Camera, Capture, ScanSource, View
 from splatseg.core.moving import MovingBox, boxes_at, inside_boxes, pixels_of_boxes
 from splatseg.core.scans import Scan
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
@@ -17,7 +17,6 @@ from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
 from splatseg.io.images import load_mask
 from splatseg.io.moving import (
-    MaskedLabels,
     MovingOptions,
     StaticScans,
     mask_moving,
@@ -308,26 +307,6 @@ def test_scans_without_a_time_go_by_their_number():
     assert static.scan("velodyne/7").points.tolist() == [[9, 9, 9]]
     with pytest.raises(InputError, match="scan 'cloud': expected the time"):
         static.scan("cloud")
-
-
-def test_label_maps_are_void_where_masks_are(tmp_path):
-    class Maps:
-        view_names = ("1", "2")
-
-        def label_map(self, name: str) -> LabelMap:
-            size = (HEIGHT, WIDTH) if name == "1" else (HEIGHT // 2, WIDTH // 2)
-            return LabelMap(ids=torch.ones(size, dtype=torch.int32), confidence=torch.ones(size))
-
-    views = [view(name, tmp_path) for name in ("1", "2", "3")]
-    options = MovingOptions(margin=0.0)
-    found = mask_moving(capture(tmp_path, *views), tmp_path / "m", boxes=[box()], options=options)
-    source = MaskedLabels(Maps(), found.views)
-    assert isinstance(source, LabelSource)
-    assert source.view_names == ("1", "2")
-    assert torch.equal(source.label_map("1").ids == -1, SHOWN)
-    assert torch.equal(source.label_map("2").ids == -1, SHOWN[::2, ::2])
-    assert source.label_map("1").confidence is not None
-    assert (MaskedLabels(Maps(), views).label_map("1").ids == 1).all()
 
 
 def test_cars_of_camvid(shared_data, tmp_path):

@@ -23,6 +23,7 @@ from splatseg.io.evidence._features import TextEmbeddings as TextEmbeddings
 from splatseg.io.evidence._features import load_text_embeddings as load_text_embeddings
 from splatseg.io.evidence._label_files import read_id_map as read_id_map
 from splatseg.io.evidence._labels import LabelEvidence as LabelEvidence
+from splatseg.io.evidence._masked import without_masked as without_masked
 from splatseg.io.evidence._masks import MaskEvidence as MaskEvidence
 from splatseg.io.evidence._open import evidence_header as evidence_header
 from splatseg.io.evidence._open import evidence_names as evidence_names

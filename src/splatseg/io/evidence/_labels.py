@@ -1,14 +1,15 @@
 """Label maps: one file a view; as we write it a PNG of one channel, 8 or 16 bit, 0 for none."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Rle
+from splatseg.core import UNLABELLED, ClassTable, FeatureMap, LabelMap, MaskSet, Rle, View
+from splatseg.core.scene import camera_of_map
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
@@ -19,6 +20,7 @@ from splatseg.io.evidence._base import (
     refuse,
 )
 from splatseg.io.evidence._label_files import Palette, read_id_map, read_label_file
+from splatseg.io.images import load_mask
 
 CONFIDENCE_STEPS = 65535
 """A confidence of 1 in a file of confidences, 16 bit."""
@@ -79,6 +81,9 @@ class LabelEvidence(FileEvidence):
     recorded: Mapping[int, int] | None = None
     """The model's own id by id in the files, as evidence.json has it."""
 
+    masked: Mapping[str, View] = field(default_factory=dict[str, View])
+    """Views by their names, whose masks leave pixels out: these have no id."""
+
     @property
     @override
     def kind(self) -> EvidenceKind:
@@ -101,7 +106,8 @@ class LabelEvidence(FileEvidence):
         ids = self.rule.to_memory(read)
         self._check_recorded(name, ids)
         confidence = self._confidence(name, ids.shape) if sure is None else torch.from_numpy(sure)
-        return LabelMap(ids=torch.from_numpy(ids), confidence=confidence)
+        found = LabelMap(ids=torch.from_numpy(ids), confidence=confidence)
+        return _used(found, self.masked[name]) if name in self.masked else found
 
     @override
     def masks(self, name: str) -> MaskSet:
@@ -154,6 +160,18 @@ def masks_of_ids(label_map: LabelMap) -> tuple[MaskSet, tuple[int, ...]]:
         levels=torch.zeros(len(present), dtype=torch.int32),
     )
     return masks, tuple(present)
+
+
+def _used(found: LabelMap, view: View) -> LabelMap:
+    """A label map without ids where the mask of its view is 0."""
+    used = load_mask(view)
+    if used is None:
+        return found
+    camera_of_map(view, found.height, found.width)
+    rows = ((torch.arange(found.height) + 0.5) * used.shape[0] / found.height).long()
+    columns = ((torch.arange(found.width) + 0.5) * used.shape[1] / found.width).long()
+    left_out = used[rows][:, columns] == 0
+    return replace(found, ids=found.ids.masked_fill(left_out, UNLABELLED))
 
 
 def check_rule(zero_is_class: bool, void: int | None) -> IdRule:

@@ -1,17 +1,14 @@
-"""Scans and label maps as they are read, without moving things."""
+"""Scans as they are read, without moving things."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import torch
 
 from splatseg._check import check_choice
-from splatseg.core import UNLABELLED, LabelMap, LabelSource, ScanSource, View
+from splatseg.core import ScanSource
 from splatseg.core.boundary import boundary
 from splatseg.core.moving import MovingBox, boxes_at, inside_boxes
 from splatseg.core.scans import Scan
-from splatseg.core.scene import camera_of_map
-from splatseg.io.images import load_mask
 from splatseg.io.moving._times import CLOCKS, Clock, scan_time
 
 
@@ -61,41 +58,3 @@ class StaticScans:
         there = boxes_at(self._boxes, time)
         moving = inside_boxes(scan.points, there, margin=self._margin)
         return scan.take(torch.nonzero(~moving).squeeze(1)) if bool(moving.any()) else scan
-
-
-class MaskedLabels:
-    """Label maps without the pixels that masks of views leave out; a `core.LabelSource`.
-
-    Args:
-        labels: Label maps of views.
-        views: Views with their masks; maps of others are as they are.
-    """
-
-    @boundary
-    def __init__(self, labels: LabelSource, views: Sequence[View]) -> None:
-        self._labels = labels
-        self._views = {view.name: view for view in views if view.mask is not None}
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """Views that have a label map."""
-        return self._labels.view_names
-
-    def label_map(self, name: str) -> LabelMap:
-        """The label map of a view, -1 where its mask is 0.
-
-        Raises:
-            ShapeError: If the map is not of its view.
-        """
-        found = self._labels.label_map(name)
-        if name not in self._views:
-            return found
-        view = self._views[name]
-        used = load_mask(view)
-        if used is None:
-            return found
-        camera_of_map(view, found.height, found.width)
-        rows = torch.arange(found.height) * view.camera.height // found.height
-        columns = torch.arange(found.width) * view.camera.width // found.width
-        ignored = used[rows][:, columns] == 0
-        return replace(found, ids=found.ids.masked_fill(ignored, UNLABELLED))
