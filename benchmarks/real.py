@@ -6,7 +6,8 @@
 
 `camvid`: a network's class maps of single frames, lifted from all frames and drawn into the same,
 and lifted from the train views and drawn into the held-out ones, as are mesh fields of the scene
-(`splatseg street`); pooled mean IoU over the eight static classes and over all eleven. `dtu`: the
+(`splatseg street`); pooled mean IoU over the eight static classes and over all eleven. A scene that
+was fitted without moving things (`fit --moving-classes`) is labelled without them. `dtu`: the
 object masks of three views, lifted and drawn into all others; the scene must have been fitted
 without masks (`fit --masks off`). `replica`: masks that need no weights, as they come (painted
 smallest last, with ids of each view's own) and associated (the layer that `segment --method
@@ -30,7 +31,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import InstanceTree, LabelMap, Labels, Renderable, Scene, View
-from splatseg.io.evidence import open_evidence
+from splatseg.io.evidence import open_evidence, without_masked
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift import (
     UpliftOptions,
@@ -94,7 +95,8 @@ def camvid(job: Job) -> None:
         came = _subset(job.data / "labels_semantic", scored, job.work / "came")
         _classes(f"{title}, as they came", _score("semantic", came, truth))
         begin = time.monotonic()
-        soft = uplift(job.scene.gaussians, train, found, options=UpliftOptions(candidates=8))
+        used = without_masked(found, train)
+        soft = uplift(job.scene.gaussians, train, used, options=UpliftOptions(candidates=8))
         seconds = time.monotonic() - begin
         measured = soft.info.view_correlation
         relabelled = correct_confusion(soft, view_correlation=measured)

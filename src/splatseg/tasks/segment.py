@@ -42,7 +42,7 @@ from splatseg.tasks._refined_scene import refined_folder, save_refined
 from splatseg.tasks._segment_inputs import named_companions, named_models, trained_features
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.fit_quality import fit_quality
-from splatseg.tasks.scene_parts import layer_of, views_asked, views_recorded
+from splatseg.tasks.scene_parts import layer_of, mask_use, views_asked, views_recorded
 from splatseg.tasks.segment_options import SegmentOptions
 from splatseg.tasks.stopped_training import told_how_to_resume, training_checkpoints
 
@@ -133,7 +133,8 @@ def segment(
     merged = _classes_to_merge(scene, options, evidence, layers)
     check_name("layer", name := options.layer or evidence_name)
     views = _views(scene, evidence, options.views, observer)
-    if options.view_masks == "ignore":
+    masks = mask_use(scene) if options.view_masks == "auto" else options.view_masks
+    if masks == "ignore":
         evidence = without_masked(evidence, views)
     inputs = MethodInputs(
         gaussians=scene.gaussians,

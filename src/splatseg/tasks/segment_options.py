@@ -29,10 +29,10 @@ class SegmentOptions:
     """Which views may be used: train, all, or names by comma or by space. What is asked for
     is recorded in the layer."""
 
-    view_masks: Literal["ignore", "off"] = "ignore"
-    """Meaning of the views' masks to label maps and tracks. ignore: pixels where they are 0 have
-    no label, as they had no loss in the fit; such as those of moving things. off: masks are not
-    used."""
+    view_masks: Literal["auto", "ignore", "off"] = "auto"
+    """Meaning of the views' masks to label maps, panoptic segments and tracks. ignore: pixels where
+    they are 0 have no label, such as those of moving things. off: masks are not used. auto: ignore
+    where the fit ignored them too, else off."""
 
     published: bool = False
     """The method as its authors published it: their options, and no completion."""
@@ -49,4 +49,4 @@ class SegmentOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("view_masks", self.view_masks, ("ignore", "off"))
+        check_choice("view_masks", self.view_masks, ("auto", "ignore", "off"))
