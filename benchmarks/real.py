@@ -6,8 +6,9 @@
 
 `camvid`: a network's class maps of single frames, lifted from all frames and drawn into the same,
 and lifted from the train views and drawn into the held-out ones, as are mesh fields of the scene
-(`splatseg street`); pooled mean IoU over the eight static classes and over all eleven. A scene that
-was fitted without moving things (`fit --moving-classes`) is labelled without them. `dtu`: the
+(`splatseg street`); pooled mean IoU over the eight static classes (`static`; `still`, where nothing
+moves) and over all eleven. A scene that was fitted without moving things (`fit --moving-classes`)
+is labelled without them. `dtu`: the
 object masks of three views, lifted and drawn into all others; the scene must have been fitted
 without masks (`fit --masks off`). `replica`: masks that need no weights, as they come (painted
 smallest last, with ids of each view's own) and associated (the layer that `segment --method
@@ -44,6 +45,9 @@ from splatseg.methods.cosseg import CossegOptions
 from splatseg.tasks.scene_parts import scene_field
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
+
+STATIC = 8
+"""Classes of camvid from 1 on that stand still; those after them move."""
 
 _SCORE = Path(__file__).resolve().parents[1] / ".." / "shared" / "score" / "score.py"
 
@@ -93,7 +97,7 @@ def camvid(job: Job) -> None:
     ):
         truth = _subset(job.data / "semantic", scored, job.work / "truth")
         came = _subset(job.data / "labels_semantic", scored, job.work / "came")
-        _classes(f"{title}, as they came", _score("semantic", came, truth))
+        _classes(f"{title}, as they came", came, truth)
         begin = time.monotonic()
         used = without_masked(found, train)
         soft = uplift(job.scene.gaussians, train, used, options=UpliftOptions(candidates=8))
@@ -103,17 +107,16 @@ def camvid(job: Job) -> None:
         for name, labels in (("uplift", soft), ("confusion corrected", relabelled)):
             hard = complete(job.scene.gaussians, replace(labels, candidates=None, shares=None))
             drawn = job.draw(hard, scored, name)
-            _classes(f"{title}, {name}", _score("semantic", drawn, truth), seconds)
+            _classes(f"{title}, {name}", drawn, truth, seconds)
     truth = _subset(job.data / "semantic", held, job.work / "truth")
     for words in job.cosseg:
         begin = time.monotonic()
         labels = _cosseg(job, words)
         drawn = job.draw(labels, held, "cosseg")
-        said = _score("semantic", drawn, truth)
-        _classes(f"held-out frames, cosseg {words}", said, time.monotonic() - begin)
+        _classes(f"held-out frames, cosseg {words}", drawn, truth, time.monotonic() - begin)
     for name in job.fields:
         drawn = job.draw_field(scene_field(job.scene, name), held, "field")
-        _classes(f"held-out frames, field {name}", _score("semantic", drawn, truth))
+        _classes(f"held-out frames, field {name}", drawn, truth)
 
 
 def _cosseg(job: Job, words: str) -> Labels:
@@ -231,15 +234,30 @@ def _score(command: str, predicted: Path, truth: Path) -> dict[str, Any]:
     return json.loads(said.stdout)
 
 
-def _classes(title: str, said: Mapping[str, Any], seconds: float | None = None) -> None:
-    each = [said["per_class"][str(k)] for k in range(1, 9)]
+def _classes(title: str, drawn: Path, truth: Path, seconds: float | None = None) -> None:
+    """Scores of all pixels, and of those that show nothing that moves."""
+    said = _score("semantic", drawn, truth)
+    still = _score("semantic", drawn, _still(truth))
+    of_all, of_still = (
+        float(np.mean([one["per_class"][str(k)] for k in range(1, STATIC + 1)]))
+        for one in (said, still)
+    )
     spent = "" if seconds is None else f"  {seconds:.1f} s"
     print(
-        f"{title:36s} static {np.mean(each):.4f}  all {said['mIoU']:.4f}  "
+        f"{title:36s} static {of_all:.4f}  still {of_still:.4f}  all {said['mIoU']:.4f}  "
         + " ".join(f"{v:.2f}" for v in said["per_class"].values())
         + spent,
         flush=True,
     )
+
+
+def _still(truth: Path) -> Path:
+    """True maps without the pixels of moving classes, beside those with them."""
+    target = _fresh(truth.with_name(f"{truth.name}_still"))
+    for path in sorted(truth.glob("*.png")):
+        ids = np.array(Image.open(path))
+        Image.fromarray(np.where(ids > STATIC, 0, ids).astype(ids.dtype)).save(target / path.name)
+    return target
 
 
 def _instances(title: str, said: Mapping[str, Any]) -> None:
