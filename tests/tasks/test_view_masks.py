@@ -111,10 +111,10 @@ def test_segment_leaves_out_what_moved(made, small_room, tmp_path) -> None:
     assert gone not in present()
     assert present(view_masks="off") == whole.present.tolist()
     # As the fit took masks; what is known of no fit took none.
-    fitted = {"options": {"masks": "off"}}
-    masked = replace(masked, provenance=fitted)
-    assert present() == whole.present.tolist()
-    assert gone not in present(view_masks="ignore")
+    for meaning in ("off", "alpha"):
+        masked = replace(masked, provenance={"options": {"masks": meaning}})
+        assert present() == whole.present.tolist()
+        assert gone not in present(view_masks="ignore")
     masked = replace(masked, provenance={})
     assert present() == whole.present.tolist()
     with pytest.raises(InputError, match="^view_masks: expected one of auto, ignore, off"):
