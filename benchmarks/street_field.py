@@ -54,8 +54,8 @@ from splatseg.street.radiance import (
     train_radiance,
 )
 from splatseg.street.shapes import load_shapes
-from splatseg.tasks._street_sources import capture_points, drive_sources
 from splatseg.tasks.render_truth import scene_of_views
+from splatseg.tasks.street._sources import capture_points, drive_sources
 
 
 def fitted_mesh(scene: Scene, views: tuple[View, ...], depth: str, steps: int) -> PrimitiveMesh:

@@ -90,18 +90,18 @@ def test_whatever_reads_a_field_reads_blocks(made, generated_drive, splatseg, tm
 
 def test_ctrl_c_says_how_to_go_on(made, generated_drive, splatseg, tmp_path, monkeypatch) -> None:
     """Labels are asked for as well: what was stopped is finished before they are given."""
-    from splatseg.tasks import _street_blocks
+    from splatseg.tasks.street import _blocks
 
     root = shutil.copytree(made, tmp_path / "scene")
     words = ("street", root, "--scans", generated_drive, *FAST, *BLOCKS, "--field", "b", "--quiet")
-    whole = _street_blocks.BlockParts.make
+    whole = _blocks.BlockParts.make
 
     def interrupted(self, block):
         if block.index == 1:
             raise KeyboardInterrupt
         return whole(self, block)
 
-    monkeypatch.setattr(_street_blocks.BlockParts, "make", interrupted)
+    monkeypatch.setattr(_blocks.BlockParts, "make", interrupted)
     status, out, err = splatseg(*words)
     assert (status, out) == (1, "")
     assert err == (

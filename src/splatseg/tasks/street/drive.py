@@ -33,12 +33,12 @@ from splatseg.street.blocks import (
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks._moving import LeftOut
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._street_blocks import BlockParts
-from splatseg.tasks._street_build import FieldBuilder
-from splatseg.tasks._street_identity import differences, drive_identity
-from splatseg.tasks._street_inputs import drive_inputs
-from splatseg.tasks._street_names import check_field_name
-from splatseg.tasks.street_options import StreetOptions
+from splatseg.tasks.street._blocks import BlockParts
+from splatseg.tasks.street._build import FieldBuilder
+from splatseg.tasks.street._identity import differences, drive_identity
+from splatseg.tasks.street._inputs import drive_inputs
+from splatseg.tasks.street._names import check_field_name
+from splatseg.tasks.street.options import StreetOptions
 
 _DIFFERENCES = 200
 """Characters of a message that lists what differs."""

@@ -24,13 +24,13 @@ from splatseg.street.files import save_mesh_field
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks._moving import LeftOut
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._street_build import FieldBuilder
-from splatseg.tasks._street_depths import DepthSample
-from splatseg.tasks._street_inputs import drive_inputs
-from splatseg.tasks._street_sources import capture_points
 from splatseg.tasks.new_scene import check_new_folder
 from splatseg.tasks.render_truth import scene_of_views
-from splatseg.tasks.street_options import StreetOptions
+from splatseg.tasks.street._build import FieldBuilder
+from splatseg.tasks.street._depths import DepthSample
+from splatseg.tasks.street._inputs import drive_inputs
+from splatseg.tasks.street._sources import capture_points
+from splatseg.tasks.street.options import StreetOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -16,8 +16,8 @@ from splatseg.report.point_map import LabelledPoints
 from splatseg.street.geometry import DepthView
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
-from splatseg.tasks._street_depths import KeptDepths, depth_errors, spread_views
-from splatseg.tasks.street_report import LabelledScans, report_street
+from splatseg.tasks.street._depths import KeptDepths, depth_errors, spread_views
+from splatseg.tasks.street.report import LabelledScans, report_street
 from support.analytic import BallOverFloor
 from support.mesh_fields import balls
 

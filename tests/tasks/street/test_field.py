@@ -23,8 +23,8 @@ from splatseg.tasks import (
     save_street_field,
     street_field,
 )
-from splatseg.tasks._street_sources import drive_sources
 from splatseg.tasks.scene_parts import scene_field
+from splatseg.tasks.street._sources import drive_sources
 
 QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=1, iterations=3, rays=64)
 EVIDENCE = StreetOptions(evidence="labels_semantic")

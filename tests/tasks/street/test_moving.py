@@ -21,9 +21,9 @@ from splatseg.io.scans import read_scans
 from splatseg.street.geometry import DepthView
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import StreetDrive, StreetOptions, make_street_field, open_drive, street_field
-from splatseg.tasks._street_inputs import drive_inputs
-from splatseg.tasks._street_masks import masked_depths, masked_depths_of
-from splatseg.tasks._street_sources import drive_sources
+from splatseg.tasks.street._inputs import drive_inputs
+from splatseg.tasks.street._masks import masked_depths, masked_depths_of
+from splatseg.tasks.street._sources import drive_sources
 from support.observers import Stopping
 
 LAYER = "labels_semantic"

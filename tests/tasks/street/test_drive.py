@@ -30,7 +30,7 @@ from splatseg.tasks import (
     street_field,
 )
 from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.street_drive import street_drive
+from splatseg.tasks.street.drive import street_drive
 from support.observers import Stopping
 
 LEARNING = DnmpOptions(voxels=(2.0,), geometry_iterations=3, iterations=200, rays=256)

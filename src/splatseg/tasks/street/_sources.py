@@ -25,7 +25,7 @@ from splatseg.street.geometry import (
     scan_views,
 )
 from splatseg.street.sources import depth_points, gaussian_points, scan_points
-from splatseg.tasks._street_masks import masked_depths, masked_depths_of
+from splatseg.tasks.street._masks import masked_depths, masked_depths_of
 
 DEPTHS = ("auto", "scans", "scans+gaussians", "maps", "gaussians", "points")
 """Where depth may come from; another word is the name of evidence of depth."""

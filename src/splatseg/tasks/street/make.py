@@ -8,11 +8,11 @@ from splatseg.io.scene_folder import work_on_scene
 from splatseg.render import BackendName
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks._observer import SILENT, Observer
-from splatseg.tasks._street_names import check_field_name, is_stopped
 from splatseg.tasks.scene_parts import scene_field
-from splatseg.tasks.street import StreetField, save_street_field, street_field
-from splatseg.tasks.street_drive import StreetDrive, street_drive
-from splatseg.tasks.street_options import StreetOptions
+from splatseg.tasks.street._names import check_field_name, is_stopped
+from splatseg.tasks.street.drive import StreetDrive, street_drive
+from splatseg.tasks.street.field import StreetField, save_street_field, street_field
+from splatseg.tasks.street.options import StreetOptions
 
 
 @boundary

@@ -30,11 +30,11 @@ from splatseg.report.street_report import (
 from splatseg.report.words import count_text
 from splatseg.street.geometry import enclosing
 from splatseg.street.shapes import load_shapes
-from splatseg.tasks._street_depths import depth_errors, spread_views
 from splatseg.tasks.outputs import REPORTS_FOLDER
 from splatseg.tasks.scan_labels import LabelBy, ScanLabels
-from splatseg.tasks.street import StreetField
-from splatseg.tasks.street_drive import StreetDrive
+from splatseg.tasks.street._depths import depth_errors, spread_views
+from splatseg.tasks.street.drive import StreetDrive
+from splatseg.tasks.street.field import StreetField
 
 _VIEWS = 4
 _LONGEST = 720

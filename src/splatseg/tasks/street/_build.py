@@ -16,11 +16,11 @@ from splatseg.street.build import MeshFieldFit, build_mesh_field
 from splatseg.street.field import MeshField
 from splatseg.street.options import PUBLISHED, DnmpOptions
 from splatseg.tasks._observer import Observer
-from splatseg.tasks._street_depths import DepthSample, KeptDepths
-from splatseg.tasks._street_inputs import DriveInputs
-from splatseg.tasks._street_sources import drive_sources
 from splatseg.tasks.scene_parts import views_recorded
-from splatseg.tasks.street_options import StreetOptions
+from splatseg.tasks.street._depths import DepthSample, KeptDepths
+from splatseg.tasks.street._inputs import DriveInputs
+from splatseg.tasks.street._sources import drive_sources
+from splatseg.tasks.street.options import StreetOptions
 
 _CELLS = 5
 """Points are thinned to so many cells along the side of the finest voxel."""

@@ -20,9 +20,9 @@ from splatseg.tasks._moving import (
     without_moving_points,
 )
 from splatseg.tasks._observer import Observer
-from splatseg.tasks._street_sources import source_capture
 from splatseg.tasks.scene_parts import views_asked
-from splatseg.tasks.street_options import StreetOptions
+from splatseg.tasks.street._sources import source_capture
+from splatseg.tasks.street.options import StreetOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -11,11 +11,11 @@ from splatseg.street.blocks import Drive, DriveBlock, DriveScans, block_file, bl
 from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field
 from splatseg.tasks._observer import Observer
-from splatseg.tasks._street_build import FieldBuilder
-from splatseg.tasks._street_identity import DigestedScans
-from splatseg.tasks._street_inputs import DriveInputs, check_labelled
-from splatseg.tasks._street_sources import capture_points
-from splatseg.tasks.street_options import StreetOptions
+from splatseg.tasks.street._build import FieldBuilder
+from splatseg.tasks.street._identity import DigestedScans
+from splatseg.tasks.street._inputs import DriveInputs, check_labelled
+from splatseg.tasks.street._sources import capture_points
+from splatseg.tasks.street.options import StreetOptions
 
 
 class BlockParts:

@@ -13,10 +13,10 @@ from splatseg.io.class_tables import class_rows
 from splatseg.io.digests import camera_numbers, digest, file_mark
 from splatseg.io.evidence import DepthEvidence, LabelEvidence, find_evidence, open_evidence
 from splatseg.street.options import DnmpOptions
-from splatseg.tasks._street_build import versions
-from splatseg.tasks._street_inputs import DriveInputs
-from splatseg.tasks._street_sources import DEPTHS
-from splatseg.tasks.street_options import StreetOptions
+from splatseg.tasks.street._build import versions
+from splatseg.tasks.street._inputs import DriveInputs
+from splatseg.tasks.street._sources import DEPTHS
+from splatseg.tasks.street.options import StreetOptions
 
 _NAMES_AND_PATHS = ("field", "scans", "moving")
 """Options that are no part of a field: data may move."""
