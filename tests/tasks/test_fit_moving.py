@@ -167,7 +167,7 @@ def test_what_is_refused_leaves_nothing(small_room, boxes, box, tmp_path) -> Non
         ("is their clock another", {"moving": late}),
         ("none.json", {"moving": tmp_path / "none.json"}),
         (unknown, {"moving_classes": ("unicorn",)}),
-        (r"^moving_evidence: expected label maps .*labels_semantic.*, got 'x'",
+        (r"^moving_evidence: expected one of those at hand .*labels_semantic.*, got 'x'",
          {"moving_classes": (row,), "moving_evidence": "x"}),
         ("^moving_evidence: expected classes with it", {"moving": boxes, "moving_evidence": LAYER}),
         ("^moving_evidence: expected classes with it", {"moving_evidence": LAYER}),

@@ -1,14 +1,14 @@
 """Moving things left out of a fit: masks of training views, kept in the scene that is made."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from splatseg.core import Capture
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
-from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_evidence
+from splatseg.io.evidence import Evidence, open_evidence
 from splatseg.io.scene_folder import MASKS_FOLDER
+from splatseg.tasks._label_evidence import find_label_maps
 from splatseg.tasks._moving import LeftOut, MovingThings, without_moving
 
 
@@ -52,28 +52,10 @@ def capture_without_moving(
 def _labels(capture: Capture, scene: Path, asked: str | None) -> Evidence:
     folder = Path(asked or "")
     if asked is None or not folder.is_dir():
-        folder = _found([capture.path, scene], asked)
+        folder = find_label_maps([capture.path, scene], asked, option="moving_evidence")
     found = open_evidence(folder)
     if found.kind != "labels":
         raise InputError(
             f"moving_evidence: expected evidence of labels, got {found.kind} in {folder}."
         )
     return found
-
-
-def _found(folders: Sequence[Path], asked: str | None) -> Path:
-    """The folder of evidence of a name; without one, that of the only label maps."""
-    names = evidence_names(folders)
-    if asked is None:
-        # A scene may have depth maps of scans, which the fit itself has put there.
-        kinds = {n: open_evidence(find_evidence(folders, n), unfinished="allow") for n in names}
-        names = tuple(name for name, evidence in kinds.items() if evidence.kind == "labels")
-        asked = names[0] if len(names) == 1 else None
-    known = ", ".join(names) or "there is none; `splatseg see` makes some"
-    expected = f"moving_evidence: expected label maps by name or folder ({known})"
-    if asked is None:
-        raise InputError(f"{expected}, got none.")
-    try:
-        return find_evidence(folders, asked)
-    except InputError as error:
-        raise InputError(f"{expected}, got {asked!r:.80}.") from error

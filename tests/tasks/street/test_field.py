@@ -10,6 +10,7 @@ from PIL import Image
 
 from splatseg.core import Gaussians, ScanSource, Scene
 from splatseg.errors import InputError
+from splatseg.io.evidence import create_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene_fields import scene_field_names
 from splatseg.street.options import DnmpOptions
@@ -23,7 +24,9 @@ from splatseg.tasks import (
     save_street_field,
     street_field,
 )
+from splatseg.tasks._observer import SILENT
 from splatseg.tasks.scene_parts import scene_field
+from splatseg.tasks.street._inputs import drive_inputs
 from splatseg.tasks.street._sources import drive_sources
 
 QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=1, iterations=3, rays=64)
@@ -182,6 +185,14 @@ def test_options_count(drive, generated_drive) -> None:
     )
     assert coarse.field.mesh.sizes == (4.0,)
     assert coarse.field.radius == 1.5
+
+
+def test_the_only_label_maps_teach(drive, tmp_path) -> None:
+    """Depth of scans, which a fit leaves in its scene, is evidence too."""
+    (tmp_path / "evidence").mkdir()
+    create_evidence(tmp_path / "evidence" / "depth_scans", kind="depth")
+    with drive_inputs(replace(drive, root=tmp_path), StreetOptions(), SILENT) as inputs:
+        assert inputs.name == "labels_semantic"
 
 
 def test_what_is_refused(drive, generated_drive, tmp_path) -> None:

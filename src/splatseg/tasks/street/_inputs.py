@@ -8,9 +8,10 @@ from pathlib import Path
 
 from splatseg.core import Capture, ScanSource, Scene, View
 from splatseg.errors import InputError
-from splatseg.io.evidence import Evidence, check_map_sizes, find_evidence, open_evidence
+from splatseg.io.evidence import Evidence, check_map_sizes, open_evidence
 from splatseg.io.moving import view_times
 from splatseg.io.scans import read_scans
+from splatseg.tasks._label_evidence import find_label_maps
 from splatseg.tasks._moving import (
     LeftOut,
     MovingClock,
@@ -110,7 +111,7 @@ def check_labelled(views: Sequence[View], evidence: Evidence, where: str) -> int
 
 def _evidence(scene: Scene, options: StreetOptions) -> tuple[str, Evidence]:
     folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    folder = find_evidence(folders, options.evidence)
+    folder = find_label_maps(folders, options.evidence)
     found = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
     if found.kind != "labels":
         raise InputError(f"{folder}: expected evidence of labels, got {found.kind}.")

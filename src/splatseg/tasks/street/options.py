@@ -24,7 +24,7 @@ class StreetOptions:
 
     evidence: str | None = None
     """Name of the evidence: a folder of the scene's or of its capture, such as labels_semantic.
-    None takes the only one there is."""
+    None takes the only label maps there are."""
 
     layer: str | None = None
     """Name of the field's layer. None names it like the evidence."""
