@@ -27,9 +27,6 @@ Stage = Callable[[str, int, int], None]
 _ENOUGH = 10.0
 """Rays that saw a vertex which counts half."""
 
-_STEPS = 1000
-"""What the progress of the geometry is told in."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeshFieldFit:
@@ -94,9 +91,11 @@ def build_mesh_field(
     )
     _check_several(primitives, len(points), options, metres_per_unit)
 
+    steps = options.geometry.iterations * len(options.voxels)
+
     def shaping(record: GeometryRecord) -> None:
         if progress is not None:
-            progress("geometry", round(_STEPS * record.progress), _STEPS)
+            progress("geometry", round(steps * record.progress), steps)
 
     def learning(record: RadianceRecord) -> None:
         if progress is not None:

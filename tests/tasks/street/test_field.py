@@ -24,7 +24,7 @@ from splatseg.tasks import (
     save_street_field,
     street_field,
 )
-from splatseg.tasks._observer import SILENT
+from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import scene_field
 from splatseg.tasks.street._inputs import drive_inputs
 from splatseg.tasks.street._sources import drive_sources
@@ -185,6 +185,24 @@ def test_options_count(drive, generated_drive) -> None:
     )
     assert coarse.field.mesh.sizes == (4.0,)
     assert coarse.field.radius == 1.5
+
+
+def test_progress_counts_the_steps_of_all_levels(drive, generated_drive) -> None:
+    class Listening(Observer):
+        def __init__(self) -> None:
+            self.heard: list[tuple[str, int, int]] = []
+
+        def progress(self, stage: str, done: int, total: int) -> None:
+            self.heard.append((stage, done, total))
+
+    observer = Listening()
+    options = replace(EVIDENCE, scans=generated_drive)
+    few = replace(QUICK, geometry_iterations=2, iterations=3)
+    street_field(drive, options=options, field_options=few, observer=observer)
+    geometry = [told[1:] for told in observer.heard if told[0] == "geometry"]
+    assert geometry[0] == (1, 4)
+    assert geometry[-1] == (4, 4)
+    assert {total for stage, _, total in observer.heard if stage == "field"} == {3}
 
 
 def test_the_only_label_maps_teach(drive, tmp_path) -> None:
