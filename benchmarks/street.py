@@ -61,6 +61,7 @@ from splatseg.lift.points import (
 from splatseg.methods import find_method
 from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field
+from splatseg.tasks.scan_labels import viewed_points
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
 
@@ -126,8 +127,7 @@ class Bench:
 
     def viewed(self, name: str, options: ViewedPointOptions) -> ViewedPoints:
         """The same, its points labelled by views."""
-        cameras = [view.camera for view in self.scene.train_views]
-        return ViewedPoints(self.field(name), cameras, options=options)
+        return viewed_points(self.scene, self.field(name), options=options)
 
     def mesh(self, name: str) -> MeshField:
         """The mesh field of a row, renamed."""
@@ -201,9 +201,7 @@ ROWS: dict[str, Row] = {
     "shapes": lambda b: b.viewed("uplift", ViewedPointOptions(smoothing_steps=0)),
     "drive": lambda b: b.viewed("uplift", ViewedPointOptions()),
     "mesh": lambda b: b.mesh("mesh"),
-    "mesh_views": lambda b: ViewedPoints(
-        b.mesh("mesh"), [view.camera for view in b.scene.train_views]
-    ),
+    "mesh_views": lambda b: viewed_points(b.scene, b.mesh("mesh")),
     "mesh_published": lambda b: b.mesh("mesh_published"),
 }
 OF_FIELDS = {"mesh": "field", "mesh_views": "field", "mesh_published": "published_field"}

@@ -22,6 +22,7 @@ from splatseg.io.evidence import (
     without_masked,
 )
 from splatseg.io.scene import load_scene
+from splatseg.tasks._observer import Observer
 
 HEIGHT, WIDTH = 4, 6
 ROOM = {"evidence": "labels_semantic", "layer": "x", "complete": False}
@@ -102,14 +103,26 @@ def test_segment_leaves_out_what_moved(made, small_room, tmp_path) -> None:
         views.append(replace(view, mask=tmp_path / f"{view.name}.png"))
     masked = replace(scene, views=tuple(views))
 
+    class Listening(Observer):
+        def note(self, message: str) -> None:
+            notes.append(message)
+
+    notes: list[str] = []
+
     def present(**more: str) -> list[int]:
         options = SegmentOptions(**ROOM, **more)
-        layer = segment(masked, "uplift", options=options, backend="cpu").layer
+        listening = Listening()
+        made = segment(masked, "uplift", options=options, backend="cpu", observer=listening)
+        layer = made.layer
         assert isinstance(layer, Labels)
         return layer.present.tolist()
 
     assert gone not in present()
+    said = "masks of 5 of 5 views leave pixels out"
+    assert said in notes
+    notes.clear()
     assert present(view_masks="off") == whole.present.tolist()
+    assert said not in notes
     # As the fit took masks; what is known of no fit took none.
     for meaning in ("off", "alpha"):
         masked = replace(masked, provenance={"options": {"masks": meaning}})

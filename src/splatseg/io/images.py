@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from torch import Tensor
@@ -140,6 +140,29 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
     if target != keep.size:
         keep = keep.resize(target, Image.Resampling.BOX)
     return torch.from_numpy((np.asarray(keep) == 255).astype(np.uint8))
+
+
+@boundary
+def left_out_pixels(view: View, height: int, width: int) -> Bool[Tensor, "height width"] | None:
+    """Which pixels of a map of a view its mask leaves out; None where the view has no mask.
+
+    A pixel of the map takes the pixel of the mask that its centre falls into.
+
+    Args:
+        view: The view.
+        height: Of the map, in any size.
+        width: Likewise.
+
+    Raises:
+        MissingFileError: If the mask is not where it was.
+        FileFormatError: If it cannot be decoded, or its size is not the photograph's.
+    """
+    used = load_mask(view)
+    if used is None:
+        return None
+    rows = ((torch.arange(height) + 0.5) * used.shape[0] / height).long()
+    columns = ((torch.arange(width) + 0.5) * used.shape[1] / width).long()
+    return used[rows][:, columns] == 0
 
 
 @boundary

@@ -135,7 +135,10 @@ def segment(
     views = _views(scene, evidence, options.views, observer)
     masks = mask_use(scene) if options.view_masks == "auto" else options.view_masks
     if masks == "ignore":
-        evidence = without_masked(evidence, views)
+        evidence, whole = without_masked(evidence, views), evidence
+        if evidence is not whole:
+            masked = sum(view.mask is not None for view in views)
+            observer.note(f"masks of {masked} of {len(views)} views leave pixels out")
     inputs = MethodInputs(
         gaussians=scene.gaussians,
         views=views,

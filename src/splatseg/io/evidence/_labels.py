@@ -20,7 +20,7 @@ from splatseg.io.evidence._base import (
     refuse,
 )
 from splatseg.io.evidence._label_files import Palette, read_id_map, read_label_file
-from splatseg.io.images import load_mask
+from splatseg.io.images import left_out_pixels
 
 CONFIDENCE_STEPS = 65535
 """A confidence of 1 in a file of confidences, 16 bit."""
@@ -164,13 +164,10 @@ def masks_of_ids(label_map: LabelMap) -> tuple[MaskSet, tuple[int, ...]]:
 
 def _used(found: LabelMap, view: View) -> LabelMap:
     """A label map without ids where the mask of its view is 0."""
-    used = load_mask(view)
-    if used is None:
+    left_out = left_out_pixels(view, found.height, found.width)
+    if left_out is None:
         return found
     camera_of_map(view, found.height, found.width)
-    rows = ((torch.arange(found.height) + 0.5) * used.shape[0] / found.height).long()
-    columns = ((torch.arange(found.width) + 0.5) * used.shape[1] / found.width).long()
-    left_out = used[rows][:, columns] == 0
     return replace(found, ids=found.ids.masked_fill(left_out, UNLABELLED))
 
 

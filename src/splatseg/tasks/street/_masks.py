@@ -3,10 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-import torch
-
 from splatseg.core import View
-from splatseg.io.images import load_mask
+from splatseg.io.images import left_out_pixels
 from splatseg.street.geometry import DepthView
 
 
@@ -40,10 +38,5 @@ def masked_depths_of(
 
 def _masked(view: View, depth: DepthView) -> DepthView:
     """The depth with the pixels of the mask that are nearest to its own."""
-    used = load_mask(view)
-    if used is None:
-        return depth
-    height, width = depth.depth.shape
-    rows = ((torch.arange(height) + 0.5) * used.shape[0] / height).long()
-    columns = ((torch.arange(width) + 0.5) * used.shape[1] / width).long()
-    return replace(depth, depth=depth.depth.masked_fill(used[rows][:, columns] == 0, 0.0))
+    left_out = left_out_pixels(view, *depth.depth.shape)
+    return depth if left_out is None else replace(depth, depth=depth.depth.masked_fill(left_out, 0))
