@@ -13,7 +13,9 @@ from hypothesis import HealthCheck, settings
 from support import shared
 from support.drive import write_drive
 from support.room import write_room
+from support.products import ReorderedProducts
 from support.scorer import SCORERS, Score
+from support.summary import SummaryAfterInternalError
 
 PROJECT_ROOT = Path(__file__).resolve().parent.parent
 SHARED = shared.SharedData.find(os.environ, PROJECT_ROOT)
@@ -34,6 +36,9 @@ settings.load_profile("splatseg")
 def pytest_configure(config: pytest.Config) -> None:
     """Tests marked `data` run where the folder of large scenes is, and are told of elsewhere."""
     config.pluginmanager.register(shared.DataTests(SHARED), "splatseg-data-tests")
+    config.pluginmanager.register(SummaryAfterInternalError(), "splatseg-summary")
+    if os.environ.get("SPLATSEG_TEST_PRODUCTS"):  # one of scripts/machines
+        ReorderedProducts().__enter__()
 
 
 @pytest.fixture(scope="session")

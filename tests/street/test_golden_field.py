@@ -1,15 +1,19 @@
-"""The golden mesh field: read, shown and written as when it was made."""
+"""The golden mesh field: read, shown and written as when it was made, on any processor."""
 
 import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
+from splatseg.core import Camera
 from splatseg.io.tensors import read_safetensors
+from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field, save_mesh_field
 
 
@@ -44,15 +48,56 @@ def test_values_come_back(golden: ModuleType, version_1: Path) -> None:
         assert torch.equal(found.model.state[name], tensor), name
 
 
+PIXELS = ("colour", "alpha", "depth", "label_map", "label_map_confidence")
+ROUNDING = 1e-5
+"""What a field shows differs by less between processors, but for rays at edges."""
+
+
+def largest(one: Tensor, two: Tensor) -> Tensor:
+    """The largest difference of each pixel (or point)."""
+    return (one.double() - two.double()).abs().reshape(*one.shape[:2], -1).amax(dim=-1)
+
+
+def at_edges(field: MeshField, camera: Camera) -> Tensor:
+    """Pixels whose rays pass an edge of a triangle so closely that rounding decides on the side.
+
+    A ray moved by a hundred thousandth of a pixel, ten times what rounding moves it, shows other
+    things: elsewhere it changes colours and depths by a few millionths.
+    """
+
+    def shown(right: float, down: float) -> dict[str, Tensor]:
+        moved = replace(camera, cx=camera.cx + right, cy=camera.cy + down)
+        with field.view(moved) as view:
+            signals = view.signals()
+        assert signals.colour is not None
+        return {"colour": signals.colour, "alpha": signals.alpha, "depth": signals.depth}
+
+    here = shown(0, 0)
+    found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    for right, down in ((-1e-5, 0), (1e-5, 0), (0, -1e-5), (0, 1e-5)):
+        there = shown(right, down)
+        for name, values in here.items():
+            found |= largest(values, there[name]).reshape(found.shape) > 2e-4
+    return found
+
+
 def test_views_and_points_are_as_recorded(golden: ModuleType, version_1: Path) -> None:
+    """Tight inside; at edges, which are few, a ray may have fallen on the other side."""
     recorded: dict[str, Any] = json.loads((version_1 / golden.SHOWN).read_text())
-    shown = golden.shown_of(load_mesh_field(version_1 / golden.FIELD))
+    field = load_mesh_field(version_1 / golden.FIELD)
+    shown = golden.shown_of(field)
     assert set(shown) == set(recorded)
+    edges = at_edges(field, golden.golden_camera())
+    assert int(edges.sum()) <= 3, "of 54 pixels"
     for name, values in recorded.items():
-        exact = name in ("label_map", "point_ids")
-        assert torch.allclose(
-            torch.tensor(shown[name]), torch.tensor(values), rtol=0, atol=0 if exact else 1e-5
-        ), name
+        found, expected = torch.tensor(shown[name]), torch.tensor(values)
+        if name not in PIXELS:
+            exact = name == "point_ids"
+            assert torch.allclose(found, expected, rtol=0, atol=0 if exact else ROUNDING), name
+            continue
+        away = largest(found, expected)
+        assert float(away[~edges].max()) <= (0 if name == "label_map" else ROUNDING), name
+        assert name == "label_map" or float(away.max()) < (0.3 if name == "depth" else 0.05), name
     # What is recorded is worth comparing: all classes, cover in part, a point without a label.
     assert {id for row in recorded["label_map"] for id in row} == set(golden.IDS)
     assert set(recorded["point_ids"]) == {*golden.IDS, -1}

@@ -65,10 +65,14 @@ class LevelFit:
         _, self._corners = template()
 
     def primitives(self) -> Primitives:
-        """The primitives as they are now."""
+        """The primitives as they are now; codes that no ray moved are those that were given."""
         with torch.no_grad():
+            # A unit vector divided by its norm again is another in its last bits.
+            moved = (self._codes != self._start.codes).any(dim=1, keepdim=True)
             return Primitives(
-                codes=functional.normalize(self._codes, dim=1),
+                codes=torch.where(
+                    moved, functional.normalize(self._codes, dim=1), self._start.codes
+                ),
                 centres=self._start.centres + self._offsets * self._start.scales[:, None],
                 scales=self._start.scales,
                 levels=self._start.levels,
