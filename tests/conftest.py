@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, settings
 
 from support import shared
 from support.drive import write_drive
-from support.room import write_room
 from support.products import ReorderedProducts
+from support.room import write_room
 from support.scorer import SCORERS, Score
 from support.summary import SummaryAfterInternalError
 
