@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 
 from support import shared
 from support.drive import write_drive
-from support.products import ReorderedProducts
+from support.products import reorder_all_products, reordered
 from support.room import write_room
 from support.scorer import SCORERS, Score
 from support.summary import SummaryAfterInternalError
@@ -37,14 +37,22 @@ def pytest_configure(config: pytest.Config) -> None:
     """Tests marked `data` run where the folder of large scenes is, and are told of elsewhere."""
     config.pluginmanager.register(shared.DataTests(SHARED), "splatseg-data-tests")
     config.pluginmanager.register(SummaryAfterInternalError(), "splatseg-summary")
-    if os.environ.get("SPLATSEG_TEST_PRODUCTS"):  # one of scripts/machines
-        ReorderedProducts().__enter__()
+    if reordered():
+        reorder_all_products()
 
 
 @pytest.fixture(scope="session")
 def project_root() -> Path:
     """The folder that holds pyproject.toml."""
     return PROJECT_ROOT
+
+
+@pytest.fixture(autouse=True)
+def _draws_begin_anew() -> None:
+    """Torch draws the same numbers in a test, whatever ran before it."""
+    import torch
+
+    torch.manual_seed(20240817)
 
 
 @pytest.fixture

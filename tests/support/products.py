@@ -1,11 +1,16 @@
 """Products of matrices as another library for them would round them."""
 
+import os
+import threading
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
+
+VARIABLE = "SPLATSEG_TEST_PRODUCTS"
+"""Of the environment: set by scripts/machines for tests of the machine `reordered`."""
 
 aten = torch.ops.aten
 
@@ -50,7 +55,7 @@ class ReorderedProducts(TorchDispatchMode):
     """While it is entered, matrix products of torch are added up in another order.
 
     A test that passes with and without it does not hang on the order, and so neither on the
-    processor. Products of other processes, of other threads and of NumPy stay as they are.
+    processor. Products of other processes and of NumPy stay as they are.
     """
 
     def __torch_dispatch__(
@@ -71,3 +76,20 @@ class ReorderedProducts(TorchDispatchMode):
             if parts is not NotImplemented:
                 return parts
         return func(*args, **kwargs)
+
+
+def reordered() -> bool:
+    """Whether these tests are of the machine whose products are reordered."""
+    return bool(os.environ.get(VARIABLE))
+
+
+def reorder_all_products() -> None:
+    """Enter `ReorderedProducts` for good, in this thread and in all that start from now on."""
+    run = threading.Thread.run
+
+    def run_reordered(thread: threading.Thread) -> None:
+        with ReorderedProducts():
+            run(thread)
+
+    threading.Thread.run = run_reordered  # type: ignore[method-assign]
+    ReorderedProducts().__enter__()
