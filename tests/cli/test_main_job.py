@@ -95,6 +95,7 @@ def test_a_source_whose_zero_is_a_class(small, splatseg, tmp_path) -> None:
     assert {k: v["source_id"] for k, v in legend["ids"].items()} == {"1": 0, "2": 1, "7": 6}
 
 
+@pytest.mark.bits
 def test_segment_is_repeatable(small, splatseg) -> None:
     path = small.scene / "layers" / "a.npz"
     for _ in range(2):

@@ -70,6 +70,7 @@ def test_the_reference_backend_takes_the_same_steps(capture: Capture) -> None:
         )
 
 
+@pytest.mark.bits
 def test_same_seed_same_scene_for_any_number_of_threads(capture: Capture) -> None:
     options = replace(OPTIONS, steps=90)
     before = _native.threads()

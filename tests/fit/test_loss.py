@@ -132,6 +132,7 @@ def test_an_empty_mask_has_no_loss(rng) -> None:
         assert not bool(found.gradient.any())
 
 
+@pytest.mark.bits
 def test_threads_do_not_change_a_bit(rng) -> None:
     image, photograph = _pair(rng, 70, 90)
     mask = torch.from_numpy(rng.random((70, 90)) < 0.9)

@@ -137,6 +137,7 @@ def test_rows_beyond_the_parameters_are_refused() -> None:
         gathered(_random(3, 50), torch.tensor([50]))
 
 
+@pytest.mark.bits
 def test_settled_gaussians_do_not_depend_on_threads(rng) -> None:
     """Nor on where a row stands; and they are what the differentiable ones are."""
     count = 70_001

@@ -103,6 +103,7 @@ def test_the_filter_of_the_gaussians_stays(make_capture, tiny) -> None:
     assert found.low_pass == 0.1
 
 
+@pytest.mark.bits
 def test_seed_decides_and_threads_do_not(make_capture, tiny) -> None:
     views = make_capture().train_views
 

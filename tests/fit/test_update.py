@@ -214,6 +214,7 @@ def test_the_walk_depends_on_seed_step_and_row_alone() -> None:
     assert not bool(_walked(0.02, 50, noise=0.0).any())
 
 
+@pytest.mark.bits
 def test_threads_do_not_change_a_bit(rng) -> None:
     start = [_parameters(rng, 3000) for _ in range(2)]
     second = Parameters(**{name: tensor.abs() for name, tensor in start[1].tensors()})

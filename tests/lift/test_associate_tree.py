@@ -296,6 +296,7 @@ def bits(tree: InstanceTree) -> list[bytes]:
     return [column.contiguous().numpy().tobytes() for column in columns]
 
 
+@pytest.mark.bits
 def test_same_bits_at_one_two_and_three_threads() -> None:
     before = torch.get_num_threads(), threads()
     found = []

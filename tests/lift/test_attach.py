@@ -275,6 +275,7 @@ def test_extreme_values() -> None:
         AttachOptions(min_part=2)
 
 
+@pytest.mark.bits
 def test_the_same_every_time_and_with_any_number_of_threads(scene, rng) -> None:
     edited = scene[kept_of(rng, COUNT)].transformed(move_of(rng))
     before = torch.get_num_threads()

@@ -245,6 +245,7 @@ def equal(a: InstanceTree, b: InstanceTree) -> bool:
     )
 
 
+@pytest.mark.bits
 def test_the_number_of_threads_changes_nothing(nested, vague) -> None:
     before = torch.get_num_threads(), _native.threads()
     found = []

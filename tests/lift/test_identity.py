@@ -266,6 +266,7 @@ def test_probabilities_settle_contradictions_by_majority(rng) -> None:
     torch.testing.assert_close(labels.confidence[4], torch.tensor(0.75), rtol=0, atol=0.08)
 
 
+@pytest.mark.bits
 def test_same_seed_same_output(rng, views) -> None:
     gaussians = random_gaussians(rng, 40)
     maps = random_maps(rng, views, IDS)

@@ -69,6 +69,7 @@ def test_what_cancels_is_no_entry_and_leaves_nothing_behind() -> None:
     assert again.toarray().tolist() == [[5], [2]], "the sum was 0 in between"
 
 
+@pytest.mark.bits
 def test_threads_do_not_matter(rng) -> None:
     a, b = sparse(rng, (500, 300), 0.1, np.float32), sparse(rng, (300, 200), 0.1, np.float32)
     before = _native.threads()

@@ -212,6 +212,7 @@ def test_distorted_and_reduced_maps_count_in_their_own_pixels(tmp_path) -> None:
         assert 1 - found.agreement[1] < 0.6 * (1 - found.agreement[0])
 
 
+@pytest.mark.bits
 def test_neither_threads_nor_the_order_of_views_matter_but_the_seed(scene) -> None:
     gaussians, views, maps = scene
     options = replace(OPTIONS, sharpen_steps=7, decide_every=3)

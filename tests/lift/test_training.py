@@ -260,6 +260,7 @@ class Stop:
         return self.left == 0
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("passes", [0, 2])
 @pytest.mark.parametrize("stop", [3, 9, 11])
 def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
@@ -491,6 +492,7 @@ def test_a_checkpoint_of_another_training_is_refused(rng, views, tmp_path) -> No
             run(settings={"blend": "a"})
 
 
+@pytest.mark.bits
 def test_same_seed_same_result_on_any_number_of_threads(rng) -> None:
     sampler = many_views(rng, 5)
     before, torch_before = _native.threads(), torch.get_num_threads()

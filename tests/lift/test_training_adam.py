@@ -68,6 +68,7 @@ def test_steps_beyond_the_last_take_its_corrections() -> None:
     assert values[0] == pytest.approx(values[1], rel=1e-2)
 
 
+@pytest.mark.bits
 def test_threads_change_nothing(rng) -> None:
     start = torch.from_numpy(rng.normal(size=(5000, 16)).astype(np.float32))
     rows = torch.from_numpy(np.sort(rng.choice(5000, 4000, replace=False)))

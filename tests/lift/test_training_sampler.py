@@ -190,6 +190,7 @@ def test_faint_entries_are_dropped_and_rows_keep_their_sums(rng, views) -> None:
     torch.testing.assert_close(kept.sum(dim=1), full.sum(dim=1), rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("source", ["labels", "masks"])
 def test_spilled_rows_are_the_same_bit_for_bit(rng, views, tmp_path, source) -> None:
     gaussians = random_gaussians(rng, 40)

@@ -152,6 +152,7 @@ def test_scores_rank_an_object_above_its_fragments(squares) -> None:
     assert min(score.values()) > float(fragments.median())
 
 
+@pytest.mark.bits
 def test_the_same_picture_gives_the_same_masks_whatever_the_threads(squares) -> None:
     first = region_masks(squares)
     before = cv2.getNumThreads(), torch.get_num_threads()

@@ -64,6 +64,7 @@ def test_distances_beyond_float32_do_not_overflow() -> None:
     torch.testing.assert_close(means, torch.ones(1, 1, dtype=torch.float64))
 
 
+@pytest.mark.bits
 def test_any_number_of_threads_gives_the_same_bits() -> None:
     points, asked = cloud(3000, 1, False), cloud(2000, 2, False)
     values = torch.randn(3000, 5, generator=torch.Generator().manual_seed(3))

@@ -57,6 +57,7 @@ def test_work_hardly_grows_with_the_number_of_points() -> None:
     assert large < 1.2 * small
 
 
+@pytest.mark.bits
 @pytest.mark.usefixtures("every_isa")
 @pytest.mark.parametrize("shape", ["equal", "two positions", "dense and sparse"])
 def test_threads_change_nothing(shape: str) -> None:

@@ -103,6 +103,7 @@ def test_a_radius_is_decided_as_the_index_decides_it() -> None:
             assert torch.equal(subset.near(radius), want)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_threads_do_not_matter(threads: int) -> None:
     points = cloud("strays", 20_000, 6)

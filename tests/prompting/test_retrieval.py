@@ -123,6 +123,7 @@ def test_memory_is_as_said() -> None:
     assert sizes == [160 * 128, 160 * 64, 160 * (32 + 4)]
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("threads", [2, 5])
 def test_threads_do_not_matter(threads: int) -> None:
     stored = StoredFeatures.of(random(20_000, 8, seed=12))

@@ -77,6 +77,7 @@ def test_it_is_the_argmax_of_dense_renders(
         assert (same | (found.values - expected.values).abs().le(2e-6)).all()
 
 
+@pytest.mark.bits
 def test_the_cpu_gives_the_bits_of_dense_renders(rng, scene) -> None:
     camera = random_camera(rng, width=WIDTH, height=HEIGHT)
     signal = random_signal(rng, count=64, per_row=1, soft=True)
@@ -90,6 +91,7 @@ def test_the_cpu_gives_the_bits_of_dense_renders(rng, scene) -> None:
     assert torch.equal(found.channels, channel.to(torch.int32))
 
 
+@pytest.mark.bits
 def test_bits_do_not_depend_on_threads_nor_on_what_was_asked_before(rng, scene) -> None:
     camera = random_camera(rng, width=WIDTH, height=HEIGHT)
     signal = random_signal(rng, count=40, per_row=2, soft=True)

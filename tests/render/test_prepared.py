@@ -193,6 +193,7 @@ def test_a_sparse_image_of_nothing_still_shows_gaussians(backend, camera, scene)
     assert bool((found.weights > 0).any())
 
 
+@pytest.mark.bits
 def test_sparse_back_projection_does_not_depend_on_threads(rng, same_threads_afterwards) -> None:
     camera, scene = random_camera(rng, width=131, height=90), random_gaussians(rng, 3000)
     ids = torch.from_numpy(rng.integers(0, 300, (90 * 131, 1)))

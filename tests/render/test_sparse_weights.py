@@ -140,6 +140,7 @@ def test_half_signals_are_computed_in_single_precision(rng) -> None:
     assert leaf.grad.dtype == torch.float16
 
 
+@pytest.mark.bits
 def test_threads_change_nothing(rng, same_threads_afterwards) -> None:
     rows = random_rows(rng, 5000, gaussians=700, dtype=torch.float16)
     signal = torch.from_numpy(rng.normal(size=(700, 70)).astype(np.float32))

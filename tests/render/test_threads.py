@@ -56,6 +56,7 @@ def _everything(bench, rng) -> dict[str, torch.Tensor]:
     }
 
 
+@pytest.mark.bits
 def test_results_do_not_depend_on_threads(fast_backend, same_threads_afterwards):
     if fast_backend.name == "cuda":
         pytest.skip("threads are the CPU's; gsplat sums in whatever order the GPU takes")

@@ -162,6 +162,7 @@ def test_a_folded_lens_shows_no_ghosts() -> None:
     assert rows.max() < 190
 
 
+@pytest.mark.bits
 def test_float32_and_threads_give_the_same_bits(rng) -> None:
     camera = camera_of(*BARREL, width=120, height=90, fx=90.0, fy=90.0, cx=60.0, cy=45.0)
     warp = Warp.between(camera, camera.undistorted())

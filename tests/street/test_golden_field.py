@@ -81,6 +81,7 @@ def at_edges(field: MeshField, camera: Camera) -> Tensor:
     return found
 
 
+@pytest.mark.bits
 def test_views_and_points_are_as_recorded(golden: ModuleType, version_1: Path) -> None:
     """Tight inside; at edges, which are few, a ray may have fallen on the other side."""
     recorded: dict[str, Any] = json.loads((version_1 / golden.SHOWN).read_text())
@@ -105,6 +106,7 @@ def test_views_and_points_are_as_recorded(golden: ModuleType, version_1: Path) -
     assert bool(((alpha > 0.5) & (alpha < 0.97)).any())
 
 
+@pytest.mark.bits
 def test_it_is_written_to_the_same_bytes(
     golden: ModuleType, version_1: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -135,6 +135,7 @@ def test_limits_of_levels_keep_room_for_the_coarse_one() -> None:
     assert shared.tolist() == [0, 0, 1, 1, 3, 3]
 
 
+@pytest.mark.bits
 def test_bits_do_not_depend_on_threads_or_on_company() -> None:
     mesh = crumpled(9, seed=3)
     origins, directions = rays(3000, seed=6)

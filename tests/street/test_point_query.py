@@ -98,6 +98,7 @@ def test_the_order_of_points_and_of_vertices_does_not_matter() -> None:
     assert torch.equal(other.columns(points)[0], columns)
 
 
+@pytest.mark.bits
 def test_blocks_and_threads_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, opacity, probabilities = field(3000, 4, 5)
     points = torch.randn(999, 3, generator=torch.Generator().manual_seed(6))

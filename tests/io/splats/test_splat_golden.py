@@ -82,6 +82,7 @@ def test_every_golden_file_is_tested(golden: Path) -> None:
     assert {path.name for path in golden.iterdir()} == {*BOUNDS, "three.json"}
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("name", BOUNDS)
 def test_golden_file(golden: Path, truth: dict[str, torch.Tensor], name: str) -> None:
     bound = BOUNDS[name]

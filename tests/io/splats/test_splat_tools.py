@@ -89,6 +89,7 @@ def test_files_of_other_tools(tools: Path, ring: Gaussians, name: str) -> None:
     assert float((got.rotations * want.rotations).sum(dim=1).abs().min()) > 1 - 2e-4
 
 
+@pytest.mark.bits
 def test_gsplat_writes_the_same_again(tools: Path, project_root: Path, tmp_path: Path) -> None:
     """The script beside the files is what made them.
 

@@ -76,6 +76,7 @@ def test_pixels_without_a_say_change_nothing(rng) -> None:
     np.testing.assert_array_equal(solver.memberships().toarray(), np.where(allowed, start, 0))
 
 
+@pytest.mark.bits
 def test_the_number_of_threads_changes_no_bit(rng) -> None:
     rows, start, allowed, label = problem(rng, pixels=3000, gaussians=900, ids=20)
     before = _native.threads()

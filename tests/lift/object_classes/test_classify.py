@@ -116,6 +116,7 @@ def test_features_that_say_nothing_change_nothing() -> None:
     assert int(one[0].argmax()) == 0
 
 
+@pytest.mark.bits
 def test_bits_do_not_depend_on_threads() -> None:
     objects = random_objects(60, 9, 40)
     before = torch.get_num_threads()

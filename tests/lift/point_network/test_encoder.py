@@ -126,6 +126,7 @@ def test_blocks_of_points_are_the_whole(
         assert torch.allclose(one, two, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.bits
 def test_threads_do_not_change_features() -> None:
     config = RandlaConfig(widths=(16, 32), neighbours=16, ratios=(4, 4))
     encoder = randomised(RandlaEncoder(config)).requires_grad_(False)

@@ -153,6 +153,7 @@ def test_half_the_memory() -> None:
         features_of(encoder, positions, colours, metres_per_unit=1.0, precision="float16")
 
 
+@pytest.mark.bits
 def test_threads_and_seeds() -> None:
     positions, colours = scene(300)
     encoder = encoder_of()

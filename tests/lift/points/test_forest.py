@@ -1,5 +1,6 @@
 """Samples of samples, and trees that tell shapes apart."""
 
+import pytest
 import torch
 
 from splatseg.lift.points.forest import ShapeForest, ShapeSamples, drawn
@@ -63,6 +64,7 @@ def test_unsure_points_teach_less() -> None:
     torch.testing.assert_close(told, torch.tensor([[0.8, 0.2, 0.0]]))
 
 
+@pytest.mark.bits
 def test_threads_and_blocks_change_nothing(rng, monkeypatch) -> None:
     rows = torch.from_numpy(rng.random((200, 3)).astype("float32"))
     given = samples(rows, rng.integers(0, 3, 200).tolist())

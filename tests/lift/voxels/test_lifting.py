@@ -180,6 +180,7 @@ def test_weights_of_w_are_uplift_where_each_gaussian_has_its_voxel(rng) -> None:
     )
 
 
+@pytest.mark.bits
 def test_the_order_of_views_and_the_threads_make_no_difference(scene) -> None:
     _, grid, views, features = scene
     first = lift_to_voxels(grid, views, features)

@@ -164,6 +164,7 @@ def test_what_was_skipped_and_assumed_is_recorded(halves, encoder_file) -> None:
     assert unknown.info.details["scale_assumed"] is True
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("points", ["all", "visible"])
 def test_bits_do_not_depend_on_threads_or_on_the_order_of_views(
     halves, encoder_file, points
@@ -191,6 +192,7 @@ def replace_views(halves):
     return Changed()
 
 
+@pytest.mark.bits
 def test_what_was_interrupted_goes_on_to_the_same_bits(halves, encoder_file, tmp_path) -> None:
     whole = trained(halves, encoder_file)
     path = tmp_path / "training.npz"

@@ -121,6 +121,7 @@ def test_each_option_makes_a_difference(halves, photographed, change) -> None:
     assert not torch.equal(usual.means, changed.means)
 
 
+@pytest.mark.bits
 def test_labels_move_gaussians_and_bits_repeat(halves, photographed) -> None:
     _, without = trained(halves, photographed, label_weight=0.0)
     _, labelled = trained(halves, photographed)

@@ -175,6 +175,7 @@ def test_early_stopping_keeps_the_best(walls) -> None:
     assert never.info.details["best_step"] == 60
 
 
+@pytest.mark.bits
 def test_same_seed_same_bits_on_any_number_of_threads(walls, plain) -> None:
     before = _native.threads(), torch.get_num_threads()
     try:
@@ -200,6 +201,7 @@ def test_the_order_of_views_does_not_matter(walls, plain) -> None:
     assert not torch.equal(other.values, plain.values)
 
 
+@pytest.mark.bits
 def test_what_was_interrupted_goes_on_to_the_same_bits(walls, plain, tmp_path) -> None:
     path = tmp_path / "saga.npz"
     stop = threading.Event()

@@ -136,6 +136,7 @@ def test_fusion_adds_the_coarser_map_and_doubles_the_size() -> None:
     torch.testing.assert_close(edge[1] - edge[0], (edge[-1] - edge[0]) / 3, rtol=0, atol=1e-5)
 
 
+@pytest.mark.bits
 def test_the_image_side_is_transformers_dpt(weights: Path) -> None:
     """The same weights in the network of another author, of an image of another size."""
     from transformers import DPTConfig, DPTForSemanticSegmentation

@@ -92,6 +92,7 @@ def test_more_steps_are_better_than_one(photographed) -> None:
     assert many.centre.mean() < one.centre.mean()
 
 
+@pytest.mark.bits
 def test_the_same_samples_give_the_same_bits(photographed) -> None:
     samples = photographed.samples(window(8, 2), WRONG)
     one, two = (

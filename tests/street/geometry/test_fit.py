@@ -83,6 +83,7 @@ def test_primitives_reach_a_wall_and_a_floor(kind: str) -> None:
     )
 
 
+@pytest.mark.bits
 def test_each_level_is_fitted_as_if_it_were_alone() -> None:
     primitives, view = corner()
     both = fitted((primitives, view)).primitives
@@ -93,6 +94,7 @@ def test_each_level_is_fitted_as_if_it_were_alone() -> None:
         assert not same(alone, own)
 
 
+@pytest.mark.bits
 def test_the_number_of_threads_changes_no_bit() -> None:
     before = torch.get_num_threads()
     found: list[GeometryFit] = []
@@ -155,6 +157,7 @@ def test_records_tell_how_far_it_is() -> None:
 # One option, one test.
 
 
+@pytest.mark.bits
 def test_iterations_are_steps_and_none_changes_nothing() -> None:
     none = fitted(ahead(), iterations=0)
     assert same(none.primitives, ahead()[0])
@@ -232,6 +235,7 @@ def test_error_to_the_plane_is_smaller_than_along_the_ray() -> None:
     assert plane < 0.9 * ray
 
 
+@pytest.mark.bits
 def test_truncation_leaves_out_rays_that_see_past() -> None:
     far = ahead(depth=20.0)
     assert same(fitted(far, truncation=2.0).primitives, far[0])

@@ -130,6 +130,7 @@ def test_colours_are_left_out_where_nobody_asks() -> None:
     assert render_view(model(), caster, camera(0), colour=False).colour is None
 
 
+@pytest.mark.bits
 def test_bits_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("splatseg.street.radiance.render._RAYS", 16)
     field, caster = model(), MeshCaster(two_balls())

@@ -53,6 +53,7 @@ def test_it_learns_colours_classes_and_the_sky(tmp_path: Path) -> None:
     assert float((seen.colour - COLOURS[column]).abs().mean()) < 0.1
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("rays", [64, 1500])
 def test_bits_do_not_depend_on_threads(tmp_path: Path, rays: int) -> None:
     """1500 rays are two shares."""
@@ -69,6 +70,7 @@ def test_bits_do_not_depend_on_threads(tmp_path: Path, rays: int) -> None:
     assert found[0].records == found[1].records
 
 
+@pytest.mark.bits
 def test_bits_do_not_depend_on_where_hits_are_kept(tmp_path: Path) -> None:
     memory = trained(SMALL, tmp_path)
     files = trained(replace(SMALL, cache_memory=0), tmp_path)
