@@ -69,6 +69,7 @@ def same_scene(a: Scene, b: Scene) -> None:
     assert dict(a.provenance) == dict(b.provenance)
 
 
+@pytest.mark.bits
 def test_version_1_is_read(version_1, golden) -> None:
     scene = load_scene(version_1)
     same_scene(golden.golden_scene(), scene)
@@ -100,6 +101,7 @@ def test_version_1_is_read(version_1, golden) -> None:
     assert torch.equal(read.features, features.features)
 
 
+@pytest.mark.bits
 def test_version_1_is_written_as_it_was(golden, project_root, tmp_path, monkeypatch) -> None:
     """The script gives the committed bytes; a change of them needs a new version."""
     monkeypatch.setattr(golden, "ROOT", tmp_path / "scene-v1")

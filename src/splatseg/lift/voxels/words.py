@@ -181,7 +181,9 @@ class TableWords:
 
     def _found_span(self, components: int) -> WordSpan:
         known = torch.nonzero(self._lengths > 0).squeeze(1)
-        chosen = known[torch.linspace(0, len(known) - 1, min(_SPAN_ROWS, len(known))).long()]
+        count = min(_SPAN_ROWS, len(known))
+        # In whole numbers: rounding down what a processor rounded would choose others on another.
+        chosen = known[torch.arange(count) * (len(known) - 1) // max(count - 1, 1)]
         weights = self._weights[chosen]
         return word_span(
             self._table.decode(chosen),
