@@ -1,17 +1,19 @@
 """Labels that contradict each other, by every method, scored on the test views.
 
     python benchmarks/cosseg.py SCENE ../shared/data/office --evidence labels_semantic_hard \\
-        --rows majority uplift objects cosseg
+        --rows majority uplift object_vote object-classes cosseg
 
 Every row is a process of its own, so that its seconds and its peak of memory are its own. Rows:
 
 - `majority`: `uplift` without relabelling and completion; `uplift`: by default.
 - `object_vote`: the instances of `masks_sam` (`associate`), each with the majority class of its
   Gaussians.
-- `logits`, `probabilities`, `identity`, `cosseg`: by default; `published`: `cosseg --published`;
-  `decoder`: `cosseg --decide decoder`. `--set OPTION=VALUE` changes options of the method.
+- `object-classes`: classes of the objects of `masks_sam`, in closed form; no part of
+  CoSSegGaussians.
+- `logits`, `probabilities`, `identity`, `cosseg`: by default, `cosseg` with features;
+  `published`: `cosseg --published`. `--set OPTION=VALUE` changes options of the method.
 - `associate`: of tracks.
-- `joint`: `decoder` with Gaussians that learn along (`--joint`); with the mean PSNR of test views,
+- `joint`: `cosseg` with Gaussians that learn along (`--joint`); with the mean PSNR of test views,
   before and after.
 - `walk`: votes smoothed by a random walk over neighbours alike in colour and features.
 
@@ -62,11 +64,13 @@ METHODS = {
     "logits": ("logits", {}, {}),
     "probabilities": ("probabilities", {}, {}),
     "identity": ("identity", {}, {}),
-    "cosseg": ("cosseg", {"features": "features_dino", "masks": "masks_sam"}, {}),
-    "decoder": ("cosseg", {"features": "features_dino", "decide": "decoder"}, {}),
+    "object-classes": (
+        "object-classes", {"features": "features_dino", "masks": "masks_sam"}, {},
+    ),
+    "cosseg": ("cosseg", {"features": "features_dino"}, {}),
     "published": ("cosseg", {}, {"published": True}),
-    "joint": ("cosseg", {"features": "features_dino", "decide": "decoder", "joint": _NEW}, {}),
-}
+    "joint": ("cosseg", {"features": "features_dino", "joint": _NEW}, {}),
+}  # fmt: skip
 
 
 def made(

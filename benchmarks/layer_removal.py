@@ -1,9 +1,9 @@
 """What removing things by the labels of layers leaves of them, layer against layer.
 
-    splatseg segment SCENE --method cosseg --evidence labels_tracked_hard --masks masks_sam \\
-        --features features_dino --layer cosseg
+    splatseg segment SCENE --method object-classes --evidence labels_tracked_hard \\
+        --masks masks_sam --features features_dino --layer object-classes
     splatseg segment SCENE --method associate --evidence labels_tracked_hard --layer associate
-    python benchmarks/layer_removal.py SCENE ../shared/data/office associate cosseg
+    python benchmarks/layer_removal.py SCENE ../shared/data/office associate object-classes
 
 Each thing of the truth is removed as a person would who clicks on it: by the one id that most
 pixels of it have in the label map of the training view that shows it largest. Nothing is cut.

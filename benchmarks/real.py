@@ -41,7 +41,7 @@ from splatseg.lift import (
     label_map,
     uplift,
 )
-from splatseg.methods.cosseg import CossegOptions
+from splatseg.methods import find_method
 from splatseg.tasks.scene_parts import scene_field
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
@@ -60,7 +60,7 @@ class Job:
     data: Path
     work: Path
     masks: str
-    cosseg: Sequence[str] = ()
+    object_classes: Sequence[str] = ()
     fields: Sequence[str] = ()
 
     def draw(self, labels: Labels, views: Sequence[View], name: str, *, binary: int = 0) -> Path:
@@ -109,19 +109,19 @@ def camvid(job: Job) -> None:
             drawn = job.draw(hard, scored, name)
             _classes(f"{title}, {name}", drawn, truth, seconds)
     truth = _subset(job.data / "semantic", held, job.work / "truth")
-    for words in job.cosseg:
+    for words in job.object_classes:
         begin = time.monotonic()
-        labels = _cosseg(job, words)
-        drawn = job.draw(labels, held, "cosseg")
-        _classes(f"held-out frames, cosseg {words}", drawn, truth, time.monotonic() - begin)
+        labels = _object_classes(job, words)
+        drawn = job.draw(labels, held, "object-classes")
+        _classes(f"held-out frames, object-classes {words}", drawn, truth, time.monotonic() - begin)
     for name in job.fields:
         drawn = job.draw_field(scene_field(job.scene, name), held, "field")
         _classes(f"held-out frames, field {name}", drawn, truth)
 
 
-def _cosseg(job: Job, words: str) -> Labels:
-    """The layer of ``cosseg`` with options such as ``masks=masks decide=objects``."""
-    base, changes = CossegOptions(), dict[str, Any]()
+def _object_classes(job: Job, words: str) -> Labels:
+    """The layer of ``object-classes`` with options such as ``masks=masks candidates=3``."""
+    base, changes = find_method("object-classes").options(), dict[str, Any]()
     for word in words.split():
         name, value = word.split("=")
         kind = type(getattr(base, name))
@@ -130,7 +130,7 @@ def _cosseg(job: Job, words: str) -> Labels:
             changes[name] = float(value)
     return segment(
         job.scene,
-        "cosseg",
+        "object-classes",
         options=SegmentOptions(evidence="labels_semantic"),
         method_options=replace(base, **changes),
     ).labels
@@ -277,7 +277,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--masks", default="masks", help="replica: evidence and layer of the scene")
     parser.add_argument(
-        "--cosseg",
+        "--object-classes",
         nargs="*",
         default=[],
         metavar="OPTIONS",
@@ -293,7 +293,7 @@ def main() -> None:
             data=arguments.data,
             work=arguments.work or Path(temporary or ""),
             masks=arguments.masks,
-            cosseg=arguments.cosseg,
+            object_classes=arguments.object_classes,
             fields=arguments.fields,
         )
         {"camvid": camvid, "dtu": dtu, "replica": replica}[arguments.what](job)

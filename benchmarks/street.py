@@ -13,9 +13,9 @@ label is wrong. Rows, each a field (`splatseg.core.Renderable`) and a layer of i
 - `majority`, `uplift`: labels of Gaussians without and with relabelling and completion; a point
   takes those around it by density. `nearest`: that of the nearest centre. `surface`: by density
   within three standard deviations, and undefined beyond.
-- `vote`, `vote_depth`: views vote at centres, without and with occlusion. `cosseg`: objects of
-  `masks_sam` vote. `sam`, `panoptic`: objects of `masks_sam` and `labels_panoptic`, associated,
-  each with the class that most of its Gaussians have.
+- `vote`, `vote_depth`: views vote at centres, without and with occlusion. `object-classes`:
+  objects of `masks_sam` vote. `sam`, `panoptic`: objects of `masks_sam` and `labels_panoptic`,
+  associated, each with the class that most of its Gaussians have.
 - `views`: points take what the views of the field show at them, and nothing else. `shapes`: and
   what is shaped like them, without smoothing; `drive`: with it, the default for drives.
 
@@ -77,7 +77,7 @@ METHODS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "uplift": ("uplift", {}, {}),
     "vote": ("vote", {}, {}),
     "vote_depth": ("vote", {"occlusion": "depth"}, {}),
-    "cosseg": ("cosseg", {"masks": "masks_sam"}, {}),
+    "object-classes": ("object-classes", {"masks": "masks_sam"}, {}),
 }
 
 
@@ -194,7 +194,7 @@ ROWS: dict[str, Row] = {
     "surface": lambda b: b.field("uplift", PointLabelOptions(max_mahalanobis=3.0)),
     "vote": lambda b: b.field("vote"),
     "vote_depth": lambda b: b.field("vote_depth"),
-    "cosseg": lambda b: b.field("cosseg"),
+    "object-classes": lambda b: b.field("object-classes"),
     "sam": lambda b: b.field("sam"),
     "panoptic": lambda b: b.field("panoptic"),
     "views": lambda b: b.viewed("uplift", ViewedPointOptions(**PLAIN)),

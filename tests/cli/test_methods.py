@@ -78,8 +78,9 @@ def test_the_same_file_is_a_method_of_ours(small, splatseg, monkeypatch) -> None
     assert keeps_ids("vote")
     assert keeps_boundaries("vote")
     # Its labels are not those of the label maps that they are from.
-    assert keeps_ids("cosseg")
-    assert not keeps_boundaries("cosseg")
+    for repairs in ("cosseg", "object-classes"):
+        assert keeps_ids(repairs)
+        assert not keeps_boundaries(repairs)
     assert not keeps_boundaries("majority")
 
 
@@ -122,7 +123,7 @@ def test_flags_of_another_method_are_refused(small, splatseg) -> None:
     [
         ("uplit", "did you mean uplift"),
         ("asociate", "did you mean associate"),
-        ("xyzzy", "known: uplift, features, objects, voxels, vote, associate, identity, saga"),
+        ("xyzzy", "known: uplift, features, objects, voxels, vote, associate, object-classes"),
     ],
 )
 def test_an_unknown_method_gets_the_nearest_names(small, splatseg, name, said) -> None:

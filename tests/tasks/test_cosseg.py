@@ -16,7 +16,6 @@ from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
 
 LABELS = SegmentOptions(evidence="labels_semantic")
-TRACKS = SegmentOptions(evidence="labels_tracked")
 
 
 @pytest.fixture(scope="module")
@@ -24,57 +23,17 @@ def scene(fitted_room, tmp_path_factory) -> Path:
     return Path(shutil.copytree(fitted_room, tmp_path_factory.mktemp("cosseg") / "scene"))
 
 
-def test_classes_by_objects_and_features(scene, capsys) -> None:
-    words = ["segment", str(scene), "--method", "cosseg", "--evidence", "labels_semantic"]
-    assert main(words) == 2
-    assert "masks: expected evidence of masks" in capsys.readouterr().err
-    words += ["--masks", "masks_sam", "--features", "features_dino", "--layer", "classes"]
-    assert main(words) == 0
-    layer = load_scene_layer(scene, "classes")
-    assert isinstance(layer, Labels)
-    assert layer.info.method == "cosseg"
-    known = load_scene(scene).classes
-    assert known is not None
-    assert {id for id in layer.ids.tolist() if id >= 0} <= {row.id for row in known.rows}
-    assert float((layer.ids >= 0).float().mean()) > 0.95
-
-
-def test_objects_of_tracks_have_classes(scene) -> None:
-    options = CossegOptions(features="features_dino", masks="masks_sam")
-    layer = segment(load_scene(scene), "cosseg", options=TRACKS, method_options=options).layer
-    assert isinstance(layer, Labels)
-    present = {id for id in layer.ids.tolist() if id >= 0}
-    assert len(present) > 5
-    assert set(layer.info.class_of) <= present | set(layer.info.names)
-    assert layer.info.class_of
-
-
 def test_the_decoder_of_features_alone(scene) -> None:
-    options = CossegOptions(
-        features="features_dino", decide="decoder", spatial="none", steps=5, readout="rendered"
-    )
+    options = CossegOptions(features="features_dino", spatial="none", steps=5, readout="rendered")
     layer = segment(load_scene(scene), "cosseg", options=LABELS, method_options=options).layer
     assert isinstance(layer, Features)
     assert layer.info.details["blocks"] == ["block3", "block6", "block9", "block12"]
 
 
-def test_what_is_missing_is_told_in_one_sentence(scene) -> None:
-    with pytest.raises(InputError, match="masks: expected evidence of masks, such as masks_sam"):
-        segment(load_scene(scene), "cosseg", options=LABELS)
-    wrong = CossegOptions(features="masks_sam", masks="masks_sam")
-    with pytest.raises(InputError, match="features: expected evidence of features, got 'masks_sa"):
-        segment(load_scene(scene), "cosseg", options=LABELS, method_options=wrong)
-    nothing = CossegOptions(features="nothing", masks="masks_sam")
-    with pytest.raises(
-        InputError, match="^features: expected one of those at hand .*masks_sam.*'nothing'"
-    ):
-        segment(load_scene(scene), "cosseg", options=LABELS, method_options=nothing)
-
-
 def joint_words(scene: Path, folder: Path) -> list[str]:
     return [
         "segment", str(scene), "--method", "cosseg", "--evidence", "labels_semantic",
-        "--decide", "decoder", "--features", "features_dino", "--spatial", "none",
+        "--features", "features_dino", "--spatial", "none",
         "--joint", str(folder), "--joint-steps", "3", "--layer", "joint", "--quiet",
     ]  # fmt: skip
 
@@ -106,29 +65,11 @@ def test_a_new_scene_is_refused_before_the_work(scene, tmp_path, capsys) -> None
     assert "resume: a training with joint keeps nothing to go on from" in capsys.readouterr().err
     assert main([*words, "--report"]) == 2
     assert "with joint the layer is of a new one" in capsys.readouterr().err
-    words[words.index("decoder")] = "objects"
-    assert main([*words, "--masks", "masks_sam"]) == 2
-    assert "joint: goes with decide decoder, got objects" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
 
 
-def test_panoptic_segments_become_objects_with_classes(scene) -> None:
-    """No other masks are named: the segments themselves are associated."""
-    shared = SegmentOptions(evidence="labels_panoptic")
-    options = CossegOptions(features="features_dino")
-    layer = segment(load_scene(scene), "cosseg", options=shared, method_options=options).layer
-    assert isinstance(layer, Labels)
-    present = {id for id in layer.ids.tolist() if id >= 0}
-    known = {row.id for row in load_scene(scene).classes.rows}
-    assert len(present) > 5
-    assert set(layer.info.class_of.values()) <= known
-    assert set(layer.info.class_of) >= present
-
-
 def decoded(scene: Path, evidence: str, **change) -> Labels:
-    options = CossegOptions(
-        features="features_dino", decide="decoder", spatial="none", steps=30, batch=512, **change
-    )
+    options = CossegOptions(features="features_dino", spatial="none", steps=30, batch=512, **change)
     layer = segment(
         load_scene(scene), "cosseg", options=SegmentOptions(evidence=evidence),
         method_options=options,

@@ -14,8 +14,8 @@ from splatseg.methods._method import Method
 ENTRY_POINT_GROUP = "splatseg.methods"
 
 _OWN = (
-    "uplift", "features", "objects", "voxels", "vote", "associate", "identity", "saga", "cosseg",
-    "logits", "probabilities", "prompt",
+    "uplift", "features", "objects", "voxels", "vote", "associate", "object-classes", "identity",
+    "saga", "cosseg", "logits", "probabilities", "prompt",
 )  # fmt: skip
 _ABOVE = {"dnmp": "splatseg.street.method:METHOD"}
 """Methods of packages above this one, imported when they are asked for, and where they are."""
@@ -104,7 +104,7 @@ def keeps_boundaries(method: object) -> bool:
 
 
 def _known() -> dict[str, EntryPoint]:
-    modules = {name: f"splatseg.methods.{name}:METHOD" for name in _OWN} | _ABOVE
+    modules = {name: f"splatseg.methods.{name.replace('-', '_')}:METHOD" for name in _OWN} | _ABOVE
     own = {
         name: EntryPoint(name=name, value=value, group=ENTRY_POINT_GROUP)
         for name, value in modules.items()

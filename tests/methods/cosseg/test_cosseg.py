@@ -16,7 +16,7 @@ from .conftest import Blocks, Maps
 
 DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
 QUICK = {
-    "decide": "decoder", "steps": 30, "batch": 200, "pixels": 200, "held_out": 0.0, "rate": 0.01,
+    "steps": 30, "batch": 200, "pixels": 200, "held_out": 0.0, "rate": 0.01,
     "decoded": (6, 5), "head": (8, 4),
 }  # fmt: skip
 

@@ -18,18 +18,16 @@ References:
     Hu et al., RandLA-Net: Efficient Semantic Segmentation of Large-Scale Point Clouds (2020).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import TypeVar
 
-from splatseg.core import ClassTable, Layer
-from splatseg.errors import InputError
-from splatseg.io.evidence import PanopticEvidence, TrackedEvidence
-from splatseg.lift.segments.recorded import EvidenceSegments
+from splatseg.core import Layer
 from splatseg.methods._method import Method, MethodInputs, Refined
 from splatseg.methods._trained_labels import context_of, hard_labels
-from splatseg.methods.cosseg._linked import CategoryMaps, LinkedLabels, linked_labels
-from splatseg.methods.cosseg._objects import label_objects
+from splatseg.methods.cosseg._blocks import BlockSource as BlockSource
+from splatseg.methods.cosseg._distilled import distilled_features as distilled_features
+from splatseg.methods.cosseg._linked import LinkedLabels, linked_labels
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
 from splatseg.methods.cosseg._train_jointly import train_cosseg_jointly as train_cosseg_jointly
@@ -38,9 +36,7 @@ _Made = TypeVar("_Made")
 
 
 def run(inputs: MethodInputs, options: CossegOptions) -> Layer | Refined:
-    """Find labels of objects, or train the decoder and read it, as the options say."""
-    if options.decide == "objects":
-        return _closed_form(inputs, options)
+    """Train the decoder and read it, as the options say."""
     linked = linked_labels(inputs, options.link)
     gaussians = None
     if options.joint is None:
@@ -71,53 +67,9 @@ def _trained(
     )
 
 
-def _closed_form(inputs: MethodInputs, options: CossegOptions) -> Layer:
-    """Of label maps the classes of Gaussians, of segments the objects with a class each."""
-    evidence = inputs.evidence
-    masks = inputs.companions.get("masks", evidence)
-    if masks.kind == "labels":
-        raise InputError(
-            "masks: expected evidence of masks, such as masks_sam, to find objects by, got none; "
-            "`decide` by decoder wants none."
-        )
-    tracked = isinstance(evidence, TrackedEvidence)
-    found = label_objects(
-        inputs.gaussians,
-        inputs.views,
-        CategoryMaps(evidence=evidence) if isinstance(evidence, PanopticEvidence) else evidence,
-        features=inputs.features("features"),
-        masks=EvidenceSegments(evidence=masks),
-        options=options,
-        object_options=options.classification,
-        classes=inputs.label_names if evidence.kind == "labels" else inputs.categories,
-        context=context_of(inputs),
-        categories=_categories(evidence, inputs.categories) if tracked else None,
-        told=inputs.progress,
-    )
-    if found.classes is None or evidence.kind != "labels":
-        return found.objects
-    return found.classes
-
-
-def _categories(
-    evidence: TrackedEvidence, table: ClassTable | None
-) -> Mapping[int, Mapping[int, float]]:
-    """How many pixels under each track were taken for which class."""
-    if table is None:
-        raise InputError(
-            f"{evidence.folder}: expected a table of classes to tell what tracks are of, and "
-            "neither the capture nor the evidence has one."
-        )
-    ids = {row.name: row.id for row in table.rows}
-    return {
-        track.id: {ids[name]: float(votes) for name, votes in track.votes.items() if name in ids}
-        for track in evidence.tracks
-    }
-
-
 METHOD = Method(
     name="cosseg",
-    summary="labels that contradict each other, decided by objects or by a decoder of features",
+    summary="a decoder of features of photographs and of the shape in space is trained on labels",
     reference="CoSSegGaussians (Dou et al. 2024), eq. 2 to 5",
     evidence=("labels", "tracked", "panoptic"),
     options=CossegOptions,
@@ -128,5 +80,5 @@ METHOD = Method(
     resumes=True,
     published=CossegOptions.published(),
     refines="joint",
-    companions={"features": ("features",), "masks": ("masks", "panoptic", "tracked")},
+    companions={"features": ("features",)},
 )

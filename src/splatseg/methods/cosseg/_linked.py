@@ -1,34 +1,18 @@
 """Labels whose ids mean the same in all views, and what class each is of."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from splatseg.core import InstanceTree, LabelMap, Labels, LabelSource
+from splatseg.core import InstanceTree, Labels, LabelSource
 from splatseg.errors import InputError
-from splatseg.io.evidence import PanopticEvidence, TrackedEvidence
+from splatseg.io.evidence import TrackedEvidence
 from splatseg.lift.segments.matching import MatchedMaps
 from splatseg.lift.segments.recorded import EvidenceSegments
 from splatseg.methods._method import MethodInputs
 from splatseg.methods.associate import associate
 
 Link = Literal["given", "associate"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CategoryMaps:
-    """Categories of panoptic segments as a `LabelSource`."""
-
-    evidence: PanopticEvidence
-
-    @property
-    def view_names(self) -> Sequence[str]:
-        """Views that have a file."""
-        return self.evidence.view_names
-
-    def label_map(self, name: str) -> LabelMap:
-        """Category ids of a view."""
-        return self.evidence.category_map(name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,7 +7,6 @@ from typing import Literal, get_args
 from splatseg._check import check_choice, check_range
 from splatseg.errors import RangeError
 from splatseg.lift.heads import Blend
-from splatseg.lift.object_classes import ObjectClassOptions
 from splatseg.lift.training import SamplingOptions
 from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
@@ -15,10 +14,8 @@ from splatseg.methods.cosseg._distilled import Division
 from splatseg.methods.cosseg._joint_options import JointOptions
 from splatseg.methods.cosseg._linked import Link
 
-Compared = Literal["deepest", "all"]
 Semantic = Literal["all", "first", "none"]
 Spatial = Literal["all", "first", "none"]
-Decide = Literal["objects", "decoder"]
 Points = Literal["visible", "all", "blocks"]
 Weighting = Literal["none", "agreement"]
 Transitions = Literal["none", "views"]
@@ -40,23 +37,10 @@ class CossegOptions(LabelTrainingOptions):
     """Name of evidence of features, such as features_dino: several blocks of a network. None
     decodes space alone."""
 
-    masks: str | None = None
-    """Name of evidence of masks, such as masks_sam, by which `objects` are found. None takes the
-    segments that are labelled themselves, of tracks and of panoptic maps; maps of classes have
-    none."""
-
     link: Link | None = None
-    """How a decoder's ids are linked over views. given: ids are of tracks or classes. associate:
+    """How ids are linked over views. given: ids are of tracks or classes. associate:
     segments become objects (`segment --method associate`) and have the ids of these. None: as
     given, and panoptic segments by association."""
-
-    decide: Decide = "objects"
-    """How labels are found. objects: in closed form; masks are associated into objects, and each
-    gets the class that its own votes and those of objects that look like it speak for. decoder:
-    a network that is given features and space is trained, as published."""
-
-    compared: Compared = "deepest"
-    """Which blocks tell that objects look alike: the deepest, which knows classes best, or all."""
 
     semantic: Semantic = "all"
     """Which blocks the decoder is given. all: each at a scale of its own. first: the shallowest
@@ -65,25 +49,6 @@ class CossegOptions(LabelTrainingOptions):
     lifted_side: int = 256
     """Longest side, in pixels, of the views through which features are lifted; they come in
     patches of many pixels."""
-
-    classification: ObjectClassOptions = field(default_factory=ObjectClassOptions)
-    """How votes and features of objects are weighed."""
-
-    own_share: float | None = None
-    """Share, in [0, 1], that a Gaussian's own votes have in its class beside its object's. None:
-    the more the less neighbouring views err alike, as measured. Of tracks none."""
-
-    candidates: int = 1
-    """Ids kept of each Gaussian, with `decide` objects. 1 makes a hard layer; with more it keeps
-    their shares and is rendered softly."""
-
-    max_correlation: float = 1 / 3
-    """Correlation of neighbouring views, in [0, 1], from which on own votes have no share, unless
-    objects are heterogeneous."""
-
-    max_heterogeneity: float = 0.22
-    """Share of the disagreement of votes, in (0, 1], that may be between the Gaussians of an object
-    before own votes have a share; they have all of it at twice as much."""
 
     spatial: Spatial = "all"
     """Which levels of the point network are used. all: each is joined to what is decoded there.
@@ -148,10 +113,8 @@ class CossegOptions(LabelTrainingOptions):
 
     def __post_init__(self) -> None:
         LabelTrainingOptions.__post_init__(self)
-        check_choice("decide", self.decide, get_args(Decide))
         if self.link is not None:
             check_choice("link", self.link, get_args(Link))
-        check_choice("compared", self.compared, get_args(Compared))
         check_choice("semantic", self.semantic, get_args(Semantic))
         check_choice("spatial", self.spatial, get_args(Spatial))
         check_choice("division", self.division, get_args(Division))
@@ -164,7 +127,6 @@ class CossegOptions(LabelTrainingOptions):
             ("min_pixels", 0),
             ("block_points", 1),
             ("lifted_side", 1),
-            ("candidates", 1),
         ):
             if getattr(self, name) < least:
                 raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
@@ -174,15 +136,6 @@ class CossegOptions(LabelTrainingOptions):
         check_rate("rate", self.rate)
         check_rate("transition_rate", self.transition_rate)
         check_range("min_share", self.min_share, 0.0, 1.0)
-        check_range("max_correlation", self.max_correlation, 0.0, 1.0)
-        if not 0 < self.max_heterogeneity <= 1:
-            raise RangeError(
-                f"max_heterogeneity: expected above 0 and at most 1, got {self.max_heterogeneity}."
-            )
-        if self.own_share is not None:
-            check_range("own_share", self.own_share, 0.0, 1.0)
-        if self.joint is not None and self.decide != "decoder":
-            raise RangeError(f"joint: goes with decide decoder, got {self.decide}.")
         if self.spatial == "none" and self.semantic == "none":
             raise RangeError("semantic, spatial: expected one of the two, got neither.")
 
@@ -206,7 +159,6 @@ class CossegOptions(LabelTrainingOptions):
         """
         return cls(
             features="features_dino",
-            decide="decoder",
             readout="rendered",
             steps=steps,
             batch=4096,

@@ -60,7 +60,7 @@ def train_cosseg_jointly(
         ShapeError: If maps or features do not have their photograph's proportions.
         SplatsegError: If the loss is no longer a number.
     """
-    options, context = options or CossegOptions(decide="decoder"), context or TrainingContext()
+    options, context = options or CossegOptions(), context or TrainingContext()
     how = options.joint_training
     data = label_data(gaussians, views, evidence, options=options, context=context)
     given = prepare(

@@ -1,16 +1,15 @@
-r"""Labels of objects in closed form: votes of all pixels of an object, and of objects alike.
+"""Labels of objects in closed form: votes of all pixels of an object, and of objects alike.
 
 Masks are associated into objects (`methods.associate`), which need no names; labels vote for
-classes on the Gaussians, and features are lifted onto them, as for the decoder. Then each object
+classes on the Gaussians, and features are lifted onto them (`methods.cosseg`). Then each object
 gets the class that its own votes and those of objects that look like it speak for
 (`lift.object_classes`), and a Gaussian that is in several objects in part gets the classes of its
-objects by its shares in them, together with what its own votes say (`_object_shares`). Nothing is
-trained.
+objects by its shares in them, together with what its own votes say (`_shares`). Nothing is trained.
 """
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -28,19 +27,17 @@ from splatseg.core import (
 )
 from splatseg.lift.mass.uplift import UpliftOptions, uplift
 from splatseg.lift.object_classes import (
-    ObjectClassOptions,
     PooledObjects,
     classify_objects,
     pool_objects,
     with_categories,
 )
 from splatseg.lift.segments.table import SegmentSource
-from splatseg.methods._trained_labels import TrainingContext, recorded_options
 from splatseg.methods.associate import associate
-from splatseg.methods.cosseg._blocks import BlockSource
-from splatseg.methods.cosseg._distilled import distilled_features
-from splatseg.methods.cosseg._object_shares import CANDIDATES, own_share, spread
-from splatseg.methods.cosseg._options import CossegOptions
+from splatseg.methods.cosseg import BlockSource, distilled_features
+from splatseg.methods.object_classes._options import ObjectLabelOptions
+from splatseg.methods.object_classes._shares import CANDIDATES, own_share, spread
+from splatseg.render import RenderOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,11 +58,11 @@ def label_objects(
     *,
     features: BlockSource | None,
     masks: SegmentSource,
-    options: CossegOptions,
-    object_options: ObjectClassOptions,
-    classes: ClassTable | None,
-    context: TrainingContext,
+    options: ObjectLabelOptions,
+    classes: ClassTable | None = None,
     categories: Mapping[int, Mapping[int, float]] | None = None,
+    render_options: RenderOptions | None = None,
+    backend: str = "auto",
     told: Callable[[int, int], None] | None = None,
 ) -> ObjectLabels:
     """Associate masks, and find the class of each object.
@@ -76,11 +73,11 @@ def label_objects(
         evidence: Label maps, of classes or of tracks.
         features: Several blocks of a network; None takes votes of each object alone.
         masks: Masks of objects, parts and groups; or segments of objects, which do not overlap.
-        options: How features are reduced and lifted.
-        object_options: How votes and features are weighed.
+        options: How features are lifted, and votes and features weighed.
         classes: Names of the classes.
-        context: Render options and backend.
         categories: Of tracks, how much speaks for which class. None: labels are classes.
+        render_options: Switches of the blending model.
+        backend: Name of the rendering backend.
         told: Called with the stages done and all there are.
 
     Raises:
@@ -99,11 +96,19 @@ def label_objects(
         evidence,
         options=UpliftOptions(candidates=CANDIDATES),
         classes=classes,
-        render_options=context.render_options,
-        backend=context.backend,
+        render_options=render_options,
+        backend=backend,
     )
     tell(1)
-    objects = _associated(gaussians, views, masks, context)
+    instances = associate(
+        gaussians,
+        views,
+        masks,
+        render_options=render_options,
+        backend=backend,
+    )
+    # Those of a tree where segments may overlap.
+    objects = instances.cut("object") if isinstance(instances, InstanceTree) else instances
     tell(2)
     scales: tuple[Tensor, ...] = (torch.zeros(len(gaussians), 1),)
     weights = torch.zeros(len(gaussians))
@@ -115,19 +120,19 @@ def label_objects(
             components=options.components,
             division="mean",
             longest_side=options.lifted_side,
-            render_options=context.render_options,
-            backend=context.backend,
+            render_options=render_options,
+            backend=backend,
         )
         scales = distilled.scales[-1:] if options.compared == "deepest" else distilled.scales
         weights = distilled.weights
     tell(3)
-    info = replace(found.info, method="cosseg", options=recorded_options(options))
+    info = replace(found.info, method="object-classes", options=asdict(options))
     votes = replace(found, info=info)
     pooled = pool_objects(objects, votes, scales, weights)
     if categories is not None:
         objects, pooled = named_by_tracks(objects, pooled)
-        pooled = with_categories(pooled, categories, rounds=object_options.category_rounds)
-    probabilities = classify_objects(pooled, options=object_options)
+        pooled = with_categories(pooled, categories, rounds=options.classification.category_rounds)
+    probabilities = classify_objects(pooled, options=options.classification)
     tell(4)
     names = {} if classes is None else {row.id: row.name for row in classes.rows}
     return ObjectLabels(
@@ -145,20 +150,6 @@ def label_objects(
         ),
         objects=_with_classes(objects, pooled, probabilities, replace(info, names=names)),
     )
-
-
-def _associated(
-    gaussians: Gaussians, views: Sequence[View], segments: SegmentSource, context: TrainingContext
-) -> Labels:
-    """The objects that segments are of: those of a tree where segments may overlap."""
-    found = associate(
-        gaussians,
-        views,
-        segments,
-        render_options=context.render_options,
-        backend=context.backend,
-    )
-    return found.cut("object") if isinstance(found, InstanceTree) else found
 
 
 def named_by_tracks(objects: Labels, pooled: PooledObjects) -> tuple[Labels, PooledObjects]:

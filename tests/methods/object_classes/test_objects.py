@@ -5,15 +5,17 @@ from dataclasses import replace
 import pytest
 import torch
 
+from methods.cosseg.conftest import Maps
 from splatseg.core import LabelMap, Labels, LayerInfo
 from splatseg.errors import RangeError
 from splatseg.lift.object_classes import ObjectClassOptions, PooledObjects, pool_objects
-from splatseg.methods._trained_labels import TrainingContext
-from splatseg.methods.cosseg import CossegOptions
-from splatseg.methods.cosseg._object_shares import own_share
-from splatseg.methods.cosseg._objects import ObjectLabels, label_objects, named_by_tracks
-
-from .conftest import Maps
+from splatseg.methods.object_classes import ObjectLabelOptions
+from splatseg.methods.object_classes._objects import (
+    ObjectLabels,
+    label_objects,
+    named_by_tracks,
+)
+from splatseg.methods.object_classes._shares import own_share
 
 
 class Masks:
@@ -35,12 +37,10 @@ class Masks:
         return {}
 
 
-def labelled(halves, maps, *, features=True, options=None, categories=None, **more) -> ObjectLabels:
+def labelled(halves, maps, *, features=True, categories=None, **more) -> ObjectLabels:
     return label_objects(
         halves.gaussians, halves.views, maps, features=halves.blocks if features else None,
-        masks=Masks(halves), options=CossegOptions(**more),
-        object_options=options or ObjectClassOptions(), classes=None,
-        context=TrainingContext(backend="auto"), categories=categories,
+        masks=Masks(halves), options=ObjectLabelOptions(**more), categories=categories,
     )  # fmt: skip
 
 
@@ -73,9 +73,8 @@ def test_an_object_has_one_label_though_parts_of_it_are_outvoted(halves) -> None
     again = label_objects(
         halves.gaussians, halves.views[::-1], strip(halves, ("v0", "v1", "v2")),
         features=halves.blocks, masks=Masks(halves),
-        options=CossegOptions(candidates=1, own_share=0.0),
-        object_options=ObjectClassOptions(), classes=None,
-        context=TrainingContext(backend="auto"), told=lambda *step: told.append(step),
+        options=ObjectLabelOptions(candidates=1, own_share=0.0),
+        told=lambda *step: told.append(step),
     )  # fmt: skip
     assert torch.equal(again.classes.ids, found.classes.ids)
     assert again.classes.candidates is None
@@ -90,8 +89,7 @@ def test_what_is_in_no_object_keeps_its_votes(halves) -> None:
         masks.sets[name] = type(one).from_dense(torch.stack([one.dense(1)]))
     found = label_objects(
         halves.gaussians, halves.views, strip(halves), features=None, masks=masks,
-        options=CossegOptions(), object_options=ObjectClassOptions(), classes=None,
-        context=TrainingContext(backend="auto"),
+        options=ObjectLabelOptions(),
     )  # fmt: skip
     left = (halves.side == 3) & away(halves)
     ids = found.classes.ids[left]
@@ -108,7 +106,7 @@ def pooled_features(halves, monkeypatch, **change):
         kept.append([scale.clone() for scale in scales])
         return pool_objects(objects, votes, scales, weights)
 
-    monkeypatch.setattr("splatseg.methods.cosseg._objects.pool_objects", keep)
+    monkeypatch.setattr("splatseg.methods.object_classes._objects.pool_objects", keep)
     labelled(halves, halves.evidence, **change)
     return kept[0]
 
@@ -137,7 +135,7 @@ def test_rounds_tell_the_objects_of_a_track_apart(halves) -> None:
     sure = {}
     for rounds in (1, 10):
         found = labelled(
-            halves, strip(halves), options=ObjectClassOptions(category_rounds=rounds),
+            halves, strip(halves), classification=ObjectClassOptions(category_rounds=rounds),
             categories={3: {30: 5.0}, 8: {80: 4.0, 30: 2.0}},
         )  # fmt: skip
         sure[rounds] = found.objects.info.details["mean_class_probability"]
@@ -173,8 +171,7 @@ def test_names_are_those_of_classes(halves) -> None:
     table = ClassTable(rows=(ClassInfo(id=3, name="board"), ClassInfo(id=8, name="door")))
     found = label_objects(
         halves.gaussians, halves.views, halves.evidence, features=halves.blocks,
-        masks=Masks(halves), options=CossegOptions(), object_options=ObjectClassOptions(),
-        classes=table, context=TrainingContext(backend="auto"),
+        masks=Masks(halves), options=ObjectLabelOptions(), classes=table,
     )  # fmt: skip
     assert found.classes.info.names == {3: "board", 8: "door"}
     names = set(found.objects.info.names.values())
@@ -224,33 +221,39 @@ def test_the_share_of_own_votes_falls_with_the_correlation_of_views(
 ) -> None:
     votes = sure([5, 5, 7, 7], correlation)
     objects = sure([1, 1, 2, 2])
-    found = own_share(CossegOptions(max_correlation=limit), objects, votes)
+    found = own_share(ObjectLabelOptions(max_correlation=limit), objects, votes)
     assert found.share == pytest.approx(expected)
     assert found.heterogeneity == 0
-    given = CossegOptions(max_correlation=limit, own_share=0.3)
+    given = ObjectLabelOptions(max_correlation=limit, own_share=0.3)
     assert own_share(given, objects, votes).share == 0.3
 
 
 def test_own_votes_count_where_objects_are_none() -> None:
     """Half of what Gaussians disagree about is between those of one object: (0 + 1/2) / 1."""
     votes, objects = sure([5, 7, 5, 7], 0.9), sure([1, 1, 2, 3])
-    assert own_share(CossegOptions(), objects, votes).heterogeneity == 1
+    assert own_share(ObjectLabelOptions(), objects, votes).heterogeneity == 1
     mixed = replace(votes, shares=torch.tensor([[0.5, 0.5]]).repeat(4, 1),
                     candidates=torch.tensor([[5, 7]]).repeat(4, 1))  # fmt: skip
-    assert own_share(CossegOptions(), objects, mixed).heterogeneity == 0
+    assert own_share(ObjectLabelOptions(), objects, mixed).heterogeneity == 0
     shares = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.5, 0.5]])
     half = replace(mixed, shares=shares)
     # Objects 1, 2 and 3 have 2, 1 and 1 of the mass and half of it each disagrees.
-    found = own_share(CossegOptions(max_heterogeneity=0.4), objects, half)
+    found = own_share(ObjectLabelOptions(max_heterogeneity=0.4), objects, half)
     assert found.heterogeneity == pytest.approx(0.5)
     assert found.share == pytest.approx(0.25)
-    assert own_share(CossegOptions(max_heterogeneity=0.2), objects, half).share == 1
-    assert own_share(CossegOptions(max_heterogeneity=0.6), objects, half).share == 0
+    assert own_share(ObjectLabelOptions(max_heterogeneity=0.2), objects, half).share == 1
+    assert own_share(ObjectLabelOptions(max_heterogeneity=0.6), objects, half).share == 0
 
 
 @pytest.mark.parametrize("name", ["own_share", "max_correlation"])
 def test_shares_beyond_one_are_refused(name) -> None:
     with pytest.raises(RangeError, match=rf"^{name}: expected a value in \[0, 1\], got 1\.5\."):
-        CossegOptions(**{name: 1.5})
+        ObjectLabelOptions(**{name: 1.5})
     with pytest.raises(RangeError, match="max_heterogeneity: expected above 0 and at most 1"):
-        CossegOptions(max_heterogeneity=0.0)
+        ObjectLabelOptions(max_heterogeneity=0.0)
+
+
+@pytest.mark.parametrize("name", ["lifted_side", "components", "candidates"])
+def test_counts_below_one_are_refused(name) -> None:
+    with pytest.raises(RangeError, match=f"^{name}: expected at least 1, got 0"):
+        ObjectLabelOptions(**{name: 0})

@@ -24,7 +24,7 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Labels
 from splatseg.lift.mass.confusion import correct_confusion
 from splatseg.lift.object_classes import PooledObjects, heterogeneity
-from splatseg.methods.cosseg._options import CossegOptions
+from splatseg.methods.object_classes._options import ObjectLabelOptions
 
 CANDIDATES = 16
 """Ids of a Gaussian whose votes are counted."""
@@ -41,7 +41,7 @@ class OwnShare:
     heterogeneity: float
 
 
-def own_share(options: CossegOptions, objects: Labels, votes: Labels) -> OwnShare:
+def own_share(options: ObjectLabelOptions, objects: Labels, votes: Labels) -> OwnShare:
     """Lambda, as given or from how the votes err.
 
     Args:
