@@ -178,8 +178,11 @@ def test_options_count(drive, generated_drive) -> None:
     assert len(one.views) == 1
     assert one.field.seen is not None
     assert 0 < float(one.field.seen.max()) <= 1
-    plain = street_field(drive, options=scans, field_options=replace(QUICK, weigh_seen=False))
-    assert plain.field.seen is None
+    assert one.field.vertex_rule == "weighed"
+    asked = street_field(drive, options=scans, field_options=replace(QUICK, vertex_rule="adjusted"))
+    assert asked.field.vertex_rule == asked.field.info.options["vertex_rule"] == "adjusted"
+    adjusted = asked.field.info.details["adjusted_vertices"]
+    assert 0 < adjusted == int((asked.field.seen > 0).sum()) < asked.field.info.details["vertices"]
     coarse = street_field(
         drive, options=scans, field_options=replace(QUICK, voxels=(4.0,), radius=1.5)
     )
