@@ -29,7 +29,8 @@ def root(tmp_path):
     root = write_drive(tmp_path / "set")
     static = root / "data_3d_semantics/train" / DRIVE / "static"
     write_window(static / f"{WINDOW}.ply", XYZ, np.full((5, 3), 9), semantic=IDS,
-                 visible=np.array([1, 0, 1, 1, 0]), confidence=np.array([1, 0.5, 1, 1, 0.25]))  # fmt: skip
+                 visible=np.array([1, 0, 1, 1, 0]),
+                 confidence=np.array([1, 0.5, 1, 1, 0.25]))  # fmt: skip
     ids = np.full((HEIGHT, WIDTH), 7)
     ids[0, :4] = 35, 0, 255, 29
     save_ids(root, "semantic", ids)

@@ -228,9 +228,7 @@ def test_windows_of_a_list(run, sets) -> None:
         with pytest.raises(InputError, match="expected windows of the list 2013_05_28_drive_val"):
             run("kitti360", "points=density", "windows=val")
         listed.write_text("some words\n")
-        with pytest.raises(
-            InputError, match="expected lines such as data_3d_semantics/train/DRIVE"
-        ):
+        with pytest.raises(InputError, match="expected lines such as data_3d_"):
             run("kitti360", "points=density", "windows=val")
     finally:
         listed.unlink()
