@@ -18,10 +18,11 @@ was made before. Held-out views of the crop are scored: PSNR (mean over views) a
 
 Curves are continued by two laws, both fitted to all widths at once by least squares, with a level
 of its own for each width: `log`, q = a_w + b log n', which never ends and gives an upper end; and
-`power`, q = a_w - b_w n'^-c with c of all widths, which does, and gives a lower one (c between 0.1
-and 2). The interval is the 95 % of a bootstrap over the held-out views under both laws together. A
-crop has less to learn than the drive with the same network: its curves are ahead of the drive's,
-and what they end at is optimistic.
+`power`, q = a_w - b n'^-c, which does, and gives a lower one (c between 0.1 and 2). A width with
+few runs has its level by these and the shape of the curve by the others. The interval is the 95 %
+of a bootstrap over the held-out views under both laws together. A crop has less to learn than the
+drive with the same network: its curves are ahead of the drive's, and what they end at is
+optimistic.
 """
 
 import argparse
@@ -110,11 +111,11 @@ def continued(runs: list[dict], chosen: list[int], width: int) -> dict[str, tupl
         log = np.linalg.lstsq(np.column_stack((level, np.log(steps))), y, rcond=None)[0]
         fits = []
         for power in GUESSES:
-            terms = np.column_stack((level, -level * (steps / steps.min())[:, None] ** -power))
+            terms = np.column_stack((level, -((steps / steps.min()) ** -power)))
             weights = np.linalg.lstsq(terms, y, rcond=None)[0]
             error = float(((terms @ weights - y) ** 2).sum())
             end = (WHOLE / steps.min()) ** -power
-            fits.append((error, weights[own] - weights[len(widths) + own] * end))
+            fits.append((error, weights[own] - weights[-1] * end))
         found[name] = (min(fits)[1], log[own] + log[-1] * np.log(WHOLE))
     return found
 
@@ -132,8 +133,6 @@ def told(runs: list[dict]) -> None:
     rng = np.random.default_rng(0)
     draws = [list(range(count)), *(rng.integers(0, count, count).tolist() for _ in range(300))]
     for width in sorted({run["width"] for run in runs}):
-        if sum(run["width"] == width for run in runs) < 2:
-            continue
         ends = [continued(runs, chosen, width) for chosen in draws]
         for name in MEASURES:
             both = np.array([end[name] for end in ends])
@@ -151,7 +150,7 @@ def main() -> None:
     parser.add_argument("--field", type=Path, help="whose primitives are used")
     parser.add_argument("--widths", type=int, nargs="+", default=[64, 128, 256])
     parser.add_argument("--steps", type=int, nargs="+", default=[200, 400, 800, 1600])
-    parser.add_argument("--json", type=Path, help="write all runs here, after each of them")
+    parser.add_argument("--json", type=Path, help="runs; those that are there are kept")
     parser.add_argument("--read", type=Path, help="runs that were made, to be continued again")
     args = parser.parse_args()
     if args.read is not None:
@@ -175,9 +174,10 @@ def main() -> None:
     print(f"{len(views)} views to learn from; held out: {', '.join(view.name for view in out)}")
     mesh = load_mesh_field(args.field).mesh
     caster = MeshCaster(mesh)
-    runs: list[dict] = []
+    runs = json.loads(args.json.read_text()) if args.json and args.json.is_file() else []
+    there = {(run["steps"], run["width"]) for run in runs}
     # The shortest of all widths first: what is stopped has curves of every width.
-    for steps, width in sorted((s, w) for s in args.steps for w in args.widths):
+    for steps, width in sorted({(s, w) for s in args.steps for w in args.widths} - there):
         begun = time.process_time()
         fit = train_radiance(mesh, views, evidence, options=scaled(width, steps))
         runs.append(
