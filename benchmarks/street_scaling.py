@@ -8,21 +8,21 @@ One run of the published setting (50 000 steps of 4 096 rays, 8 layers of 256) i
 cores. Here a crop of the drive (every second training view of the poses 20 to 33) is learned by the
 published network and by narrower ones (all widths of its layers in proportion, all else as
 published), each run from the start to its own end, as rates fall over all of a run. Batches have
-1 024 rays; what counts is how often a ray of the crop is drawn. A run of n steps here is told as
-the steps of the published setting on the whole drive that draw each of its rays as often:
+1 024 rays. A run of n steps here is either n steps of the published setting (`updates`), or as many
+as draw each ray of the whole drive as often as the rays of the crop were drawn (`passes`; 50 000
+published steps are 9.5 passes):
 
     n' = n (1024 / 4096) (rays of the drive / rays of the crop)
 
-so that 50 000 published steps are 9.5 passes over all rays. Primitives are those of a field that
-was made before. Held-out views of the crop are scored: PSNR (mean over views) and mIoU (pooled).
+Which of the two tells more is open, so both are told. Primitives are those of a field that was made
+before. Held-out views of the crop are scored: PSNR (mean over views) and mIoU (pooled).
 
 Curves are continued by two laws, both fitted to all widths at once by least squares, with a level
 of its own for each width: `log`, q = a_w + b log n', which never ends and gives an upper end; and
 `power`, q = a_w - b n'^-c, which does, and gives a lower one (c between 0.1 and 2). A width with
 few runs has its level by these and the shape of the curve by the others. The interval is the 95 %
-of a bootstrap over the held-out views under both laws together. A crop has less to learn than the
-drive with the same network: its curves are ahead of the drive's, and what they end at is
-optimistic.
+of a bootstrap over the held-out views under both laws together: it knows nothing of how far the
+laws reach, of the crop, or of the smaller batch.
 """
 
 import argparse
@@ -98,11 +98,13 @@ def pooled(rows: list[dict]) -> tuple[float, float]:
     return float(np.mean([row["psnr"] for row in rows])), semantic_score(total).miou
 
 
-def continued(runs: list[dict], chosen: list[int], width: int) -> dict[str, tuple[float, float]]:
+def continued(
+    runs: list[dict], chosen: list[int], width: int, axis: str
+) -> dict[str, tuple[float, float]]:
     """What a width ends at by either law, from some of the held-out views."""
     widths = sorted({run["width"] for run in runs})
     level = np.array([[run["width"] == w for w in widths] for run in runs], dtype=float)
-    steps = np.array([run["drive_steps"] for run in runs], dtype=float)
+    steps = np.array([run[axis] for run in runs], dtype=float)
     own = widths.index(width)
     found = {}
     values = np.array([pooled([run["views"][i] for i in chosen]) for run in runs])
@@ -132,16 +134,17 @@ def told(runs: list[dict]) -> None:
     count = len(runs[0]["views"])
     rng = np.random.default_rng(0)
     draws = [list(range(count)), *(rng.integers(0, count, count).tolist() for _ in range(300))]
-    for width in sorted({run["width"] for run in runs}):
-        ends = [continued(runs, chosen, width) for chosen in draws]
-        for name in MEASURES:
-            both = np.array([end[name] for end in ends])
-            low, high = np.percentile(both, (2.5, 97.5))
-            power, log = ends[0][name]
-            print(
-                f"width {width}, {WHOLE} steps, {name}: power {power:.3f}, log {log:.3f}; "
-                f"95 % of both {low:.3f} to {high:.3f}"
-            )
+    for axis, name_of_axis in (("steps", "updates"), ("drive_steps", "passes")):
+        for width in sorted({run["width"] for run in runs}):
+            ends = [continued(runs, chosen, width, axis) for chosen in draws]
+            for name in MEASURES:
+                both = np.array([end[name] for end in ends])
+                low, high = np.percentile(both, (2.5, 97.5))
+                power, log = ends[0][name]
+                print(
+                    f"by {name_of_axis}: width {width}, {WHOLE} steps, {name}: power {power:.3f}, "
+                    f"log {log:.3f}; 95 % of both {low:.3f} to {high:.3f}"
+                )
 
 
 def main() -> None:
