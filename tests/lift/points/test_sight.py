@@ -26,12 +26,12 @@ def wall(depth: float = WALL) -> torch.Tensor:
 def test_what_lies_before_a_surface_or_a_little_behind_is_seen() -> None:
     points = torch.tensor([
         [-0.1, 0, 1.0], [-0.1, 0, 2.15], [-0.1, 0, 2.17], [0.1, 0, 1.0], [-0.1, 0, -1.0],
-        [-9.0, 0, 1.0],
+        [-9.0, 0, 1.0], [0.005, 0, 0.05],
     ])  # fmt: skip
     # 2 m, 3 % and 0.1 m: up to 2.16 m.
-    seen = [True, True, False, False, False, False]
+    seen = [True, True, False, False, False, False, False]
     assert points_in_sight(points, [(camera(), wall())]).tolist() == seen
-    assert points_in_sight(points, []).tolist() == [False] * 6
+    assert points_in_sight(points, []).tolist() == [False] * 7
     # A scene in decimetres: the same wall and points.
     scaled = points_in_sight(10 * points, [(camera(), wall(20.0))], metres_per_unit=0.1)
     assert scaled.tolist() == seen
