@@ -5,7 +5,11 @@
 
 Evidence are the label maps of training views; truth are the labels of all points of all scans and
 the maps of `test` and `test_novel` views, scored by the independent scorer. A point without a
-label is wrong. Rows, each a field (`splatseg.core.Renderable`) and a layer of it:
+label is wrong. Points are scored apart as well by whether a camera saw them: a training view (of
+`--field` where one is given, those that it learned from) whose true depth map has the point no
+more than 0.1 m and 3 % behind it.
+
+Rows, each a field (`splatseg.core.Renderable`) and a layer of it:
 
 - `published`: region voting as Street Gaussians is compared in the paper of the mesh field: the
   majority of centres in a ball, each of which has one vote, of votes of pixels (`uplift` without
@@ -19,11 +23,14 @@ label is wrong. Rows, each a field (`splatseg.core.Renderable`) and a layer of i
 - `views`: points take what the views of the field show at them, and nothing else. `shapes`: and
   what is shaped like them, without smoothing; `drive`: with it, the default for drives.
 
-- `mesh`: points of a mesh field by its eq. 9, and its views; `mesh_views`: points by what its views
-  show at them and by their shapes; `mesh_published`: as `mesh`, of the field of --published-field.
-  `splatseg street` makes these fields; their rows need --field or --published-field.
+- Of the mesh field of --field, which `splatseg street` makes: `mesh_adjusted`, `mesh_weighed` and
+  `mesh_all`: points by its eq. 9 over the vertices of that rule (`--vertex-rule`; adjusted is the
+  paper's), and its views; `mesh_completed`: as adjusted, but points that eq. 9 leaves undefined
+  take the label of the nearest point that has one; `mesh_views`: points by what its views show at
+  them and by their shapes.
 
-`mIoU` is over all classes with points, `big` over those with 1 000 points or more, with 95 %
+`mIoU` is over all classes with points, `seen` and `unseen` over those points that a camera saw and
+that none saw, `big` over classes with 1 000 points or more, with 95 %
 intervals of a bootstrap over scans. The columns of classes are the paper's 13, nan where the truth
 has none: bus counts as others. `test` and `novel` are mIoU of label maps, PSNR and SSIM those of
 the test views.
@@ -49,6 +56,7 @@ from scored import _SCORE
 from torch import Tensor
 
 from splatseg.core import InstanceTree, Labels, PointLabels, Renderable, RenderableLayer, View
+from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import load_scene
 from splatseg.lift import GaussianField, PointLabelOptions
@@ -56,9 +64,11 @@ from splatseg.lift.points import (
     RegionOptions,
     ViewedPointOptions,
     ViewedPoints,
+    points_in_sight,
     region_labels,
 )
 from splatseg.methods import find_method
+from splatseg.neighbours import NeighbourIndex
 from splatseg.street.field import MeshField
 from splatseg.street.files import load_mesh_field
 from splatseg.tasks.scan_labels import viewed_points
@@ -107,13 +117,11 @@ class Region:
 class Bench:
     """A scene, its capture, and layers that rows share."""
 
-    def __init__(
-        self, scene: Path, data: Path, radius: float, fields: dict[str, Path | None]
-    ) -> None:
+    def __init__(self, scene: Path, data: Path, radius: float, field: Path | None) -> None:
         self.scene = replace(load_scene(scene), source=data.resolve())
-        self.data, self.radius, self.fields = data, radius, fields
+        self.data, self.radius = data, radius
+        self._file = field
         self._layers: dict[str, Labels] = {}
-        self._meshes: dict[str, MeshField] = {}
 
     def labels(self, name: str) -> Labels:
         """A layer of classes, made once."""
@@ -129,14 +137,31 @@ class Bench:
         """The same, its points labelled by views."""
         return viewed_points(self.scene, self.field(name), options=options)
 
-    def mesh(self, name: str) -> MeshField:
-        """The mesh field of a row, renamed."""
-        path = self.fields[name]
-        if path is None:
-            raise SystemExit(f"row {name}: expected a mesh field, see --help; got none")
-        if name not in self._meshes:
-            self._meshes[name] = load_mesh_field(path).with_layer(LAYER)
-        return self._meshes[name]
+    @cached_property
+    def mesh(self) -> MeshField:
+        """The mesh field, renamed."""
+        if self._file is None:
+            raise SystemExit("rows of a mesh field: expected --field, got none")
+        return load_mesh_field(self._file).with_layer(LAYER)
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Whether a camera saw each point, by true depth maps."""
+        views = read_capture(self.data).train_views
+        learned = None if self._file is None else self.mesh.info.views
+        if learned is not None:
+            views = tuple(view for view in views if view.name in set(learned))
+        depths = ((view.camera, self._true_depth(view)) for view in views)
+        return points_in_sight(self.scans[0], depths).numpy()
+
+    def _true_depth(self, view: View) -> Tensor:
+        """z-depth of the nearest of every second pixel, metres."""
+        meta = json.loads((self.data / "metadata.json").read_text())["depth"]
+        with Image.open(self.data / "depth" / f"{view.name}.png") as image:
+            depth = torch.from_numpy(np.array(image).astype(np.float32) * meta["unit_m"])
+        for axis in (0, 1):
+            depth = depth.repeat_interleave(meta["stride"], dim=axis)
+        return depth
 
     def _made(self, name: str) -> Labels:
         if name in ("sam", "panoptic"):
@@ -183,6 +208,25 @@ def with_objects(labels: Labels, objects: Labels) -> Labels:
     return replace(labels, ids=out.int(), candidates=None, shares=None)
 
 
+class Completed:
+    """A field whose points without a label take that of the nearest point that has one."""
+
+    def __init__(self, field: MeshField) -> None:
+        self._field = field
+        self.layer_names, self.view, self.layer = field.layer_names, field.view, field.layer
+
+    def labels_at(self, points: Float[Tensor, "p 3"], layer: str) -> PointLabels:
+        """Labels of all points of one call, which are one cloud."""
+        found = self._field.labels_at(points, layer)
+        known = found.ids >= 0
+        if not known.any() or known.all():
+            return found
+        nearest = NeighbourIndex(points[known]).nearest(points[~known], 1).indices[:, 0]
+        ids = found.ids.clone()
+        ids[~known] = found.ids[known][nearest]
+        return PointLabels(ids=ids, confidence=found.confidence)
+
+
 Row = Callable[[Bench], Renderable]
 PLAIN = {"shapes": False, "smoothing_steps": 0}
 ROWS: dict[str, Row] = {
@@ -200,12 +244,12 @@ ROWS: dict[str, Row] = {
     "views": lambda b: b.viewed("uplift", ViewedPointOptions(**PLAIN)),
     "shapes": lambda b: b.viewed("uplift", ViewedPointOptions(smoothing_steps=0)),
     "drive": lambda b: b.viewed("uplift", ViewedPointOptions()),
-    "mesh": lambda b: b.mesh("mesh"),
-    "mesh_views": lambda b: viewed_points(b.scene, b.mesh("mesh")),
-    "mesh_published": lambda b: b.mesh("mesh_published"),
+    "mesh_adjusted": lambda b: b.mesh.with_layer(vertex_rule="adjusted"),
+    "mesh_completed": lambda b: Completed(b.mesh.with_layer(vertex_rule="adjusted")),
+    "mesh_weighed": lambda b: b.mesh.with_layer(vertex_rule="weighed"),
+    "mesh_all": lambda b: b.mesh.with_layer(vertex_rule="all"),
+    "mesh_views": lambda b: viewed_points(b.scene, b.mesh),
 }
-OF_FIELDS = {"mesh": "field", "mesh_views": "field", "mesh_published": "published_field"}
-"""Rows that need a field, and the option that names it."""
 
 
 def scored(*arguments: str | Path) -> dict[str, Any]:
@@ -221,6 +265,12 @@ def points_score(bench: Bench, ids: np.ndarray, work: Path) -> dict[str, Any]:
     np.savez(work / "p.npz", semantic=ids)
     np.savez(work / "t.npz", semantic=truth)
     said = scored("points", "--pred", work / "p.npz", "--truth", work / "t.npz")
+    apart: dict[str, float] = {"share_seen": float(bench.seen[truth > 0].mean())}
+    for name, among in (("seen", bench.seen), ("unseen", ~bench.seen)):
+        np.savez(work / "p.npz", semantic=ids[among])
+        np.savez(work / "t.npz", semantic=truth[among])
+        of_these = scored("points", "--pred", work / "p.npz", "--truth", work / "t.npz")
+        apart |= {name: of_these["mIoU"], f"undefined_{name}": of_these["unlabelled"]}
     n = max(bench.classes) + 1
     flat = (scan * n + truth) * n + ids
     counts = np.bincount(flat, minlength=(scan.max() + 1) * n * n).reshape(-1, n, n)
@@ -243,6 +293,7 @@ def points_score(bench: Bench, ids: np.ndarray, work: Path) -> dict[str, Any]:
         "big": mean_iou(counts.sum(0), big),
         "big_interval": interval([mean_iou(c, big) for c in again]),
         "undefined": said["unlabelled"],
+        **apart,
         "accuracy": said["accuracy"],
         "per_class": of_table,
         "table_1": float(np.nanmean(list(of_table.values()))),
@@ -311,8 +362,10 @@ def measured(bench: Bench, row: Row, known: dict[int, dict[str, Any]]) -> dict[s
 def shown(field: Renderable) -> object:
     """What views of a field are drawn of: labels of Gaussians, or a field of meshes."""
     inner = field
-    while isinstance(inner, Region | ViewedPoints):
+    while isinstance(inner, Region | ViewedPoints | Completed):
         inner = inner._field
+    if isinstance(inner, MeshField):
+        return inner.model
     return inner.labels(LAYER) if isinstance(inner, GaussianField) else inner
 
 
@@ -322,25 +375,26 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), help="all that can be run")
-    parser.add_argument("--field", type=Path, help="of the rows mesh and mesh_views")
-    parser.add_argument("--published-field", type=Path, help="of the row mesh_published")
+    parser.add_argument("--field", type=Path, help="of the rows whose names begin with mesh")
     parser.add_argument("--radius", type=float, default=0.5, help="of regions, metres")
     parser.add_argument("--json", type=Path, help="write all figures here")
     arguments = parser.parse_args()
-    fields = {row: getattr(arguments, option) for row, option in OF_FIELDS.items()}
-    rows = arguments.rows or [row for row in ROWS if fields.get(row, True) is not None]
-    bench = Bench(arguments.scene, arguments.data, arguments.radius, fields)
-    print("| row | mIoU | big | undefined | test | novel | PSNR | SSIM | s | 13 classes | "
-          + " | ".join(TABLE) + " |")  # fmt: skip
-    print("|" + " --- |" * (10 + len(TABLE)))
+    with_mesh = arguments.field is not None
+    rows = arguments.rows or [row for row in ROWS if with_mesh or not row.startswith("mesh")]
+    bench = Bench(arguments.scene, arguments.data, arguments.radius, arguments.field)
+    print("| row | mIoU | seen | unseen | big | undefined | of seen | of unseen | test | novel "
+          "| PSNR | SSIM | s | 13 classes | " + " | ".join(TABLE) + " |")  # fmt: skip
+    print("|" + " --- |" * (14 + len(TABLE)))
     all_found, known = {}, {}
     for name in rows:
         found = all_found[name] = measured(bench, ROWS[name], known)
-        spread = [f"{v:.3f} ({low:.3f} to {high:.3f})" for v, (low, high) in (
+        whole, big = (f"{v:.3f} ({low:.3f} to {high:.3f})" for v, (low, high) in (
             (found["points"], found["points_interval"]), (found["big"], found["big_interval"]),
-        )]  # fmt: skip
-        rest = [f"{found['undefined']:.3f}", f"{found['test']:.4f}", f"{found['novel']:.4f}",
-                f"{found['PSNR']:.2f}", f"{found['SSIM']:.3f}",
+        ))  # fmt: skip
+        spread = [whole, f"{found['seen']:.3f}", f"{found['unseen']:.3f}", big]
+        undefined = [found[key] for key in ("undefined", "undefined_seen", "undefined_unseen")]
+        rest = [*(f"{share:.3f}" for share in undefined), f"{found['test']:.4f}",
+                f"{found['novel']:.4f}", f"{found['PSNR']:.2f}", f"{found['SSIM']:.3f}",
                 f"{found['seconds']['points']:.1f}", f"{100 * found['table_1']:.1f}"]  # fmt: skip
         classes = [f"{100 * v:.1f}" for v in found["per_class"].values()]
         print("| " + " | ".join([name, *spread, *rest, *classes]) + " |", flush=True)

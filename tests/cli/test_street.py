@@ -80,6 +80,33 @@ def test_scans_are_labelled_by_the_field(made, generated_drive, splatseg, tmp_pa
     assert (found["vertices"][0] > 0).sum() == int((ids > 0).sum())
 
 
+def test_eq_9_is_asked_as_published_of_a_field_that_is_there(
+    made, generated_drive, splatseg, tmp_path
+) -> None:
+    """By --vertex-rule or --published: what no adjusted vertex is near has no label; it is told."""
+    found = {}
+    for name, words in (
+        ("own", ()),
+        ("adjusted", ("--vertex-rule", "adjusted")),
+        ("published", ("--published",)),
+        ("all", ("--vertex-rule", "all")),
+    ):
+        line = ("street", made, "--label-scans", generated_drive, "-o", tmp_path / name)
+        status, out, _ = splatseg(*line, "--by", "vertices", *words, "--json", "--quiet")
+        assert status == 0
+        found[name] = json.loads(out)["labels"]
+    rules = {name: facts["vertex_rule"] for name, facts in found.items()}
+    assert rules == {
+        "own": "weighed", "adjusted": "adjusted", "published": "adjusted", "all": "all",
+    }  # fmt: skip
+    assert found["adjusted"]["unlabelled"] == found["published"]["unlabelled"]
+    assert found["adjusted"]["unlabelled"] > found["all"]["unlabelled"]
+    assert found["own"]["unlabelled"] == found["all"]["unlabelled"]
+    line = ("street", made, "--label-scans", generated_drive, "-o", tmp_path / "own")
+    status, out, _ = splatseg(*line, "--by", "vertices", "--published")
+    assert "scans labelled by vertices (those that training adjusted, as published)" in out
+
+
 def test_what_is_wrong_is_one_sentence(made, generated_drive, splatseg, tmp_path) -> None:
     def refused(*words: object) -> str:
         status, out, err = splatseg("street", *words, "--quiet")

@@ -44,6 +44,13 @@ def test_labels_of_scans_are_on_the_page_of_the_field_that_gave_them(
     record = json.loads((scene / "reports/street.json").read_text())
     assert record["points"]["ids"] == facts["labels"]["ids"]
     assert record["points"]["unlabelled"] == facts["labels"]["unlabelled"]
+    assert record["points"]["vertex_rule"] is None
+    whole, seen, unseen = record["points"]["scores"]
+    assert [row["points"] for row in (whole, seen, unseen)] == ["all", "seen", "unseen"]
+    assert whole["count"] == seen["count"] + unseen["count"] == facts["labels"]["points"]
+    assert seen["count"] > 0 < unseen["count"]
+    assert whole["undefined"] == facts["labels"]["unlabelled"] / facts["labels"]["points"]
+    assert "Points against their truth" in page
 
 
 def test_a_drive_in_blocks_has_a_page_of_its_name(reported, generated_drive, splatseg) -> None:

@@ -197,6 +197,62 @@ def test_vertices_that_no_ray_saw_count_a_hundredth() -> None:
         MeshField(field.mesh, field.model, seen=seen * 2)
 
 
+def two_balls() -> tuple[MeshField, torch.Tensor, torch.Tensor]:
+    """A car that training adjusted but for its inside, beside a larger road that no ray met.
+
+    Three points: between the two and nearer to the road, within the road's reach alone, far away.
+    """
+    mesh = balls([[0, 0, 0], [1.2, 0, 0]], radius=0.5)
+    field = told_field(mesh, [1, 0])
+    seen = torch.zeros(len(mesh.vertices))
+    outside = mesh.vertices[:42, 0] > 0
+    seen[:42][outside] = 1e-4
+    points = torch.tensor([[0.65, 0, 0], [1.9, 0, 0], [9.0, 0, 0]])
+    return field, seen, points
+
+
+def test_eq_9_as_published_asks_only_vertices_that_training_adjusted() -> None:
+    """V_b: "vertices whose features f_i have been adjusted during training" (paper, section 3.2).
+
+    A point that has only untouched vertices around it is undefined; one that has both takes the
+    label of the touched, however near the others are and however little rays saw.
+    """
+    field, seen, points = two_balls()
+    road, car = field.model.ids[0], field.model.ids[1]
+    asked = {
+        rule: MeshField(field.mesh, field.model, seen=seen, radius=0.4, vertex_rule=rule)
+        for rule in ("adjusted", "weighed", "all")
+    }
+    ids = {rule: one.labels_at(points, "semantic").ids.tolist() for rule, one in asked.items()}
+    assert ids["all"] == [road, road, -1], "the wrong reading of the paper"
+    assert ids["adjusted"] == [car, -1, -1]
+    assert ids["weighed"] == [road, road, -1], "a hundredth of all is more than what rays saw"
+    well_seen = MeshField(field.mesh, field.model, seen=seen.sign(), radius=0.4)
+    assert well_seen.vertex_rule == "weighed"
+    assert well_seen.labels_at(points, "semantic").ids.tolist() == [car, road, -1]
+    opacity, probabilities = field.model.vertex_outputs(field.mesh)
+    kept = seen > 0
+    want = reference.point_columns(
+        field.mesh.vertices[kept], opacity[kept], probabilities[kept], points, radius=0.4
+    )
+    assert torch.equal(asked["adjusted"].query.columns(points)[0], want)
+
+
+def test_a_rule_needs_to_know_what_rays_saw() -> None:
+    field, seen, points = two_balls()
+    assert field.vertex_rule == "all"
+    for rule in ("adjusted", "weighed"):
+        with pytest.raises(InputError, match=f"^vertex_rule: expected all for a field .* {rule}"):
+            field.with_layer(vertex_rule=rule)
+    with pytest.raises(InputError, match="^vertex_rule: expected one of adjusted, weighed, all"):
+        MeshField(field.mesh, field.model, seen=seen, vertex_rule="some")  # pyright: ignore[reportArgumentType]
+    known = MeshField(field.mesh, field.model, seen=seen, radius=0.4)
+    changed = known.with_layer(vertex_rule="adjusted")
+    assert changed.info.options["vertex_rule"] == "adjusted"
+    assert changed.with_layer("street").vertex_rule == "adjusted"
+    assert changed.labels_at(points, "semantic").ids.tolist()[1] == -1
+
+
 def test_another_name_and_record_leave_the_rest() -> None:
     made = random_field()
     seen = torch.linspace(0, 1, len(made.mesh.vertices))

@@ -10,7 +10,7 @@ import torch
 from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
 from splatseg.io.tensors import read_safetensors
 from splatseg.io.tensors_writing import write_tensors
-from splatseg.street.field import MeshField
+from splatseg.street.field import VERTEX_RULES, MeshField
 from splatseg.street.files import (
     FORMAT,
     load_mesh_field,
@@ -201,6 +201,23 @@ def test_what_training_saw_comes_back(tmp_path: Path) -> None:
     tensors, metadata = read_safetensors(path)
     assert tensors["seen"].dtype == torch.float16
     assert torch.equal(load_mesh_field(path).seen, seen)
+    assert load_mesh_field(path).vertex_rule == "weighed"
+    for rule in VERTEX_RULES:
+        asked = MeshField(field.mesh, field.model, seen=seen, vertex_rule=rule)
+        save_mesh_field(asked, tmp_path / "asked.safetensors")
+        assert load_mesh_field(tmp_path / "asked.safetensors").vertex_rule == rule
+    about = json.loads(metadata["about"])
+    # The first files say no rule; those with `seen` weighed by it.
+    for rule, found in ((None, "weighed"), ("all", "all")):
+        told = {k: v for k, v in about.items() if k != "vertex_rule"}
+        told |= {} if rule is None else {"vertex_rule": rule}
+        write_tensors(tensors, path, metadata=metadata | {"about": json.dumps(told)})
+        assert load_mesh_field(path).vertex_rule == found
+    write_tensors(
+        tensors, path, metadata=metadata | {"about": json.dumps(about | {"vertex_rule": "near"})}
+    )
+    with pytest.raises(FileFormatError, match="vertex_rule: expected one of adjusted, weighed"):
+        load_mesh_field(path)
     for wrong, words in (
         (seen[1:], "seen: expected shape"),
         (2 * seen, "seen: expected values"),

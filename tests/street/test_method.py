@@ -1,5 +1,6 @@
 """The method dnmp: labels of Gaussians by the mesh field of the same drive."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -41,8 +42,40 @@ def test_it_is_found_by_its_name() -> None:
     assert keeps_ids("dnmp")
     assert (method.evidence, method.returns, method.seeded) == (("labels",), "labels", True)
     assert method.published_options == PUBLISHED
-    assert method.published_options.radiance.iterations == 50_000
-    assert method.published_options.geometry.iterations == 5000
+
+
+def test_published_settings_are_those_of_the_papers() -> None:
+    """Written out from the paper (papers/002) and from DNMP's code where the paper refers to it.
+
+    Paper, section 4.1: batches of 4 096 rays, 5k iterations of geometry, then 50k of the field;
+    section 3.2: w = 0.1, eq. 2 is the distance along the ray, eq. 9 asks adjusted vertices. DNMP:
+    voxels of 0.5 and 1 m, networks of 8 layers of 256 (the input again after the fourth), features
+    of 3 numbers in 3 octaves, 4 fine and 2 coarse hits, rates of 5e-4, weight 0.05 of depth.
+    """
+    published = find_method("dnmp").published_options
+    assert published.voxels == (0.5, 1.0)
+    assert (published.coarse, published.start) == ("everywhere", "sphere")
+    assert published.asked_vertices == "adjusted"
+    assert published.radius is None, "the side of the finest voxels"
+    geometry = published.geometry
+    assert (geometry.iterations, geometry.rays, geometry.error) == (5_000, 4_096, "ray")
+    assert (geometry.rate, geometry.offset_rate, geometry.depth_weight) == (5e-4, 5e-4, 0.05)
+    assert geometry.final_rate == pytest.approx(0.99501248, abs=1e-6), "0.999999 a step"
+    assert (geometry.normal_weight, geometry.laplacian_weight, geometry.edge_weight) == (0, 0, 0)
+    assert (geometry.truncation, geometry.distance_power) == (math.inf, 0.0)
+    assert geometry.carve == math.inf, "nothing is carved"
+    assert (geometry.refresh, geometry.reuse) == (100, 1)
+    field = published.radiance
+    assert (field.iterations, field.rays) == (50_000, 4_096)
+    assert field.semantic_weight == 0.1
+    assert (field.depth, field.width, field.skip) == (8, 256, 5)
+    assert (field.feature_size, field.feature_frequencies) == (3, 3)
+    assert (field.semantic_width, field.colour_widths) == (128, (256, 256))
+    assert (field.position_frequencies, field.view_frequencies) == (6, 4)
+    assert field.view_encoding == "normal_view"
+    assert (field.max_hits, field.fine_hits, field.coarse_hits) == (6, 4, 2)
+    assert (field.order, field.sides) == ("levels", "both")
+    assert (field.rate, field.feature_rate, field.final_rate) == (5e-4, 5e-4, 0.1)
 
 
 def test_gaussians_take_the_labels_of_the_field_and_far_ones_none(inputs, generated_drive) -> None:
@@ -61,6 +94,8 @@ def test_gaussians_take_the_labels_of_the_field_and_far_ones_none(inputs, genera
     sky = max(row.id for row in inputs.classes.rows)
     assert labels.background == sky
     assert labels.info.method == "dnmp"
+    assert labels.info.options["vertex_rule"] == "weighed"
+    assert labels.info.details["undefined"] == int((ids < 0).sum()) > 0
     assert labels.info.names[1] == "road"
     assert steps == sorted(steps)
     assert steps[-1] == 1000
@@ -83,6 +118,7 @@ def test_without_gaussians_there_is_nothing_to_label(inputs) -> None:
         ({"iterations": 0}, "iterations: expected 1 or more, got 0"),
         ({"rays": 0}, "rays: expected 1 or more"),
         ({"geometry_iterations": -1}, "geometry_iterations: expected 0 or more"),
+        ({"vertex_rule": "near"}, "vertex_rule: expected one of"),
         ({"carve": 0.0}, "carve: expected a positive number"),
         ({"radius": float("nan")}, "radius: expected a positive number"),
         ({"semantic_weight": -1.0}, "semantic_weight: expected 0 or more"),
@@ -104,8 +140,9 @@ def test_every_option_reaches_the_stage_that_it_is_of() -> None:
     assert radiance.cache_memory == 99
     fast, published = DnmpOptions(), DnmpOptions(setting="published")
     assert fast.geometry.carve == 0.9
-    assert (fast.weighs_seen, published.weighs_seen) == (True, False)
-    assert replace(published, weigh_seen=True).weighs_seen
+    assert (fast.asked_vertices, published.asked_vertices) == ("weighed", "adjusted")
+    for rule in ("adjusted", "weighed", "all"):
+        assert replace(published, vertex_rule=rule).asked_vertices == rule
     assert published.geometry.carve > 1
     assert published.radiance.width == 256 > fast.radiance.width
     assert replace(published, iterations=5).radiance.iterations == 5

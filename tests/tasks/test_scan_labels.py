@@ -13,8 +13,10 @@ from splatseg.errors import InputError
 from splatseg.io.captures import read_capture
 from splatseg.io.scans import read_scans
 from splatseg.lift.points import ViewedPointOptions
-from splatseg.tasks import ScanLabelOptions, label_scans
+from splatseg.street.field import MeshField
+from splatseg.tasks import ScanLabelOptions, label_scans, viewed_points
 from support.analytic import BALL, FLOOR, BallOverFloor
+from support.mesh_fields import balls, told_field
 from support.ply import write_ply
 
 
@@ -98,6 +100,26 @@ def test_a_field_labels_range_images_in_their_shape(scene, generated_drive, tmp_
     assert record["unlabelled"] == int(((semantic == 0) & ~nothing_came).sum()) > 0
     assert record["names"] == {str(FLOOR): "floor", str(BALL): "ball"}
     assert record["points_by_id"][str(BALL)] == int((semantic == BALL).sum())
+
+
+def test_labels_say_which_vertices_were_asked(scene, generated_drive, tmp_path) -> None:
+    """And points that have none of them around are undefined, counted and written as 0."""
+    points = read_scans(generated_drive).scan("0001").points
+    near = points[points.norm(dim=1).argmin()]
+    bare = told_field(balls([near.tolist()], radius=0.3), [0])
+    seen = torch.zeros(len(bare.mesh.vertices))
+    for rule, labelled in (("adjusted", 0), ("weighed", 1), ("all", 1)):
+        field = MeshField(bare.mesh, bare.model, seen=seen, vertex_rule=rule)
+        made = label_scans(scene, generated_drive, tmp_path / rule, field=field)
+        record = json.loads((tmp_path / rule / "labels.json").read_text())
+        assert record["vertex_rule"] == made.vertex_rule == rule
+        assert (made.counts.unlabelled < made.counts.points) == bool(labelled)
+        assert record["unlabelled"] == made.counts.unlabelled
+    viewed = label_scans(
+        scene, generated_drive, tmp_path / "views", field=viewed_points(scene, bare)
+    )
+    assert viewed.vertex_rule is None
+    assert json.loads((tmp_path / "views/labels.json").read_text())["vertex_rule"] is None
 
 
 def test_a_field_may_label_all_scans_in_its_own_way(scene, generated_drive, tmp_path) -> None:

@@ -17,11 +17,13 @@ from splatseg.io.scene_fields import scene_field_path
 from splatseg.io.scene_folder import is_scene
 from splatseg.report.point_map import LabelledPoints
 from splatseg.report.words import counted
+from splatseg.street.field import VERTEX_WORDS
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import (
     LabelBy,
     LabelledScans,
     ScanLabelOptions,
+    ScanLabels,
     StreetDrive,
     StreetField,
     StreetOptions,
@@ -36,6 +38,9 @@ from splatseg.tasks import (
 from splatseg.tasks.scene_parts import gaussian_field
 
 CONFIG = (tyro.conf.HelptextFromCommentsOff,)
+
+_REPORTED = 2_000_000
+"""Points that a report scores and draws, evenly of all where there are more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +97,7 @@ class Command:
     by: LabelBy = "gaussians"
     """Who labels points. gaussians: what views of the Gaussians show there, and shapes. mesh: the
     same of the mesh field, which is made first where it is not there. vertices: those of the field
-    around a point, as published (eq. 9)."""
+    around a point (eq. 9), by --vertex-rule, which is asked of a field that is there as well."""
 
     form: Literal["auto", "npz", "label", "ply", "las"] = "auto"
     """Of the files of labels. npz: semantic and confidence, a value for each of the scan's file.
@@ -100,7 +105,8 @@ class Command:
 
     report: bool = False
     """Also write SCENE/reports/FIELD.html and FIELD.json: what was built, how it went, training
-    views, and, with --label-scans, the points from above and counts by class."""
+    views, and, with --label-scans, the points from above, counts by class, and, of scans that have
+    classes, scores of all points, of those that a camera saw, and of those that none saw."""
 
     backend: Backend = "auto"
     data: Data = None
@@ -126,25 +132,30 @@ def run(command: Command) -> None:
     if scans is None or command.by != "gaussians":
         found = _field(command, scene, root, observer, facts=facts, lines=lines)
     if scans is not None and command.output is not None:
-        kept = LabelledPoints()
+        kept = LabelledPoints(limit=_REPORTED)
         made = label_scans(
             scene,
             scans,
             command.output,
             field=None if found is None else _labeller(command, scene, found.field),
             options=replace(options, layer=command.inputs.layer if found is None else None),
-            seen=(lambda scan, labels: kept.add(scan.points, labels.ids))
+            seen=(
+                lambda scan, labels: kept.add(
+                    scan.points, labels.ids, truth=scan.labels.get("semantic")
+                )
+            )
             if command.report
             else None,
             backend=command.backend,
             observer=observer,
         )
-        labelled = LabelledScans(made=made, by=command.by, points=kept)
+        labelled = LabelledScans(made=made, by=command.by, points=kept, classes=scans.classes)
         counts = made.counts
         share = 100 * counts.unlabelled / max(counts.points, 1)
         facts["labels"] = {
             "folder": made.folder,
             "by": command.by,
+            "vertex_rule": made.vertex_rule,
             "layer": made.layer,
             "form": made.form,
             "scans": counts.scans,
@@ -154,8 +165,8 @@ def run(command: Command) -> None:
         }
         lines.append(
             f"{counts.points - counts.unlabelled} of {counts.points} points of {counts.scans} "
-            f"scans labelled, {counts.unlabelled} ({share:.1f} %) without a label; in "
-            f"{made.folder}"
+            f"scans labelled{_asked(made)}, {counts.unlabelled} ({share:.1f} %) without a label; "
+            f"in {made.folder}"
         )
     if command.report:
         facts["report"] = _report(command, scene, found, labelled)
@@ -167,6 +178,11 @@ def run(command: Command) -> None:
 def _labeller(command: Command, scene: Scene, field: Renderable) -> Renderable:
     """The mesh field as points are to take its labels."""
     return field if command.by == "vertices" else viewed_points(scene, field)
+
+
+def _asked(made: ScanLabels) -> str:
+    """Which vertices gave the labels, for a sentence; nothing where none did."""
+    return "" if made.vertex_rule is None else f" by vertices ({VERTEX_WORDS[made.vertex_rule]})"
 
 
 def _report(
@@ -218,7 +234,7 @@ def _field(
 ) -> "_Found":
     """The field of this name: read, where points are to be labelled by it, or made."""
     if command.label_scans is not None and not command.overwrite:
-        there = made_street_field(scene, options=command.inputs)
+        there = made_street_field(scene, options=command.inputs, field_options=command.primitives)
         if there is not None:
             return _Found(field=there, made=None)
     made = make_street_field(

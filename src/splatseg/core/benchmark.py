@@ -93,12 +93,17 @@ class TruePoints:
 
     table: ClassTable | None = None
 
+    visible: Bool[Tensor, "n"] | None = None
+    """Which of them the data set says that a photograph shows; None where it does not say."""
+
     faces: Int[Tensor, "m 3"] | None = None
     """Triangles between the points, where the annotation is that of a mesh."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("points", self.points, (len(self.labels), 3))
+        if self.visible is not None:
+            check_shape("visible", self.visible, (len(self.labels),))
         if self.faces is not None:
             check_shape("faces", self.faces, (None, 3))
 

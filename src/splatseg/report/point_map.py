@@ -35,20 +35,33 @@ class LabelledPoints:
         self._rows: list[Tensor] = []
         self._points: list[Tensor] = []
         self._ids: list[Tensor] = []
+        self._truth: list[Tensor] = []
 
-    def add(self, points: Float[Tensor, "n 3"], ids: Int[Tensor, "n"]) -> None:
-        """Take the points of a scan, world, and their ids, -1 where they have none."""
+    def add(
+        self,
+        points: Float[Tensor, "n 3"],
+        ids: Int[Tensor, "n"],
+        *,
+        truth: Int[Tensor, "n"] | None = None,
+    ) -> None:
+        """Take the points of a scan, world, with their ids and true ids, -1 where they have none.
+
+        Without `truth` no point of the scan has one.
+        """
         check_shape("ids", ids, (len(points),))
+        true = torch.full((len(points),), -1, dtype=torch.int32) if truth is None else truth
+        check_shape("truth", true, (len(points),))
         rows = torch.arange(self._seen, self._seen + len(points))
         self._seen += len(points)
         kept = rows % self._step == 0
         self._rows.append(rows[kept])
         self._points.append(points.detach().cpu()[kept].double())
         self._ids.append(ids.detach().cpu()[kept].int())
+        self._truth.append(true.detach().cpu()[kept].int())
         while sum(map(len, self._rows)) > self._limit:
             self._step *= 2
             stays = [part % self._step == 0 for part in self._rows]
-            for held in (self._rows, self._points, self._ids):
+            for held in (self._rows, self._points, self._ids, self._truth):
                 held[:] = [part[some] for part, some in zip(held, stays, strict=True)]
 
     @property
@@ -60,6 +73,11 @@ class LabelledPoints:
     def ids(self) -> Int[Tensor, "n"]:
         """Their ids."""
         return torch.cat(self._ids) if self._ids else torch.zeros(0, dtype=torch.int32)
+
+    @property
+    def truth(self) -> Int[Tensor, "n"]:
+        """Their true ids, -1 where scans brought none."""
+        return torch.cat(self._truth) if self._truth else torch.zeros(0, dtype=torch.int32)
 
 
 def point_map(

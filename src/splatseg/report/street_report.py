@@ -54,6 +54,24 @@ class DepthError:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PointScore:
+    """How well some points of scans that brought their truth are labelled."""
+
+    points: str
+    """Which: all, seen (by a camera), or unseen."""
+
+    count: int
+    """Of them, with a truth."""
+
+    miou: float | None
+    """Mean IoU of the classes that they have; a point without a label is wrong. None of none."""
+
+    accuracy: float | None
+    undefined: float | None
+    """Share without a label."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PointCounts:
     """Points of laser scans that were labelled."""
 
@@ -63,11 +81,20 @@ class PointCounts:
     by: str
     """Who labelled them."""
 
+    vertex_rule: str | None
+    """Which vertices eq. 9 asked; None where points took labels otherwise."""
+
     scans: int
     points: int
     unlabelled: int
     ids: Mapping[int, int]
     """How many points have each id, by id."""
+
+    scores: tuple[PointScore, ...] = ()
+    """Where scans brought their truth: of all points, of seen and of unseen ones."""
+
+    sight: str = ""
+    """By whose depth points count as seen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,6 +153,8 @@ def street_report(
         blocks.append(above)
         blocks += [legend] if views is None and data.classes.rows else []
     blocks += [] if data.points is None else [_point_table(data, data.points)]
+    if data.points is not None and data.points.scores:
+        blocks.append(_score_table(data.points))
     blocks += [_levels(data)] if data.levels else []
     blocks += [_depths(data)] if data.depth else []
     charts = _charts(data)
@@ -270,6 +299,16 @@ def _point_table(data: StreetReportData, points: PointCounts) -> Table:
         columns=("class", "id", "points", "share"),
         rows=tuple(rows),
         note=f"Of {counted(points.scans, 'scan')}; the labels are in {points.folder}.",
+    )
+
+
+def _score_table(points: PointCounts) -> Table:
+    return Table(
+        title="Points against their truth",
+        columns=("points", "number", "mIoU", "accuracy", "without a label"),
+        rows=tuple((s.points, s.count, s.miou, s.accuracy, s.undefined) for s in points.scores),
+        note="Seen are points that a view which was learned from shows, by "
+        f"{points.sight}: no more than 0.1 m and 3 % behind it. A point without a label is wrong.",
     )
 
 

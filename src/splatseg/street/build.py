@@ -12,7 +12,7 @@ from splatseg.core import ClassTable, LayerInfo, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
-from splatseg.street.field import MeshField
+from splatseg.street.field import MeshField, with_vertex_rule
 from splatseg.street.geometry import DepthView, GeometryFit, GeometryRecord, fit_geometry
 from splatseg.street.options import DnmpOptions
 from splatseg.street.primitives import Primitives, voxel_primitives
@@ -26,6 +26,9 @@ Stage = Callable[[str, int, int], None]
 
 _ENOUGH = 10.0
 """Rays that saw a vertex which counts half."""
+
+_LEAST_HALF = 2.0**-24
+"""The least positive number of float16."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -124,6 +127,7 @@ def build_mesh_field(
     model = trained.model
     with torch.no_grad():
         model.features.copy_(model.features.half().float())
+    seen = seen_shares(trained.seen)
     names = {} if classes is None else {row.id: row.name for row in classes.rows}
     info = LayerInfo(
         method=METHOD_NAME,
@@ -138,6 +142,8 @@ def build_mesh_field(
             "removed_before_surfaces": shaped.carved,
             "rays": trained.rays,
             "hits": trained.hits,
+            "vertices": len(seen),
+            "adjusted_vertices": int((seen > 0).sum()),
         },
     )
     radius = None if options.radius is None else options.radius / metres_per_unit
@@ -146,9 +152,10 @@ def build_mesh_field(
             mesh,
             model,
             layer=layer,
-            info=info,
+            info=with_vertex_rule(info, options.asked_vertices),
             radius=radius,
-            seen=seen_shares(trained.seen) if options.weighs_seen else None,
+            seen=seen,
+            vertex_rule=options.asked_vertices,
         ),
         start=primitives,
         geometry=shaped,
@@ -157,8 +164,12 @@ def build_mesh_field(
 
 
 def seen_shares(seen: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-    """What vertices that so many rays saw count in eq. 9, in [0, 1], as float16 holds it."""
-    return (seen / (seen + _ENOUGH)).half().float()
+    """What vertices that so many rays saw count in eq. 9, in [0, 1], as float16 holds it.
+
+    Above 0 exactly where a ray adjusted the vertex, however little it saw of it.
+    """
+    shares = (seen / (seen + _ENOUGH)).half().float()
+    return torch.where(seen > 0, shares.clamp_min(_LEAST_HALF), 0.0)
 
 
 def _check_several(

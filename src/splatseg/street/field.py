@@ -1,16 +1,17 @@
 """Primitives with colours and classes as one field, to be rendered, scored and asked of points."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
-from types import TracebackType
-from typing import Self
+from types import MappingProxyType, TracebackType
+from typing import Literal, Self, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg._check import check_shape, check_values
+from splatseg._check import check_choice, check_shape, check_values
 from splatseg.core import (
     UNLABELLED,
     Camera,
@@ -36,9 +37,24 @@ _COVERED = 0.5
 """Sum of probabilities that a pixel needs for a label."""
 
 
+VertexRule = Literal["adjusted", "weighed", "all"]
+"""Which vertices eq. 9 asks. adjusted: V_b as published, those whose features training adjusted.
+weighed: all, each by how much training rays saw of it. all: all, as the network has them."""
+
+VERTEX_RULES: tuple[VertexRule, ...] = get_args(VertexRule)
+
+VERTEX_WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "adjusted": "those that training adjusted, as published",
+        "weighed": "each by what training rays saw of it",
+        "all": "all alike",
+    }
+)
+"""The same in a few words."""
+
 _LEAST_SEEN = 0.01
-"""What a vertex counts at least: far from all that was seen, the network's guess is better than
-nothing."""
+"""What a vertex counts at least by `weighed`: far from all that was seen, the network's guess is
+better than nothing."""
 
 
 class MeshField:
@@ -53,14 +69,17 @@ class MeshField:
         layer: Name of its layer.
         info: How it was made, and what ids are called.
         radius: Of the ball of eq. 9, scene units; None is the side of the finest voxels.
-        seen: How well training knows each vertex, in [0, 1]: sigma of eq. 9 is multiplied by it, or
-            by 0.01 where that is more. Most vertices are inside walls or behind others, where no
-            ray taught the network what it says. None is 1 for all, as published.
+        seen: How well training knows each vertex, in [0, 1]; 0 where no ray adjusted its features,
+            as inside walls and behind others: most vertices. None where that is not known.
+        vertex_rule: Which vertices eq. 9 asks. adjusted: those with `seen` above 0, V_b as
+            published; a point with none in its ball is undefined. weighed: all, with sigma times
+            `seen`, or times 0.01 where that is more. all: all, as the network has them. None is
+            weighed with `seen`, all without.
 
     Raises:
         ShapeError: If the model has not one row of features a vertex, or `seen` not one number.
         RangeError: If the radius is not positive, or a value of `seen` is not in [0, 1].
-        InputError: If an id of the model is not 1 or more.
+        InputError: If an id of the model is not 1 or more, or a rule needs `seen`.
     """
 
     @boundary
@@ -73,6 +92,7 @@ class MeshField:
         info: LayerInfo | None = None,
         radius: float | None = None,
         seen: Float[Tensor, "v"] | None = None,
+        vertex_rule: VertexRule | None = None,
     ) -> None:
         check_shape("model.features", model.features, (len(mesh.vertices), None))
         if min(model.ids) < 1:
@@ -85,7 +105,16 @@ class MeshField:
         if seen is not None:
             check_shape("seen", seen, (len(mesh.vertices),))
             check_values("seen", seen, 0.0, 1.0)
+        if vertex_rule is None:
+            vertex_rule = "all" if seen is None else "weighed"
+        check_choice("vertex_rule", vertex_rule, VERTEX_RULES)
+        if seen is None and vertex_rule != "all":
+            raise InputError(
+                f"vertex_rule: expected all for a field that does not know what training rays saw "
+                f"of its vertices, got {vertex_rule}."
+            )
         self._seen = None if seen is None else seen.detach().cpu().float()
+        self._vertex_rule: VertexRule = vertex_rule
         self._mesh, self._model = mesh, model.eval().requires_grad_(requires_grad=False)
         self._layer, self._radius = layer, radius
         self._info = LayerInfo() if info is None else info
@@ -113,8 +142,13 @@ class MeshField:
 
     @property
     def seen(self) -> Float[Tensor, "v"] | None:
-        """How well training knows each vertex; None where that is not asked."""
+        """How well training knows each vertex; None where that is not known."""
         return self._seen
+
+    @property
+    def vertex_rule(self) -> VertexRule:
+        """Which vertices eq. 9 asks."""
+        return self._vertex_rule
 
     @property
     def info(self) -> LayerInfo:
@@ -137,19 +171,31 @@ class MeshField:
         return RenderableLayer(ids=tuple(sorted(self._model.ids)), info=self._info)
 
     @boundary
-    def with_layer(self, layer: str | None = None, *, info: LayerInfo | None = None) -> "MeshField":
-        """The same field with another name of its layer, or another record; None keeps it.
+    def with_layer(
+        self,
+        layer: str | None = None,
+        *,
+        info: LayerInfo | None = None,
+        vertex_rule: VertexRule | None = None,
+    ) -> "MeshField":
+        """The same field with another name of its layer, another record or rule; None keeps it.
+
+        A rule is written into the record, as its option ``vertex_rule``.
 
         Raises:
-            InputError: If the name is empty or has an @.
+            InputError: If the name is empty or has an @, or the rule needs what is not known.
         """
+        info = self._info if info is None else info
+        if vertex_rule is not None:
+            info = with_vertex_rule(info, vertex_rule)
         return MeshField(
             self._mesh,
             self._model,
             layer=self._layer if layer is None else layer,
-            info=self._info if info is None else info,
+            info=info,
             radius=self._radius,
             seen=self._seen,
+            vertex_rule=self._vertex_rule if vertex_rule is None else vertex_rule,
         )
 
     def view(self, camera: Camera) -> "MeshFieldView":
@@ -165,7 +211,7 @@ class MeshField:
             layer: Name of its layer.
 
         Returns:
-            Ids, -1 where no vertex is near, and the winner's share of the sum.
+            Ids, -1 where no vertex that the rule asks is near, and the winner's share of the sum.
 
         Raises:
             InputError: If it is another layer's name.
@@ -179,16 +225,26 @@ class MeshField:
 
     @cached_property
     def query(self) -> BallQuery:
-        """Its vertices with opacities and probabilities, made when first asked for."""
+        """Vertices that the rule asks, with opacities and probabilities, made when first needed."""
         opacity, probabilities = self._model.vertex_outputs(self._mesh)
-        if self._seen is not None:
-            opacity = opacity * self._seen.clamp_min(_LEAST_SEEN)
-        return BallQuery(self._mesh.vertices, opacity, probabilities, radius=self._radius)
+        vertices, seen = self._mesh.vertices, self._seen
+        if seen is not None and self._vertex_rule == "weighed":
+            opacity = opacity * seen.clamp_min(_LEAST_SEEN)
+        if seen is not None and self._vertex_rule == "adjusted":
+            adjusted = seen > 0
+            vertices, opacity = vertices[adjusted], opacity[adjusted]
+            probabilities = probabilities[adjusted]
+        return BallQuery(vertices, opacity, probabilities, radius=self._radius)
 
     @cached_property
     def caster(self) -> MeshCaster:
         """Its triangles arranged for rays, when first asked for."""
         return MeshCaster(self._mesh)
+
+
+def with_vertex_rule(info: LayerInfo, rule: VertexRule) -> LayerInfo:
+    """A record that says by which rule points ask vertices."""
+    return replace(info, options={**info.options, "vertex_rule": rule})
 
 
 class MeshFieldView:

@@ -20,7 +20,7 @@ from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, parse_object
 from splatseg.io.tensors import read_safetensors, read_safetensors_words
 from splatseg.io.tensors_writing import write_tensors
-from splatseg.street.field import MeshField
+from splatseg.street.field import VERTEX_RULES, MeshField, VertexRule
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.radiance import RadianceModel, RadianceOptions
 from splatseg.street.shapes.template import VERTICES
@@ -63,6 +63,7 @@ def save_mesh_field(field: MeshField, path: Path) -> None:
         "ids": list(field.model.ids),
         "layer": field.layer_names[0],
         "radius": field.radius,
+        "vertex_rule": field.vertex_rule,
         "options": asdict(field.model.options),
         "info": layer_info_to_json(field.info),
     }
@@ -91,6 +92,7 @@ def load_mesh_field(path: Path) -> MeshField:
             info=_info(about, path),
             radius=json_number(about["radius"], where=f"{path}: radius"),
             seen=_seen(tensors, path),
+            vertex_rule=_vertex_rule(about, path),
         )
 
 
@@ -173,6 +175,16 @@ def _seen(tensors: Mapping[str, Tensor], path: Path) -> Tensor | None:
     if seen is not None and not seen.is_floating_point():
         raise FileFormatError(f"{path}: seen: expected floating-point numbers, got {seen.dtype}.")
     return None if seen is None else seen.float()
+
+
+def _vertex_rule(about: Mapping[str, Any], path: Path) -> VertexRule | None:
+    """None where the first files of this version say none: it is told by `seen` then."""
+    rule = about.get("vertex_rule")
+    if rule is not None and rule not in VERTEX_RULES:
+        raise FileFormatError(
+            f"{path}: vertex_rule: expected one of {', '.join(VERTEX_RULES)}, got {quoted(rule)}."
+        )
+    return rule
 
 
 def _options(about: Mapping[str, Any], path: Path) -> RadianceOptions:

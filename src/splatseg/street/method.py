@@ -2,7 +2,9 @@ r"""``segment --method dnmp``: labels of Gaussians from a mesh field of the same
 
 Primitives are put where the Gaussians show surfaces and fitted to the depth that they show; the
 field learns from photographs and label maps, as the paper has it. A Gaussian takes the label of
-its centre, by eq. 9; one without a vertex near it has none, and is completed as usual.
+its centre, by eq. 9; one without a vertex near it that the rule asks has none, and is completed as
+usual. The layer's record has the rule (option ``vertex_rule``), and how many Gaussians eq. 9 left
+undefined (``undefined``).
 
 References:
     DNMP with semantics (papers/002).
@@ -10,6 +12,7 @@ References:
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import torch
 
@@ -59,11 +62,13 @@ def run(inputs: MethodInputs, options: DnmpOptions) -> Labels:
         progress=None if inputs.progress is None else _told(inputs.progress),
     )
     labels = made.field.labels_at(inputs.gaussians.means.detach().cpu(), made.field.layer_names[0])
+    info = made.field.info
+    undefined = int((labels.ids == UNLABELLED).sum())
     return Labels(
         ids=labels.ids,
         confidence=labels.confidence,
         background=_background(made.field, inputs.views),
-        info=made.field.info,
+        info=replace(info, details={**info.details, "undefined": undefined}),
     )
 
 

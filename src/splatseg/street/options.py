@@ -7,6 +7,7 @@ from typing import Any, Literal
 from splatseg._check import check_choice
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
+from splatseg.street.field import VERTEX_RULES, VertexRule
 from splatseg.street.geometry import PUBLISHED_GEOMETRY, GeometryOptions
 from splatseg.street.primitives import CoarseRule, StartShape
 from splatseg.street.radiance import PUBLISHED_RADIANCE, RadianceOptions
@@ -56,9 +57,10 @@ class DnmpOptions:
     """Of the ball around a point, metres, whose vertices label it. None is the side of the finest
     voxels."""
 
-    weigh_seen: bool | None = None
-    """In that ball, vertices that no training ray saw count nearly nothing. None is yes, or no with
-    published."""
+    vertex_rule: VertexRule | None = None
+    """Which vertices in that ball are asked (eq. 9). adjusted: those whose features training
+    adjusted, as published; a point with none has no label. weighed: all, each by how much training
+    rays saw of it, 0.01 at least. all: all alike. None is weighed, or adjusted with published."""
 
     memory: int = 1 << 30
     """Bytes of hits of training rays that are kept in memory; more lie in files."""
@@ -68,6 +70,8 @@ class DnmpOptions:
         check_choice("setting", self.setting, ("fast", "published"))
         check_choice("coarse", self.coarse, ("everywhere", "sparse"))
         check_choice("start", self.start, ("sphere", "encoded"))
+        if self.vertex_rule is not None:
+            check_choice("vertex_rule", self.vertex_rule, VERTEX_RULES)
         if not self.voxels or not all(0 < size < math.inf for size in self.voxels):
             raise RangeError(f"voxels: expected positive lengths in metres, got {self.voxels}.")
         for name in ("geometry_iterations", "iterations", "rays"):
@@ -102,9 +106,11 @@ class DnmpOptions:
         return replace(options, cache_memory=self.memory, **given)
 
     @property
-    def weighs_seen(self) -> bool:
-        """Whether vertices that no ray saw count less in eq. 9."""
-        return self.setting == "fast" if self.weigh_seen is None else self.weigh_seen
+    def asked_vertices(self) -> VertexRule:
+        """Which vertices eq. 9 asks."""
+        if self.vertex_rule is not None:
+            return self.vertex_rule
+        return "weighed" if self.setting == "fast" else "adjusted"
 
 
 _CARVE = 0.9

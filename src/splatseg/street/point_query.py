@@ -6,7 +6,9 @@ r"""Labels of any point from the vertices of primitives around it: eq. 9 of the 
 over the vertices :math:`x_i` within the radius r of x, with opacity :math:`\sigma_i` and
 probabilities :math:`k_i` of classes, which do not depend on x and are known once for all. A point
 that lies on a vertex takes that vertex alone, which is the limit; a point without a vertex in its
-ball, or with none that is opaque, has no label.
+ball, or with none that is opaque, has no label. The paper asks the vertices "whose features have
+been adjusted during training": which are given here is the caller's choice
+(`street.field.VertexRule`).
 
 References:
     DNMP with semantics (papers/002), section 3.2, eq. 9.

@@ -20,13 +20,14 @@ from splatseg.io.scans import Scans, read_scans
 from splatseg.io.scene import load_scene_layer, scene_layer_names
 from splatseg.lift.points import ViewedPointOptions, ViewedPoints
 from splatseg.render import BackendName
-from splatseg.street.blocks import ScanLabeller
+from splatseg.street.blocks import DriveField, ScanLabeller
+from splatseg.street.field import MeshField
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import gaussian_field
 
 LabelBy = Literal["gaussians", "mesh", "vertices"]
 """gaussians: what views of the Gaussians show at a point, and its shape. mesh: the same of the mesh
-field. vertices: the vertices of the mesh field around it, eq. 9, as published."""
+field. vertices: the vertices of the mesh field around it, eq. 9, by the field's rule."""
 
 
 _LABEL_FILES = ("semantic-kitti", "kitti-raw", "kitti-odometry", "kitti360")
@@ -60,6 +61,10 @@ class ScanLabels:
     form: ScanLabelForm
     layer: str
     counts: ScanLabelCounts
+
+    vertex_rule: str | None
+    """Which vertices eq. 9 asked (`street.field.VertexRule`); None where points took labels
+    otherwise, or from blocks that do not say."""
 
 
 @boundary
@@ -129,6 +134,7 @@ def label_scans(
     if summary.kind != "labels":
         raise InputError(f"layer: expected labels, {layer!r:.80} holds {summary.kind}.")
     form = _form(scans) if options.form == "auto" else options.form
+    rule = _vertex_rule(field, layer)
     with observer.stage("label scans") as step:
         counts = write_scan_labels(
             _told(_labelled(field, scans, layer, step), seen),
@@ -138,10 +144,21 @@ def label_scans(
             about={
                 "source": str(scans.path),
                 "layer": layer,
+                "vertex_rule": rule,
                 "names": {str(id): name for id, name in summary.info.names.items()},
             },
         )
-    return ScanLabels(folder=folder, form=form, layer=layer, counts=counts)
+    return ScanLabels(folder=folder, form=form, layer=layer, counts=counts, vertex_rule=rule)
+
+
+def _vertex_rule(field: Renderable, layer: str) -> str | None:
+    """Which vertices points ask of a field whose points ask vertices."""
+    if isinstance(field, MeshField):
+        return field.vertex_rule
+    if isinstance(field, DriveField):
+        rule = field.layer(layer).info.options.get("vertex_rule")
+        return rule if isinstance(rule, str) else None
+    return None
 
 
 def _told(

@@ -1,6 +1,7 @@
 """Parts of a scene by the names that people give them: views of a split, layers, evidence."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from splatseg.core import (
     FlatLayer,
@@ -20,6 +21,9 @@ from splatseg.io.scene_fields import scene_field_path
 from splatseg.lift import GaussianField, PointLabelOptions
 from splatseg.render import BackendName
 from splatseg.tasks._film import path_views
+
+if TYPE_CHECKING:
+    from splatseg.street.field import VertexRule
 
 
 def views_of_split(scene: Scene, split: str) -> tuple[View, ...]:
@@ -128,13 +132,19 @@ def gaussian_field(
     )
 
 
-def scene_field(scene: Scene, name: str) -> Renderable:
+def scene_field(scene: Scene, name: str, *, vertex_rule: "VertexRule | None" = None) -> Renderable:
     """A field of the scene that is no Gaussians, by name: what `tasks.make_street_field` made.
 
     Of a drive in blocks few are held; they are read when they are asked for.
 
+    Args:
+        scene: The scene.
+        name: Of the field.
+        vertex_rule: Which vertices points ask; None is the rule that the field was made with.
+
     Raises:
-        InputError: If the scene has none of this name.
+        InputError: If the scene has none of this name, or the field does not know what the rule
+            needs.
         MissingFileError: If it is a drive in blocks that was stopped.
         FileFormatError: If its file is damaged.
     """
@@ -145,7 +155,9 @@ def scene_field(scene: Scene, name: str) -> Renderable:
     if scene.root is None:
         raise InputError(f"field {name!r:.80}: the scene has no folder to read it from.")
     path = scene_field_path(scene.root, name)
-    return open_blocks(path) if path.is_dir() else load_mesh_field(path)
+    if path.is_dir():
+        return open_blocks(path, vertex_rule=vertex_rule)
+    return load_mesh_field(path).with_layer(vertex_rule=vertex_rule)
 
 
 def views_that_made(scene: Scene, info: LayerInfo, evidence: Evidence) -> tuple[View, ...]:

@@ -29,6 +29,7 @@ def root(tmp_path):
     root = write_drive(tmp_path / "set")
     static = root / "data_3d_semantics/train" / DRIVE / "static"
     write_window(static / f"{WINDOW}.ply", XYZ, np.full((5, 3), 9), semantic=IDS,
+                 visible=np.array([1, 0, 1, 1, 0]),
                  confidence=np.array([1, 0.5, 1, 1, 0.25]))  # fmt: skip
     ids = np.full((HEIGHT, WIDTH), 7)
     ids[0, :4] = 35, 0, 255, 29
@@ -52,6 +53,7 @@ def test_a_window_is_a_scene(root) -> None:
     # A garage is a building and a small pole a pole; parking and nothing do not count.
     assert points.labels.ids.tolist() == [7, 11, -1, -1, 17]
     assert points.labels.confidence.tolist() == [1, 0.5, 1, 1, 0.25]
+    assert points.visible.tolist() == [True, False, True, True, False]
     assert points.table is EVALUATED
 
 

@@ -15,6 +15,7 @@ from splatseg.core import Gaussians, Scene
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.core.sh import SH_C0
 from splatseg.errors import InputError, RangeError
+from splatseg.evaluate import Confusion, semantic_score
 from splatseg.evaluate.protocols import TABLE_1, find_protocol, merged_name
 from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.scene import load_scene, save_scene
@@ -160,6 +161,83 @@ def test_rules_and_choices_count(run) -> None:
     no_sky = run("kitti360", "points=fair", "sky=no")
     assert only(no_sky, "uplift-fair")["view_miou"] != only(usual, "uplift-fair")["view_miou"]
     assert only(no_sky, "uplift-fair")["miou"] == only(usual, "uplift-fair")["miou"]
+
+
+@pytest.fixture
+def half_hidden(sets, monkeypatch) -> BenchmarkScene:
+    """The drive as if photographs showed every second point alone, of uneven confidence."""
+    scene = sets("kitti360").scene
+    assert scene.points is not None
+    count = len(scene.points.labels)
+    confidence = torch.linspace(0.1, 1, count)
+    told = replace(
+        scene.points,
+        visible=torch.arange(count) % 2 == 0,
+        labels=replace(scene.points.labels, confidence=confidence),
+    )
+    changed = replace(scene, points=told)
+    monkeypatch.setattr(
+        "splatseg.tasks.benchmark.scenes.read_benchmark", lambda *_, **__: (changed,)
+    )
+    return changed
+
+
+def test_points_that_photographs_show_are_scored_apart(run, half_hidden, tmp_path, score) -> None:
+    """All count, as in KITTI-360's own evaluation, unless only visible ones are asked for."""
+    usual = run("kitti360", "points=region", "radius=0.05")
+    whole = only(usual, "uplift-region")
+    (scene,) = usual.methods[0].scenes
+    with np.load(tmp_path / f"out/predictions/kitti360/uplift-region/{scene.scene}.npz") as file:
+        found, true = file["semantic"], file["truth"]
+    shown = half_hidden.points.visible.numpy()
+    for name, among in (("visible", shown), ("hidden", ~shown)):
+        np.savez(tmp_path / "p.npz", semantic=found[among])
+        np.savez(tmp_path / "t.npz", semantic=true[among])
+        theirs = score("points", "--pred", tmp_path / "p.npz", "--truth", tmp_path / "t.npz")
+        assert whole[f"{name}_miou"] == pytest.approx(theirs["mIoU"], abs=1e-6)
+    assert whole["visible_miou"] != whole["hidden_miou"]
+    visible = only(run("kitti360", "points=region", "radius=0.05", "visible=yes"), "uplift-region")
+    assert visible["miou"] == whole["visible_miou"] != whole["miou"]
+    assert visible["hidden_miou"] == whole["hidden_miou"]
+    assert visible["undefined"] != whole["undefined"]
+    sure = only(run("kitti360", "points=region", "radius=0.05", "confidence=yes"), "uplift-region")
+    assert sure["miou"] != whole["miou"]
+    weights = half_hidden.points.labels.confidence
+    ids, truth = (torch.from_numpy(a.astype(np.int64)) for a in (found, true))
+    ids, truth = (torch.where(a == 0, -1, a) for a in (ids, truth))
+    expected = semantic_score(Confusion.of(ids, truth, weights)).miou
+    assert sure["miou"] == pytest.approx(expected, abs=1e-9)
+
+
+def test_points_must_say_what_is_visible(run) -> None:
+    with pytest.raises(InputError, match="^visible: expected points that say whether a photograph"):
+        run("waymo", "points=density", "visible=yes")
+    assert "visible_miou" not in only(run("waymo", "points=density"), "uplift-density")
+
+
+def test_windows_of_a_list(run, sets) -> None:
+    data = sets("kitti360")
+    folder = data.folder / "data_3d_semantics/train"
+    (file,) = folder.glob("*/static/*.ply")
+    line = file.relative_to(data.folder)
+    listed = folder / "2013_05_28_drive_val.txt"
+    try:
+        listed.write_text(f"{line}\n")
+        assert len(run("kitti360", "points=density", "windows=val").methods[0].scenes) == 1
+        listed.write_text(f"{line.with_name('0000000900_0000000950.ply')}\n")
+        with pytest.raises(InputError, match="expected windows of the list 2013_05_28_drive_val"):
+            run("kitti360", "points=density", "windows=val")
+        listed.write_text("some words\n")
+        with pytest.raises(InputError, match="expected lines such as data_3d_"):
+            run("kitti360", "points=density", "windows=val")
+    finally:
+        listed.unlink()
+    with pytest.raises(InputError, match="2013_05_28_drive_train.txt"):
+        run("kitti360", "points=density", "windows=train")
+    with pytest.raises(InputError, match="^windows: scenes of layout waymo are no windows"):
+        run("waymo", "points=density", "windows=val")
+    with pytest.raises(InputError, match="^windows: expected the word of a list"):
+        run("kitti360", "points=density", "windows=../val")
 
 
 def test_own_classes_have_their_own_names(run) -> None:

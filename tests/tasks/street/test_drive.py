@@ -207,6 +207,23 @@ def test_scans_are_labelled_block_by_block(both, generated_drive, tmp_path, monk
         assert np.array_equal(written[number].reshape(-1), ids.numpy())
 
 
+def test_blocks_are_asked_by_another_rule(both, generated_drive, tmp_path) -> None:
+    scene, _, made = both
+    scans = read_scans(generated_drive)
+    points = scans.scan(scans.scan_names[0]).points
+    assert made.field.layer(LAYER).info.options["vertex_rule"] == "weighed"
+    field = made_street_field(
+        scene, options=StreetOptions(block_length=20.0),
+        field_options=DnmpOptions(vertex_rule="adjusted"),
+    )  # fmt: skip
+    own, adjusted = (one.labels_at(points, LAYER).ids for one in (made.field, field))
+    assert int((adjusted < 0).sum()) > int((own < 0).sum())
+    labels = label_scans(scene, scans, tmp_path / "labels", field=field)
+    assert labels.vertex_rule == "adjusted"
+    assert label_scans(scene, scans, tmp_path / "own", field=made.field).vertex_rule == "weighed"
+    assert labels.counts.unlabelled >= int((adjusted < 0).sum())
+
+
 def test_what_was_stopped_goes_on_to_the_same_bytes(scene, quick, options) -> None:
     said = stopped(scene, options)
     assert said.startswith(f"1 of 2 blocks of {scene.root / 'fields/street'} are made; the same")

@@ -13,6 +13,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import create_evidence
 from splatseg.io.scans import read_scans
 from splatseg.io.scene_fields import scene_field_names
+from splatseg.street.build import seen_shares
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import (
     EvaluationOptions,
@@ -172,14 +173,24 @@ def test_maps_of_the_capture_give_depth_and_points(drive, tmp_path) -> None:
     torch.testing.assert_close(z, torch.full_like(z, 3.0), atol=0.3, rtol=0)
 
 
+def test_what_a_ray_saw_next_to_nothing_of_was_adjusted() -> None:
+    """float16 holds no number so small; Adam moved the vertex by its whole rate all the same."""
+    shares = seen_shares(torch.tensor([0.0, 1e-30, 1e-7, 10.0, 1e9]))
+    assert shares.tolist() == [0.0, 2.0**-24, 2.0**-24, 0.5, 1.0]
+    assert torch.equal(shares, shares.half().float())
+
+
 def test_options_count(drive, generated_drive) -> None:
     scans = StreetOptions(evidence="labels_semantic", scans=generated_drive)
     one = street_field(drive, options=replace(scans, views=("train_0000",)), field_options=QUICK)
     assert len(one.views) == 1
     assert one.field.seen is not None
     assert 0 < float(one.field.seen.max()) <= 1
-    plain = street_field(drive, options=scans, field_options=replace(QUICK, weigh_seen=False))
-    assert plain.field.seen is None
+    assert one.field.vertex_rule == "weighed"
+    asked = street_field(drive, options=scans, field_options=replace(QUICK, vertex_rule="adjusted"))
+    assert asked.field.vertex_rule == asked.field.info.options["vertex_rule"] == "adjusted"
+    adjusted = asked.field.info.details["adjusted_vertices"]
+    assert 0 < adjusted == int((asked.field.seen > 0).sum()) < asked.field.info.details["vertices"]
     coarse = street_field(
         drive, options=scans, field_options=replace(QUICK, voxels=(4.0,), radius=1.5)
     )

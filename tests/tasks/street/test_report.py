@@ -6,20 +6,24 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from splatseg.core import Camera, Scene, View
+from splatseg.core import Camera, ClassInfo, ClassTable, LayerInfo, RenderableLayer, Scene, View
 from splatseg.errors import InputError
 from splatseg.io.scans import read_scans
 from splatseg.report.point_map import LabelledPoints
+from splatseg.street.field import MeshField
 from splatseg.street.geometry import DepthView
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks import ScanLabelOptions, StreetOptions, label_scans, open_drive, street_field
 from splatseg.tasks.street._depths import KeptDepths, depth_errors, spread_views
+from splatseg.tasks.street.point_scores import in_sight, point_scores, true_ids
 from splatseg.tasks.street.report import LabelledScans, report_street
 from support.analytic import BallOverFloor
-from support.mesh_fields import balls
+from support.mesh_fields import balls, told_field
 
 QUICK = DnmpOptions(voxels=(2.0, 4.0), geometry_iterations=4, iterations=3, rays=64)
 
@@ -71,6 +75,54 @@ def test_a_field_and_its_points(made, scene, generated_drive, tmp_path) -> None:
     assert len(record["psnr"]) == min(4, len(scene.train_views))
     assert record["points"]["points"] == labels.counts.points
     assert record["training"][-1]["iteration"] == 3
+
+
+def test_points_are_scored_apart_by_whether_a_camera_saw_them() -> None:
+    """Two classes; the seen points are right but for one without a label, the unseen are wrong."""
+    ids = torch.tensor([1, 1, 2, -1, 1, 1, -1])
+    truth = torch.tensor([1, 1, 2, 2, 2, 2, -1])
+    seen = torch.tensor([True, True, True, True, False, False, True])
+    whole, near, far = point_scores(ids, truth, seen)
+    assert (whole.points, whole.count, near.count, far.count) == ("all", 6, 4, 2)
+    assert near.miou == pytest.approx((1 + 1 / 2) / 2)
+    assert whole.miou == pytest.approx((2 / 4 + 1 / 4) / 2)
+    assert (far.miou, far.accuracy, far.undefined) == (0.0, 0.0, 0.0)
+    assert (near.undefined, near.accuracy) == (0.25, 0.75)
+    assert whole.undefined == pytest.approx(1 / 6)
+    none = point_scores(ids, truth, torch.ones(7, dtype=torch.bool))[2]
+    assert (none.count, none.miou, none.undefined) == (0, None, None)
+
+
+def test_whose_views_and_depth_say_what_was_seen(made, scene, tmp_path) -> None:
+    """Maps of the capture where all views have one, else the field; only views it learned from."""
+    cloud = torch.tensor([[0.0, 0, 3.0], [0, 0, 3.05], [0, 0, 9.0]], dtype=torch.float64)
+    view = replace(scene.train_views[0], camera=camera(0.0))
+    steps = np.full((30, 40), 3000, np.uint16)
+    Image.fromarray(steps).save(tmp_path / "a.png")
+    mapped = replace(view, depth=tmp_path / "a.png", depth_unit=0.001)
+    other = replace(scene.train_views[1], camera=camera(0.0), depth=None)
+    known = replace(scene, views=(mapped, other))
+    field = balls_field(views=(mapped.name,))
+    seen, whose = in_sight(known, field, "semantic", cloud)
+    assert (seen.tolist(), whose) == ([True, True, False], "the capture's depth maps")
+    field = balls_field(views=(mapped.name, other.name))
+    seen, whose = in_sight(known, field, "semantic", cloud)
+    assert whose == "the depth that the field shows"
+    assert seen.tolist() == [False, False, False], "its ball stands before them"
+
+
+def test_true_classes_are_matched_by_name() -> None:
+    table = ClassTable(rows=tuple(ClassInfo(id=i, name=n) for i, n in ((4, "sign"), (5, "tram"))))
+    layer = RenderableLayer(ids=(1, 9), info=LayerInfo(names={1: "road", 9: "traffic sign"}))
+    truth = torch.tensor([4, 5, -1])
+    assert true_ids(truth, table, layer).tolist() == [9, -1, -1]
+    assert true_ids(truth, None, layer).tolist() == [4, 5, -1]
+
+
+def balls_field(*, views: tuple[str, ...]) -> MeshField:
+    """A ball one before a camera at the origin."""
+    field = told_field(balls([[0, 0, 1]]), [0])
+    return field.with_layer(info=LayerInfo(views=views))
 
 
 def test_a_field_that_was_there(made, scene) -> None:

@@ -16,6 +16,7 @@ from splatseg.evaluate.protocols._street_names import street_class as street_cla
 from splatseg.evaluate.protocols._streets import SKY as SKY
 from splatseg.evaluate.protocols._streets import TABLE_1 as TABLE_1
 from splatseg.evaluate.protocols._streets import merged_name as merged_name
+from splatseg.evaluate.protocols._switches import ALL_WINDOWS as ALL_WINDOWS
 from splatseg.evaluate.protocols._switches import MapSwitches as MapSwitches
 from splatseg.evaluate.protocols._switches import PointSwitches as PointSwitches
 from splatseg.evaluate.protocols._switches import RoomSwitches as RoomSwitches

@@ -1,5 +1,6 @@
 """Switches of protocols: every choice that changes a figure, as a value that is recorded."""
 
+import re
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
@@ -247,6 +248,10 @@ class PointSwitches(Switches):
             raise RangeError(f"frame_step: expected 1 or more, got {self.frame_step}.")
 
 
+ALL_WINDOWS = "all"
+"""All windows of a drive that are there."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreetSwitches(Switches):
     """Choices of a drive along a street: points of lasers, and views that were held out."""
@@ -268,6 +273,17 @@ class StreetSwitches(Switches):
     sky: bool = True
     """Whether sky is one of the classes of views; points have none."""
 
+    visible: bool = False
+    """Whether only those points count that the data set says a photograph shows. KITTI-360's own
+    evaluation counts all."""
+
+    confidence: bool = False
+    """Whether points count by the confidence of their truth, as in KITTI-360's own evaluation."""
+
+    windows: str = ALL_WINDOWS
+    """all: all windows of a drive that are there. Another word, such as val: those that the data
+    set's list of this name has, 2013_05_28_drive_val.txt beside the drives' points."""
+
     scans: bool = True
     """Whether fits take the scans of the layout, where it has any."""
 
@@ -279,6 +295,8 @@ class StreetSwitches(Switches):
             raise InputError(f"points: expected each rule once, got {', '.join(self.points)!r}.")
         if not self.radius > 0:
             raise RangeError(f"radius: expected a positive number, got {self.radius}.")
+        if not re.fullmatch(r"[a-z0-9]+", self.windows):
+            raise InputError(f"windows: expected the word of a list, got {self.windows!r:.80}.")
         check_choice("undefined", self.undefined, ("wrong", "skipped"))
         check_choice("classes", self.classes, ("table-1", "own"))
         # What would change nothing is no choice.

@@ -12,6 +12,7 @@ from splatseg._check import check_choice
 from splatseg.core import BenchmarkScene
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.benchmarks.kitti360 import LAYOUT as KITTI360
 from splatseg.io.benchmarks.kitti360 import find_kitti360_scenes, read_kitti360_scenes
 from splatseg.io.benchmarks.lerf_mask import find_lerf_mask, read_lerf_mask
 from splatseg.io.benchmarks.lerf_ovs import find_lerf_ovs, read_lerf_ovs
@@ -63,7 +64,7 @@ LAYOUTS = tuple(_LAYOUTS)
 
 @boundary
 def read_benchmark(
-    layout: str, folder: Path, *, sequence: str | None = None
+    layout: str, folder: Path, *, sequence: str | None = None, windows: str | None = None
 ) -> tuple[BenchmarkScene, ...]:
     """Read scenes of a benchmark: cameras, tasks and truth, sorted by name.
 
@@ -76,21 +77,27 @@ def read_benchmark(
             drive, ``.../DRIVE/START_END``, which is no folder.
         sequence: Which walk through a scene is read, of a layout with several (``replica``); None
             reads the first.
+        windows: Name of the data set's list whose windows are read, of ``kitti360``; None is all.
 
     Raises:
         MissingFileError: If there is no such folder, or files of the layout are missing.
         InputError: If a file is damaged, or of a view that the scene does not have; one sentence
-            that names it. Also if scenes of the layout have one walk, and another is asked for.
+            that names it. Also if scenes of the layout have one walk, and another is asked for, or
+            the layout has no windows.
     """
     check_choice("layout", layout, LAYOUTS)
     if sequence is not None:
         if layout != REPLICA:
             raise InputError(f"sequence: scenes of layout {layout} have one, got {sequence!r}.")
         check_choice("sequence", sequence, SEQUENCES)
+    if windows is not None and layout != KITTI360:
+        raise InputError(f"windows: scenes of layout {layout} are no windows, got {windows!r}.")
     if not folder.is_dir() and window_of(folder.name) is None:
         raise MissingFileError(f"{folder}: there is no such folder of a benchmark.")
     if sequence is not None:
         return read_replica_scenes(folder, sequence=sequence)
+    if windows is not None:
+        return read_kitti360_scenes(folder, windows=windows)
     return _LAYOUTS[layout].read(folder)
 
 

@@ -7,7 +7,7 @@ and 3D, TPAMI 2022.
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -32,14 +32,16 @@ from splatseg.io.benchmarks._masks import check_proportions, true_ids
 from splatseg.io.benchmarks._views import read_views
 from splatseg.io.captures.kitti360 import static_windows
 from splatseg.io.captures.kitti360_drive import (
+    ACCUMULATED,
     PHOTOGRAPHS,
     SEMANTICS,
     Drive,
     drives,
     find_drive,
     window_name,
+    window_of,
 )
-from splatseg.io.foreign import is_file, is_folder, reading
+from splatseg.io.foreign import is_file, is_folder, read_lines, reading
 from splatseg.io.images import open_image
 from splatseg.io.label_tables import label_table, learned_as
 from splatseg.io.ply import read_ply_header
@@ -50,6 +52,9 @@ LAYOUT = "kitti360"
 MAX_POINTS = 40_000_000
 """Labelled points of all scenes that are read together; they are held in memory, and a drive has
 hundreds of millions."""
+
+_LINE_PARTS = 3
+"""Of a line of a list of windows: at least DRIVE/static/START_END.ply."""
 
 _INSTANCES = 1000
 _VOID = (0, 255)
@@ -68,10 +73,20 @@ EVALUATED = _evaluated()
 ``trainId``; everything else of the annotation is of no class."""
 
 
-def find_kitti360_scenes(folder: Path) -> tuple[Drive, ...]:
+def find_kitti360_scenes(folder: Path, *, windows: str | None = None) -> tuple[Drive, ...]:
     """Windows of drives with photographs; drives that have no accumulated points as a whole.
 
     The folder is a drive, a window of one, or the data set's with several drives.
+
+    Args:
+        folder: What is read.
+        windows: Name of the data set's list whose windows are meant, such as ``val``:
+            ``data_3d_semantics/train/2013_05_28_drive_val.txt``. None is all.
+
+    Raises:
+        MissingFileError: If the list is not there.
+        FileFormatError: If a line of it names no window.
+        InputError: If no window of the folder is in the list.
     """
     if is_folder(folder / PHOTOGRAPHS):
         named = [find_drive(folder / PHOTOGRAPHS / name) for name in drives(folder)]
@@ -81,12 +96,38 @@ def find_kitti360_scenes(folder: Path) -> tuple[Drive, ...]:
     for drive in named:
         if drive is None or not is_folder(drive.folder):
             continue
-        windows = static_windows(drive) if drive.window is None else {}
-        found += [replace(drive, window=window) for window in windows] or [drive]
+        there = static_windows(drive) if drive.window is None else {}
+        found += [replace(drive, window=window) for window in there] or [drive]
+    if windows is not None:
+        found = _listed(folder, found, windows)
     return tuple(sorted(found, key=lambda drive: drive.called))
 
 
-def read_kitti360_scenes(folder: Path) -> tuple[BenchmarkScene, ...]:
+def _listed(folder: Path, found: list[Drive], name: str) -> list[Drive]:
+    """Those windows that a list of the data set has."""
+    if not found:
+        return []
+    path = found[0].root / ACCUMULATED / "train" / f"2013_05_28_drive_{name}.txt"
+    listed: set[tuple[str, tuple[int, int]]] = set()
+    for line in read_lines(path, "a list of windows"):
+        parts = PurePosixPath(line).parts
+        window = window_of(parts[-1])
+        if len(parts) < _LINE_PARTS or window is None:
+            raise FileFormatError(
+                f"{path}: expected lines such as data_3d_semantics/train/DRIVE/static/"
+                f"START_END.ply, got {quoted(line)}."
+            )
+        listed.add((parts[-3], window))
+    kept = [drive for drive in found if drive.window and (drive.name, drive.window) in listed]
+    if not kept:
+        raise InputError(
+            f"{folder}: expected windows of the list {path.name}, got {len(found)} of which it has "
+            "none."
+        )
+    return kept
+
+
+def read_kitti360_scenes(folder: Path, *, windows: str | None = None) -> tuple[BenchmarkScene, ...]:
     """Read windows of drives, each a scene with its photographs and labelled points.
 
     A window is a file ``data_3d_semantics/train/DRIVE/static/START_END.ply`` and the photographs
@@ -96,14 +137,15 @@ def read_kitti360_scenes(folder: Path) -> tuple[BenchmarkScene, ...]:
 
     Args:
         folder: A drive, a window (``.../DRIVE/START_END``), or the data set's folder.
+        windows: Name of the data set's list whose windows are read, such as ``val``; None is all.
 
     Raises:
-        MissingFileError: If there is no drive with photographs, or a scene has neither labelled
-            points nor maps.
-        InputError: If a file is damaged, or there are so many windows that their points would not
-            fit in memory; name one then.
+        MissingFileError: If there is no drive with photographs, a scene has neither labelled
+            points nor maps, or the list is not there.
+        InputError: If a file is damaged, no window is in the list, or there are so many windows
+            that their points would not fit in memory; name one then.
     """
-    scenes = find_kitti360_scenes(folder)
+    scenes = find_kitti360_scenes(folder, windows=windows)
     if not scenes:
         raise MissingFileError(
             f"{folder}: expected a drive of KITTI-360 with photographs, {PHOTOGRAPHS}/DRIVE, got "
@@ -118,8 +160,8 @@ def read_true_points(path: Path) -> TruePoints:
 
     Raises:
         MissingFileError: If there is no such file.
-        FileFormatError: If it is damaged, lacks ``semantic``, or has an id or a confidence that
-            cannot be.
+        FileFormatError: If it is damaged, lacks ``semantic``, or has an id, a confidence or a
+            ``visible`` that cannot be.
     """
     columns = read_ply_vertices(path)
     points = vertex_positions(path, columns)
@@ -128,6 +170,9 @@ def read_true_points(path: Path) -> TruePoints:
     confidence = columns.get("confidence", np.ones(len(points), np.float32)).astype(np.float32)
     if not ((confidence >= 0) & (confidence <= 1)).all():
         raise FileFormatError(f"{path}: expected confidences from 0 to 1, got others.")
+    visible = columns.get("visible")
+    if visible is not None and not np.isin(visible, (0, 1)).all():
+        raise FileFormatError(f"{path}: expected visible to be 0 or 1, got others.")
     return TruePoints(
         points=torch.from_numpy(np.ascontiguousarray(points, np.float32)),
         labels=Labels(
@@ -135,6 +180,7 @@ def read_true_points(path: Path) -> TruePoints:
             confidence=torch.from_numpy(confidence),
         ),
         table=EVALUATED,
+        visible=None if visible is None else torch.from_numpy(visible.astype(np.bool_)),
     )
 
 

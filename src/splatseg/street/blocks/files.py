@@ -5,6 +5,7 @@ FOLDER/0000.safetensors    the field of block 0, see `splatseg.street.files`
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,7 +23,7 @@ from splatseg.io.scene_fields import DRIVE_FILE
 from splatseg.io.write_errors import named_write_failures
 from splatseg.street.blocks.cut import Drive, DriveBlock
 from splatseg.street.blocks.field import DriveField, joined_layers
-from splatseg.street.field import MeshField
+from splatseg.street.field import MeshField, VertexRule, with_vertex_rule
 from splatseg.street.files import load_mesh_field, load_mesh_field_layer, save_mesh_field
 
 FORMAT = "splatseg.street.drive"
@@ -122,7 +123,9 @@ def block_file(folder: Path, index: int) -> Path:
 
 
 @boundary
-def open_blocks(folder: Path, *, max_open: int = 2) -> DriveField:
+def open_blocks(
+    folder: Path, *, max_open: int = 2, vertex_rule: VertexRule | None = None
+) -> DriveField:
     """The drive of a folder as one field; blocks are read when they are asked for.
 
     Of each no more than the header of its file is read before.
@@ -130,6 +133,7 @@ def open_blocks(folder: Path, *, max_open: int = 2) -> DriveField:
     Args:
         folder: What `build_blocks` wrote.
         max_open: Blocks that are held in memory.
+        vertex_rule: Which vertices points ask; None is the rule that each block was made with.
 
     Raises:
         MissingFileError: If there is none, or a block lacks.
@@ -146,10 +150,16 @@ def open_blocks(folder: Path, *, max_open: int = 2) -> DriveField:
         )
 
     def read(block: DriveBlock) -> MeshField:
-        return load_mesh_field(block_file(folder, block.index))
+        return load_mesh_field(block_file(folder, block.index)).with_layer(vertex_rule=vertex_rule)
 
     headers = (load_mesh_field_layer(block_file(folder, b.index)) for b in drive.blocks)
-    return DriveField(drive, read, max_open=max_open, layers=joined_layers(headers))
+    layers = joined_layers(headers)
+    if vertex_rule is not None:
+        layers = {
+            name: replace(layer, info=with_vertex_rule(layer.info, vertex_rule))
+            for name, layer in layers.items()
+        }
+    return DriveField(drive, read, max_open=max_open, layers=layers)
 
 
 @boundary

@@ -6,7 +6,13 @@ from pathlib import Path
 
 from splatseg.core.benchmark import BenchmarkScene
 from splatseg.errors import InputError
-from splatseg.evaluate.protocols import Protocol, RoomSwitches, SpokenSwitches
+from splatseg.evaluate.protocols import (
+    ALL_WINDOWS,
+    Protocol,
+    RoomSwitches,
+    SpokenSwitches,
+    StreetSwitches,
+)
 from splatseg.io.benchmarks import find_layout, read_benchmark
 from splatseg.io.benchmarks.spin_nerf import WORDS_FILE
 from splatseg.tasks.benchmark.options import BenchOptions
@@ -89,8 +95,10 @@ def _read(protocol: Protocol, data: Path) -> tuple[BenchmarkScene, ...]:
     """The data set, in the one of the protocol's layouts that it has."""
     switches = protocol.switches
     sequence = switches.sequence if isinstance(switches, RoomSwitches) else None
+    windows = switches.windows if isinstance(switches, StreetSwitches) else ALL_WINDOWS
     if len(protocol.layouts) == 1:
-        return read_benchmark(protocol.layouts[0], data, sequence=sequence)
+        listed = None if windows == ALL_WINDOWS else windows
+        return read_benchmark(protocol.layouts[0], data, sequence=sequence, windows=listed)
     found = find_layout(data)
     if found not in protocol.layouts:
         raise InputError(

@@ -94,8 +94,9 @@ class Drive:
 
         Returns:
             ``miou`` of points, of each of Table 1's classes its IoU, ``accuracy``, ``undefined``,
-            the share of points without a label; of views ``view_miou``, ``psnr`` and ``ssim``. A
-            row a class of points, and a row a view.
+            the share of points without a label; where points say whether a photograph shows them
+            ``visible_miou`` and ``hidden_miou`` of those that are shown and are not; of views
+            ``view_miou``, ``psnr`` and ``ssim``. A row a class of points, and a row a view.
 
         Raises:
             InputError: If there is no truth, or the method gives no classes.
@@ -200,8 +201,17 @@ class Drive:
         if self._switches.undefined == "skipped":
             true = torch.where(undefined, UNLABELLED, true)
         found = map_ids(labels.ids, columns.found, default=UNLABELLED)
+        apart = self._apart(found, true, truth)
+        if self._switches.visible:
+            if truth.visible is None:
+                raise InputError(
+                    f"visible: expected points that say whether a photograph shows them, those of "
+                    f"{job.bench.name} do not."
+                )
+            true = torch.where(truth.visible, true, UNLABELLED)
+            undefined &= truth.visible
         _keep(job, found, true)
-        score = semantic_score(Confusion.of(found, true))
+        score = semantic_score(Confusion.of(found, true, self._weights(truth)))
         rows: list[dict[str, Any]] = [
             {
                 "class": id,
@@ -215,8 +225,27 @@ class Drive:
         scores = {"miou": score.miou}
         if self._switches.classes == "table-1":
             scores |= {row["name"]: row["iou"] for row in rows}
+        scores |= apart
         scores |= {"accuracy": score.accuracy, "undefined": int(undefined.sum()) / max(known, 1)}
         return scores, rows, [f"points: {columns.note}."] if columns.note else []
+
+    def _apart(
+        self, found: Int[Tensor, "p"], true: Int[Tensor, "p"], truth: TruePoints
+    ) -> dict[str, float]:
+        """Scores of the points that photographs show and of those that none shows."""
+        scores: dict[str, float] = {}
+        if truth.visible is None:
+            return scores
+        for name, among in (("visible", truth.visible), ("hidden", ~truth.visible)):
+            of_these = torch.where(among, true, UNLABELLED)
+            if bool((of_these != UNLABELLED).any()):
+                score = semantic_score(Confusion.of(found, of_these, self._weights(truth)))
+                scores[f"{name}_miou"] = score.miou
+        return scores
+
+    def _weights(self, truth: TruePoints) -> Float[Tensor, "p"] | None:
+        """What points count; None is all alike."""
+        return truth.labels.confidence if self._switches.confidence else None
 
     def _labels_at(self, rule: str, points: Float[Tensor, "p 3"]) -> PointLabels:
         """Labels of all points, in ids of the layer."""

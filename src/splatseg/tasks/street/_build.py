@@ -65,7 +65,7 @@ class FieldBuilder:
         self._scene, self._inputs, self._options = scene, inputs, options
         self._backend: BackendName = backend
         self._observer = observer
-        self.chosen = _chosen(options, field_options)
+        self.chosen = chosen_options(options, field_options)
         self.layer = options.layer or inputs.name
         self.timings: dict[str, float] = {}
 
@@ -143,7 +143,8 @@ def versions() -> dict[str, str]:
     }
 
 
-def _chosen(options: StreetOptions, given: DnmpOptions | None) -> DnmpOptions:
+def chosen_options(options: StreetOptions, given: DnmpOptions | None) -> DnmpOptions:
+    """How fields are made: as given, in the published setting where the field is to be that."""
     if given is None:
         return PUBLISHED if options.published else DnmpOptions()
     return replace(given, setting="published") if options.published else given

@@ -9,6 +9,7 @@ from splatseg.render import BackendName
 from splatseg.street.options import DnmpOptions
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.scene_parts import scene_field
+from splatseg.tasks.street._build import chosen_options
 from splatseg.tasks.street._names import check_field_name, is_stopped
 from splatseg.tasks.street.drive import StreetDrive, street_drive
 from splatseg.tasks.street.field import StreetField, save_street_field, street_field
@@ -69,12 +70,19 @@ def make_street_field(
 
 
 @boundary
-def made_street_field(scene: Scene, *, options: StreetOptions | None = None) -> Renderable | None:
+def made_street_field(
+    scene: Scene,
+    *,
+    options: StreetOptions | None = None,
+    field_options: DnmpOptions | None = None,
+) -> Renderable | None:
     """The field of this name that a scene has.
 
     Args:
         scene: The scene.
-        options: Of which field, and whether it is made in blocks.
+        options: Of which field, whether it is made in blocks, and whether as published.
+        field_options: Of these the rule by which points ask vertices, where one is asked for, is
+            that of the field that is there, too.
 
     Returns:
         None where `make_street_field` is to be asked: where there is none, or where blocks that
@@ -83,6 +91,7 @@ def made_street_field(scene: Scene, *, options: StreetOptions | None = None) -> 
     Raises:
         FileFormatError: If its file is damaged.
         MissingFileError: If it was stopped, and is not asked for in blocks.
+        InputError: If the field does not know what the rule needs.
     """
     options = options or StreetOptions()
     if scene.root is None or options.field not in scene_field_names(scene.root):
@@ -90,4 +99,7 @@ def made_street_field(scene: Scene, *, options: StreetOptions | None = None) -> 
     in_blocks = options.block_length is not None
     if in_blocks and is_stopped(scene_field_path(scene.root, options.field)):
         return None
-    return scene_field(scene, options.field)
+    chosen = chosen_options(options, field_options)
+    default = chosen.vertex_rule is None and chosen.setting == "fast"
+    rule = None if default else chosen.asked_vertices
+    return scene_field(scene, options.field, vertex_rule=rule)

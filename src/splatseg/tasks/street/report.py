@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from splatseg.core import ClassTable, Renderable, Scene, View
+from splatseg.core import UNLABELLED, ClassTable, Renderable, Scene, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import label_map_in
@@ -28,6 +28,7 @@ from splatseg.report.street_report import (
     street_report,
 )
 from splatseg.report.words import count_text
+from splatseg.street.field import VERTEX_WORDS
 from splatseg.street.geometry import enclosing
 from splatseg.street.shapes import load_shapes
 from splatseg.tasks.outputs import REPORTS_FOLDER
@@ -35,6 +36,7 @@ from splatseg.tasks.scan_labels import LabelBy, ScanLabels
 from splatseg.tasks.street._depths import depth_errors, spread_views
 from splatseg.tasks.street.drive import StreetDrive
 from splatseg.tasks.street.field import StreetField
+from splatseg.tasks.street.point_scores import in_sight, point_scores, true_ids
 
 _VIEWS = 4
 _LONGEST = 720
@@ -56,6 +58,9 @@ class LabelledScans:
 
     points: LabelledPoints
     """Some of their points."""
+
+    classes: ClassTable | None = None
+    """What the scans' own classes are called; None where they have no names."""
 
 
 @boundary
@@ -101,7 +106,7 @@ def report_street(
             classes=classes,
             metres_per_unit=scene.metres_per_unit or 1.0,
             psnr=likeness,
-            points=None if scans is None else _counts(scans, root),
+            points=None if scans is None else _counts(scans, scene, field, layer, root),
             command=command,
             **_told(made, scene),
         )
@@ -208,12 +213,24 @@ def _pictures(
     return pictures, decibels
 
 
-def _counts(scans: LabelledScans, root: Path) -> PointCounts:
+def _counts(
+    scans: LabelledScans, scene: Scene, field: Renderable, layer: str, root: Path
+) -> PointCounts:
     counts, folder = scans.made.counts, scans.made.folder
     inside = folder.is_relative_to(root)
+    rule = scans.made.vertex_rule
+    kept = scans.points
+    truth = true_ids(kept.truth, scans.classes, field.layer(layer))
+    scores, sight = (), ""
+    if bool((truth != UNLABELLED).any()):
+        seen, sight = in_sight(scene, field, layer, kept.points)
+        scores = point_scores(kept.ids, truth, seen)
     return PointCounts(
         folder=str(folder.relative_to(root) if inside else folder),
-        by=_BY[scans.by],
+        by=_BY[scans.by] + ("" if rule is None else f" ({VERTEX_WORDS[rule]})"),
+        vertex_rule=rule,
+        scores=scores,
+        sight=sight,
         scans=counts.scans,
         points=counts.points,
         unlabelled=counts.unlabelled,
