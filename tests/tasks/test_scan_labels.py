@@ -15,6 +15,7 @@ from splatseg.io.scans import read_scans
 from splatseg.lift.points import ViewedPointOptions
 from splatseg.tasks import ScanLabelOptions, label_scans
 from support.analytic import BALL, FLOOR, BallOverFloor
+from support.arrays import arrays_of
 from support.ply import write_ply
 
 
@@ -79,7 +80,7 @@ def labelled(scene, generated_drive) -> tuple[Scene, Labels]:
 def test_a_field_labels_range_images_in_their_shape(scene, generated_drive, tmp_path) -> None:
     made = label_scans(scene, generated_drive, tmp_path / "out", field=Halves())
     assert (made.form, made.layer) == ("npz", "things")
-    truth = np.load(generated_drive / "lidar.npz")
+    truth = arrays_of(generated_drive / "lidar.npz")
     with np.load(tmp_path / "out/labels.npz") as found:
         semantic, confidence = found["semantic"], found["confidence"]
     assert semantic.shape == truth["range_2mm"].shape
@@ -115,7 +116,7 @@ def test_gaussians_label_points_by_what_views_show(labelled, generated_drive, tm
     assert made.layer == "classes"
     with np.load(tmp_path / "out/labels.npz") as found:
         semantic = found["semantic"]
-    truth = np.load(generated_drive / "lidar.npz")["semantic"]
+    truth = arrays_of(generated_drive / "lidar.npz")["semantic"]
     said = (semantic > 0) & (truth > 0)
     assert said.mean() > 0.2
     assert (semantic[said] == truth[said]).mean() > 0.8
