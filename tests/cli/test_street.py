@@ -9,6 +9,7 @@ import pytest
 
 from splatseg.io.scans import read_scans
 from splatseg.street.files import load_mesh_field
+from support.arrays import arrays_of
 from support.ply import write_ply
 
 FAST = ("--voxels", "2.0", "4.0", "--geometry-iterations", "1", "--iterations", "3", "--rays", "64")
@@ -57,8 +58,8 @@ def test_scans_are_labelled_by_the_field(made, generated_drive, splatseg, tmp_pa
     facts = json.loads(out)["labels"]
     assert (facts["by"], facts["form"], facts["layer"]) == ("mesh", "npz", "labels_semantic")
     assert facts["points"] == sum(facts["ids"].values()) + facts["unlabelled"]
-    shape = np.load(generated_drive / "lidar.npz")["range_2mm"].shape
-    assert np.load(tmp_path / "out/labels.npz")["semantic"].shape == shape
+    shape = arrays_of(generated_drive / "lidar.npz")["range_2mm"].shape
+    assert arrays_of(tmp_path / "out/labels.npz")["semantic"].shape == shape
     status, out, _ = splatseg(
         "street", made, "--label-scans", generated_drive, "-o", tmp_path / "out", "--by", "mesh",
         "--form", "label",
@@ -71,7 +72,7 @@ def test_scans_are_labelled_by_the_field(made, generated_drive, splatseg, tmp_pa
         words = ("street", made, "--label-scans", generated_drive, "-o", tmp_path / by, "--by", by)
         status, out, _ = splatseg(*words, "--json", "--quiet")
         assert (status, json.loads(out)["labels"]["by"]) == (0, by)
-        found[by] = np.load(tmp_path / by / "labels.npz")["semantic"]
+        found[by] = arrays_of(tmp_path / by / "labels.npz")["semantic"]
     assert not np.array_equal(found["mesh"], found["vertices"])
     field = load_mesh_field(made / "fields/street.safetensors")
     scans = read_scans(generated_drive)

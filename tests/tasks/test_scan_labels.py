@@ -16,7 +16,11 @@ from splatseg.lift.points import ViewedPointOptions
 from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, label_scans, viewed_points
 from support.analytic import BALL, FLOOR, BallOverFloor
+<<<<<<< HEAD
 from support.mesh_fields import balls, told_field
+=======
+from support.arrays import arrays_of
+>>>>>>> da7658193465206425af47ddad784c16c735689a
 from support.ply import write_ply
 
 
@@ -81,7 +85,7 @@ def labelled(scene, generated_drive) -> tuple[Scene, Labels]:
 def test_a_field_labels_range_images_in_their_shape(scene, generated_drive, tmp_path) -> None:
     made = label_scans(scene, generated_drive, tmp_path / "out", field=Halves())
     assert (made.form, made.layer) == ("npz", "things")
-    truth = np.load(generated_drive / "lidar.npz")
+    truth = arrays_of(generated_drive / "lidar.npz")
     with np.load(tmp_path / "out/labels.npz") as found:
         semantic, confidence = found["semantic"], found["confidence"]
     assert semantic.shape == truth["range_2mm"].shape
@@ -137,7 +141,7 @@ def test_gaussians_label_points_by_what_views_show(labelled, generated_drive, tm
     assert made.layer == "classes"
     with np.load(tmp_path / "out/labels.npz") as found:
         semantic = found["semantic"]
-    truth = np.load(generated_drive / "lidar.npz")["semantic"]
+    truth = arrays_of(generated_drive / "lidar.npz")["semantic"]
     said = (semantic > 0) & (truth > 0)
     assert said.mean() > 0.2
     assert (semantic[said] == truth[said]).mean() > 0.8

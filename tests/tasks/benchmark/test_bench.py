@@ -17,6 +17,7 @@ from splatseg.evaluate import SurfaceField
 from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.evidence import create_evidence, save_label_map
 from splatseg.tasks.benchmark import load_result
+from support.arrays import arrays_of
 
 DataSet = Callable[[str], Path]
 EVIDENCE = ("masks_sam", "labels_semantic", "labels_panoptic", "features_text", "features_dino")
@@ -225,7 +226,7 @@ def test_classes_of_points(method: str, bench, data_set, tmp_path, score) -> Non
     scene = scene_of("scannet", data)
     ours = load_result(out / f"results/scannet-19/{method}/{scene.name}.json").scores
     path = out / "predictions" / "scannet-19" / method / f"{scene.name}.npz"
-    arrays = np.load(path)
+    arrays = arrays_of(path)
     np.savez(tmp_path / "truth.npz", semantic=arrays["truth"])
     theirs = score("points", "--pred", path, "--truth", tmp_path / "truth.npz")
     assert ours["miou"] == pytest.approx(theirs["mIoU"], abs=1e-6)

@@ -31,6 +31,7 @@ from splatseg.tasks import (
 )
 from splatseg.tasks.scene_parts import scene_field
 from splatseg.tasks.street.drive import street_drive
+from support.arrays import arrays_of
 from support.observers import Stopping
 
 LEARNING = DnmpOptions(voxels=(2.0,), geometry_iterations=3, iterations=200, rays=256)
@@ -200,7 +201,7 @@ def test_scans_are_labelled_block_by_block(both, generated_drive, tmp_path, monk
     found = scene_field(scene, "street")
     asked = ScanLabelOptions(form="npz")
     label_scans(scene, generated_drive, tmp_path / "labels", field=found, options=asked)
-    written = np.load(tmp_path / "labels/labels.npz")["semantic"]
+    written = arrays_of(tmp_path / "labels/labels.npz")["semantic"]
     for number, name in enumerate(scans.scan_names):
         scan = scans.scan(name)
         ids = scan.recorded_labels(expected[name]).clamp_min(0)
