@@ -16,11 +16,8 @@ from splatseg.lift.points import ViewedPointOptions
 from splatseg.street.field import MeshField
 from splatseg.tasks import ScanLabelOptions, label_scans, viewed_points
 from support.analytic import BALL, FLOOR, BallOverFloor
-<<<<<<< HEAD
-from support.mesh_fields import balls, told_field
-=======
 from support.arrays import arrays_of
->>>>>>> da7658193465206425af47ddad784c16c735689a
+from support.mesh_fields import balls, told_field
 from support.ply import write_ply
 
 
