@@ -68,5 +68,5 @@ def _with_facts(info: LayerInfo, given: Given, everything: PointSet) -> LayerInf
     if given.encoder is not None:
         facts["point_network"] = given.encoder.source
         facts["metres_per_unit"] = everything.metres_per_unit
-        facts["scale_assumed"] = given.source.metres_per_unit is None
+        facts["scale_assumed"] = given.is_scale_assumed
     return replace(info, details={**info.details, **facts})

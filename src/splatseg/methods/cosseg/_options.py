@@ -1,6 +1,6 @@
 """How a fusion decoder is trained."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -8,7 +8,7 @@ from splatseg._check import check_choice, check_range
 from splatseg.errors import RangeError
 from splatseg.lift.heads import Blend
 from splatseg.lift.object_classes import ObjectClassOptions
-from splatseg.lift.training import SamplingOptions
+from splatseg.lift.training import SamplingOptions, TrainingOptions
 from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
 from splatseg.methods.cosseg._distilled import Division
@@ -138,6 +138,13 @@ class CossegOptions(LabelTrainingOptions):
     rate: float = 3e-3
     """Adam's rate for the decoder."""
 
+    dropout: float = 0.0
+    """Share of what is decoded, in [0, 1), that is dropped before the classifier while training."""
+
+    views_per_step: int = 8
+    """Views whose mean gradient makes a step, with points visible: each is decoded from its own
+    points, one after the other. One view alone pulls the decoder to what that view shows."""
+
     joint: Path | None = None
     """Folder of a new scene whose Gaussians learn from photographs and labels together with the
     decoder, as published; the layer is written there. None: Gaussians stay as they are, and
@@ -165,6 +172,7 @@ class CossegOptions(LabelTrainingOptions):
             ("block_points", 1),
             ("lifted_side", 1),
             ("candidates", 1),
+            ("views_per_step", 1),
         ):
             if getattr(self, name) < least:
                 raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
@@ -173,6 +181,8 @@ class CossegOptions(LabelTrainingOptions):
                 raise RangeError(f"{name}: expected numbers from 1, got {getattr(self, name)}.")
         check_rate("rate", self.rate)
         check_rate("transition_rate", self.transition_rate)
+        if not 0 <= self.dropout < 1:
+            raise RangeError(f"dropout: expected at least 0 and below 1, got {self.dropout}.")
         check_range("min_share", self.min_share, 0.0, 1.0)
         check_range("max_correlation", self.max_correlation, 0.0, 1.0)
         if not 0 < self.max_heterogeneity <= 1:
@@ -186,16 +196,23 @@ class CossegOptions(LabelTrainingOptions):
         if self.spatial == "none" and self.semantic == "none":
             raise RangeError("semantic, spatial: expected one of the two, got neither.")
 
+    @property
+    def by_view(self) -> bool:
+        """Whether each view is decoded from the points that it shows."""
+        return self.points == "visible" and self.spatial != "none"
+
     def drawing(self) -> SamplingOptions:
-        """Which pixels are drawn: of one view at a time where points are those that it shows."""
+        """Which pixels are drawn: batches of one view where each has points of its own."""
         drawn = LabelTrainingOptions.drawing(self)
-        return SamplingOptions(
-            pixels=drawn.pixels,
-            sampling=drawn.sampling,
-            min_weight=drawn.min_weight,
-            memory=drawn.memory,
-            views_per_batch=1 if self.points == "visible" and self.spatial != "none" else None,
-        )
+        return replace(drawn, views_per_batch=1 if self.by_view else None)
+
+    def training(self) -> TrainingOptions:
+        """How training goes: a step is of as many views as it should have."""
+        usual = LabelTrainingOptions.training(self)
+        if not self.by_view:
+            return usual
+        views = self.views_per_step
+        return replace(usual, batch=max(1, self.batch // views), accumulate=views)
 
     @classmethod
     def published(cls, *, steps: int = 2000) -> "CossegOptions":
