@@ -127,6 +127,10 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=CossegOptions.published(),
+    published_differs="It differs: 4000 of 10 000 steps, each of 8 views x 512 pixels and not of a "
+    "whole picture; weights below 0.01 left out of them; a point encoder trained on generated "
+    "rooms, not on S3DIS, unless --encoder names one; Gaussians that stay as they are (--joint "
+    "moves them); views rendered from one decoding of all Gaussians.",
     refines="joint",
     companions={"features": ("features",), "masks": ("masks", "panoptic", "tracked")},
 )

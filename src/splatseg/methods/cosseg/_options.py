@@ -30,6 +30,8 @@ PUBLISHED_STEPS = 10_000
 """Each with one whole picture."""
 PUBLISHED_DECODED = (32, 32, 128, 256, 512, 1024)
 """RandLA-Net's own decoder for S3DIS, which the paper extends."""
+PUBLISHED_DROPOUT = 0.5
+"""RandLA-Net's, before its classifier."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +94,7 @@ class CossegOptions(LabelTrainingOptions):
 
     division: Division = "mean"
     """What features summed over pixels are divided by. mean: their weights. pixels: the number of
-    pixels. sum: nothing, as equation 2 is printed."""
+    pixels, as equation 2 counts them and its source divides. sum: nothing, as it is printed."""
 
     components: int = PUBLISHED_COMPONENTS
     """Principal components that wider blocks are reduced to."""
@@ -214,12 +216,26 @@ class CossegOptions(LabelTrainingOptions):
         views = self.views_per_step
         return replace(usual, batch=max(1, self.batch // views), accumulate=views)
 
-    @classmethod
-    def published(cls, *, steps: int = 2000) -> "CossegOptions":
-        """The published setting: its features, points, loss and rate.
+    def trained(self, steps: int) -> str:
+        """How long the decoder was trained, beside what was published."""
+        if self.by_view:
+            each = f"{self.views_per_step} views x {self.batch // self.views_per_step} pixels"
+        else:
+            each = f"{self.batch} pixels of all views"
+        published = self == replace(
+            self.published(), steps=self.steps, encoder=self.encoder, memory=self.memory
+        )
+        if not published:
+            return f"{steps} steps of {each}, not the published setting"
+        return f"published, {steps} of {PUBLISHED_STEPS} steps of {each}"
 
-        Steps are of sampled pixels of one view, and fewer than `PUBLISHED_STEPS`. The paper prunes
-        Gaussians by their pixels and does not say below how many.
+    @classmethod
+    def published(cls, *, steps: int = 4000) -> "CossegOptions":
+        """The published setting: its features, points, decoder, loss and rate.
+
+        Published are `PUBLISHED_STEPS` steps, each of a whole picture. Here a step is of as many
+        pixels of `views_per_step` pictures as are worth their time, and `steps` are what two cores
+        do in an hour. The paper prunes Gaussians by their pixels and does not say below how many.
         """
         return cls(
             features="features_dino",
@@ -227,14 +243,17 @@ class CossegOptions(LabelTrainingOptions):
             readout="rendered",
             steps=steps,
             batch=4096,
-            division="sum",
+            views_per_step=8,
+            sampling="strata",
+            division="pixels",
             min_pixels=10,
             points="visible",
             decoded=PUBLISHED_DECODED,
+            dropout=PUBLISHED_DROPOUT,
             blend="features",
             rate=PUBLISHED_RATE,
             schedule="constant",
-            min_weight=0.0,
+            min_weight=0.01,
             held_out=0.0,
             patience=0,
         )

@@ -122,6 +122,7 @@ def train_cosseg(
         blend=options.blend,
         classes=classes,
         seed=context.seed,
+        trained=options.trained(len(result.losses)),
     )
 
 

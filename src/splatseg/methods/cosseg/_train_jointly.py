@@ -22,7 +22,7 @@ from splatseg.methods.cosseg._fusion import (
 )
 from splatseg.methods.cosseg._given import prepare
 from splatseg.methods.cosseg._joint import LabelLoss, train_jointly
-from splatseg.methods.cosseg._options import CossegOptions
+from splatseg.methods.cosseg._options import PUBLISHED_STEPS, CossegOptions
 
 
 @boundary
@@ -113,7 +113,15 @@ def train_cosseg_jointly(
         best_step=len(loss.losses),
         stopped="steps",
     )
+    steps = len(loss.losses)
     layer = decoded_layer(
-        given, everything, data, result, blend="features", classes=classes, seed=context.seed
+        given,
+        everything,
+        data,
+        result,
+        blend="features",
+        classes=classes,
+        seed=context.seed,
+        trained=f"{steps} of {PUBLISHED_STEPS} published steps of a whole picture, jointly",
     )
     return learnt, layer
