@@ -1,6 +1,5 @@
 """Tables and bars of a report of a segmentation."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -206,7 +205,7 @@ def _points(value: object) -> tuple[tuple[float, float], ...]:
     return tuple(
         (float(x), float(y))
         for x, y in (cast("list[object]", one) for one in pairs if len(one) == 2)  # pyright: ignore[reportUnknownArgumentType]
-        if isinstance(x, int | float) and isinstance(y, int | float) and math.isfinite(y)
+        if isinstance(x, int | float) and isinstance(y, int | float)
     )
 
 

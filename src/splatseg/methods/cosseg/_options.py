@@ -34,6 +34,10 @@ PUBLISHED_DROPOUT = 0.5
 """RandLA-Net's, before its classifier."""
 
 
+_NOT_PUBLISHED = ("steps", "features", "encoder", "memory")
+"""What may be otherwise in the published setting."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CossegOptions(LabelTrainingOptions):
     """How labels are decoded from features and space."""
@@ -222,9 +226,8 @@ class CossegOptions(LabelTrainingOptions):
             each = f"{self.views_per_step} views x {self.batch // self.views_per_step} pixels"
         else:
             each = f"{self.batch} pixels of all views"
-        published = self == replace(
-            self.published(), steps=self.steps, encoder=self.encoder, memory=self.memory
-        )
+        theirs = {name: getattr(self, name) for name in _NOT_PUBLISHED}
+        published = self == replace(self.published(), **theirs)
         if not published:
             return f"{steps} steps of {each}, not the published setting"
         return f"published, {steps} of {PUBLISHED_STEPS} steps of {each}"
