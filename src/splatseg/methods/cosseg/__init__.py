@@ -30,6 +30,7 @@ from splatseg.methods._method import Method, MethodInputs, Refined
 from splatseg.methods._trained_labels import context_of, hard_labels
 from splatseg.methods.cosseg._linked import CategoryMaps, LinkedLabels, linked_labels
 from splatseg.methods.cosseg._objects import label_objects
+from splatseg.methods.cosseg._options import PUBLISHED_DIFFERS
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
 from splatseg.methods.cosseg._train_jointly import train_cosseg_jointly as train_cosseg_jointly
@@ -127,10 +128,7 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=CossegOptions.published(),
-    published_differs="It differs: 4000 of 10 000 steps, each of 8 views x 512 pixels and not of a "
-    "whole picture; weights below 0.01 left out of them; a point encoder trained on generated "
-    "rooms, not on S3DIS, unless --encoder names one; Gaussians that stay as they are (--joint "
-    "moves them); views rendered from one decoding of all Gaussians.",
+    published_differs=PUBLISHED_DIFFERS,
     refines="joint",
     companions={"features": ("features",), "masks": ("masks", "panoptic", "tracked")},
 )

@@ -27,11 +27,17 @@ Transitions = Literal["none", "views"]
 PUBLISHED_COMPONENTS = 64
 PUBLISHED_RATE = 1e-3
 PUBLISHED_STEPS = 10_000
-"""Each with one whole picture."""
+"""Each of one whole picture."""
 PUBLISHED_DECODED = (32, 32, 128, 256, 512, 1024)
 """RandLA-Net's own decoder for S3DIS, which the paper extends."""
 PUBLISHED_DROPOUT = 0.5
 """RandLA-Net's, before its classifier."""
+PUBLISHED_DIFFERS = (
+    "It differs: a step is of 8 views x 512 pixels and not of one whole picture, without weights "
+    "below 0.01; the point encoder was trained on generated rooms, not on S3DIS, unless --encoder "
+    "names one; Gaussians stay as they are (--joint moves them); views are rendered from one "
+    "decoding of all Gaussians."
+)
 
 
 _NOT_PUBLISHED = ("steps", "features", "encoder", "memory")
@@ -233,12 +239,11 @@ class CossegOptions(LabelTrainingOptions):
         return f"published, {steps} of {PUBLISHED_STEPS} steps of {each}"
 
     @classmethod
-    def published(cls, *, steps: int = 4000) -> "CossegOptions":
-        """The published setting: its features, points, decoder, loss and rate.
+    def published(cls, *, steps: int = PUBLISHED_STEPS) -> "CossegOptions":
+        """The published setting: its features, points, decoder, loss, steps and rate.
 
-        Published are `PUBLISHED_STEPS` steps, each of a whole picture. Here a step is of as many
-        pixels of `views_per_step` pictures as are worth their time, and `steps` are what two cores
-        do in an hour. The paper prunes Gaussians by their pixels and does not say below how many.
+        A published step is of a whole picture; here it is of 4096 pixels, of `views_per_step`
+        pictures. The paper prunes Gaussians by their pixels and does not say below how many.
         """
         return cls(
             features="features_dino",
