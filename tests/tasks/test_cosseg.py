@@ -107,6 +107,23 @@ def test_the_published_setting_on_features_of_a_network(
     assert said in page
 
 
+def test_help_says_in_what_the_published_setting_differs(capsys) -> None:
+    def said(method: str) -> str:
+        assert main(["segment", "--method", method, "--help"]) == 0
+        return " ".join(capsys.readouterr().out.split())
+
+    published = CossegOptions.published()
+    views, pixels = published.views_per_step, published.batch // published.views_per_step
+    for words in (
+        f"It differs: a step is of {views} views x {pixels} pixels",
+        f"without weights below {published.min_weight:g}",
+        "trained on generated rooms, not on S3DIS",
+        "rendered from one decoding",
+    ):
+        assert words in said("cosseg"), words
+    assert "It differs" not in said("identity")
+
+
 def test_what_is_missing_is_told_in_one_sentence(scene) -> None:
     with pytest.raises(InputError, match="masks: expected evidence of masks, such as masks_sam"):
         segment(load_scene(scene), "cosseg", options=LABELS)

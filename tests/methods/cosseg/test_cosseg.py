@@ -294,7 +294,8 @@ def test_what_was_interrupted_under_the_published_setting_goes_on(
 def test_the_published_setting(halves, encoder_file) -> None:
     """As the papers print it: Dou et al. 3.3, 4.1; Hu et al. Fig. 7 and their S3DIS settings."""
     published = CossegOptions.published()
-    assert (published.rate, published.components) == (1e-3, 64)
+    assert (published.rate, published.schedule, published.steps) == (1e-3, "constant", 10_000)
+    assert published.components == 64
     assert (published.points, published.division, published.blend) == (
         "visible", "pixels", "features",
     )  # fmt: skip

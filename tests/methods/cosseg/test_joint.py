@@ -76,6 +76,17 @@ def test_the_loss_by_hand(halves) -> None:
     assert loss.losses == [pytest.approx(float(found) / 0.5)]
 
 
+def test_drop_out_is_drawn(halves) -> None:
+    view, rows = halves.views[0], torch.arange(len(halves.gaussians))
+
+    def first(seed: int, **changes) -> float:
+        loss = label_loss(halves, rng=np.random.default_rng(seed), **changes)
+        return float(loss(view, halves.gaussians, rows).detach())
+
+    assert first(2, dropout=0.5) == first(2, dropout=0.5)
+    assert len({first(2), first(2, dropout=0.5), first(3, dropout=0.5)}) == 3
+
+
 def test_pixels_without_a_label_say_nothing(halves) -> None:
     view, rows = halves.views[0], torch.arange(len(halves.gaussians))
     nothing = Maps({view.name: LabelMap(ids=torch.full((24, 32), -1, dtype=torch.int32))})

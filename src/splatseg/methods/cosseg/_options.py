@@ -155,7 +155,7 @@ class CossegOptions(LabelTrainingOptions):
 
     views_per_step: int = 8
     """Views whose mean gradient makes a step, with points visible: each is decoded from its own
-    points, one after the other. One view alone pulls the decoder to what that view shows."""
+    points, one after the other. A step of more views learns more, and takes as much longer."""
 
     joint: Path | None = None
     """Folder of a new scene whose Gaussians learn from photographs and labels together with the
