@@ -274,6 +274,22 @@ def test_what_association_says_is_shown(write) -> None:
     assert "Segments to instances" not in broken
 
 
+def test_how_a_layer_was_trained_is_shown(write) -> None:
+    curve = [[10, 0.75], [20, 0.5], [30, "x"], "odd"]
+    said = {
+        "loss_curve": curve,
+        "trained": "published, 30 of 10000 steps",
+        "point_network": "randla",
+        "point_network_trained_on": 7,
+    }
+    page = write(labels=layer_of(write.scene, info={"details": said}))
+    for words in ("How it was trained", "Loss", "steps", "published, 30 of 10000 steps", "randla"):
+        assert words in page, words
+    assert "How it was trained" not in write()
+    broken = write(labels=layer_of(write.scene, info={"details": {"loss_curve": "yes"}}))
+    assert "How it was trained" not in broken
+
+
 def test_a_page_that_is_too_large_gets_smaller_pictures(write, monkeypatch) -> None:
     large = write()
     monkeypatch.setattr(segment_report, "_IMAGE_SIZES", (448, 20, 10))

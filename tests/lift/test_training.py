@@ -260,13 +260,87 @@ class Stop:
         return self.left == 0
 
 
+class Summed:
+    """The loss of the model, and a shared array that counts batches and that no gradient moves."""
+
+    def __init__(self, rate: float = 0.01) -> None:
+        self._model = Regression(rate=rate)
+        self.row_parameters = self._model.row_parameters
+        self.shared_parameters = dict(self._model.shared_parameters)
+        self.shared_parameters["count"] = Parameter(start=torch.zeros(1), rate=0.01)
+        self.seen: list[Batch] = []
+
+    def loss(self, batch: Batch, values: Values) -> torch.Tensor:
+        self.seen.append(batch)
+        before = values.shared["count"]
+        values.keep("count", before + 1)
+        assert torch.equal(values.shared["count"], before + 1)
+        return self._model.loss(batch, values)
+
+    def score(self, batches: Sequence[Batch], values: Values) -> float:
+        return 0.0
+
+
+def test_a_step_over_batches_is_the_mean_of_their_gradients(rng) -> None:
+    """Adam with a large epsilon moves by rate g / (|g| + epsilon), from which g is read."""
+    large = 1e3
+    options = TrainingOptions(**SHORT | {"steps": 1, "accumulate": 3, "epsilon": large})
+    model = Summed(rate=large)
+    result = train(model, many_views(rng, 4), options=options, seed=3)
+    moved = (model.shared_parameters["scale"].start - result.shared["scale"]).double()
+    found = moved * large / (large - moved.abs())
+    assert len(model.seen) == 3
+    values = {name: one.start for name, one in model.row_parameters.items()}
+    shared = {name: one.start for name, one in model.shared_parameters.items()}
+    alone = np.random.default_rng((3, 2, 1))  # of the first step; batches draw in turn
+    gradients, losses = [], []
+    for batch in model.seen:
+        each = Values(values, shared, rng=alone, step=1, differentiable=True)
+        loss = Regression().loss(batch, each)
+        loss.backward()
+        gradients.append(each.shared["scale"].grad)
+        losses.append(float(loss.detach()))
+    wanted = torch.stack(gradients).mean(dim=0).double()
+    torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-4)
+    assert list(result.losses) == [pytest.approx(np.mean(losses), rel=1e-5)]
+    assert not torch.allclose(found, gradients[-1].double(), rtol=0.1)
+
+
+def test_what_a_model_keeps_no_gradient_moves(rng) -> None:
+    options = TrainingOptions(**SHORT | {"steps": 4, "accumulate": 3})
+    result = train(Summed(), many_views(rng, 4), options=options, seed=3)
+    assert float(result.shared["count"]) == 12.0
+
+
+def test_batches_of_a_step_are_of_different_views(rng) -> None:
+    """Each view gives a batch before any gives another, whatever the draw."""
+    source = many_views(rng, 6)
+    views = [View(name=view.name, camera=view.camera) for view in source.views]
+    maps = random_maps(rng, views, IDS)
+    sampler = sampler_of(random_gaussians(rng, N), views, maps, pixels=40, views_per_batch=1)
+    for passes in (0, 1, 2):
+        model = Summed()
+        options = TrainingOptions(
+            **SHORT | {"batch": 10, "steps": 8, "accumulate": 3, "passes": passes}
+        )
+        train(model, sampler, options=options, seed=passes)
+        views_of = [int(batch.views.unique()) for batch in model.seen]
+        assert len(views_of) == 24
+        for begin in range(0, 24, 6):
+            assert sorted(views_of[begin : begin + 6]) == list(range(6))
+        first = {(view, *b.pixels.tolist()) for view, b in zip(views_of, model.seen, strict=True)}
+        assert len(first) == 24  # a pass goes through all batches
+
+
 @pytest.mark.bits
+@pytest.mark.parametrize("accumulate", [1, 3])
 @pytest.mark.parametrize("passes", [0, 2])
 @pytest.mark.parametrize("stop", [3, 9, 11])
-def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
+def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop, accumulate) -> None:
     sampler = many_views(rng, 6)
     options = TrainingOptions(
         steps=25, batch=50, passes=passes, held_out=0.34, score_every=4, patience=9,
+        accumulate=accumulate,
         schedule="cosine", warmup=3, held_out_pixels=10, score_start=True,
     )  # fmt: skip
     whole_model = Regression()
@@ -285,7 +359,7 @@ def test_resuming_is_bit_for_bit(rng, tmp_path, passes, stop) -> None:
         progress=lambda state: steps.append(state.step),
     )  # fmt: skip
     assert steps == list(range(stop + 1, 26))
-    assert model.drawn == whole_model.drawn[stop:]
+    assert model.drawn == whole_model.drawn[stop * accumulate :]
     assert torch.equal(whole.rows["values"], again.rows["values"])
     assert torch.equal(whole.shared["scale"], again.shared["scale"])
     assert torch.equal(whole.visibility, again.visibility)

@@ -17,7 +17,12 @@ from splatseg.lift.training import (
     SamplingOptions,
     held_out_views,
 )
-from splatseg.lift.training._pixels import draw_by_group, draw_uniformly, equal_shares
+from splatseg.lift.training._pixels import (
+    draw_by_group,
+    draw_by_strata,
+    draw_uniformly,
+    equal_shares,
+)
 
 from .conftest import (
     BACKEND,
@@ -99,6 +104,41 @@ def test_uniform_draws_every_pixel_alike(rng) -> None:
         counts[pixels] += 1
     # Binomial with mean 500 and deviation 19: 5 deviations.
     assert float((counts - 500).abs().max()) < 97
+
+
+def test_strata_cover_the_picture(rng) -> None:
+    """Of any 16 pixels one after the other, each quarter of the picture has about 4."""
+    height, width = 24, 32
+    everything = torch.arange(height * width)
+    pixels, stands_for = draw_by_strata(everything, width, 192, rng)
+    assert len(set(pixels.tolist())) == 192
+    assert stands_for.tolist() == [4.0] * 192
+    rows, columns = pixels // width, pixels % width
+    # Each patch of 2 x 2 has one.
+    assert len(set(zip((rows // 2).tolist(), (columns // 2).tolist(), strict=True))) == 192
+    quarter = (rows >= 16) * 2 + (columns >= 16)
+    share = torch.bincount((everything // width >= 16) * 2 + (everything % width >= 16)) / 768
+    for begin in range(0, 192, 16):
+        found = torch.bincount(quarter[begin : begin + 16], minlength=4)
+        assert float((found - 16 * share).abs().max()) < 2.2, (begin, found)
+    other, _ = draw_by_strata(everything, width, 192, rng)
+    assert not torch.equal(pixels, other)
+
+
+def test_strata_draw_every_pixel_alike(rng) -> None:
+    """Where parts do not divide, each pixel stands for as many as its part has."""
+    some = torch.tensor([3, 5, 8, 13, 40, 41, 42, 60, 61, 62, 63])
+    counts, total = torch.zeros(64), torch.zeros(64)
+    for _ in range(2000):
+        pixels, stands_for = draw_by_strata(some, 8, 4, rng)
+        assert len(pixels) == 4
+        counts[pixels] += 1
+        total[pixels] += stands_for
+    assert bool((counts[some] > 0).all())
+    assert float(counts.sum()) == 8000
+    assert float((total[some] / 2000 - 1).abs().max()) < 0.15
+    assert len(draw_by_strata(some, 8, 100, rng)[0]) == 11
+    assert len(draw_by_strata(some[:0], 8, 100, rng)[0]) == 0
 
 
 def test_groups_draw_equally_many_of_each(rng) -> None:

@@ -34,6 +34,14 @@ def dino() -> Any:
     return ViTModel(ViTConfig(**_VIT, intermediate_size=64, image_size=64, patch_size=16))
 
 
+def dino_wide() -> Any:
+    """DINO of 2021 whose blocks are wider than what `cosseg` reduces them to."""
+    from transformers import ViTConfig, ViTModel
+
+    wide = {**_VIT, "hidden_size": 96}
+    return ViTModel(ViTConfig(**wide, intermediate_size=64, image_size=64, patch_size=16))
+
+
 def dinov2() -> Any:
     """DINOv2."""
     from transformers import Dinov2Config, Dinov2Model
@@ -134,6 +142,7 @@ _MAKERS = {
     "sam_hq": sam_hq,
     "sam2": sam2,
     "dino": dino,
+    "dino_wide": dino_wide,
     "dinov2": dinov2,
     "dinov2_with_registers": dinov2_with_registers,
     "dinov3": dinov3,

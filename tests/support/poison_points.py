@@ -44,6 +44,13 @@ def of_points(folder: Path) -> dict[str, Any]:
         "join_pyramids": {"pyramids": (pyramid,)},
         "average_on_grid": {"positions": points, "colours": points, "side": 0.5},
         "feed_points": {"positions": points, "colours": points, "inputs": inputs},
+        "points_origin": {"positions": points, "inputs": inputs},
+        "scene_options": {
+            "encoder": loaded,
+            "positions": points,
+            "options": SpatialOptions(),
+            "seed": 0,
+        },
         "spatial_features": {
             "encoder": loaded,
             "positions": points,

@@ -11,9 +11,16 @@ from splatseg.core import Features, Labels
 from splatseg.errors import InputError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.scene import load_scene, load_scene_layer
+from splatseg.lift.point_network import (
+    PointInputs,
+    RandlaConfig,
+    RandlaEncoder,
+    save_point_encoder,
+)
 from splatseg.methods.cosseg import CossegOptions
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
+from support.checkpoints import saved
 
 LABELS = SegmentOptions(evidence="labels_semantic")
 
@@ -28,6 +35,65 @@ def test_the_decoder_of_features_alone(scene) -> None:
     layer = segment(load_scene(scene), "cosseg", options=LABELS, method_options=options).layer
     assert isinstance(layer, Features)
     assert layer.info.details["blocks"] == ["block3", "block6", "block9", "block12"]
+
+
+@pytest.fixture(scope="module")
+def small_encoder(tmp_path_factory) -> Path:
+    """A point network that a view of few Gaussians has points enough for."""
+    config = RandlaConfig(first_width=4, widths=(4, 4), neighbours=4, ratios=(4, 2))
+    path = tmp_path_factory.mktemp("encoder") / "small.safetensors"
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)
+        encoder = RandlaEncoder(config)
+    save_point_encoder(encoder, path, inputs=PointInputs(grid_size=0.04), facts={})
+    return path
+
+
+def test_the_published_setting_on_features_of_a_network(
+    scene, small_encoder, tmp_path, monkeypatch, capsys
+) -> None:
+    """From DINO, with its class token and blocks wider than 64 channels, to a page of the layer."""
+    pytest.importorskip("transformers")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+
+    def run(*words: object) -> None:
+        status = main([str(word) for word in words])
+        assert status == 0, capsys.readouterr().err
+
+    weights = saved("dino_wide", tmp_path)
+    run("see", scene, "--model", "dino", "--weights", weights, "--evidence", "dino", "--device",
+        "cpu", "--size", 64)  # fmt: skip
+    found = open_evidence(scene / "evidence" / "dino").deep_features("train_0000")
+    assert found.class_token is not None
+    assert [one.channels for one in found.maps] == [96] * 4
+    run("segment", scene, "--method", "cosseg", "--published", "--evidence", "labels_semantic",
+        "--features", "dino", "--encoder", small_encoder, "--steps", 3, "--layer", "published",
+        "--report")  # fmt: skip
+    layer = load_scene_layer(scene, "published")
+    assert isinstance(layer, Features)
+    assert layer.info.details["skipped"] == []
+    said = "published, 3 of 10000 steps of 8 views x 512 pixels"
+    assert layer.info.details["trained"] == said
+    page = (scene / "reports" / "published.html").read_text()
+    assert "How it was trained" in page
+    assert said in page
+
+
+def test_help_says_in_what_the_published_setting_differs(capsys) -> None:
+    def said(method: str) -> str:
+        assert main(["segment", "--method", method, "--help"]) == 0
+        return " ".join(capsys.readouterr().out.split())
+
+    published = CossegOptions.published()
+    views, pixels = published.views_per_step, published.batch // published.views_per_step
+    for words in (
+        f"It differs: a step is of {views} views x {pixels} pixels",
+        f"without weights below {published.min_weight:g}",
+        "trained on generated rooms, not on S3DIS",
+        "rendered from one decoding",
+    ):
+        assert words in said("cosseg"), words
+    assert "It differs" not in said("identity")
 
 
 def joint_words(scene: Path, folder: Path) -> list[str]:

@@ -123,7 +123,9 @@ def command_for(words: Sequence[str]) -> type[Any]:
         tyro.conf.OmitArgPrefixes,
         tyro.conf.arg(help=f"Options of method {name}: {method.summary} ({method.reference})."),
     ]
-    own = [("options", options, field(default=default))]
+    own: list[tuple[str, Any, Any]] = [("options", options, field(default=default))]
+    if method.published_differs:
+        own.append(_shared_that_differs(method.published_differs))
     made = make_dataclass(
         "Command",
         own if method.resumes else [*own, _HIDDEN_CHECKPOINTS],
@@ -133,6 +135,17 @@ def command_for(words: Sequence[str]) -> type[Any]:
     )
     made.__doc__ = Command.__doc__
     return made
+
+
+def _shared_that_differs(differs: str) -> tuple[str, Any, Any]:
+    """What methods share, with a --published that says how the setting differs from the paper's."""
+    said = f"The method as its authors published it: their options, and no completion. {differs}"
+    told = Annotated[bool, tyro.conf.arg(help=said)]
+    shared = make_dataclass(
+        "Shared", [("published", told, field(default=False))], bases=(_Shared,), frozen=True,
+        kw_only=True,
+    )  # fmt: skip
+    return "shared", tyro.conf.OmitArgPrefixes[shared], field(default_factory=shared)
 
 
 def _with_summaries() -> type[Any]:

@@ -33,6 +33,7 @@ from splatseg.core.json_values import JSON as JSON
 from splatseg.core.json_values import plain_json as plain_json
 from splatseg.core.json_values import plain_object as plain_object
 from splatseg.core.layer_info import LEARNED_BYTES as LEARNED_BYTES
+from splatseg.core.layer_info import LOSS_CURVE as LOSS_CURVE
 from splatseg.core.layer_info import InstanceFacts as InstanceFacts
 from splatseg.core.layer_info import LayerEdit as LayerEdit
 from splatseg.core.layer_info import LayerEditName as LayerEditName

@@ -16,6 +16,9 @@ _Value = TypeVar("_Value")
 LEARNED_BYTES = "learned_bytes"
 """Among the details of a layer: bytes of all that its method trained, kept in it or not."""
 
+LOSS_CURVE = "loss_curve"
+"""Among the details of a trained layer: steps, and the mean loss of the part that ends there."""
+
 LayerEditName = Literal[
     "correct_confusion", "complete", "merge_panoptic", "sharpen", "attach", "merge", "decompose"
 ]

@@ -138,6 +138,10 @@ class Method:
     published: Any = None
     """The options of the publication, an instance of `options`; None where the defaults are."""
 
+    published_differs: str = ""
+    """What of the publication its setting here leaves out or does otherwise, in a sentence for the
+    help of ``--published``."""
+
     companions: Mapping[str, tuple[EvidenceKind, ...]] = field(
         default_factory=dict[str, tuple[EvidenceKind, ...]]
     )

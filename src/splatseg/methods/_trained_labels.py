@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from splatseg.core import (
     LEARNED_BYTES,
+    LOSS_CURVE,
     ClassTable,
     Features,
     Gaussians,
@@ -35,6 +37,7 @@ from splatseg.methods._method import MethodInputs
 from splatseg.methods._trained_options import LabelTrainingOptions
 from splatseg.render import RenderOptions
 
+_PARTS = 100
 _NOT_TRAINED = ("readout", "min_share", "memory", "max_bytes")
 """Options that decide how what was trained is read, and where rows are kept."""
 
@@ -143,6 +146,14 @@ def recorded_options(options: LabelTrainingOptions) -> dict[str, Any]:
     return found
 
 
+def loss_curve(losses: Sequence[float]) -> list[list[float]]:
+    """Losses in brief: the last step and the mean loss of at most 100 equal parts of a training."""
+    ends = [len(losses) * part // _PARTS for part in range(_PARTS + 1)]
+    return [
+        [end, float(np.mean(losses[begin:end]))] for begin, end in pairwise(ends) if end > begin
+    ]
+
+
 def layer_info(
     method: str,
     options: dict[str, Any],
@@ -169,6 +180,7 @@ def layer_info(
             "best_step": result.best_step,
             "stopped": result.stopped,
             "scores": [[step, score] for step, score in result.scores],
+            LOSS_CURVE: loss_curve(result.losses),
             LEARNED_BYTES: result.learned_bytes,
         },
     )

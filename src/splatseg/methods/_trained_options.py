@@ -27,7 +27,8 @@ class LabelTrainingOptions:
     """Labelled pixels of each view that are drawn at a time."""
 
     sampling: Sampling = "uniform"
-    """uniform: all labelled pixels alike. groups: equally many of each id in a view."""
+    """uniform: all labelled pixels alike. groups: equally many of each id in a view. strata: one
+    of each of as many equal parts of the picture."""
 
     passes: int = 4
     """How often drawn pixels are gone through before new ones are drawn; 0 draws once."""

@@ -24,6 +24,7 @@ from splatseg.report._segment_tables import (
     instances_without_labels,
     seen_id_table,
     support_table,
+    training_blocks,
 )
 from splatseg.report.html import Block, Figure, Legend, Notice, Report, Table
 from splatseg.report.images import ObjectGallery, Scale
@@ -126,6 +127,7 @@ def segmentation_page(data: SegmentationReportData, *, longest: int) -> Report:
         blocks += conflict_tables(labels, data.classes)
     blocks += difference_tables(data.compared)
     blocks += association_tables(data.summary.info)
+    blocks += training_blocks(data.summary.info)
     scores = data.score.per_class if isinstance(data.score, SemanticScore) else {}
     blocks.append(
         seen_id_table(data.panels, data.classes, scores=scores, scored=data.scored)

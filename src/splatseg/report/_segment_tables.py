@@ -8,6 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from splatseg.core import (
+    LOSS_CURVE,
     UNLABELLED,
     ClassTable,
     Labels,
@@ -16,7 +17,8 @@ from splatseg.core import (
 )
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
 from splatseg.report._segment_panels import ViewPanel
-from splatseg.report.html import Bars, Block, Cell, Table
+from splatseg.report.chart import Chart, Line
+from splatseg.report.html import Bars, Block, Cell, Curves, Table
 from splatseg.report.words import count_text
 
 _BINS = 10
@@ -24,6 +26,9 @@ _MIN_VIEWS = (1, 2, 3, 5, 10, 20, 50, 100)
 _CLOSE = (0.5, 0.8, 0.95)
 _ROWS = 60
 _LONG = 200
+
+TRAINING_FACTS = ("trained", "point_network", "point_network_trained_on")
+"""Details of a layer that say how it was trained."""
 
 
 def support_table(labels: Labels) -> Table:
@@ -173,6 +178,35 @@ def association_tables(info: LayerInfo) -> list[Block]:
             title = name.replace("_", " ").capitalize()
             blocks.append(Table(title=title, columns=("what", "value"), rows=tuple(rows[:_ROWS])))
     return blocks
+
+
+def training_blocks(info: LayerInfo) -> list[Block]:
+    """How a trained layer was trained: its loss, and what its method says of it in words."""
+    blocks: list[Block] = []
+    curve = _points(info.details.get(LOSS_CURVE))
+    if curve:
+        line = Line(name="training views", points=curve)
+        chart = Chart(title="Loss", across="steps", lines=(line,))
+        blocks.append(Curves(title="How it was trained", charts=(chart,)))
+    said = {
+        key: info.details[key] for key in TRAINING_FACTS if isinstance(info.details.get(key), str)
+    }
+    if said:
+        rows = fact_rows(said)
+        blocks.append(Table(title="Training", columns=("what", "value"), rows=tuple(rows)))
+    return blocks
+
+
+def _points(value: object) -> tuple[tuple[float, float], ...]:
+    """Points of a curve; what is none, in a record of another program, is left out."""
+    if not isinstance(value, list):
+        return ()
+    pairs = [one for one in cast("list[object]", value) if isinstance(one, list)]
+    return tuple(
+        (float(x), float(y))
+        for x, y in (cast("list[object]", one) for one in pairs if len(one) == 2)  # pyright: ignore[reportUnknownArgumentType]
+        if isinstance(x, int | float) and isinstance(y, int | float)
+    )
 
 
 def instances_without_labels(layer: RenderableLayer) -> list[str]:

@@ -15,6 +15,7 @@ from splatseg.lift.point_network import (
     SpatialOptions,
     average_on_grid,
     feed_points,
+    scene_options,
     spatial_features,
 )
 from splatseg.neighbours import NeighbourIndex
@@ -115,6 +116,27 @@ def test_colours_are_scaled_and_cut_off() -> None:
     assert torch.equal(channels[:, 3:], (colours * 4 - 1).clamp(0, 1) * 255)
     assert float(channels[:, 3:].min()) == 0
     assert float(channels[:, 3:].max()) == 255
+
+
+@pytest.mark.parametrize("origin", ["mean", "floor"])
+def test_parts_of_a_scene_are_fed_from_one_origin(origin) -> None:
+    """With the options of the scene, a part's coordinates are those that it has in the whole."""
+    positions, colours = scene(120)
+    encoder = encoder_of(fed=PointInputs(grid_size=GRID, origin=origin))
+    options = scene_options(encoder, positions, options=SpatialOptions(), seed=4)
+    whole = spatial_features(encoder, positions, colours, options=SpatialOptions(), seed=4)
+    assert (options.metres_per_unit, options.origin) == (whole.metres_per_unit, whole.origin)
+    part = torch.argsort(positions[:, 0])[:60]
+    found = spatial_features(encoder, positions[part], colours[part], options=options, seed=4)
+    assert torch.equal(found.pyramid.positions, whole.pyramid.positions[part])
+    own = spatial_features(
+        encoder, positions[part], colours[part], options=SpatialOptions(), seed=4
+    )
+    assert not torch.allclose(own.pyramid.positions, whole.pyramid.positions[part], atol=1e-2)
+    given = SpatialOptions(metres_per_unit=2.0, origin=(1.0, 2.0, 3.0))
+    assert scene_options(encoder, positions, options=given, seed=4) == given
+    with pytest.raises(RangeError, match="origin: expected finite coordinates"):
+        SpatialOptions(origin=(float("nan"), 0.0, 0.0))
 
 
 def test_the_floor_is_below_all_but_a_hundredth() -> None:

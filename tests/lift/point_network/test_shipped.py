@@ -1,5 +1,7 @@
 """The encoder that comes with the package."""
 
+from dataclasses import replace
+
 import torch
 
 from splatseg.lift.point_network import (
@@ -21,6 +23,9 @@ def test_it_is_small_and_says_how_it_was_made():
     assert encoder.config == RandlaConfig(widths=(16, 48, 96, 160, 256), classes=45)
     assert (encoder.inputs.grid_size, encoder.inputs.origin) == (0.04, "floor")
     assert {"recipe", "score", "seconds"} <= set(encoder.recipe)
+    said = "52 generated rooms and 16 generated streets, 1300 steps; not S3DIS"
+    assert encoder.trained_on == said
+    assert replace(encoder, recipe={}).trained_on == "what the file does not say"
 
 
 def test_its_features_tell_classes_apart_that_colours_do_not():

@@ -1,18 +1,20 @@
 """The method: what is found, what options do, and that bits repeat."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from splatseg.core import Features, LabelMap
+from splatseg.core import Features, LabelMap, View
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.point_network import spatial_features
 from splatseg.methods._trained_labels import TrainingContext
 from splatseg.methods.cosseg import CossegOptions, train_cosseg
 
-from .conftest import Blocks, Maps
+from .conftest import Blocks, Maps, camera
 
 DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
 QUICK = {
@@ -217,20 +219,121 @@ def test_points_of_views_lie_in_files_beyond_the_budget(halves, encoder_file) ->
     assert torch.equal(whole.values, spilled.values)
 
 
+def test_views_have_the_coordinates_of_the_scene(halves, encoder_file, monkeypatch) -> None:
+    """One origin and one scale, though views show different parts of the wall."""
+    found = []
+
+    def spied(*given, **named):
+        made = spatial_features(*given, **named)
+        found.append((given[1].double(), made.pyramid.positions.double()))
+        return made
+
+    monkeypatch.setattr("splatseg.methods.cosseg._points.spatial_features", spied)
+    options = CossegOptions(**QUICK | VISIBLE | {"encoder": encoder_file, "steps": 4})
+    moved = [View(name=f"v{x}", camera=camera(x / 2)) for x in (-2, -1, 1, 2)]
+    maps = Maps({view.name: LabelMap(ids=halves.ids(view)) for view in moved})
+    blocks = Blocks({view.name: halves.deep(view) for view in moved})
+    train_cosseg(halves.gaussians, moved, maps, features=blocks, options=options, context=context())
+    assert len(found) == 5  # the scene and four views
+    assert len({len(points) for points, _ in found}) > 1
+    whole, local = found[0]
+    scale = (local[1:] - local[0]).norm() / (whole[1:] - whole[0]).norm()
+    origin = (whole * scale - local).mean(dim=0)
+    for points, fed in found:
+        torch.testing.assert_close(points * scale - origin, fed, atol=1e-4, rtol=1e-4)
+
+
+VISIBLE = {"points": "visible", "views_per_step": 4}
+
+
+@pytest.mark.parametrize(
+    "change", [{"views_per_step": 2}, {"dropout": 0.5}, {"sampling": "strata"}]
+)
+def test_options_of_a_step_make_a_difference(halves, encoder_file, change) -> None:
+    usual = trained(halves, encoder_file, **VISIBLE)
+    changed = trained(halves, encoder_file, **VISIBLE | change)
+    assert not torch.equal(usual.values, changed.values)
+
+
+def test_a_step_is_of_as_many_views_as_it_says() -> None:
+    """Batches of one view each, of which a step takes several; `batch` is all its pixels."""
+    options = CossegOptions(points="visible", views_per_step=8, batch=4096)
+    training = options.training()
+    assert options.drawing().views_per_batch == 1
+    assert (training.batch, training.accumulate) == (512, 8)
+    for other in ({"points": "all"}, {"spatial": "none"}):
+        usual = replace(options, **other)
+        assert usual.drawing().views_per_batch is None
+        assert (usual.training().batch, usual.training().accumulate) == (4096, 1)
+
+
+def test_what_was_interrupted_under_the_published_setting_goes_on(
+    halves, encoder_file, tmp_path
+) -> None:
+    """With running statistics and drop-out; the layer knows its loss curve."""
+    setting = VISIBLE | {"dropout": 0.5, "blend": "features", "sampling": "strata"}
+    whole = trained(halves, encoder_file, **setting)
+    path = tmp_path / "training.npz"
+
+    def stop(state) -> None:
+        if state.step == 11:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(
+            halves, encoder_file, **setting,
+            given=context(checkpoints=Checkpoints(path=path), progress=stop),
+        )  # fmt: skip
+    resumed = context(checkpoints=Checkpoints(path=path, resume=True))
+    again = trained(halves, encoder_file, **setting, given=resumed)
+    assert torch.equal(again.values, whole.values)
+    curve = whole.info.details["loss_curve"]
+    assert again.info.details["loss_curve"] == curve
+    assert [step for step, _ in curve] == list(range(1, 31))
+    assert curve[-1][1] < curve[0][1]
+
+
 def test_the_published_setting(halves, encoder_file) -> None:
-    """As it is, with rates raised, for steps are few."""
-    published = CossegOptions.published(steps=60)
-    assert (published.points, published.division, published.blend) == ("visible", "sum", "features")
-    assert published.rate == 1e-3
-    assert published.drawing().views_per_batch == 1
+    """As the papers print it: Dou et al. 3.3, 4.1; Hu et al. Fig. 7 and their S3DIS settings."""
+    published = CossegOptions.published()
+    assert (published.rate, published.schedule, published.steps) == (1e-3, "constant", 10_000)
+    assert published.components == 64
+    assert (published.points, published.division, published.blend) == (
+        "visible", "pixels", "features",
+    )  # fmt: skip
+    assert published.decoded == (32, 32, 128, 256, 512, 1024)
+    assert (published.head, published.dropout) == ((64, 32), 0.5)
+    assert (published.semantic, published.spatial) == ("all", "all")
+    assert (published.label_loss, published.weighting, published.transitions) == (
+        "cross_entropy", "none", "none",
+    )  # fmt: skip
+    assert (published.held_out, published.patience, published.readout) == (0.0, 0, "rendered")
+    assert (published.views_per_step, published.batch, published.sampling) == (8, 4096, "strata")
+    assert published.min_pixels == 10
+
+
+def test_the_published_setting_learns(halves, encoder_file) -> None:
+    """As it is, but for widths and pixels; and it says how far it went."""
     options = replace(
-        published, encoder=encoder_file, rate=0.01, batch=200, pixels=200, decoded=(6, 5)
-    )
+        CossegOptions.published(steps=60), encoder=encoder_file, rate=0.01, batch=200, pixels=200,
+        decoded=(6, 5), views_per_step=4,
+    )  # fmt: skip
     features = train_cosseg(
         halves.gaussians, halves.views, halves.evidence, features=halves.blocks, options=options,
         metres_per_unit=1.0, context=context(),
     )  # fmt: skip
     assert right(halves, features) > 0.97
+    said = "60 steps of 4 views x 50 pixels, not the published setting"
+    assert features.info.details["trained"] == said
+    assert features.info.details["point_network_trained_on"] == "what the file does not say"
+
+
+def test_how_long_it_was_trained_is_said_beside_what_was_published() -> None:
+    options = replace(CossegOptions.published(steps=700), encoder=Path("other.safetensors"))
+    assert options.trained(650) == "published, 650 of 10000 steps of 8 views x 512 pixels"
+    assert CossegOptions(batch=90).trained(3) == (
+        "3 steps of 90 pixels of all views, not the published setting"
+    )
 
 
 def test_bad_input_is_one_clear_sentence(halves, encoder_file) -> None:
@@ -265,6 +368,8 @@ def test_bad_input_is_one_clear_sentence(halves, encoder_file) -> None:
         ({"semantic": "none", "spatial": "none"}, "expected one of the two"),
         ({"components": 0}, "components: expected at least 1"),
         ({"min_pixels": -1}, "min_pixels: expected at least 0"),
+        ({"views_per_step": 0}, "views_per_step: expected at least 1"),
+        ({"dropout": 1.0}, "dropout: expected at least 0 and below 1, got 1.0"),
         ({"block_points": 0}, "block_points: expected at least 1"),
         ({"lifted_side": 0}, "lifted_side: expected at least 1"),
         ({"decoded": ()}, "decoded: expected numbers from 1"),

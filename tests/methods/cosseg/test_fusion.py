@@ -5,7 +5,16 @@ import pytest
 import torch
 
 from splatseg.errors import ShapeError
-from splatseg.methods.cosseg._fusion import FusionInputs, FusionShape, Scaling, decode, decode_all
+from splatseg.methods.cosseg._fusion import (
+    FusionInputs,
+    FusionShape,
+    Scaling,
+    decode,
+    decode_all,
+    dropped,
+    running,
+    running_momentum,
+)
 
 SIZES = (11, 5, 2)
 SHAPE = FusionShape(inputs=(4, 3, 5), decoded=(6, 7, 8), head=(9, 2))
@@ -28,6 +37,26 @@ def leaky(values):
     return np.where(values > 0, values, 0.2 * values)
 
 
+def some_weights(shape: FusionShape) -> dict[str, torch.Tensor]:
+    """First weights, and batch norms as if they had been trained."""
+    rng = np.random.default_rng(4)
+    weights = shape.start(rng)
+    for name, value in weights.items():
+        if name.endswith((".scale", ".variance")):
+            weights[name] = torch.from_numpy(rng.uniform(0.5, 2, value.shape).astype(np.float32))
+        elif name.endswith((".shift", ".mean")):
+            weights[name] = torch.from_numpy(rng.normal(size=value.shape).astype(np.float32))
+    return weights
+
+
+def normed(values, weights, name):
+    """The batch norm by its running statistics, and the activation."""
+    scale, shift, mean, variance = (
+        weights[f"{name}.{part}"].numpy() for part in ("scale", "shift", "mean", "variance")
+    )
+    return leaky((values - mean) / np.sqrt(variance + 1e-6) * scale + shift)
+
+
 def looped(given: FusionInputs, weights, row: int):
     """One point, from the last level down."""
     rows = [row]
@@ -41,10 +70,9 @@ def looped(given: FusionInputs, weights, row: int):
             parts.append(decoded)
             matrix.append(weights[f"level{level}.above"].numpy())
         joined = np.concatenate(parts) @ np.concatenate(matrix)
-        decoded = leaky(joined + weights[f"level{level}.bias"].numpy())
+        decoded = normed(joined, weights, f"level{level}")
     for layer in range(2):
-        decoded = leaky(decoded @ weights[f"head{layer}.own"].numpy()
-                        + weights[f"head{layer}.bias"].numpy())  # fmt: skip
+        decoded = normed(decoded @ weights[f"head{layer}.own"].numpy(), weights, f"head{layer}")
     return decoded
 
 
@@ -54,7 +82,7 @@ def test_against_a_loop(levels) -> None:
     shape = FusionShape(
         inputs=SHAPE.inputs[:levels], decoded=SHAPE.decoded[:levels], head=SHAPE.head
     )
-    weights = shape.start(np.random.default_rng(4))
+    weights = some_weights(shape)
     rows = torch.tensor([7, 0, 10])
     expected = np.stack([looped(given, weights, int(row)) for row in rows])
     np.testing.assert_allclose(decode(given, weights, rows).numpy(), expected, atol=1e-5)
@@ -64,29 +92,95 @@ def test_against_a_loop(levels) -> None:
 
 
 def test_whole_scenes_are_decoded_in_pieces(monkeypatch) -> None:
-    given, weights = inputs(), SHAPE.start(np.random.default_rng(4))
+    given, weights = inputs(), some_weights(SHAPE)
     whole = decode_all(given, weights)
     monkeypatch.setattr("splatseg.methods.cosseg._fusion._ROWS", 3)
     torch.testing.assert_close(decode_all(given, weights), whole, rtol=0, atol=1e-6)
 
 
+def test_batch_norms_are_those_of_torch() -> None:
+    """While training: the decoder as torch's own layers, of all points that are needed."""
+    given, weights = inputs(), some_weights(SHAPE)
+    rows = torch.tensor([1, 2, 5, 7, 9])
+    statistics: dict[str, torch.Tensor] = {}
+    found = decode(given, weights, rows, statistics=statistics)
+    needed = [rows]
+    for up in given.up:
+        needed.append(torch.unique(up[needed[-1]]))
+    norms = {}
+
+    def layer(name, values):
+        norm = norms[name] = torch.nn.BatchNorm1d(values.shape[1], eps=1e-6, momentum=0.25)
+        norm.weight.data, norm.bias.data = weights[f"{name}.scale"], weights[f"{name}.shift"]
+        norm.running_mean, norm.running_var = (
+            weights[f"{name}.{part}"].clone() for part in ("mean", "variance")
+        )
+        return torch.nn.functional.leaky_relu(norm(values), 0.2)
+
+    decoded = layer("level2", given.levels[2][needed[2]].float() @ weights["level2.own"])
+    for level in (1, 0):
+        above = decoded[torch.searchsorted(needed[level + 1], given.up[level][needed[level]])]
+        own = given.levels[level][needed[level]].float() @ weights[f"level{level}.own"]
+        decoded = layer(f"level{level}", own + above @ weights[f"level{level}.above"])
+    for head in range(2):
+        decoded = layer(f"head{head}", decoded @ weights[f"head{head}.own"])
+    torch.testing.assert_close(found, decoded, atol=1e-5, rtol=1e-4)
+    kept = running(weights, statistics, 0.25)
+    assert set(kept) == {name for name in weights if name.endswith((".mean", ".variance"))}
+    for name, norm in norms.items():
+        torch.testing.assert_close(kept[f"{name}.mean"], norm.running_mean, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(kept[f"{name}.variance"], norm.running_var, atol=1e-5, rtol=1e-4)
+    # As in `decode` without statistics: what is kept counts, whichever points there are.
+    alone = decode(given, weights | kept, rows[:1])
+    torch.testing.assert_close(alone, decode(given, weights | kept, rows)[:1], atol=1e-5, rtol=1e-4)
+
+
+def test_a_single_point_is_normed_by_what_ran_before() -> None:
+    given, weights = inputs(1), some_weights(FusionShape(inputs=(4,), decoded=(6,), head=(9, 2)))
+    statistics: dict[str, torch.Tensor] = {}
+    row = torch.tensor([3])
+    found = decode(given, weights, row, statistics=statistics)
+    assert not statistics
+    assert torch.equal(found, decode(given, weights, row))
+
+
+def test_first_batches_count_more() -> None:
+    assert [running_momentum(step) for step in (1, 4, 100, 5000)] == [1.0, 0.25, 0.01, 0.01]
+
+
+def test_drop_out() -> None:
+    values = torch.ones(400, 50)
+    found = dropped(values, 0.3, np.random.default_rng(0))
+    left = found[found != 0]
+    torch.testing.assert_close(left, torch.full_like(left, 1 / 0.7))
+    assert len(left) / found.numel() == pytest.approx(0.7, abs=0.01)
+    assert torch.equal(found, dropped(values, 0.3, np.random.default_rng(0)))
+    assert not torch.equal(found, dropped(values, 0.3, np.random.default_rng(1)))
+    assert dropped(values, 0.0, np.random.default_rng(0)) is values
+
+
 def test_all_weights_get_gradients() -> None:
     weights = SHAPE.start(np.random.default_rng(4))
     leaves = {name: value.requires_grad_() for name, value in weights.items()}
-    decode(inputs(), leaves, torch.tensor([1, 2])).square().sum().backward()
-    assert all(bool(leaf.grad.abs().sum() > 0) for leaf in leaves.values())
+    decode(inputs(), leaves, torch.tensor([1, 2, 4, 5]), statistics={}).pow(3).sum().backward()
+    assert {name for name, leaf in leaves.items() if leaf.grad is None} == {
+        name for name in leaves if name.endswith((".mean", ".variance"))
+    }
+    assert all(bool(leaf.grad.any()) for leaf in leaves.values() if leaf.grad is not None)
 
 
 def test_first_weights_are_those_of_linear_layers() -> None:
     weights = SHAPE.start(np.random.default_rng(4))
-    assert set(weights) == {
-        "level2.own", "level2.bias", "level1.own", "level1.above", "level1.bias", "level0.own",
-        "level0.above", "level0.bias", "head0.own", "head0.bias", "head1.own", "head1.bias",
+    assert {name for name in weights if name.endswith((".own", ".above"))} == {
+        "level2.own", "level1.own", "level1.above", "level0.own", "level0.above", "head0.own",
+        "head1.own",
     }  # fmt: skip
     assert weights["level1.above"].shape == (8, 7)
     bound = 1 / np.sqrt(3 + 8)
     largest = max(float(weights[f"level1.{name}"].abs().max()) for name in ("own", "above"))
     assert 0.8 * bound < largest <= bound
+    for part, value in {"scale": 1, "shift": 0, "mean": 0, "variance": 1}.items():
+        assert torch.equal(weights[f"level1.{part}"], torch.full((7,), float(value)))
 
 
 def test_scaling() -> None:

@@ -7,9 +7,11 @@ import torch
 from splatseg.core import Labels
 from splatseg.errors import InputError
 from splatseg.lift.mass.uplift import UpliftOptions, uplift
-from splatseg.lift.training import LabelTargets, RowSampler, SamplingOptions
+from splatseg.lift.training import LabelTargets, RowSampler, SamplingOptions, Values
 from splatseg.methods.cosseg._agreement import VoteAgreement
-from splatseg.methods.cosseg._model import transferred
+from splatseg.methods.cosseg._fusion import FusionInputs, FusionShape
+from splatseg.methods.cosseg._model import FusionModel, transferred
+from splatseg.methods.cosseg._points import PointSet
 
 
 def test_labels_of_a_view_are_reached_by_its_matrix() -> None:
@@ -22,6 +24,52 @@ def test_labels_of_a_view_are_reached_by_its_matrix() -> None:
         wanted = (matrix.T @ probabilities[row])[label[row]]
         assert float(found[row, label[row]]) == pytest.approx(float(wanted), rel=1e-5)
     torch.testing.assert_close(found.sum(dim=1), torch.ones(2))
+
+
+def test_views_of_a_step_are_normed_each_by_itself(halves) -> None:
+    """Several views in one step give the mean of the gradients that each has alone."""
+    count = len(halves.gaussians)
+    generator = torch.Generator().manual_seed(0)
+    sets = [
+        PointSet(
+            inputs=FusionInputs(levels=(torch.randn(count, 5, generator=generator) + view,), up=()),
+            rows=torch.arange(count),
+        )
+        for view in range(4)
+    ]
+    model = FusionModel(
+        FusionShape(inputs=(5,), decoded=(6,), head=(4,)), 2, points=sets.__getitem__,
+        scored_points=sets.__getitem__, blend="features", loss="cross_entropy", rate=0.01,
+        dropout=0.0, agreement=None, views=0, transition_rate=0.0, rng=np.random.default_rng(1),
+    )  # fmt: skip
+    start = {name: one.start for name, one in model.shared_parameters.items()}
+    sampler = RowSampler(
+        halves.gaussians, halves.views,
+        LabelTargets(halves.evidence, [view.name for view in halves.views]),
+        options=SamplingOptions(pixels=60, views_per_batch=1), backend="auto",
+    )  # fmt: skip
+
+    def values() -> Values:
+        return Values({}, start, rng=np.random.default_rng(2), step=3, differentiable=True)
+
+    with sampler.draw(np.random.default_rng(0), batch=60) as drawn:
+        batches = [drawn.batch(index) for index in range(len(drawn))]
+        assert [len(batch.views.unique()) for batch in batches] == [1] * 4
+        whole, alone = values(), [values() for _ in batches]
+        for batch, each in zip(batches, alone, strict=True):
+            (model.loss(batch, whole) / len(batches)).backward()
+            model.loss(batch, each).backward()
+    learnt = [name for name in start if name not in whole.kept]
+    assert set(whole.kept) == {name for name in start if name.endswith((".mean", ".variance"))}
+    for name in learnt:
+        wanted = torch.stack([each.shared[name].grad for each in alone]).mean(dim=0)
+        torch.testing.assert_close(whole.shared[name].grad, wanted, atol=1e-6, rtol=1e-4)
+    # Running statistics have met all four views, one after the other.
+    mean = start["level0.mean"]
+    for each in alone:
+        batch_mean = (each.kept["level0.mean"] - start["level0.mean"]) * 3
+        mean = mean + (batch_mean + start["level0.mean"] - mean) / 3
+    torch.testing.assert_close(whole.kept["level0.mean"], mean, atol=1e-5, rtol=1e-4)
 
 
 def test_agreement_is_what_all_views_say_of_a_label(halves) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError
-from splatseg.lift.point_network import load_point_encoder
+from splatseg.lift.point_network import SpatialOptions, load_point_encoder
 from splatseg.methods.cosseg._points import (
     PointSource,
     base_colours,
@@ -48,7 +48,8 @@ def test_boxes_hold_all_points_once_and_lie_apart() -> None:
 def source(halves, encoder_file, **more) -> PointSource:
     scales = (torch.rand(len(halves.gaussians), 2), torch.rand(len(halves.gaussians), 3))
     given = {
-        "gaussians": halves.gaussians, "scales": scales, "spatial": "all", "metres_per_unit": 1.0,
+        "gaussians": halves.gaussians, "scales": scales, "spatial": "all",
+        "space": SpatialOptions(metres_per_unit=1.0, precision="float16"),
         "encoder": load_point_encoder(encoder_file), "up": None, "seed": 0,
     }  # fmt: skip
     return PointSource(**given | more)

@@ -1,7 +1,7 @@
 """Features of the points of a scene by a frozen encoder."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -14,7 +14,7 @@ from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.point_network.checkpoint import PointEncoder
 from splatseg.lift.point_network.grid import average_on_grid
-from splatseg.lift.point_network.inputs import MAX_METRES, feed_points
+from splatseg.lift.point_network.inputs import MAX_METRES, feed_points, points_origin
 from splatseg.lift.point_network.pyramid import (
     PointPyramid,
     PyramidOptions,
@@ -39,6 +39,10 @@ class SpatialOptions:
     be as dense as what the encoder was trained on: half of the points have another one within
     its grid's side."""
 
+    origin: tuple[float, float, float] | None = None
+    """Where x, y, z are counted from, in metres. Views of a scene need one for all of them, for
+    the encoder reads coordinates; None takes that of the points."""
+
     grid: bool = False
     """Average the points in cells of the side that the encoder was trained with. The encoder then
     sees points as even as those of its training, and each point has the features of the nearest
@@ -53,6 +57,8 @@ class SpatialOptions:
         scale = self.metres_per_unit
         if scale is not None and not (math.isfinite(scale) and scale > 0):
             raise RangeError(f"metres_per_unit: expected above 0, got {scale}.")
+        if self.origin is not None and not all(math.isfinite(value) for value in self.origin):
+            raise RangeError(f"origin: expected finite coordinates, got {self.origin}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,8 +79,40 @@ class SpatialFeatures:
     metres_per_unit: float
     """How the positions were scaled."""
 
+    origin: tuple[float, float, float]
+    """Where x, y, z were counted from, in metres."""
+
     is_scale_assumed: bool
     """Whether that was not known, and taken from how dense the points are."""
+
+
+@boundary
+def scene_options(
+    encoder: PointEncoder,
+    positions: Float[Tensor, "n 3"],
+    *,
+    options: SpatialOptions,
+    seed: int,
+) -> SpatialOptions:
+    """Options with the scale and the origin of a scene, by which subsets of it are encoded alike.
+
+    Args:
+        encoder: Of `load_point_encoder`.
+        positions: All points of the scene, z up.
+        options: What is given stays; what is None is found of the points.
+        seed: Of the points by which the scale is told.
+
+    Raises:
+        ShapeError: If positions are not (n, 3).
+        RangeError: If a value is not finite or the scene, in metres, too large.
+        InputError: If points lie on each other so that the scale cannot be told.
+    """
+    check_shape("positions", positions, (None, 3))
+    check_finite("positions", positions)
+    check_seed(seed)
+    metres, scale = _in_metres(positions.detach().cpu().double(), encoder, options, seed)
+    origin = options.origin or points_origin(metres, inputs=encoder.inputs)
+    return replace(options, metres_per_unit=scale, origin=origin)
 
 
 @boundary
@@ -118,7 +156,8 @@ def spatial_features(
         averages = average_on_grid(metres, given, side=encoder.inputs.grid_size)
         rows = nearest_rows(NeighbourIndex(averages.positions), metres, 1, torch.int64)[:, 0]
         metres, given = averages.positions, averages.colours
-    local, channels = feed_points(metres, given, inputs=encoder.inputs)
+    origin = options.origin or points_origin(metres, inputs=encoder.inputs)
+    local, channels = feed_points(metres, given, inputs=encoder.inputs, origin=origin)
     config = encoder.config
     pyramid = point_pyramid(
         local,
@@ -132,6 +171,7 @@ def spatial_features(
         levels=tuple(_stored(level, options.precision) for level in levels),
         rows=rows,
         metres_per_unit=scale,
+        origin=origin,
         is_scale_assumed=options.metres_per_unit is None,
     )
 

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_choice, check_finite, check_shape, check_values
@@ -49,11 +50,34 @@ class PointInputs:
 
 
 @boundary
+def points_origin(
+    positions: Float[Tensor, "n 3"], *, inputs: PointInputs
+) -> tuple[float, float, float]:
+    """Where x, y, z of these points are counted from.
+
+    Args:
+        positions: Metres, z up, at least one point.
+        inputs: What the network was trained on.
+
+    Raises:
+        ShapeError: If the positions are not (n, 3).
+        RangeError: If a value is not finite, a point lies beyond 1000 km, or there is none.
+    """
+    points = _checked(positions)
+    # NumPy's sums are the same on any number of threads.
+    x, y, z = points.mean(axis=0).tolist()
+    if inputs.origin == "floor":
+        z = float(np.quantile(points[:, 2], _FLOOR))
+    return x, y, z
+
+
+@boundary
 def feed_points(
     positions: Float[Tensor, "n 3"],
     colours: Float[Tensor, "n 3"] | None,
     *,
     inputs: PointInputs,
+    origin: tuple[float, float, float] | None = None,
 ) -> tuple[Float32[Tensor, "n 3"], Float32[Tensor, "n channels"]]:
     """Positions and input channels of points as a network takes them.
 
@@ -62,6 +86,8 @@ def feed_points(
         colours: Red, green and blue in [0, 1]; values beyond, which the colours of Gaussians may
             have, are cut off. None gives positions alone.
         inputs: What the network was trained on.
+        origin: Of the coordinates, which spatial encodings read. Subsets of a scene, such as what
+            single views show, need that of the scene; None takes `points_origin` of the points.
 
     Returns:
         Positions from the origin, for `point_pyramid`; and the 3 or 6 channels of each point,
@@ -71,15 +97,10 @@ def feed_points(
         ShapeError: If positions or colours are not (n, 3).
         RangeError: If a value is not finite, a point lies beyond 1000 km, or there is none.
     """
-    check_shape("positions", positions, (None, 3))
-    check_values("positions", positions, -MAX_METRES, MAX_METRES)
-    if not len(positions):
-        raise RangeError("positions: expected at least one point, got none.")
-    # NumPy's sums are the same on any number of threads.
-    points = positions.detach().cpu().double().numpy()
-    origin = points.mean(axis=0)
-    if inputs.origin == "floor":
-        origin[2] = np.quantile(points[:, 2], _FLOOR)
+    points = _checked(positions)
+    if origin is None:
+        origin = points_origin(positions, inputs=inputs)
+    check_values("origin", torch.tensor(origin), -MAX_METRES, MAX_METRES)
     local = torch.from_numpy((points - origin).astype(np.float32))
     if colours is None:
         return local, local
@@ -87,3 +108,11 @@ def feed_points(
     check_finite("colours", colours)
     fed = colours.detach().cpu().float().clamp(0, 1) * inputs.colour_range
     return local, torch.cat((local, fed), dim=1)
+
+
+def _checked(positions: Tensor) -> NDArray[np.float64]:
+    check_shape("positions", positions, (None, 3))
+    check_values("positions", positions, -MAX_METRES, MAX_METRES)
+    if not len(positions):
+        raise RangeError("positions: expected at least one point, got none.")
+    return positions.detach().cpu().double().numpy()

@@ -80,6 +80,7 @@ class Values:
         }
         self._asked: list[tuple[str, Tensor, Tensor]] = []
         self._differentiable = differentiable
+        self._kept: dict[str, Tensor] = {}
         self.rng = rng
         self.step = step
 
@@ -95,6 +96,19 @@ class Values:
             picked.requires_grad_()
             self._asked.append((name, index, picked))
         return picked
+
+    def keep(self, name: str, value: Tensor) -> None:
+        """Set a shared array that no gradient moves, such as running statistics.
+
+        `shared` has it at once, and the training from this step on.
+        """
+        self._kept[name] = value.detach()
+        self._shared[name] = self._kept[name]
+
+    @property
+    def kept(self) -> Mapping[str, Tensor]:
+        """What `keep` was given, by name."""
+        return self._kept
 
     def render(self, name: str, batch: Batch) -> Float[Tensor, "pixels channels"]:
         """An array as a batch's pixels show it: ``W @ array``."""

@@ -19,7 +19,11 @@ class TrainingOptions:
     """Steps at most."""
 
     batch: int = 8192
-    """Pixels a step, from all views."""
+    """Pixels of a batch, from all views."""
+
+    accumulate: int = 1
+    """Batches of a step, decoded one after the other: their mean gradient is what Adam takes, and
+    memory is for one of them."""
 
     passes: int = 1
     """How often all drawn pixels are gone through before new ones are drawn; 0 draws once."""
@@ -66,7 +70,7 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        for name in ("steps", "batch", "held_out_pixels", "score_every"):
+        for name in ("steps", "batch", "accumulate", "held_out_pixels", "score_every"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
         for name in ("passes", "warmup", "patience"):

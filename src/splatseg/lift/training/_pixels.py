@@ -5,11 +5,14 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.lift.training._targets import Ragged
 
-Sampling = Literal["uniform", "groups"]
+Sampling = Literal["uniform", "groups", "strata"]
+
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 def draw_uniformly(
@@ -23,6 +26,43 @@ def draw_uniformly(
     taken = min(count, total)
     drawn = rng.choice(total, taken, replace=False, shuffle=True)
     return pixels[torch.from_numpy(drawn)], torch.full((taken,), total / max(taken, 1))
+
+
+def draw_by_strata(
+    pixels: Int64[Tensor, "m"], width: int, count: int, rng: np.random.Generator
+) -> tuple[Int64[Tensor, "p"], Float[Tensor, "p"]]:
+    r"""One pixel of each of p parts of the picture that hold equally many pixels, give or take one.
+
+    Parts are runs of the pixels in Morton order (bits of row and column in turn), so each is a
+    patch or a few that touch. They come in the order of the fractions of :math:`u + i \phi`, with
+    :math:`\phi` the golden ratio: any so many pixels one after the other lie evenly over the
+    picture, too, and are a stratified draw by themselves.
+
+    Args:
+        pixels: Those that may be drawn, numbered row by row.
+        width: Of the picture.
+        count: How many at most.
+        rng: Draws them.
+    """
+    total = len(pixels)
+    taken = min(count, total)
+    if not taken:
+        return pixels, torch.zeros(0)
+    flat = pixels.numpy()
+    ordered = flat[np.argsort(_morton(flat // width, flat % width), kind="stable")]
+    starts = np.arange(taken + 1) * total // taken
+    sizes = np.diff(starts)
+    drawn = ordered[starts[:-1] + rng.integers(sizes)]
+    rank = np.argsort(np.argsort((rng.random() + np.arange(taken) * _GOLDEN) % 1.0))
+    return torch.from_numpy(drawn[rank]), torch.from_numpy(sizes[rank].astype(np.float32))
+
+
+def _morton(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Bits of row and column in turn."""
+    code = np.zeros_like(rows)
+    for bit in range(31):
+        code |= ((columns >> bit) & 1) << (2 * bit) | ((rows >> bit) & 1) << (2 * bit + 1)
+    return code
 
 
 def draw_by_group(

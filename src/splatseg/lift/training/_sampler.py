@@ -10,6 +10,7 @@ from typing import get_args
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_choice, check_range
@@ -18,7 +19,12 @@ from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training._batches import BatchGroup, batch_groups
-from splatseg.lift.training._pixels import Sampling, draw_by_group, draw_uniformly
+from splatseg.lift.training._pixels import (
+    Sampling,
+    draw_by_group,
+    draw_by_strata,
+    draw_uniformly,
+)
 from splatseg.lift.training._store import DrawnView, RowStore
 from splatseg.lift.training._targets import Ragged, Target, Targets, TargetSource
 from splatseg.render import (
@@ -40,7 +46,7 @@ class SamplingOptions:
 
     sampling: Sampling = "uniform"
     """uniform: all pixels that have something to learn alike. groups: equally many of each id
-    of a label map, or of each mask."""
+    of a label map, or of each mask. strata: one of each of as many equal parts of the picture."""
 
     min_weight: float = 0.0
     """Blending weight in [0, 1] below which an entry of a row is left out and the row's others
@@ -130,6 +136,7 @@ class DrawnRows:
     @boundary
     def __init__(self, store: RowStore, groups: Sequence[BatchGroup]) -> None:
         self._store = store
+        self._groups = groups
         self._batches = [(group, index) for group in groups for index in range(group.count)]
 
     def __enter__(self) -> "DrawnRows":
@@ -184,6 +191,24 @@ class DrawnRows:
                 for name in parts[0].targets
             },
         )
+
+    def order(self, rng: np.random.Generator, *, in_rounds: bool) -> NDArray[np.int64]:
+        """A random order of the batches.
+
+        In rounds, a batch of each group comes before the next of any, so that batches one after
+        the other are of different views.
+        """
+        order = rng.permutation(len(self))
+        if not in_rounds:
+            return order
+        groups = np.repeat(np.arange(len(self._groups)), [group.count for group in self._groups])[
+            order
+        ]
+        rounds = np.zeros(len(self), dtype=np.int64)
+        for group in range(len(self._groups)):
+            own = groups == group
+            rounds[own] = np.arange(int(own.sum()))
+        return order[np.argsort(rounds, kind="stable")]
 
     def visibility(self, count: int) -> Float[Tensor, "n"]:
         """Blending weight of each of `count` Gaussians in all pixels that may be drawn, estimated.
@@ -321,6 +346,8 @@ class RowSampler:
         camera = camera_of_map(view, choice.height, choice.width)
         if options.sampling == "uniform":
             pixels, stands_for = draw_uniformly(choice.pixels, count, rng)
+        elif options.sampling == "strata":
+            pixels, stands_for = draw_by_strata(choice.pixels, choice.width, count, rng)
         else:
             size = choice.height * choice.width
             pixels, stands_for = draw_by_group(source.groups(view.name), size, count, rng)

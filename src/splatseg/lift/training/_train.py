@@ -1,6 +1,6 @@
 """The loop: draw, step, score, stop."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -231,10 +231,10 @@ class _Run:
         state, options = self.state, self._options
         if self._held_out is not None and options.score_start and not state.step:
             self._score()
-        batch = self._next_batch()
+        batches = self._next_batches()
         state.step += 1
         with one_torch_thread():
-            self._step(batch)
+            self._step(batches)
         last = state.step == options.steps
         due = state.step % options.score_every == 0 or last
         if self._held_out is not None and due:
@@ -280,24 +280,31 @@ class _Run:
         with one_torch_thread():
             return self._sampler.draw(self._rng(_DRAW, number), batch=self._options.batch)
 
-    def _next_batch(self) -> Batch:
-        state, passes = self.state, self._options.passes
+    def _next_batches(self) -> Iterator[Batch]:
+        """The batches of the next step, each cut when it is asked for."""
+        state, options = self.state, self._options
         if self._drawn is None and state.draw:  # resumed: the same draw again
             self._drawn = self._draw(state.draw)
-        since = state.step - state.draw_began
-        if self._drawn is None or (passes and since >= passes * len(self._drawn)):
+        done = (state.step - state.draw_began) * options.accumulate
+        if self._drawn is None or (options.passes and done >= options.passes * len(self._drawn)):
             self.close()
             state.draw += 1
             state.draw_began = state.step
             self._drawn = self._draw(state.draw)
             state.visibility += self._drawn.visibility(len(state.visibility))
-            since = 0
-        number, position = divmod(since, len(self._drawn))
-        order = self._rng(_ORDER, state.draw, number).permutation(len(self._drawn))
-        return self._drawn.batch(int(order[position]))
+            done = 0
+        return self._batches(self._drawn, done)
 
-    def _step(self, batch: Batch) -> None:
-        state = self.state
+    def _batches(self, drawn: DrawnRows, done: int) -> Iterator[Batch]:
+        """The batches of a step of which so many were gone through before."""
+        count = self._options.accumulate
+        for index in range(done, done + count):
+            number, position = divmod(index, len(drawn))
+            rng = self._rng(_ORDER, self.state.draw, number)
+            yield drawn.batch(int(drawn.order(rng, in_rounds=count > 1)[position]))
+
+    def _step(self, batches: Iterator[Batch]) -> None:
+        state, options = self.state, self._options
         values = Values(
             state.rows,
             state.shared,
@@ -305,10 +312,15 @@ class _Run:
             step=state.step,
             differentiable=True,
         )
-        loss = self._model.loss(batch, values)
-        loss.backward()
-        state.losses.append(float(loss.detach()))
-        factor = rate_factor(state.step, self._options)
+        total = 0.0
+        for batch in batches:
+            loss = self._model.loss(batch, values) / options.accumulate
+            loss.backward()
+            total += float(loss.detach())
+        state.losses.append(total)
+        for name, value in values.kept.items():
+            state.shared[name].copy_(value)
+        factor = rate_factor(state.step, options)
         for name, value in state.rows.items():
             rows, gradient = values.row_gradients(name)
             rate = self._rates[name] * factor
@@ -317,7 +329,7 @@ class _Run:
         only = torch.zeros(1, dtype=torch.int64)
         for name, value in state.shared.items():
             gradient = values.shared[name].grad
-            if gradient is None:
+            if name in values.kept or gradient is None:
                 continue
             self._adam.step(
                 value.view(1, -1),

@@ -28,6 +28,7 @@ from splatseg.methods._trained_labels import context_of, hard_labels
 from splatseg.methods.cosseg._blocks import BlockSource as BlockSource
 from splatseg.methods.cosseg._distilled import distilled_features as distilled_features
 from splatseg.methods.cosseg._linked import LinkedLabels, linked_labels
+from splatseg.methods.cosseg._options import PUBLISHED_DIFFERS
 from splatseg.methods.cosseg._options import CossegOptions as CossegOptions
 from splatseg.methods.cosseg._train import train_cosseg as train_cosseg
 from splatseg.methods.cosseg._train_jointly import train_cosseg_jointly as train_cosseg_jointly
@@ -79,6 +80,7 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=CossegOptions.published(),
+    published_differs=PUBLISHED_DIFFERS,
     refines="joint",
     companions={"features": ("features",)},
 )

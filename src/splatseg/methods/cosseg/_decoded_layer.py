@@ -24,6 +24,7 @@ def decoded_layer(
     blend: Blend,
     classes: ClassTable | None,
     seed: int,
+    trained: str,
 ) -> Features:
     """What is decoded of every Gaussian, with the classifier that reads it.
 
@@ -35,6 +36,7 @@ def decoded_layer(
         blend: Whether what is decoded is rendered and then classified, or probabilities rendered.
         classes: Names of the ids.
         seed: Of the training.
+        trained: How long, in words.
     """
     options = given.options
     with one_torch_thread():
@@ -56,17 +58,20 @@ def decoded_layer(
     info = layer_info(
         "cosseg", recorded_options(options), data, result, head=head, classes=classes, seed=seed
     )
-    return Features(values=values, weights=weights, info=_with_facts(info, given, everything))
+    return Features(
+        values=values, weights=weights, info=_with_facts(info, given, everything, trained)
+    )
 
 
-def _with_facts(info: LayerInfo, given: Given, everything: PointSet) -> LayerInfo:
+def _with_facts(info: LayerInfo, given: Given, everything: PointSet, trained: str) -> LayerInfo:
     """The record, with what was decoded from."""
-    facts: dict[str, Any] = {"decoded": len(given.chosen)}
+    facts: dict[str, Any] = {"decoded": len(given.chosen), "trained": trained}
     if given.distilled is not None:
         facts["blocks"] = list(given.distilled.names)
         facts["skipped"] = [name for name, done in given.distilled.steps.items() if not done]
     if given.encoder is not None:
         facts["point_network"] = given.encoder.source
+        facts["point_network_trained_on"] = given.encoder.trained_on
         facts["metres_per_unit"] = everything.metres_per_unit
-        facts["scale_assumed"] = given.source.metres_per_unit is None
+        facts["scale_assumed"] = given.is_scale_assumed
     return replace(info, details={**info.details, **facts})

@@ -5,11 +5,13 @@ distilled feature :math:`d_l` of one block, the shallowest at the points themsel
 farthest up. From the last level L on, what is decoded goes to the nearest points of the level
 below and is joined to what is there:
 
-.. math:: x_L = \phi(A_L (e_L \oplus d_L) + b_L), \qquad
-          x_l = \phi(A_l (x_{l+1}[\mathrm{up}_l] \oplus e_l \oplus d_l) + b_l), \qquad
+.. math:: x_L = \phi(A_L (e_L \oplus d_L)), \qquad
+          x_l = \phi(A_l (x_{l+1}[\mathrm{up}_l] \oplus e_l \oplus d_l)), \qquad
           h = \mathrm{head}(x_0)
 
-with :math:`\phi` a leaky ReLU and a head of more such layers. A linear classifier of h gives the
+with :math:`\phi` a batch norm and a leaky ReLU, and a head of more such layers. While training,
+batch norms take mean and variance of the points that a view's pixels need, and running ones are
+kept, which count afterwards; drop-out falls on h. A linear classifier of h gives the
 logits of ids; it is kept apart (`lift.heads.ClassifierHead`), so that what is stored of a Gaussian
 does not grow with their number. A matrix is applied to what comes from above before it is spread:
 each point above stands for four below.
@@ -28,13 +30,20 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
-from torch.nn.functional import embedding, leaky_relu
+from torch.nn.functional import batch_norm, embedding, leaky_relu
 
 from splatseg.errors import ShapeError
+from splatseg.lift.point_network.layers import MOMENTUM
 from splatseg.methods._label_models import linear_start
 
 SLOPE = 0.2
 """Of the leaky ReLUs, as RandLA-Net has them."""
+
+EPSILON = 1e-6
+"""Added to variances, as RandLA-Net has it."""
+
+RUNNING = (".mean", ".variance")
+"""How the names of running statistics end; no gradient moves these."""
 
 _ROWS = 1 << 16
 """Points decoded at a time where no gradient is asked for."""
@@ -48,8 +57,8 @@ _LARGEST = 60000.0
 Weights = Mapping[str, Tensor]
 
 
-START = 0xC055
-"""What the generator of first weights is seeded with besides the seed."""
+START, DROPPED = 0xC055, 0xC056
+"""What generators of first weights and of drop-out are seeded with besides the seed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,14 +92,24 @@ class FusionShape:
     """Channels of the head's layers, one after the other; the last is what is classified."""
 
     def start(self, rng: np.random.Generator) -> dict[str, Tensor]:
-        """First weights: uniform within 1 / sqrt(inputs), as torch's linear layers."""
+        """First weights: uniform within 1 / sqrt(inputs), as torch's linear layers.
+
+        A batch norm takes a bias away, so there is none.
+        """
         found: dict[str, Tensor] = {}
 
         def layer(name: str, parts: Mapping[str, int], outputs: int) -> None:
             bound = 1 / math.sqrt(sum(parts.values()))
             for part, width in parts.items():
                 found[f"{name}.{part}"] = _uniform(rng, bound, (width, outputs))
-            found[f"{name}.bias"] = _uniform(rng, bound, (outputs,))
+            found[f"{name}.scale"], found[f"{name}.shift"] = (
+                torch.ones(outputs),
+                torch.zeros(outputs),
+            )
+            found[f"{name}.mean"], found[f"{name}.variance"] = (
+                torch.zeros(outputs),
+                torch.ones(outputs),
+            )
 
         last = len(self.inputs) - 1
         for level in range(last, -1, -1):
@@ -104,8 +123,16 @@ class FusionShape:
         return found
 
 
+Statistics = dict[str, Tensor]
+"""Mean and variance of the rows of each batch norm, named as the running ones."""
+
+
 def decode(
-    inputs: FusionInputs, weights: Weights, rows: Int64[Tensor, "t"]
+    inputs: FusionInputs,
+    weights: Weights,
+    rows: Int64[Tensor, "t"],
+    *,
+    statistics: Statistics | None = None,
 ) -> Float[Tensor, "t channels"]:
     """What is decoded of some points, differentiable towards the weights.
 
@@ -115,19 +142,43 @@ def decode(
         inputs: Of the points.
         weights: Named as `FusionShape.start` names them.
         rows: Rows of level 0, distinct.
+        statistics: While training: batch norms are by the points that are computed, and their
+            statistics are put here. None takes the running ones of `weights`.
     """
     needed, position = [rows], []
-    for up in inputs.up:
-        above, where = torch.unique(up[needed[-1]], return_inverse=True)
+    for level, up in enumerate(inputs.up):
+        above, where = _distinct(up[needed[-1]], len(inputs.levels[level + 1]))
         needed.append(above)
         position.append(where)
     last = len(inputs.levels) - 1
-    decoded = _own(inputs, weights, last, needed[last])
+    decoded = _own(inputs, weights, last, needed[last], statistics=statistics)
     for level in range(last - 1, -1, -1):
         # The gradient of `embedding` is a sum in the order of entries, in one pass.
         spread = embedding(position[level], decoded @ weights[f"level{level}.above"])
-        decoded = _own(inputs, weights, level, needed[level], spread)
-    return _headed(weights, decoded)
+        decoded = _own(inputs, weights, level, needed[level], spread, statistics=statistics)
+    return _headed(weights, decoded, statistics)
+
+
+def running(weights: Weights, statistics: Statistics, momentum: float) -> dict[str, Tensor]:
+    """Running statistics after a batch: the share `momentum` is the batch's."""
+    return {
+        name: weights[name].detach().lerp(value, momentum) for name, value in statistics.items()
+    }
+
+
+def running_momentum(step: int) -> float:
+    """The share of a batch in running statistics: RandLA-Net's, and more in the first steps."""
+    return max(MOMENTUM, 1 / step)
+
+
+def dropped(
+    values: Float[Tensor, "n channels"], share: float, rng: np.random.Generator
+) -> Float[Tensor, "n channels"]:
+    """Drop-out: a share of all numbers 0, at random, and the others larger by what is missing."""
+    if not share:
+        return values
+    stay = torch.from_numpy(rng.random(tuple(values.shape), dtype=np.float32) >= share)
+    return values * (stay / (1 - share))
 
 
 def decode_all(inputs: FusionInputs, weights: Weights) -> Float[Tensor, "n channels"]:
@@ -170,19 +221,54 @@ class Scaling:
 
 
 def _own(
-    inputs: FusionInputs, weights: Weights, level: int, rows: Tensor, above: Tensor | None = None
+    inputs: FusionInputs,
+    weights: Weights,
+    level: int,
+    rows: Tensor,
+    above: Tensor | None = None,
+    *,
+    statistics: Statistics | None = None,
 ) -> Tensor:
-    own = inputs.levels[level].index_select(0, rows).float()
-    decoded = torch.addmm(weights[f"level{level}.bias"], own, weights[f"level{level}.own"])
-    return leaky_relu(decoded if above is None else decoded + above, SLOPE)
+    own = inputs.levels[level].index_select(0, rows).float() @ weights[f"level{level}.own"]
+    return _activated(weights, f"level{level}", own if above is None else own + above, statistics)
 
 
-def _headed(weights: Weights, decoded: Tensor) -> Tensor:
-    layers = sum(name.startswith("head") and name.endswith(".bias") for name in weights)
+def _headed(weights: Weights, decoded: Tensor, statistics: Statistics | None = None) -> Tensor:
+    layers = sum(name.startswith("head") and name.endswith(".own") for name in weights)
     for index in range(layers):
-        own, bias = weights[f"head{index}.own"], weights[f"head{index}.bias"]
-        decoded = leaky_relu(torch.addmm(bias, decoded, own), SLOPE)
+        name = f"head{index}"
+        decoded = _activated(weights, name, decoded @ weights[f"{name}.own"], statistics)
     return decoded
+
+
+def _activated(
+    weights: Weights, name: str, values: Tensor, statistics: Statistics | None
+) -> Tensor:
+    """Batch norm and leaky ReLU."""
+    mean, variance = (weights[name + end].detach() for end in RUNNING)
+    batch = statistics is not None and len(values) > 1  # one row has no variance
+    if batch:
+        mean, variance = torch.zeros_like(mean), torch.zeros_like(variance)
+    found = batch_norm(
+        values,
+        mean,
+        variance,
+        weights[f"{name}.scale"],
+        weights[f"{name}.shift"],
+        training=batch,
+        momentum=1.0,  # what is in the two is that of the batch alone
+        eps=EPSILON,
+    )
+    if statistics is not None and batch:
+        statistics |= {name + end: one for end, one in zip(RUNNING, (mean, variance), strict=True)}
+    return leaky_relu(found, SLOPE, inplace=True)
+
+
+def _distinct(rows: Int64[Tensor, "m"], count: int) -> tuple[Tensor, Tensor]:
+    """Distinct rows below `count`, ascending, and the position of each among them."""
+    marked = torch.zeros(count, dtype=torch.bool)
+    marked[rows] = True
+    return torch.nonzero(marked).squeeze(1), (torch.cumsum(marked, 0) - 1)[rows]
 
 
 def _uniform(rng: np.random.Generator, bound: float, shape: tuple[int, ...]) -> Tensor:

@@ -11,7 +11,12 @@ from torch import Tensor
 
 from splatseg.core import Gaussians
 from splatseg.errors import InputError
-from splatseg.lift.point_network import PointEncoder, load_point_encoder
+from splatseg.lift.point_network import (
+    PointEncoder,
+    SpatialOptions,
+    load_point_encoder,
+    scene_options,
+)
 from splatseg.methods._trained_labels import LabelData, TrainingContext
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._distilled import (
@@ -26,6 +31,7 @@ from splatseg.methods.cosseg._points import (
     boxes,
     check_decoded,
     joined_blocks,
+    upright,
 )
 
 
@@ -38,6 +44,9 @@ class Given:
     distilled: DistilledFeatures | None
     encoder: PointEncoder | None
     source: PointSource
+    is_scale_assumed: bool
+    """Whether the scene's scale was told by how dense its points are."""
+
     options: CossegOptions
 
     def points_of(self, chosen: Int64[Tensor, "m"]) -> RawPoints:
@@ -106,7 +115,11 @@ def prepare(
             render_options=context.render_options,
             backend=context.backend,
         )
-    encoder = None if options.spatial == "none" else load_point_encoder(options.encoder)
+    encoder, space = None, SpatialOptions(metres_per_unit=frame[0], precision="float16")
+    if options.spatial != "none":
+        encoder = load_point_encoder(options.encoder)
+        means = upright(gaussians.means.detach().cpu()[chosen], frame[1])
+        space = scene_options(encoder, means, options=space, seed=context.seed)
     scales: Sequence[Tensor] = () if distilled is None else distilled.scales
     if options.semantic == "first":
         scales = scales[:1]
@@ -115,12 +128,13 @@ def prepare(
         chosen=chosen,
         distilled=distilled,
         encoder=encoder,
+        is_scale_assumed=frame[0] is None,
         source=PointSource(
             gaussians=gaussians,
             scales=scales,
             encoder=encoder,
             spatial=options.spatial,
-            metres_per_unit=frame[0],
+            space=space,
             up=frame[1],
             seed=context.seed,
         ),

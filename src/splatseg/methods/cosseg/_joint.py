@@ -16,6 +16,7 @@ References:
 import math
 from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Int64
 from torch import Tensor
@@ -24,7 +25,14 @@ from splatseg.core import UNLABELLED, Gaussians, LabelSource, View, camera_of_ma
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Refinement
-from splatseg.methods.cosseg._fusion import decode
+from splatseg.methods.cosseg._fusion import (
+    RUNNING,
+    Statistics,
+    decode,
+    dropped,
+    running,
+    running_momentum,
+)
 from splatseg.methods.cosseg._joint_options import JointOptions
 from splatseg.methods.cosseg._points import PointSet
 from splatseg.render import options_for, render
@@ -40,6 +48,8 @@ class LabelLoss:
         ids: All ids, ascending.
         weight: Lambda_s.
         rate: Adam's rate for the weights.
+        dropout: Share of what is decoded that is dropped before the classifier.
+        rng: Draws what is dropped.
         backend: Name of the rendering backend.
     """
 
@@ -52,11 +62,18 @@ class LabelLoss:
         ids: Int64[Tensor, "classes"],
         weight: float,
         rate: float,
+        dropout: float,
+        rng: np.random.Generator,
         backend: str,
     ) -> None:
         self._points = points
-        self.weights = {name: one.clone().requires_grad_() for name, one in weights.items()}
-        self._adam = torch.optim.Adam(list(self.weights.values()), lr=rate)
+        self.weights = {
+            name: one.clone().requires_grad_(not name.endswith(RUNNING))
+            for name, one in weights.items()
+        }
+        learnt = [one for one in self.weights.values() if one.requires_grad]
+        self._adam = torch.optim.Adam(learnt, lr=rate)
+        self._dropout, self._rng = dropout, rng
         self._evidence = evidence
         self._ids = ids
         self._weight = weight
@@ -74,7 +91,11 @@ class LabelLoss:
             return torch.zeros(())
         local = self._points.rows[rows.cpu()]
         there = torch.nonzero(local >= 0).squeeze(1)
-        decoded = decode(self._points.inputs, self.weights, local[there])
+        statistics: Statistics = {}
+        decoded = decode(self._points.inputs, self.weights, local[there], statistics=statistics)
+        momentum = running_momentum(len(self.losses) + 1)
+        self.weights |= running(self.weights, statistics, momentum)
+        decoded = dropped(decoded, self._dropout, self._rng)
         signal = decoded.new_zeros(len(rows), decoded.shape[1]).index_copy(0, there, decoded)
         camera = camera_of_map(view, label_map.height, label_map.width)
         image = render(

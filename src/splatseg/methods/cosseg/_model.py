@@ -12,7 +12,16 @@ from splatseg.lift.heads import Blend
 from splatseg.lift.training import Batch, Parameter, Values
 from splatseg.methods._label_losses import TINY, LabelCounts
 from splatseg.methods._robust_losses import LabelLoss, label_loss
-from splatseg.methods.cosseg._fusion import FusionShape, decode, first_weights
+from splatseg.methods.cosseg._fusion import (
+    RUNNING,
+    FusionShape,
+    Statistics,
+    decode,
+    dropped,
+    first_weights,
+    running,
+    running_momentum,
+)
 from splatseg.methods.cosseg._points import PointSet
 
 Agreement = Callable[[Batch], Float[Tensor, "pixels"]]
@@ -34,6 +43,7 @@ class FusionModel:
         blend: Whether what is decoded is rendered and then classified, or probabilities rendered.
         loss: What a label costs.
         rate: Adam's rate.
+        dropout: Share of what is decoded that is dropped before the classifier while training.
         agreement: How much each pixel of a batch counts; None counts all alike.
         views: Views with matrices of their own, by which their labels differ; 0 has none.
         transition_rate: Adam's rate for these.
@@ -50,13 +60,17 @@ class FusionModel:
         blend: Blend,
         loss: LabelLoss,
         rate: float,
+        dropout: float,
         agreement: Agreement | None,
         views: int,
         transition_rate: float,
         rng: np.random.Generator,
     ) -> None:
         start = first_weights(shape, classes, rng)
-        self._shared = {name: Parameter(start=one, rate=rate) for name, one in start.items()}
+        self._shared = {
+            name: Parameter(start=one, rate=0.0 if name.endswith(RUNNING) else rate)
+            for name, one in start.items()
+        }
         if views:
             same = torch.eye(classes) * _STAYS
             self._shared["transitions"] = Parameter(
@@ -67,6 +81,7 @@ class FusionModel:
         self._points, self._scored_points = points, scored_points
         self._blend: Blend = blend
         self._loss: LabelLoss = loss
+        self._dropout = dropout
         self._agreement = agreement
 
     @property
@@ -82,7 +97,13 @@ class FusionModel:
     def loss(self, batch: Batch, values: Values) -> Float[Tensor, ""]:
         """Of what the pixels show, over the log of the number of ids."""
         label, confidence = batch.target("label"), batch.target("confidence")
-        found = self._probabilities(batch, values.shared, self._points)
+        statistics: Statistics = {}
+        found = self._probabilities(
+            batch, values.shared, self._points, statistics=statistics, rng=values.rng
+        )
+        momentum = running_momentum(values.step)
+        for name, value in running(values.shared, statistics, momentum).items():
+            values.keep(name, value)
         if "transitions" in values.shared:
             found = transferred(found, values.shared["transitions"], batch.views, label)
         each = label_loss(found, label, self._loss)
@@ -100,14 +121,22 @@ class FusionModel:
         return counts.mean_iou
 
     def _probabilities(
-        self, batch: Batch, weights: Mapping[str, Tensor], points: PointsOf
+        self,
+        batch: Batch,
+        weights: Mapping[str, Tensor],
+        points: PointsOf,
+        *,
+        statistics: Statistics | None = None,
+        rng: np.random.Generator | None = None,
     ) -> Float[Tensor, "pixels classes"]:
-        """Of each id at each pixel."""
+        """Of each id at each pixel; with statistics and a generator while training."""
         touched = batch.weights.touched
         found = points(int(batch.views[0]))
         rows = found.rows[touched]
         there = torch.nonzero(rows >= 0).squeeze(1)
-        decoded = decode(found.inputs, weights, rows[there])
+        decoded = decode(found.inputs, weights, rows[there], statistics=statistics)
+        if rng is not None:
+            decoded = dropped(decoded, self._dropout, rng)
         weight, bias = weights["classifier.weight"], weights["classifier.bias"]
         if self._blend == "features":
             rendered = batch.weights.product(_spread(decoded, there, len(touched)))

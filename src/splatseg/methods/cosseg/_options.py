@@ -1,13 +1,13 @@
 """How a fusion decoder is trained."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 from splatseg._check import check_choice, check_range
 from splatseg.errors import RangeError
 from splatseg.lift.heads import Blend
-from splatseg.lift.training import SamplingOptions
+from splatseg.lift.training import SamplingOptions, TrainingOptions
 from splatseg.methods._robust_losses import LABEL_LOSSES, LabelLoss
 from splatseg.methods._trained_options import LabelTrainingOptions, check_rate
 from splatseg.methods.cosseg._distilled import Division
@@ -24,9 +24,21 @@ Transitions = Literal["none", "views"]
 PUBLISHED_COMPONENTS = 64
 PUBLISHED_RATE = 1e-3
 PUBLISHED_STEPS = 10_000
-"""Each with one whole picture."""
+"""Each of one whole picture."""
 PUBLISHED_DECODED = (32, 32, 128, 256, 512, 1024)
 """RandLA-Net's own decoder for S3DIS, which the paper extends."""
+PUBLISHED_DROPOUT = 0.5
+"""RandLA-Net's, before its classifier."""
+PUBLISHED_DIFFERS = (
+    "It differs: a step is of 8 views x 512 pixels and not of one whole picture, without weights "
+    "below 0.01; the point encoder was trained on generated rooms, not on S3DIS, unless --encoder "
+    "names one; Gaussians stay as they are (--joint moves them); views are rendered from one "
+    "decoding of all Gaussians."
+)
+
+
+_NOT_PUBLISHED = ("steps", "features", "encoder", "memory")
+"""What may be otherwise in the published setting."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +69,7 @@ class CossegOptions(LabelTrainingOptions):
 
     division: Division = "mean"
     """What features summed over pixels are divided by. mean: their weights. pixels: the number of
-    pixels. sum: nothing, as equation 2 is printed."""
+    pixels, as equation 2 counts them and its source divides. sum: nothing, as it is printed."""
 
     components: int = PUBLISHED_COMPONENTS
     """Principal components that wider blocks are reduced to."""
@@ -103,6 +115,13 @@ class CossegOptions(LabelTrainingOptions):
     rate: float = 3e-3
     """Adam's rate for the decoder."""
 
+    dropout: float = 0.0
+    """Share of what is decoded, in [0, 1), that is dropped before the classifier while training."""
+
+    views_per_step: int = 8
+    """Views whose mean gradient makes a step, with points visible: each is decoded from its own
+    points, one after the other. A step of more views learns more, and takes as much longer."""
+
     joint: Path | None = None
     """Folder of a new scene whose Gaussians learn from photographs and labels together with the
     decoder, as published; the layer is written there. None: Gaussians stay as they are, and
@@ -127,6 +146,7 @@ class CossegOptions(LabelTrainingOptions):
             ("min_pixels", 0),
             ("block_points", 1),
             ("lifted_side", 1),
+            ("views_per_step", 1),
         ):
             if getattr(self, name) < least:
                 raise RangeError(f"{name}: expected at least {least}, got {getattr(self, name)}.")
@@ -135,41 +155,65 @@ class CossegOptions(LabelTrainingOptions):
                 raise RangeError(f"{name}: expected numbers from 1, got {getattr(self, name)}.")
         check_rate("rate", self.rate)
         check_rate("transition_rate", self.transition_rate)
+        if not 0 <= self.dropout < 1:
+            raise RangeError(f"dropout: expected at least 0 and below 1, got {self.dropout}.")
         check_range("min_share", self.min_share, 0.0, 1.0)
         if self.spatial == "none" and self.semantic == "none":
             raise RangeError("semantic, spatial: expected one of the two, got neither.")
 
+    @property
+    def by_view(self) -> bool:
+        """Whether each view is decoded from the points that it shows."""
+        return self.points == "visible" and self.spatial != "none"
+
     def drawing(self) -> SamplingOptions:
-        """Which pixels are drawn: of one view at a time where points are those that it shows."""
+        """Which pixels are drawn: batches of one view where each has points of its own."""
         drawn = LabelTrainingOptions.drawing(self)
-        return SamplingOptions(
-            pixels=drawn.pixels,
-            sampling=drawn.sampling,
-            min_weight=drawn.min_weight,
-            memory=drawn.memory,
-            views_per_batch=1 if self.points == "visible" and self.spatial != "none" else None,
-        )
+        return replace(drawn, views_per_batch=1 if self.by_view else None)
+
+    def training(self) -> TrainingOptions:
+        """How training goes: a step is of as many views as it should have."""
+        usual = LabelTrainingOptions.training(self)
+        if not self.by_view:
+            return usual
+        views = self.views_per_step
+        return replace(usual, batch=max(1, self.batch // views), accumulate=views)
+
+    def trained(self, steps: int) -> str:
+        """How long the decoder was trained, beside what was published."""
+        if self.by_view:
+            each = f"{self.views_per_step} views x {self.batch // self.views_per_step} pixels"
+        else:
+            each = f"{self.batch} pixels of all views"
+        theirs = {name: getattr(self, name) for name in _NOT_PUBLISHED}
+        published = self == replace(self.published(), **theirs)
+        if not published:
+            return f"{steps} steps of {each}, not the published setting"
+        return f"published, {steps} of {PUBLISHED_STEPS} steps of {each}"
 
     @classmethod
-    def published(cls, *, steps: int = 2000) -> "CossegOptions":
-        """The published setting: its features, points, loss and rate.
+    def published(cls, *, steps: int = PUBLISHED_STEPS) -> "CossegOptions":
+        """The published setting: its features, points, decoder, loss, steps and rate.
 
-        Steps are of sampled pixels of one view, and fewer than `PUBLISHED_STEPS`. The paper prunes
-        Gaussians by their pixels and does not say below how many.
+        A published step is of a whole picture; here it is of 4096 pixels, of `views_per_step`
+        pictures. The paper prunes Gaussians by their pixels and does not say below how many.
         """
         return cls(
             features="features_dino",
             readout="rendered",
             steps=steps,
             batch=4096,
-            division="sum",
+            views_per_step=8,
+            sampling="strata",
+            division="pixels",
             min_pixels=10,
             points="visible",
             decoded=PUBLISHED_DECODED,
+            dropout=PUBLISHED_DROPOUT,
             blend="features",
             rate=PUBLISHED_RATE,
             schedule="constant",
-            min_weight=0.0,
+            min_weight=0.01,
             held_out=0.0,
             patience=0,
         )

@@ -44,7 +44,9 @@ class PointSource:
     """None where each Gaussian is decoded from its own features."""
 
     spatial: Spatial
-    metres_per_unit: float | None
+    space: SpatialOptions
+    """Scale and origin of the scene, the same for all its subsets: views and boxes."""
+
     up: tuple[float, float, float] | None
     seed: int
 
@@ -62,7 +64,7 @@ class PointSource:
             self.encoder,
             upright(gaussians.means.detach().cpu()[chosen], self.up),
             base_colours(gaussians)[chosen],
-            options=SpatialOptions(metres_per_unit=self.metres_per_unit, precision="float16"),
+            options=self.space,
             seed=self.seed,
         )
         pyramid = found.pyramid

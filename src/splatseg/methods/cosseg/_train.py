@@ -105,6 +105,7 @@ def train_cosseg(
             blend=options.blend,
             loss=options.label_loss,
             rate=options.rate,
+            dropout=options.dropout,
             agreement=agreement,
             views=len(data.views) if options.transitions == "views" else 0,
             transition_rate=options.transition_rate,
@@ -121,6 +122,7 @@ def train_cosseg(
         blend=options.blend,
         classes=classes,
         seed=context.seed,
+        trained=options.trained(len(result.losses)),
     )
 
 

@@ -13,10 +13,16 @@ from splatseg.methods._trained_labels import TrainingContext, label_data
 from splatseg.methods.cosseg._blocks import BlockSource
 from splatseg.methods.cosseg._decoded_layer import decoded_layer
 from splatseg.methods.cosseg._distilled import pixel_counts
-from splatseg.methods.cosseg._fusion import START, FusionShape, decoded_widths, first_weights
+from splatseg.methods.cosseg._fusion import (
+    DROPPED,
+    START,
+    FusionShape,
+    decoded_widths,
+    first_weights,
+)
 from splatseg.methods.cosseg._given import prepare
 from splatseg.methods.cosseg._joint import LabelLoss, train_jointly
-from splatseg.methods.cosseg._options import CossegOptions
+from splatseg.methods.cosseg._options import PUBLISHED_STEPS, CossegOptions
 
 
 @boundary
@@ -82,6 +88,8 @@ def train_cosseg_jointly(
         ids=data.ids,
         weight=how.label_weight,
         rate=options.rate,
+        dropout=options.dropout,
+        rng=np.random.default_rng((context.seed, DROPPED)),
         backend=context.backend,
     )
     learnt = train_jointly(
@@ -105,7 +113,15 @@ def train_cosseg_jointly(
         best_step=len(loss.losses),
         stopped="steps",
     )
+    steps = len(loss.losses)
     layer = decoded_layer(
-        given, everything, data, result, blend="features", classes=classes, seed=context.seed
+        given,
+        everything,
+        data,
+        result,
+        blend="features",
+        classes=classes,
+        seed=context.seed,
+        trained=f"{steps} of {PUBLISHED_STEPS} published steps of a whole picture, jointly",
     )
     return learnt, layer
