@@ -118,11 +118,10 @@ def command_for(words: Sequence[str]) -> type[Any]:
     method = find_method(name)
     published = "--published" in words
     default = method.published_options if published else method.options()
-    options = Annotated[
-        method.options,
-        tyro.conf.OmitArgPrefixes,
-        tyro.conf.arg(help=f"Options of method {name}: {method.summary} ({method.reference})."),
-    ]
+    words = f"Options of method {name}: {method.summary} ({method.reference})."
+    if method.deviations:
+        words += f" --published: {method.deviations}"
+    options = Annotated[method.options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=words)]
     own = [("options", options, field(default=default))]
     made = make_dataclass(
         "Command",

@@ -31,8 +31,15 @@ from splatseg.lift.decomposition.decompose import decompose
 from splatseg.lift.decomposition.options import DecomposeOptions
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods._trained_labels import context_of
+from splatseg.methods.saga._options import SHORT_STEPS
 from splatseg.methods.saga._options import SagaOptions as SagaOptions
+from splatseg.methods.saga._options import trained_as_published as trained_as_published
 from splatseg.methods.saga._train import train_saga as train_saga
+
+DEVIATIONS = (
+    f"{SHORT_STEPS} steps where the paper has 30 000, at {30_000 // SHORT_STEPS} times its rate; "
+    "both losses on the 64 x 64 grid; 2D features are those at hand, not SAM's alone."
+)
 
 
 def run(inputs: MethodInputs, options: SagaOptions) -> Features | InstanceTree:
@@ -64,6 +71,7 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=SagaOptions.published(),
+    deviations=DEVIATIONS,
     companions={"guidance": ("features",)},
     trained="features",
     readouts={"tree": "tree"},
