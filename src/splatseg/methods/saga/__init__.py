@@ -7,6 +7,7 @@ pixels are to be as alike as the sets of their masks (correspondence loss, eq. 8
 
 .. math:: \mathcal{L} = \mathcal{L}_{SAM} + \lambda \mathcal{L}_{corr} .
 
+A step has the grid of 64 x 64 cells of one view, and Adam moves all Gaussians (decision 0048).
 Where the text and the published code differ, this follows the code: both losses are means, negative
 cosines of the correspondence loss count 0, and a tenth of the mean positive product of queries with
 a random tenth of all Gaussians is added. Where there are no 2D features, the query of a mask is the
