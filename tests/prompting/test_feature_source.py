@@ -63,24 +63,30 @@ def test_negative_points_take_away_what_is_more_like_them(gaussians, view, value
     assert torch.equal(found > 0.5, field_ids(gaussians) == 1)
 
 
-@pytest.mark.parametrize(("rule", "ids"), [("adaptive", {1, 3}), ("code", {1})])
-def test_thresholds_of_points_as_published(gaussians, view, values, rule, ids) -> None:
-    """The mean of all cosines; in the code the best tenth at most, and what the click shows."""
-    source = FeatureSource(
-        Features(values=values), gaussians, options=FeatureSourceOptions(rule=rule, threshold=1.0)
-    )
-    # Longer features are no nearer: cosines tell, and 2D features none.
-    longer = FeatureSource(
-        Features(values=values * torch.linspace(1, 9, len(values))[:, None]), gaussians,
-        options=FeatureSourceOptions(rule=rule, precision="float32"),
-    )  # fmt: skip
-    expected = torch.isin(field_ids(gaussians), torch.tensor(sorted(ids), dtype=torch.int32))
-    for one in (source, longer):
-        found = one.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
-        if rule == "adaptive":
-            assert torch.equal(found, expected)
-        else:
-            assert not found[~expected].any()
+def test_the_threshold_of_points_is_the_mean_of_cosines(gaussians, view, values) -> None:
+    """Longer features are no nearer."""
+    longer = values * torch.linspace(1, 9, len(values))[:, None]
+    ids = field_ids(gaussians)
+    for some in (values, longer):
+        options = FeatureSourceOptions(rule="adaptive", threshold=1.0, precision="float32")
+        source = FeatureSource(Features(values=some), gaussians, options=options)
+        found = source.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
+        assert torch.equal(found, (ids == 1) | (ids == 3))
+
+
+def test_the_threshold_of_the_code_is_the_best_tenth_or_what_a_mask_shows(
+    gaussians, view, values, rng
+) -> None:
+    values = values + 0.02 * torch.from_numpy(rng.normal(size=values.shape)).float()
+    ids = field_ids(gaussians)
+    options = FeatureSourceOptions(rule="code", precision="float32")
+    source = FeatureSource(Features(values=values), gaussians, options=options)
+    found = source.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
+    assert int(found.sum()) == len(values) // 10
+    assert (ids[found] == 1).all()
+    mask = region(slice(SKY_ROWS + 1, 19), slice(2, 18))
+    by_mask = source.membership(see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)])) > 0.5
+    assert 0 < int(by_mask.sum()) < int(found.sum()), "mean and deviation of the mask are higher"
 
 
 def test_the_gate_of_the_granularity_is_used(gaussians, view) -> None:

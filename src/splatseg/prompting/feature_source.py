@@ -154,7 +154,8 @@ class FeatureSource:
                 queries = self._thinned(prompt, shown)
             similarity: Similarity = "dot" if by_product else "cosine"
             if len(queries):
-                found[similarity].append(_Asked(similarity, queries, shown))
+                inside = shown if prompt.dense else shown[:0]
+                found[similarity].append(_Asked(similarity, queries, inside))
         return [_Asked.together(some) for some in found.values() if some]
 
     def _confidence(self, asked: "_Asked", gate: Tensor | None) -> Float[Tensor, "n"]:
@@ -173,10 +174,12 @@ class FeatureSource:
                 by_product = asked.similarity == "dot"
                 return deviation_threshold(found) if by_product else mean_threshold(found)
             case "code":
-                shown = StoredFeatures.of(
-                    asked.shown, precision="float32", similarity=asked.similarity
+                if not len(asked.inside):
+                    return published_threshold(found, found[:0])
+                inside = StoredFeatures.of(
+                    asked.inside, precision="float32", similarity=asked.similarity
                 )
-                return published_threshold(found, scores(shown, asked.queries, gate=gate))
+                return published_threshold(found, scores(inside, asked.queries, gate=gate))
 
     def _stored(self, similarity: Similarity) -> StoredFeatures:
         """The features as they are compared, made when they are first asked for."""
@@ -239,8 +242,8 @@ class _Asked:
 
     similarity: Similarity
     queries: Float[Tensor, "q d"]
-    shown: Float[Tensor, "p d"]
-    """What the pixels that they are of show."""
+    inside: Float[Tensor, "p d"]
+    """What pixels of masks and strokes show; a point alone would be as alike as can be."""
 
     @classmethod
     def together(cls, some: Sequence["_Asked"]) -> "_Asked":
@@ -248,7 +251,7 @@ class _Asked:
         return cls(
             some[0].similarity,
             torch.cat([one.queries for one in some]),
-            torch.cat([one.shown for one in some]),
+            torch.cat([one.inside for one in some]),
         )
 
 
