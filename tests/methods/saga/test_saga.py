@@ -232,6 +232,36 @@ def test_what_was_interrupted_goes_on_to_the_same_bits(walls, plain, tmp_path) -
         )  # fmt: skip
 
 
+def test_the_published_setting_resumes_to_the_same_bits(walls, tmp_path) -> None:
+    """On any number of threads, too."""
+    options = replace(SagaOptions.published(steps=20, guidance="g"), grid=8, pixels=64, batch=64)
+
+    def made(**changes) -> torch.Tensor:
+        return train_saga(
+            walls.gaussians, walls.views, walls.evidence, features=walls.grids, options=options,
+            context=context(**changes),
+        ).values  # fmt: skip
+
+    whole = made()
+    threads = _native.threads(), torch.get_num_threads()
+    try:
+        _native.set_threads(3)
+        torch.set_num_threads(3)
+        assert torch.equal(made(), whole)
+    finally:
+        _native.set_threads(threads[0])
+        torch.set_num_threads(threads[1])
+    stop, path = threading.Event(), tmp_path / "saga.npz"
+
+    def tell(progress) -> None:
+        if progress.step == 7:
+            stop.set()
+
+    with pytest.raises(KeyboardInterrupt):
+        made(checkpoints=Checkpoints(path=path), progress=tell, cancelled=stop.is_set)
+    assert torch.equal(made(checkpoints=Checkpoints(path=path, resume=True)), whole)
+
+
 def test_the_layer_and_its_head_go_through_a_file(plain, tmp_path) -> None:
     save_layer(plain, tmp_path / "saga.npz")
     read = load_layer(tmp_path / "saga.npz")
