@@ -36,7 +36,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -54,6 +54,7 @@ from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.tasks import SelectOptions, open_selector
+from splatseg.tasks.select_options import SelectPostProcessing, SelectThreshold
 
 MOST_CLICKS = 10
 ROBOT_VIEWS = 10
@@ -75,6 +76,8 @@ class Bench:
             source=args.source,
             from_layer=args.layer,
             granularity="part" if args.level == "part" else "object",
+            threshold=args.rule,
+            post_processing=args.after,
             **_steps(args),
         )
         self.session = open_selector(self.scene, options=self.options, source=self._source())
@@ -83,16 +86,12 @@ class Bench:
     def _source(self) -> FeatureSource | None:
         """Features with a threshold of their own, where one is asked for."""
         args = self.args
-        if args.threshold is None and args.rule is None:
+        if args.threshold is None:
             return None
         layer = load_scene_layer(args.scene, args.layer)
         if not isinstance(layer, Features):
             raise SystemExit(f"{args.layer}: thresholds are of features")
-        usual = FeatureSourceOptions()
-        options = FeatureSourceOptions(
-            threshold=usual.threshold if args.threshold is None else args.threshold,
-            rule=args.rule or usual.rule,
-        )
+        options = FeatureSourceOptions(threshold=args.threshold)
         return FeatureSource(layer, self.scene.gaussians, options=options)
 
     def select(self, prompts: Sequence[ViewPrompt], **changes: Any) -> Any:
@@ -305,7 +304,8 @@ def main() -> None:
     parser.add_argument("--source", default="auto")
     parser.add_argument("--layer")
     parser.add_argument("--threshold", type=float, help="of features, instead of the usual one")
-    parser.add_argument("--rule", choices=("fixed", "mean", "deviation"), help="of features")
+    parser.add_argument("--rule", choices=get_args(SelectThreshold), default="auto")
+    parser.add_argument("--after", choices=get_args(SelectPostProcessing), default="auto")
     parser.add_argument("--evidence", default="masks_sam")
     parser.add_argument("--rows", nargs="+", default=["click", "auto", "noisy", "mask"])
     parser.add_argument("--without", nargs="*", default=[], help="steps that are left out")

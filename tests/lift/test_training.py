@@ -660,3 +660,53 @@ def test_a_scene_of_labels_no_pixel_has(views) -> None:
     maps = Maps({view.name: LabelMap(ids=torch.full((12, 16), -1)) for view in views})
     with pytest.raises(InputError, match="expected a labelled pixel in 3 views"):
         LabelTargets(maps, [view.name for view in views])
+
+
+def test_dense_adam_is_that_of_the_whole_array(rng) -> None:
+    """Against torch.optim.Adam; what a step does not show goes on moving, what none shows stays."""
+    sampler = many_views(rng, 3)
+    one_view = replace(sampler.options, views_per_batch=1)
+    sampler = RowSampler(
+        sampler._gaussians, sampler.views, sampler._source, options=one_view, backend=BACKEND
+    )
+    options = TrainingOptions(**{**SHORT, "batch": 40, "passes": 0}, adam="dense")
+    model = Unpulled()
+    result = train(model, sampler, options=options, seed=4)
+    leaf = model.row_parameters["values"].start.clone().requires_grad_()
+    adam = torch.optim.Adam([leaf], lr=0.01)
+    still = 0
+    for batch in model.seen:
+        before = leaf.detach().clone()
+        adam.zero_grad()
+        dense = torch.zeros(len(batch), N)
+        dense[:, batch.weights.touched] = batch.weights.product(
+            torch.eye(len(batch.weights.touched))
+        )
+        target = batch.target("label").float()[:, None]
+        (dense @ leaf - target).square().mean().backward()
+        adam.step()
+        moved = (leaf.detach() != before).any(dim=1)
+        moved[batch.weights.touched] = False
+        still += int(moved.sum())
+    assert still > 0, "some view leaves Gaussians out that another has shown"
+    torch.testing.assert_close(result.rows["values"], leaf.detach(), rtol=1e-3, atol=1e-4)
+    never = torch.ones(N, dtype=torch.bool)
+    for batch in model.seen:
+        never[batch.weights.touched] = False
+    start = model.row_parameters["values"].start
+    assert torch.equal(result.rows["values"][never], start[never])
+    by_rows = train(Unpulled(), sampler, options=replace(options, adam="rows"), seed=4)
+    assert not torch.allclose(by_rows.rows["values"], result.rows["values"], atol=1e-3)
+
+
+class Unpulled(Regression):
+    """What is rendered alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shared_parameters = {}
+
+    def loss(self, batch: Batch, values: Values) -> torch.Tensor:
+        self.seen.append(batch)
+        target = batch.target("label").float()[:, None]
+        return (values.render("values", batch) - target).square().mean()

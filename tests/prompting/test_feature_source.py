@@ -63,14 +63,30 @@ def test_negative_points_take_away_what_is_more_like_them(gaussians, view, value
     assert torch.equal(found > 0.5, field_ids(gaussians) == 1)
 
 
-@pytest.mark.parametrize(("rule", "ids"), [("mean", {1, 3}), ("deviation", {1})])
-def test_rules_of_the_paper(gaussians, view, values, rule, ids) -> None:
-    source = FeatureSource(
-        Features(values=values), gaussians, options=FeatureSourceOptions(rule=rule, threshold=1.0)
-    )
-    found = source.membership(clicks(gaussians, view, UPPER_LEFT))
-    expected = torch.isin(field_ids(gaussians), torch.tensor(sorted(ids), dtype=torch.int32))
-    assert torch.equal(found > 0.5, expected)
+def test_the_threshold_of_points_is_the_mean_of_cosines(gaussians, view, values) -> None:
+    """Longer features are no nearer."""
+    longer = values * torch.linspace(1, 9, len(values))[:, None]
+    ids = field_ids(gaussians)
+    for some in (values, longer):
+        options = FeatureSourceOptions(rule="adaptive", threshold=1.0, precision="float32")
+        source = FeatureSource(Features(values=some), gaussians, options=options)
+        found = source.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
+        assert torch.equal(found, (ids == 1) | (ids == 3))
+
+
+def test_the_threshold_of_the_code_is_the_best_tenth_or_what_a_mask_shows(
+    gaussians, view, values, rng
+) -> None:
+    values = values + 0.02 * torch.from_numpy(rng.normal(size=values.shape)).float()
+    ids = field_ids(gaussians)
+    options = FeatureSourceOptions(rule="code", precision="float32")
+    source = FeatureSource(Features(values=values), gaussians, options=options)
+    found = source.membership(clicks(gaussians, view, UPPER_LEFT)) > 0.5
+    assert int(found.sum()) == len(values) // 10
+    assert (ids[found] == 1).all()
+    mask = region(slice(SKY_ROWS + 1, 19), slice(2, 18))
+    by_mask = source.membership(see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)])) > 0.5
+    assert 0 < int(by_mask.sum()) < int(found.sum()), "mean and deviation of the mask are higher"
 
 
 def test_the_gate_of_the_granularity_is_used(gaussians, view) -> None:
@@ -121,6 +137,50 @@ def test_a_mask_over_two_fields_asks_with_several_queries(gaussians, view, value
     assert torch.equal(several.membership(seen) > 0.5, (ids == 1) | (ids == 3))
     one = FeatureSource(Features(values=values), gaussians, options=replace(options, clusters=1))
     assert not (one.membership(seen) > 0.5).any(), "their mean is like neither"
+
+
+def projected_to(direction):
+    """A head whose projection is one direction, whatever the 2D features are."""
+    arrays = {name: torch.zeros(shape) for name, shape in projector_shapes(4, 4).items()}
+    arrays[max(name for name in arrays if name.startswith("bias"))] = torch.tensor(direction)
+    return AffinityHead(channels=4, unit=False, projector=arrays)
+
+
+def same_everywhere(of) -> FeatureMap:
+    return FeatureMap(
+        features=torch.ones(HEIGHT // 2, WIDTH // 2, 4), stride=2, height=HEIGHT, width=WIDTH
+    )
+
+
+def test_masks_asked_by_2d_features_are_products_above_mean_and_deviation(
+    gaussians, view, values
+) -> None:
+    """Equation 12: a longer feature scores higher, which a cosine does not see."""
+    ids = field_ids(gaussians)
+    query = torch.tensor([0.0, 0.0, 1.0, 0.6])
+    values = torch.where((ids == 4)[:, None], 3 * values, values)
+    head = projected_to(query.tolist())
+    layer = Features(values=values, info=LayerInfo(head=head.to_json()))
+    mask = region(slice(SKY_ROWS + 1, 19), slice(21, 34))
+    seen = see_prompts(gaussians, [ViewPrompt(view=view, mask=mask)])
+    products = values.double() @ query.double()
+    limit = products.mean() + products.std(correction=0)
+    expected = products > limit
+    assert torch.equal(expected, ids == 4), "not the field of the mask, which is shorter"
+    options = FeatureSourceOptions(rule="adaptive", precision="float32")
+    source = FeatureSource(layer, gaussians, options=options, guidance=same_everywhere)
+    found = source.membership(seen)
+    assert torch.equal(found > 0.5, expected)
+    assert float(found.max()) == pytest.approx(1.0)
+    assert float(found.min()) == pytest.approx(0.0)
+    usual = FeatureSource(
+        layer, gaussians, options=FeatureSourceOptions(threshold=0.97), guidance=same_everywhere
+    )
+    assert torch.equal(usual.membership(seen) > 0.5, ids == 2), "cosines by default"
+    # A point beside it is compared by cosines, and both together mean both.
+    both = [*seen, *clicks(gaussians, view, UPPER_LEFT)]
+    found = source.membership(both) > 0.5
+    assert found[(ids == 4) | (ids == 1)].all()
 
 
 def test_masks_are_asked_by_2d_features_where_there_are_some(gaussians, view, values) -> None:

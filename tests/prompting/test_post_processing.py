@@ -14,7 +14,6 @@ from splatseg.prompting.growing import (
     GrowOptions,
     ball_grow,
     growth_radius,
-    post_process,
     region_grow,
 )
 
@@ -135,37 +134,6 @@ def test_ball_growing_by_hand() -> None:
     among = torch.tensor([False, False, True, True, False])
     assert ball_grow(index, members, among=among).tolist() == [True, True, True, False, False]
     assert torch.equal(ball_grow(index, members, GrowOptions(max_radius=0.5)), members)
-
-
-def test_post_processing_without_a_mask() -> None:
-    points = blob(strays=5)
-    index, retrieved = NeighbourIndex(points), everyone(points)
-    retrieved[:40] = False
-    excluded = torch.zeros(len(points), dtype=torch.bool)
-    excluded[:10] = True
-    filtering, growing = FilterOptions(deviations=1.5), GrowOptions(radius_quantile=0.9)
-    got = post_process(index, retrieved, excluded=excluded, filtering=filtering, growing=growing)
-    kept = statistical_filter(index, retrieved, filtering)
-    assert torch.equal(got, ball_grow(index, kept, growing, among=~excluded))
-    assert not got[400:].any()
-    assert not got[:10].any()
-    assert got[10:40].any()
-
-
-def test_post_processing_with_a_mask() -> None:
-    """What seeds reach is kept, whatever its statistics; a second blob is not."""
-    points = torch.cat((blob(), blob() + torch.tensor([5.0, 0, 0])))
-    index, retrieved = NeighbourIndex(points), everyone(points)
-    validated = torch.arange(800) < 100
-    got = post_process(index, retrieved, validated=validated)
-    grown = region_grow(index, validated, retrieved)
-    assert torch.equal(got, ball_grow(index, grown))
-    assert int(got[:400].sum()) > 380
-    assert not got[400:].any()
-    none = torch.zeros(800, dtype=torch.bool)
-    assert torch.equal(
-        post_process(index, retrieved, validated=none), post_process(index, retrieved)
-    )
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,15 @@
 """What follows each source."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from splatseg.neighbours import NeighbourIndex
+from splatseg.prompting import steps
 from splatseg.prompting.context import SceneIndex, SelectionContext
+from splatseg.prompting.filtering import FilterOptions, statistical_filter
+from splatseg.prompting.growing import GrowOptions, ball_grow
 from splatseg.prompting.prompts import ViewPrompt
 from splatseg.prompting.seen import see_prompts
 from splatseg.prompting.steps import advised, completed, filled, filtered, grown, refined
@@ -59,6 +65,45 @@ def test_features_alone_grow_among_what_is_nearly_similar(gaussians, view, field
     more = grown(some, context(gaussians, view, "features")) > 0.5
     assert int(more.sum()) > int((some > 0.5).sum())
     assert not more[field < 0.5].any(), "what is unlike does not join"
+
+
+def test_section_3_5_to_the_letter(gaussians, view, field, monkeypatch) -> None:
+    """All neighbours count, the farthest pair is the radius, and whatever lies in it joins."""
+    index = NeighbourIndex(gaussians)
+    usual = context(gaussians, view, "features")
+    letter = replace(usual, published=True)
+    members = field > 0.5
+    scattered = members.clone()
+    scattered[torch.nonzero(field < 0.5)[::40, 0]] = True
+    confidence = torch.where(scattered, 0.9, 0.1)
+    kept = filtered(confidence, letter) > 0.5
+    assert torch.equal(kept, statistical_filter(index, scattered, FilterOptions.published()))
+    asked: list[FilterOptions] = []
+    monkeypatch.setattr(
+        steps, "statistical_filter", lambda _, mask, options: asked.append(options) or mask
+    )
+    for one in (letter, usual):
+        filtered(confidence, one)
+    assert [options.max_neighbours for options in asked] == [None, 32]
+    some = field.clone()
+    some[torch.nonzero(members)[::2, 0]] = 0.1
+    more = grown(some, letter) > 0.5
+    assert torch.equal(more, ball_grow(index, some > 0.5, GrowOptions.published()))
+    assert not torch.equal(more, grown(some, usual) > 0.5), "that is of what is nearly similar"
+    mask = torch.zeros(30, 40, dtype=torch.bool)
+    mask[11:19, 2:18] = True
+    shown = context(gaussians, view, "features", mask=mask)
+    seeds = filtered(confidence, shown) > 0.5
+    whole = filtered(confidence, replace(shown, published=True)) > 0.5
+    assert int(whole.sum()) >= int(seeds.sum())
+    assert not (grown(field, replace(shown, published=True)) > 0.5)[excluded(gaussians)].any()
+
+
+def excluded(gaussians) -> torch.Tensor:
+    """Gaussians that the view shows beside the mask, well away from its rim."""
+    column = 20 + 10 * gaussians.means[:, 0]
+    row = 10 + 10 * gaussians.means[:, 1]
+    return (column > 20) & (column < 34) & (row > 12) & (row < 28)
 
 
 def test_features_alone_are_cut_and_clicks_hold(gaussians, view, field) -> None:

@@ -2,14 +2,20 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from splatseg.cli import main
 from splatseg.core import Features
+from splatseg.errors import InputError
 from splatseg.io.layers import load_layer
+from splatseg.io.scene import load_scene
 from splatseg.lift.affinity import AffinityHead
+from splatseg.methods import find_method
+from splatseg.methods.saga import SagaOptions
+from splatseg.tasks._segment_inputs import with_companions
 
 
 @pytest.fixture
@@ -52,3 +58,47 @@ def test_features_of_a_second_evidence_guide_the_masks(scene, capsys) -> None:
     # A layer without a classifier is not rendered as labels.
     status, said = run(capsys, "evaluate", scene, "--layer", "guided", "--truth", scene)
     assert status == 2
+
+
+def test_the_published_setting_is_guided_by_what_is_at_hand(scene, capsys) -> None:
+    """The features that are taken are said and recorded; selections follow the paper."""
+    asked = ("segment", scene, "--method", "saga", "--evidence", "masks_sam", "--backend", "cpu")
+    few = ("--published", "--steps", 3, "--grid", 12, "--pixels", 144, "--batch", 144)
+    status, said = run(capsys, *asked, *few, "--layer", "paper")
+    assert status == 0, said
+    assert "guidance: features_dino, of " in said
+    layer = load_layer(scene / "layers" / "paper.npz")
+    assert layer.info.options["guidance"] == "features_dino"
+    assert AffinityHead.of(layer).projector
+    assert str(layer.info.details["setting"]).startswith("published, 3 steps")
+    status, said = run(capsys, *asked, *few, "--layer", "alone", "--guidance", "None")
+    assert status == 0, said
+    assert not AffinityHead.of(load_layer(scene / "layers" / "alone.npz")).projector
+
+
+def test_what_is_at_hand_is_taken_by_name_or_asked_for(scene) -> None:
+    told: list[str] = []
+    observer = Told(told)
+    method = find_method("saga")
+    options = SagaOptions.published(steps=3)
+    room = load_scene(scene)
+    found = with_companions(room, method, options, observer)
+    assert found.guidance == "features_dino"
+    shutil.copytree(room.source / "features_dino", scene / "evidence" / "features_sam2")
+    assert with_companions(room, method, options, observer).guidance == "features_sam2"
+    assert [line.split(",")[0] for line in told] == [
+        "guidance: features_dino",
+        "guidance: features_sam2",
+    ]
+    named = replace(options, guidance="features_dino")
+    assert with_companions(room, method, named, observer) is named
+    bare = replace(room, root=None, source=None)
+    with pytest.raises(InputError, match=r"guidance: .*splatseg see SCENE.*--guidance None\."):
+        with_companions(bare, method, options, observer)
+
+
+class Told:
+    """Keeps what it is told."""
+
+    def __init__(self, lines: list[str]) -> None:
+        self.note = lines.append

@@ -1,18 +1,19 @@
 """What a scene offers to select by: masks associated on the way, features, layers; their order."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from splatseg.cli import main
-from splatseg.core import Features, InstanceTree, Labels, TreeNode
+from splatseg.core import Features, InstanceTree, Labels, TreeNode, with_info
 from splatseg.errors import InputError
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer, scene_layer_names
 from splatseg.lift.affinity import AffinityHead
 from splatseg.prompting.prompts import ViewPrompt
-from splatseg.tasks import SelectOptions, select
+from splatseg.tasks import SelectOptions, open_selector, select
 from support.observers import Stopping
 
 
@@ -201,3 +202,58 @@ def test_features_of_the_scene_folder_are_found(room) -> None:
     made = select(load_scene(room), click(scene))
     assert (made.source, made.selection.info.options["layer"]) == ("features", "affinity")
     assert "next_click" in made.seconds
+
+
+def test_features_trained_as_published_are_asked_as_published(room) -> None:
+    """Section 3.4 and 3.5 by the record of the layer; both may be asked for, and refused."""
+    scene = load_scene(room)
+    count = len(scene.gaussians)
+    own = affinity(count)
+    details = {"setting": "published, 30000 steps (paper: 30000)"}
+    paper = with_info(own, replace(own.info, method="saga", details=details))
+    layers = {"own": own, "paper": paper}
+
+    def record(layer: str, **changes: object) -> tuple[object, object, object]:
+        options = SelectOptions(source="features", from_layer=layer, **changes)
+        made = select(scene, click(scene), options=options, layers=layers).selection.info.options
+        return made["threshold"], made.get("post_processing"), made["steps"]
+
+    every = ["filter", "grow", "refine", "fill_holes", "hidden"]
+    assert record("own") == ("fixed", None, every)
+    assert record("paper") == ("adaptive", "published", ["filter", "grow"])
+    assert record("paper", grow=False) == ("adaptive", "published", ["filter"])
+    assert record("own", threshold="code") == ("code", None, every)
+    assert record("paper", post_processing="own", threshold="fixed") == ("fixed", None, every)
+    assert record("own", post_processing="published")[1:] == ("published", ["filter", "grow"])
+    tree = SelectOptions(post_processing="published", from_layer="all")
+    labels = Labels(ids=torch.ones(count, dtype=torch.int32), confidence=torch.ones(count))
+    with pytest.raises(InputError, match="post_processing: expected a source of features"):
+        select(scene, click(scene), options=tree, layers={"all": labels})
+    with pytest.raises(InputError, match="threshold: expected"):
+        SelectOptions(threshold="some")
+    with pytest.raises(InputError, match="post_processing: expected"):
+        SelectOptions(post_processing="some")
+    session = open_selector(
+        scene, options=SelectOptions(source="features", from_layer="own"), layers=layers
+    )
+    other = SelectOptions(source="features", from_layer="own", threshold="adaptive")
+    with pytest.raises(InputError, match="threshold: expected 'auto' as the session"):
+        session.select([click(scene)], options=other)
+
+
+def test_thresholds_change_what_is_selected(room) -> None:
+    """Of features of one direction each but for noise: the mean is below 0.85, the code's above."""
+    scene = load_scene(room)
+    count = len(scene.gaussians)
+    angles = torch.linspace(0, 3, count)
+    values = torch.stack((angles.cos(), angles.sin()), dim=1)
+    layers = {"own": Features(values=values, info=affinity(count).info)}
+
+    def selected(rule: str) -> int:
+        options = SelectOptions(
+            source="features", from_layer="own", threshold=rule, filter=False, grow=False,
+            refine=False, fill_holes=False, hidden=False,
+        )  # fmt: skip
+        return select(scene, click(scene), options=options, layers=layers).selection.count
+
+    assert selected("adaptive") > selected("fixed") > selected("code")

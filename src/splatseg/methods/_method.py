@@ -10,6 +10,9 @@ from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, EvidenceKind, FeatureEvidence, TrackedEvidence
 
+ANY_COMPANION = "any"
+"""What an option of `Method.companions` says to take evidence that is at hand."""
+
 Returns = Literal["labels", "features", "tree", "selection", "field"]
 """labels: one id a Gaussian. features: one vector a Gaussian, with the head that reads it. tree:
 instances with groups above and parts below them. selection: the Gaussians of what was asked for.
@@ -146,7 +149,7 @@ class Method:
         default_factory=dict[str, tuple[EvidenceKind, ...]]
     )
     """Options that name evidence which the method takes besides, and the kinds that each may be
-    of. An option that is None names none."""
+    of. An option that is None names none; one that is `ANY_COMPANION` takes what is at hand."""
 
     models: Mapping[str, type[Any]] = field(default_factory=dict[str, type[Any]])
     """Options that name models, as ``NAME[=WEIGHTS][,OPTION=VALUE...]``, and the protocol of

@@ -68,6 +68,9 @@ class SelectionContext:
     unseen: Bool[Tensor, "n"] | None = None
     """Gaussians of which the source knows nothing; None where it knows of all."""
 
+    published: bool = False
+    """Whether what follows features is SAGA's section 3.5 to the letter."""
+
     granularity: float | None = None
     """What was asked for, see `sources.MembershipSource`."""
 

@@ -4,16 +4,23 @@ The query of a point is the feature that its pixel shows, that of strokes, masks
 centres of k-means over the features of their pixels. A Gaussian's score is its largest similarity
 with a positive query; it belongs to the target if that exceeds the one with negative queries, and a
 threshold. Features with a scale gate (`lift.AffinityHead`) are compared at the scale of what is
-asked for. The confidence is 0.5 at the threshold and at equal scores, and 1 at a similarity of 1.
+asked for. The confidence is 0.5 at the threshold and at equal scores, and 1 at the largest
+similarity that there can be.
 
 With the projector of features that were trained under guidance, a mask is asked in the space of 2D
-features: the mean of its projected features is the query if the pixels that it finds in the view
-cover 90 % of the mask, centres of k-means over them otherwise (SAM-based prompts, eq. 12).
+features (SAM-based prompts): the mean of its projected features is the query if the pixels that it
+finds in the view cover 90 % of the mask, centres of k-means over them otherwise.
+
+What is similar, and the threshold, by `FeatureSourceOptions.rule`: *fixed* compares by cosine with
+one number, SAM-based prompts too. *adaptive* is the paper's: cosines with the mean of all scores as
+the threshold; of SAM-based prompts products (eq. 12), with the mean and one standard deviation.
+*code* compares as adaptive does, with the published code's threshold
+(`retrieval.published_threshold`).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -26,15 +33,17 @@ from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.affinity import AffinityHead
 from splatseg.prompting.retrieval import (
+    Similarity,
     StoredFeatures,
     deviation_threshold,
     mean_threshold,
+    published_threshold,
     scores,
 )
 from splatseg.prompting.seen import SeenPrompt
 from splatseg.render import SparseWeights
 
-ThresholdRule = Literal["fixed", "mean", "deviation"]
+ThresholdRule = Literal["fixed", "adaptive", "code"]
 _COVERED = 0.9
 _OBJECT = 0.5
 
@@ -51,9 +60,8 @@ class FeatureSourceOptions:
     """Queries that strokes and masks are reduced to by k-means."""
 
     rule: ThresholdRule = "fixed"
-    """What a score must exceed. fixed: `threshold`. mean: the mean of the scores, as the paper has
-    it for points, strokes and masks. deviation: mean and one standard deviation, as it has them for
-    SAM-based prompts."""
+    """What a score must exceed. fixed: `threshold`. adaptive: the mean of the scores, of SAM-based
+    prompts mean and one standard deviation, as in the paper. code: as in its published code."""
 
     threshold: float = 0.85
     """Similarity in [-1, 1] of the fixed rule. The published code has 0.75; decision 0030."""
@@ -64,7 +72,7 @@ class FeatureSourceOptions:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_choice("precision", self.precision, ("float32", "float16", "int8"))
-        check_choice("rule", self.rule, ("fixed", "mean", "deviation"))
+        check_choice("rule", self.rule, get_args(ThresholdRule))
         check_range("threshold", self.threshold, -1.0, 1.0)
         if self.clusters < 1:
             raise RangeError(f"clusters: expected at least 1, got {self.clusters}.")
@@ -102,7 +110,7 @@ class FeatureSource:
         self._values = features.values.detach().cpu().float()
         self._seen = None if features.weights is None else features.weights.cpu() > 0
         self._head = AffinityHead.of(features) if features.info.head is not None else None
-        self._stored = StoredFeatures.of(self._values, precision=self._options.precision)
+        self._made: dict[Similarity, StoredFeatures] = {}
         self._guidance = guidance
 
     @property
@@ -119,28 +127,67 @@ class FeatureSource:
         Raises:
             InputError: If the prompts show nothing that has a feature.
         """
-        positive = self._queries(prompts, positive=True)
-        negative = self._queries(prompts, positive=False)
-        if not len(positive):
+        asked = self._asked(prompts)
+        if not asked:
             raise InputError("features: expected features where the prompts are, got none.")
         gate = self._gate(granularity)
-        found = scores(self._stored, positive, gate=gate)
-        limit = self._limit(found)
-        confidence = _around(found, limit)
+        confidence = torch.stack([self._confidence(one, gate) for one in asked]).amax(dim=0)
+        negative = torch.cat([self._values[:0], *map(self._negative, prompts)])
         if len(negative):
-            against = scores(self._stored, negative, gate=gate)
             # Equally like what is meant and what is not is the border as well.
+            positive = torch.cat([one.queries for one in asked])
+            found = scores(self._stored("cosine"), positive, gate=gate)
+            against = scores(self._stored("cosine"), negative, gate=gate)
             confidence = torch.minimum(confidence, (0.5 + (found - against)).clamp(0, 1))
         return confidence if self._seen is None else confidence.where(self._seen, 0.0)
 
-    def _limit(self, found: Tensor) -> float:
+    def _asked(self, prompts: Sequence[SeenPrompt]) -> list["_Asked"]:
+        """Positive queries of all prompts, those of one similarity together."""
+        found: dict[Similarity, list[_Asked]] = {"cosine": [], "dot": []}
+        for prompt in prompts:
+            shown = self._shown(prompt.positive_rows)
+            queries = None
+            if prompt.dense and prompt.inside is not None and not prompt.guessed:
+                queries = self._mask_queries(prompt)
+            by_product = queries is not None and self._options.rule != "fixed"
+            if queries is None:
+                queries = self._thinned(prompt, shown)
+            similarity: Similarity = "dot" if by_product else "cosine"
+            if len(queries):
+                inside = shown if prompt.dense else shown[:0]
+                found[similarity].append(_Asked(similarity, queries, inside))
+        return [_Asked.together(some) for some in found.values() if some]
+
+    def _confidence(self, asked: "_Asked", gate: Tensor | None) -> Float[Tensor, "n"]:
+        """In [0, 1], 0.5 at the threshold of the rule."""
+        found = scores(self._stored(asked.similarity), asked.queries, gate=gate)
+        if asked.similarity == "cosine":
+            return _around(found, self._limit(found, asked, gate), low=-1.0, high=1.0)
+        ends = float(found.min()), float(found.max())
+        return _around(found, self._limit(found, asked, gate), low=ends[0], high=ends[1])
+
+    def _limit(self, found: Tensor, asked: "_Asked", gate: Tensor | None) -> float:
         match self._options.rule:
             case "fixed":
                 return self._options.threshold
-            case "mean":
-                return mean_threshold(found)
-            case "deviation":
-                return deviation_threshold(found)
+            case "adaptive":
+                by_product = asked.similarity == "dot"
+                return deviation_threshold(found) if by_product else mean_threshold(found)
+            case "code":
+                if not len(asked.inside):
+                    return published_threshold(found, found[:0])
+                inside = StoredFeatures.of(
+                    asked.inside, precision="float32", similarity=asked.similarity
+                )
+                return published_threshold(found, scores(inside, asked.queries, gate=gate))
+
+    def _stored(self, similarity: Similarity) -> StoredFeatures:
+        """The features as they are compared, made when they are first asked for."""
+        if similarity not in self._made:
+            self._made[similarity] = StoredFeatures.of(
+                self._values, precision=self._options.precision, similarity=similarity
+            )
+        return self._made[similarity]
 
     def _gate(self, granularity: float | None) -> Tensor | None:
         head = self._head
@@ -148,20 +195,14 @@ class FeatureSource:
             return None
         return head.gate(head.scale(_OBJECT if granularity is None else granularity))
 
-    def _queries(self, prompts: Sequence[SeenPrompt], *, positive: bool) -> Float[Tensor, "q d"]:
-        """Queries of all prompts of one sign."""
-        found: list[Tensor] = [self._values[:0]]
-        for prompt in prompts:
-            if positive and prompt.dense and prompt.inside is not None and not prompt.guessed:
-                asked = self._mask_queries(prompt)
-                if asked is not None:
-                    found.append(asked)
-                    continue
-            shown = self._shown(prompt.positive_rows if positive else prompt.negative_rows)
-            if prompt.dense and len(shown) > self._options.clusters:
-                shown = self._centres(shown)
-            found.append(shown)
-        return torch.cat(found)
+    def _negative(self, prompt: SeenPrompt) -> Float[Tensor, "q d"]:
+        """Queries of what is not meant."""
+        return self._thinned(prompt, self._shown(prompt.negative_rows))
+
+    def _thinned(self, prompt: SeenPrompt, shown: Float[Tensor, "p d"]) -> Float[Tensor, "q d"]:
+        """What pixels show, of strokes, masks and boxes the centres of k-means."""
+        many = prompt.dense and len(shown) > self._options.clusters
+        return self._centres(shown) if many else shown
 
     def _shown(self, rows: SparseWeights) -> Float[Tensor, "p d"]:
         """Features that pixels show; pixels that show none are left out."""
@@ -195,8 +236,27 @@ class FeatureSource:
         return torch.from_numpy(made.cluster_centers_).float()
 
 
-def _around(found: Tensor, limit: float) -> Tensor:
-    """Confidences in [0, 1], 0.5 at the limit, linear on both sides."""
-    above = 0.5 + 0.5 * (found - limit) / max(1 - limit, 1e-6)
-    below = 0.5 - 0.5 * (limit - found) / max(1 + limit, 1e-6)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """Queries that scores are made with in one way."""
+
+    similarity: Similarity
+    queries: Float[Tensor, "q d"]
+    inside: Float[Tensor, "p d"]
+    """What pixels of masks and strokes show; a point alone would be as alike as can be."""
+
+    @classmethod
+    def together(cls, some: Sequence["_Asked"]) -> "_Asked":
+        """Those of several prompts."""
+        return cls(
+            some[0].similarity,
+            torch.cat([one.queries for one in some]),
+            torch.cat([one.inside for one in some]),
+        )
+
+
+def _around(found: Tensor, limit: float, *, low: float, high: float) -> Tensor:
+    """Confidences in [0, 1], 0.5 at the limit, linear from the least to the largest similarity."""
+    above = 0.5 + 0.5 * (found - limit) / max(high - limit, 1e-6)
+    below = 0.5 - 0.5 * (limit - found) / max(limit - low, 1e-6)
     return torch.where(found > limit, above, below).clamp(0, 1)

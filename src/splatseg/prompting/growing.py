@@ -20,7 +20,6 @@ from splatseg._check import check_range
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import RangeError
 from splatseg.neighbours import NeighbourIndex, Subset
-from splatseg.prompting.filtering import FilterOptions, statistical_filter
 
 # Nearest distances are float32; their rounding does not decide what is as far as one of them.
 _ROUNDING = 1e-6
@@ -114,41 +113,6 @@ def ball_grow(
     """
     subset = Subset(index, members)
     return subset.near(_radius(subset, options), among=among)
-
-
-@boundary
-def post_process(
-    index: NeighbourIndex,
-    retrieved: Bool[Tensor, "n"],
-    *,
-    validated: Bool[Tensor, "n"] | None = None,
-    excluded: Bool[Tensor, "n"] | None = None,
-    filtering: FilterOptions = FilterOptions(),
-    growing: GrowOptions = GrowOptions(),
-) -> Bool[Tensor, "n"]:
-    """Section 3.5 from beginning to end.
-
-    Without `validated` Gaussians it filters by statistics; with them it keeps what they reach among
-    those retrieved. Then the result grows by balls into all Gaussians.
-
-    Args:
-        index: Of the centres of all Gaussians; made once for a scene.
-        retrieved: Gaussians whose features match.
-        validated: Those of them that a mask in a view confirms; None for prompts without a mask,
-            and the same is done where none of those retrieved is validated.
-        excluded: Gaussians that the mask rules out; they are not grown into.
-        filtering: Options of the statistical filter.
-        growing: Options of both kinds of growing.
-
-    Raises:
-        ShapeError: If a mask is not (n,).
-    """
-    seeds = None if validated is None else validated & retrieved
-    if seeds is None or not bool(seeds.any()):
-        kept = statistical_filter(index, retrieved, filtering)
-    else:
-        kept = region_grow(index, seeds, retrieved, growing)
-    return ball_grow(index, kept, growing, among=None if excluded is None else ~excluded)
 
 
 def _radius(subset: Subset, options: GrowOptions) -> float:

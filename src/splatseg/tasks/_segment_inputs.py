@@ -1,6 +1,7 @@
 """What the options of a method name besides its evidence."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_evidence
 from splatseg.methods import Method
+from splatseg.methods._method import ANY_COMPANION
+from splatseg.tasks._observer import Observer
 from splatseg.tasks.named_models import model_of
 from splatseg.tasks.scene_parts import layer_of
 
@@ -50,9 +53,39 @@ def named_models(
     return found
 
 
+def with_companions(scene: Scene, method: Method, options: Any, observer: Observer) -> Any:
+    """The options, those that take any companion with the name of one that is at hand.
+
+    Of several, one whose name has ``sam`` in it comes first, then the first by name.
+
+    Raises:
+        InputError: If an option takes any and there is none.
+    """
+    folders = _folders(scene)
+    for option, kinds in method.companions.items():
+        if getattr(options, option) != ANY_COMPANION:
+            continue
+        names = [
+            name
+            for name in evidence_names(folders)
+            if open_evidence(find_evidence(folders, name)).kind in kinds
+        ]
+        if not names:
+            wanted = " or ".join(kinds)
+            raise InputError(
+                f"{option}: expected evidence of {wanted} at hand, got none; make some with "
+                f"`splatseg see SCENE --model ...` (docs/models.md says which models give "
+                f"{wanted}), or do without by --{option.replace('_', '-')} None."
+            )
+        name = min(names, key=lambda name: ("sam" not in name, name))
+        observer.note(f"{option}: {name}, of {len(names)} at hand")
+        options = replace(options, **{option: name})
+    return options
+
+
 def named_companions(scene: Scene, method: Method, options: Any) -> dict[str, Evidence]:
     """The evidence that the method's options name besides, by option."""
-    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
+    folders = _folders(scene)
     found: dict[str, Evidence] = {}
     for option, kinds in method.companions.items():
         asked = getattr(options, option)
@@ -70,3 +103,7 @@ def named_companions(scene: Scene, method: Method, options: Any) -> dict[str, Ev
             )
         found[option] = evidence
     return found
+
+
+def _folders(scene: Scene) -> list[Path]:
+    return [folder for folder in (scene.root, scene.source) if folder is not None]

@@ -18,7 +18,8 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import evidence_names, find_evidence, open_evidence
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift.affinity import KIND
-from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions
+from splatseg.methods.saga import trained_as_published
+from splatseg.prompting.feature_source import FeatureSource, FeatureSourceOptions, ThresholdRule
 from splatseg.prompting.layer_source import LayerSource
 from splatseg.prompting.sources import MembershipSource
 from splatseg.prompting.view_cache import ViewCache
@@ -43,6 +44,12 @@ class OpenedSource:
 
     evidence: str | None = None
     """The evidence that it reads."""
+
+    rule: ThresholdRule | None = None
+    """The threshold of features."""
+
+    published: bool = False
+    """Whether these are features that were trained as published."""
 
     made_layers: Mapping[str, Layer] = field(default_factory=dict[str, Layer])
     """Layers that were made to open it, by the names to keep them under."""
@@ -186,14 +193,17 @@ def _open_features(offer: Offer) -> OpenedSource | None:
             return None
         kind = layer_kind(layer)
         raise InputError(f"from_layer: expected features, {name!r} is of {kind}.")
+    published = trained_as_published(layer.info)
+    asked = offer.options.threshold
+    rule = ("adaptive" if published else "fixed") if asked == "auto" else asked
     source = FeatureSource(
         layer,
         offer.scene.gaussians,
-        options=FeatureSourceOptions(seed=offer.options.seed),
+        options=FeatureSourceOptions(rule=rule, seed=offer.options.seed),
         guidance=_guidance(offer, layer),
     )
-    offer.observer.note(f"selecting by features {name}")
-    return OpenedSource(source=source, name="features", layer=name)
+    offer.observer.note(f"selecting by features {name}, threshold {rule}")
+    return OpenedSource(source=source, name="features", layer=name, rule=rule, published=published)
 
 
 def _affinity_layer(offer: Offer) -> str | None:

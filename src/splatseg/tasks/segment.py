@@ -39,7 +39,12 @@ from splatseg.methods import Method, MethodInputs, Refined, find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._refined_scene import refined_folder, save_refined
-from splatseg.tasks._segment_inputs import named_companions, named_models, trained_features
+from splatseg.tasks._segment_inputs import (
+    named_companions,
+    named_models,
+    trained_features,
+    with_companions,
+)
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.fit_quality import fit_quality
 from splatseg.tasks.scene_parts import layer_of, mask_use, views_asked, views_recorded
@@ -129,6 +134,8 @@ def segment(
     chosen = _method_options(method, method_options, options)
     folder = refined_folder(method, chosen, checkpoints)
     trained = trained_features(scene, method, chosen, layers)
+    if trained is None:
+        chosen = with_companions(scene, method, chosen, observer)
     evidence_name, evidence = _evidence(scene, method, options, trained)
     merged = _classes_to_merge(scene, options, evidence, layers)
     check_name("layer", name := options.layer or evidence_name)

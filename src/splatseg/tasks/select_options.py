@@ -1,17 +1,22 @@
 """What a selection is made from, and what follows."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
+from splatseg._check import check_choice
 from splatseg.core import tree_level
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import InputError
 from splatseg.prompting.pipeline import StepName
 
 SelectMode = Literal["new", "add", "subtract", "intersect"]
+SelectThreshold = Literal["auto", "fixed", "adaptive", "code"]
+SelectPostProcessing = Literal["auto", "own", "published"]
 
 _LEVELS = {"group": 0.0, "object": 0.5, "part": 1.0}
 _STEPS: tuple[StepName, ...] = ("filter", "grow", "refine", "fill_holes", "hidden")
+PUBLISHED_STEPS: tuple[StepName, ...] = ("filter", "grow")
+"""The steps that SAGA's section 3.5 has."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +37,15 @@ class SelectOptions:
     granularity: str | float = "auto"
     """How much a click means: group, object, part, or a number from 0 (groups) by 0.5 (objects)
     to 1 (the finest parts). auto lets the source choose."""
+
+    threshold: SelectThreshold = "auto"
+    """How alike features must be. fixed: a cosine of 0.85. adaptive: more than the mean of all
+    scores, after masks mean and deviation of products with 2D features, as in SAGA's section 3.4.
+    code: as its published code. auto: adaptive of features trained as published, else fixed."""
+
+    post_processing: SelectPostProcessing = "auto"
+    """What follows features. own: the steps below. published: SAGA's section 3.5 to the letter, of
+    the steps filter and grow alone. auto: published of features trained as published, else own."""
 
     mode: SelectMode = "new"
     """What becomes of a selection that was there before: it is replaced, added to, subtracted
@@ -60,6 +74,8 @@ class SelectOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
+        check_choice("threshold", self.threshold, get_args(SelectThreshold))
+        check_choice("post_processing", self.post_processing, get_args(SelectPostProcessing))
 
     @property
     def level(self) -> float | None:

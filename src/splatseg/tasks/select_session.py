@@ -17,6 +17,7 @@ from splatseg.prompting.context import SceneIndex
 from splatseg.prompting.pipeline import (
     NextClickHint,
     SelectionContext,
+    StepName,
     checked_membership,
     next_click,
     postprocess,
@@ -38,7 +39,7 @@ from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._select_prompter import segmented_prompts
 from splatseg.tasks._select_record import prompt_record
 from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
-from splatseg.tasks.select_options import SelectMode, SelectOptions
+from splatseg.tasks.select_options import PUBLISHED_STEPS, SelectMode, SelectOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,7 +172,8 @@ class SelectionSession:
         context = self._seen(shown, options, seconds)
         confidence = self._membership(context, similar, seconds)
         if shown or similar:
-            confidence, steps = postprocess(confidence, context, enabled=options.steps)
+            enabled = _steps(options, published=context.published)
+            confidence, steps = postprocess(confidence, context, enabled=enabled)
             seconds |= steps
         confidence = within(confidence, solids, self._scene.gaussians)
         selection = self._described(confidence, asked, base, options)
@@ -204,13 +206,26 @@ class SelectionSession:
         return self._opened
 
     def _check_source(self, options: SelectOptions) -> None:
-        for name in ("source", "from_layer", "evidence"):
+        for name in ("source", "from_layer", "evidence", "threshold"):
             ours, theirs = getattr(self._options, name), getattr(options, name)
             if ours != theirs:
                 raise InputError(
                     f"{name}: expected {ours!r} as the session was opened with, got {theirs!r}; "
                     "open another session."
                 )
+
+    def _published(self, options: SelectOptions) -> bool:
+        """Whether section 3.5 follows to the letter."""
+        opened = self._opened
+        if options.post_processing == "auto":
+            return opened is not None and opened.published
+        if options.post_processing == "own" or opened is None:
+            return False
+        if opened.name != "features":
+            raise InputError(
+                f"post_processing: expected a source of features for published, got {opened.name}."
+            )
+        return True
 
     def _seen(
         self, shown: Sequence[ViewPrompt], options: SelectOptions, seconds: dict[str, float]
@@ -230,6 +245,7 @@ class SelectionSession:
             unseen=None if self._opened is None else getattr(self._opened.source, "unseen", None),
             scene_views=self._scene.train_views,
             source="" if self._opened is None else self._opened.name,
+            published=self._published(options),
             granularity=options.level,
             seed=options.seed,
         )
@@ -269,7 +285,7 @@ class SelectionSession:
     ) -> Selection:
         """The selection with what it adds to, and the record of both."""
         selection = combined(Selection.of_confidence(confidence), base, options.mode)
-        opened = self._opened
+        opened, published = self._opened, self._published(options)
         details: dict[str, JSON] = {"prompts": [prompt_record(prompt) for prompt in prompts]}
         if base is not None:
             details["mode"] = options.mode
@@ -282,7 +298,9 @@ class SelectionSession:
                 "layer": None if opened is None else opened.layer,
                 "granularity": options.level,
                 "prompter": None if self._prompter is None else self._prompter.name,
-                "steps": list(options.steps),
+                "steps": list(_steps(options, published=published)),
+                **({} if opened is None or opened.rule is None else {"threshold": opened.rule}),
+                **({"post_processing": "published"} if published else {}),
             },
             evidence=None if opened is None else opened.evidence,
             views=tuple(views),
@@ -307,6 +325,11 @@ def _as_prompts(
     if not given:
         raise InputError("prompts: expected at least one, got none.")
     return given
+
+
+def _steps(options: SelectOptions, *, published: bool) -> tuple[StepName, ...]:
+    """The steps that are on; of the published ones where section 3.5 is followed."""
+    return tuple(name for name in options.steps if not published or name in PUBLISHED_STEPS)
 
 
 def combined(selection: Selection, base: Selection | None, mode: SelectMode) -> Selection:

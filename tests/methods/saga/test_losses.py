@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from splatseg.methods.saga import _losses
 from splatseg.methods.saga._losses import (
     contrast_loss,
     correspondence_loss,
@@ -55,8 +56,10 @@ def test_the_guidance_loss_is_equation_7(drawn, rng) -> None:
     assert float(guidance_loss(queries, seen, inside)) == pytest.approx(total / 36, rel=1e-5)
 
 
-def test_the_correspondence_loss_is_equations_8_to_10(drawn) -> None:
-    """Also its gradient, which is taken without keeping the pairs."""
+@pytest.mark.parametrize("block", [2, 4, 512])
+def test_the_correspondence_loss_is_equations_8_to_10(drawn, monkeypatch, block) -> None:
+    """Also its gradient, which is taken without keeping the pairs, in blocks of them."""
+    monkeypatch.setattr(_losses, "_BLOCK", block)
     seen, inside, _ = drawn
     leaf = seen.double().requires_grad_()
     total = torch.zeros((), dtype=torch.float64)

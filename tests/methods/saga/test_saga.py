@@ -15,12 +15,17 @@ from splatseg.evaluate import learned_bytes
 from splatseg.io.layers import load_layer, save_layer
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.heads import ClassifierHead
+from splatseg.lift.training import RowSampler
 from splatseg.methods import MethodInputs, find_method
 from splatseg.methods._trained_labels import TrainingContext
-from splatseg.methods.saga import SagaOptions, train_saga
+from splatseg.methods.saga import SagaOptions, train_saga, trained_as_published
+from splatseg.methods.saga._targets import SagaTargets
+from splatseg.methods.saga._train import loss_curve
+from splatseg.render import weights
 
 from .conftest import Grids, Masks
 
+SHORT = 300
 DRAWN_BY = "auto"  # training is the same on all; what renders is tested in lift
 QUICK = {
     "steps": 60, "batch": 200, "pixels": 200, "views_per_batch": 1, "held_out": 0.0, "smoothing": 4,
@@ -79,8 +84,8 @@ def test_one_training_serves_windows_and_walls(walls) -> None:
 @pytest.mark.parametrize("guided", [True, False])
 def test_the_published_losses_part_the_walls(walls, guided) -> None:
     """With 2D features and from masks alone; rates raised, as steps are few."""
-    published = SagaOptions.published(steps=150)
-    options = replace(published, rate=0.05, pixels=200, batch=200, min_weight=0.001)
+    published = SagaOptions.published(steps=150, guidance="grids" if guided else None)
+    options = replace(published, grid=16, pixels=256, batch=256)
     features = train_saga(
         walls.gaussians, walls.views, walls.evidence, features=walls.grids if guided else None,
         options=options, context=context(),
@@ -126,6 +131,8 @@ def test_the_published_losses_part_the_walls(walls, guided) -> None:
         {"views_per_batch": 2},
         {"pixels": 150},
         {"sampling": "uniform"},
+        {"sampling": "uniform", "grid": 9},
+        {"adam": "dense"},
         {"passes": 1},
         {"min_weight": 0.3},
         {"schedule": "constant"},
@@ -227,6 +234,36 @@ def test_what_was_interrupted_goes_on_to_the_same_bits(walls, plain, tmp_path) -
         )  # fmt: skip
 
 
+def test_the_published_setting_resumes_to_the_same_bits(walls, tmp_path) -> None:
+    """On any number of threads, too."""
+    options = replace(SagaOptions.published(steps=20, guidance="g"), grid=8, pixels=64, batch=64)
+
+    def made(**changes) -> torch.Tensor:
+        return train_saga(
+            walls.gaussians, walls.views, walls.evidence, features=walls.grids, options=options,
+            context=context(**changes),
+        ).values  # fmt: skip
+
+    whole = made()
+    threads = _native.threads(), torch.get_num_threads()
+    try:
+        _native.set_threads(3)
+        torch.set_num_threads(3)
+        assert torch.equal(made(), whole)
+    finally:
+        _native.set_threads(threads[0])
+        torch.set_num_threads(threads[1])
+    stop, path = threading.Event(), tmp_path / "saga.npz"
+
+    def tell(progress) -> None:
+        if progress.step == 7:
+            stop.set()
+
+    with pytest.raises(KeyboardInterrupt):
+        made(checkpoints=Checkpoints(path=path), progress=tell, cancelled=stop.is_set)
+    assert torch.equal(made(checkpoints=Checkpoints(path=path, resume=True)), whole)
+
+
 def test_the_layer_and_its_head_go_through_a_file(plain, tmp_path) -> None:
     save_layer(plain, tmp_path / "saga.npz")
     read = load_layer(tmp_path / "saga.npz")
@@ -243,7 +280,6 @@ def test_the_method_is_declared(walls) -> None:
         "features",
         {"guidance": ("features",)},
     )
-    assert method.published_options == SagaOptions.published()
     inputs = MethodInputs(
         gaussians=walls.gaussians, views=tuple(walls.views), evidence=walls.evidence,
         companions={"guidance": walls.grids}, backend=DRAWN_BY, seed=3,
@@ -252,6 +288,132 @@ def test_the_method_is_declared(walls) -> None:
     layer = method.run(inputs, options)
     expected = trained(walls, features=walls.grids, guidance="grids", guidance_weight=1.0)
     assert torch.equal(layer.values, expected.values)
+
+
+def test_the_published_setting_is_that_of_the_paper() -> None:
+    """Numbers of the paper and its code, written here a second time; the default has its own."""
+    options = find_method("saga").published_options
+    paper = SagaOptions.published(steps=30_000)
+    assert paper.rate == pytest.approx(0.0025)
+    assert options.rate * options.steps == pytest.approx(75.0)
+    assert options.steps == SHORT
+    for one in (options, paper):
+        assert (one.channels, one.start, one.epsilon, one.adam) == (32, "normal", 1e-15, "dense")
+        assert (one.guidance, one.guidance_weight) == ("any", 1.0)
+        assert (one.correspondence, one.correspondence_weight) == ("overlap", 1.0)
+        assert (one.sparsity_weight, one.sparsity_share) == (0.1, 0.1)
+        assert one.projector_rate == pytest.approx(0.0025)
+        assert (one.grid, one.pixels, one.batch, one.views_per_batch) == (64, 4096, 4096, 1)
+        assert (one.sampling, one.passes, one.min_weight) == ("uniform", 0, 0.0)
+        assert (one.schedule, one.held_out, one.patience) == ("constant", 0.0, 0)
+        assert (one.unit, one.smoothing, one.norm_weight) == (False, 1, 0.0)
+    training = paper.training()
+    assert (training.steps, training.adam, training.epsilon) == (30_000, "dense", 1e-15)
+    assert (training.beta1, training.beta2, training.warmup) == (0.9, 0.999, 0)
+
+
+def test_the_published_start_is_normal(walls) -> None:
+    """With rates of 0 features stay what they start as: a mean of 0 and a deviation of 1."""
+    options = replace(
+        SagaOptions.published(steps=1, guidance=None), rate=0.0, grid=8, pixels=64, batch=64
+    )
+    values = train_saga(
+        walls.gaussians, walls.views, walls.evidence, options=options, context=context()
+    ).values
+    assert float(values.mean()) == pytest.approx(0.0, abs=0.05)
+    assert float(values.std()) == pytest.approx(1.0, abs=0.05)
+    assert float(values.abs().max()) > 3, "normal, not uniform"
+
+
+def test_a_step_has_the_whole_grid_of_one_view_and_moves_all_that_it_shows(walls) -> None:
+    options = replace(SagaOptions.published(steps=1), grid=8, pixels=64, batch=64)
+    source = SagaTargets(walls.evidence, walls.views, first(walls), walls.grids, grid=8)
+    sampler = RowSampler(
+        walls.gaussians, walls.views, source, options=options.drawing(), backend=DRAWN_BY
+    )
+    with sampler.draw(np.random.default_rng(0), batch=options.batch) as drawn:
+        assert len(drawn) == len(walls.views)
+        batch = drawn.batch(0)
+    assert sorted(batch.pixels.tolist()) == list(range(64))
+    assert len(torch.unique(batch.views)) == 1
+    # Cells are 4 pixels wide and 3 high, larger than a Gaussian: they show all that the view does.
+    shown = render_weights(walls.gaussians, walls.views[int(batch.views[0])].camera)
+    assert set(batch.weights.touched.tolist()) >= set(shown.tolist())
+    start = replace(options, rate=0.0, guidance=None)
+    moved = replace(options, guidance=None)
+    before, after = (
+        train_saga(
+            walls.gaussians, walls.views, walls.evidence, options=one, context=context()
+        ).values
+        for one in (start, moved)
+    )
+    assert bool((before != after).any(dim=1)[shown].all())
+
+
+def test_cells_have_the_masks_and_features_in_their_middle(walls) -> None:
+    source = SagaTargets(walls.evidence, walls.views, first(walls), walls.grids, grid=8)
+    choice = source.choice("v1")
+    assert (choice.height, choice.width, len(choice.pixels), choice.grid) == (8, 8, 64, True)
+    cells = torch.tensor([63, 0, 27, 35])
+    found = source.targets("v1", cells)
+    masks = walls.evidence.masks("v1")
+    offset = first(walls)["v1"]
+    for place, cell in enumerate(cells.tolist()):
+        row, column = 3 * (cell // 8) + 1, 4 * (cell % 8) + 2
+        expected = [offset + i for i in range(len(masks)) if bool(masks.dense(i)[row, column])]
+        assert found["masks"].row(place).tolist() == expected
+    # Features' cells are 4 by 4 pixels, six rows of them; a column of cells is one of theirs.
+    grid = walls.grids.features("v1").features
+    expected = torch.lerp(grid[0, 0], grid[1, 0], 0.0)
+    torch.testing.assert_close(found["guidance"][1].float(), expected, atol=0.01, rtol=0.01)
+
+
+def test_guidance_that_was_asked_for_has_to_be_there(walls) -> None:
+    with pytest.raises(InputError, match="features: expected 2D features.*guidance=None"):
+        train_saga(
+            walls.gaussians, walls.views, walls.evidence, options=SagaOptions.published(),
+            context=context(),
+        )  # fmt: skip
+
+
+def test_the_record_says_which_setting_and_how_the_loss_fell(walls, plain) -> None:
+    assert plain.info.details["setting"] == "own"
+    assert not trained_as_published(plain.info)
+    steps, losses = zip(*plain.info.details["losses"], strict=True)
+    assert (len(steps), steps[-1]) == (50, 60)
+    assert 0 < min(losses) < max(losses)
+    options = replace(SagaOptions.published(steps=3, guidance=None), grid=8, pixels=64, batch=64)
+    features = train_saga(
+        walls.gaussians, walls.views, walls.evidence, options=options, context=context()
+    )
+    assert features.info.details["setting"] == (
+        "published without 2D features, 3 steps at 10000 times its rate (paper: 30000)"
+    )
+    assert trained_as_published(features.info)
+    assert SagaOptions.published(steps=30_000).setting == "published, 30000 steps (paper: 30000)"
+    alone = replace(SagaOptions.published(steps=30_000), correspondence="none")
+    assert alone.setting == "published without correspondence, 30000 steps (paper: 30000)"
+    masks = replace(SagaOptions.published(steps=30_000, guidance=None), guidance_weight=0.0)
+    assert masks.setting == "published without guidance, 30000 steps (paper: 30000)"
+
+
+def test_losses_are_means_of_stretches() -> None:
+    assert loss_curve([4.0, 2.0]) == [[1, 4.0], [2, 2.0]]
+    curve = loss_curve([float(i) for i in range(100)])
+    assert (len(curve), curve[0], curve[-1]) == (50, [2, 0.5], [100, 98.5])
+
+
+def first(walls) -> dict[str, int]:
+    return {view.name: 4 * i for i, view in enumerate(walls.views)}
+
+
+def render_weights(gaussians, camera) -> torch.Tensor:
+    """Gaussians that a view shows at all."""
+    pixels = torch.stack(
+        torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy"), -1
+    ).reshape(-1, 2)
+    rows = weights(gaussians, camera, pixels, backend=DRAWN_BY)
+    return torch.unique(rows.ids[rows.weights > 0.01].long())
 
 
 @pytest.mark.parametrize(
@@ -271,6 +433,9 @@ def test_the_method_is_declared(walls) -> None:
         ({"correspondence": "none"}, "expected one of the two losses, got neither"),
         ({"guidance": "features"}, "guidance_weight: expected above 0"),
         ({"views_per_batch": 0}, "views_per_batch: expected at least 1"),
+        ({"grid": -1}, "grid: expected 0 or more, got -1"),
+        ({"grid": 8}, "grid: expected --sampling uniform"),
+        ({"adam": "some"}, "adam: expected"),
     ],
 )
 def test_options_out_of_range_are_refused(change, message) -> None:

@@ -29,6 +29,8 @@ from splatseg.lift import GaussianField
 from splatseg.lift.affinity import AffinityHead
 from splatseg.methods import Method, MethodInputs, _registry, register_method
 from splatseg.methods.uplift import UpliftMethodOptions
+from splatseg.tasks import select_session
+from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench
 from splatseg.tasks.benchmark.chosen import BySelection
 from splatseg.tasks.benchmark.prompts import stroke_prompt
@@ -60,6 +62,13 @@ def affinity(count: int) -> Features:
     values = torch.eye(2)[ids(count) - SQUARE]
     info = LayerInfo(head=AffinityHead(channels=2, unit=True).to_json())
     return Features(values=values, weights=torch.ones(count), info=info)
+
+
+def published(count: int) -> Features:
+    """The same, said to be trained as published."""
+    layer = affinity(count)
+    details = {"setting": "published, 30000 steps (paper: 30000)"}
+    return replace(layer, info=replace(layer.info, method="saga", details=details))
 
 
 def unsure(count: int) -> Labels:
@@ -129,6 +138,24 @@ def nvos(data: Path, folder: Path) -> Path:
         shutil.copy(data / "wall/masks/b.png", folder / "masks/red/b_mask.png")
         shutil.copy(data / "wall/images/a.png", folder / "reference_image/red/a.png")
     return folder
+
+
+@pytest.mark.parametrize("protocol", ["nvos", "spin-nerf"])
+def test_features_trained_as_published_answer_as_published(
+    protocol: str, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Thresholds of section 3.4 and what follows in section 3.5, by the record of the layer."""
+    asked: list[tuple[str | None, bool]] = []
+
+    def opened(offer: Offer) -> OpenedSource:
+        found = open_source(offer)
+        asked.append((found.rule, found.published))
+        return found
+
+    monkeypatch.setattr(select_session, "open_source", opened)
+    for layer in (affinity, published):
+        assert run(protocol, layer).methods[0].scores["iou"] > 0.3
+    assert asked == [("fixed", False), ("adaptive", True)]
 
 
 @pytest.mark.parametrize("layer", [labels, tree, affinity])

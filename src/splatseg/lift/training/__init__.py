@@ -10,6 +10,7 @@ from splatseg.lift.training._adam import RowMoments as RowMoments
 from splatseg.lift.training._model import Model as Model
 from splatseg.lift.training._model import Parameter as Parameter
 from splatseg.lift.training._model import Values as Values
+from splatseg.lift.training._options import Moving as Moving
 from splatseg.lift.training._options import Schedule as Schedule
 from splatseg.lift.training._options import TrainingOptions as TrainingOptions
 from splatseg.lift.training._pixels import Sampling as Sampling

@@ -9,6 +9,7 @@ from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 
 Schedule = Literal["constant", "exponential", "cosine"]
+Moving = Literal["rows", "dense"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +48,12 @@ class TrainingOptions:
     epsilon: float = 1e-8
     """What Adam adds to the root of the mean of squared gradients, above 0."""
 
+    adam: Moving = "rows"
+    """Which rows a step moves. rows: those that its loss depends on, each on a clock of its own.
+    dense: all, on one clock, as an optimiser of the whole array does: a row that a view does not
+    show goes on along its fading mean gradient, and one seldom seen takes longer steps when it
+    is (see `RowAdam`). Rows that nothing ever showed stay as they are either way."""
+
     held_out: float = 0.1
     """Share of the views that is not learnt from but scored, in [0, 1); of too few views to
     give one, none is, and then nothing is scored and training never stops early."""
@@ -77,6 +84,7 @@ class TrainingOptions:
             if getattr(self, name) < 0:
                 raise RangeError(f"{name}: expected 0 or more, got {getattr(self, name)}.")
         check_choice("schedule", self.schedule, get_args(Schedule))
+        check_choice("adam", self.adam, get_args(Moving))
         for name in ("beta1", "beta2", "held_out"):
             value = getattr(self, name)
             if not 0 <= value < 1:

@@ -343,7 +343,10 @@ class RowSampler:
     def _drawn(self, view: View, rng: np.random.Generator, count: int) -> DrawnView:
         source, options = self._source, self._options
         choice = source.choice(view.name)
-        camera = camera_of_map(view, choice.height, choice.width)
+        if choice.grid:
+            camera = view.camera.resized(choice.width, choice.height)
+        else:
+            camera = camera_of_map(view, choice.height, choice.width)
         if options.sampling == "uniform":
             pixels, stands_for = draw_uniformly(choice.pixels, count, rng)
         elif options.sampling == "strata":

@@ -75,6 +75,11 @@ class PixelChoice:
     pixels: Int64[Tensor, "m"]
     """Pixels that may be drawn, distinct."""
 
+    grid: bool = False
+    """Whether these are cells of a grid over the whole photograph, whatever its proportions. A
+    cell's row of W is that of a picture with as many pixels: it holds all Gaussians of the cell.
+    Otherwise height and width are the photograph's, or fewer in proportion."""
+
 
 @runtime_checkable
 class TargetSource(Protocol):

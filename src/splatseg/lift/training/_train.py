@@ -181,6 +181,13 @@ def _identity(
     }
 
 
+def _all_rows(value: Tensor, rows: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """All rows of an array, and its gradient: 0 where the loss does not depend on them."""
+    whole = torch.zeros_like(value)
+    whole[rows] = gradient
+    return torch.arange(len(value), device=value.device), whole
+
+
 class _Run:
     """One training under way."""
 
@@ -323,6 +330,8 @@ class _Run:
         factor = rate_factor(state.step, options)
         for name, value in state.rows.items():
             rows, gradient = values.row_gradients(name)
+            if self._options.adam == "dense":
+                rows, gradient = _all_rows(value, rows, gradient)
             rate = self._rates[name] * factor
             moments = state.row_moments[name]
             self._adam.step(value, moments, rows=rows, gradient=gradient, rate=rate)

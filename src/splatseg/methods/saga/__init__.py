@@ -7,6 +7,7 @@ pixels are to be as alike as the sets of their masks (correspondence loss, eq. 8
 
 .. math:: \mathcal{L} = \mathcal{L}_{SAM} + \lambda \mathcal{L}_{corr} .
 
+A step has the grid of 64 x 64 cells of one view, and Adam moves all Gaussians (decision 0048).
 Where the text and the published code differ, this follows the code: both losses are means, negative
 cosines of the correspondence loss count 0, and a tenth of the mean positive product of queries with
 a random tenth of all Gaussians is added. Where there are no 2D features, the query of a mask is the
@@ -31,8 +32,15 @@ from splatseg.lift.decomposition.decompose import decompose
 from splatseg.lift.decomposition.options import DecomposeOptions
 from splatseg.methods._method import Method, MethodInputs
 from splatseg.methods._trained_labels import context_of
+from splatseg.methods.saga._options import SHORT_STEPS
 from splatseg.methods.saga._options import SagaOptions as SagaOptions
+from splatseg.methods.saga._options import trained_as_published as trained_as_published
 from splatseg.methods.saga._train import train_saga as train_saga
+
+PUBLISHED_DIFFERS = (
+    f"It differs: {SHORT_STEPS} steps where the paper has 30 000, at {30_000 // SHORT_STEPS} times its rate; "
+    "both losses on the 64 x 64 grid; 2D features are those at hand, not SAM's alone."
+)
 
 
 def run(inputs: MethodInputs, options: SagaOptions) -> Features | InstanceTree:
@@ -64,6 +72,7 @@ METHOD = Method(
     seeded=True,
     resumes=True,
     published=SagaOptions.published(),
+    published_differs=PUBLISHED_DIFFERS,
     companions={"guidance": ("features",)},
     trained="features",
     readouts={"tree": "tree"},

@@ -4,9 +4,11 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from splatseg._check import check_choice, check_range
+from splatseg.core import LayerInfo
 from splatseg.errors import InputError, RangeError, quoted
 from splatseg.lift.decomposition.options import DecomposeOptions
-from splatseg.lift.training import Sampling, SamplingOptions, Schedule, TrainingOptions
+from splatseg.lift.training import Moving, Sampling, SamplingOptions, Schedule, TrainingOptions
+from splatseg.methods._method import ANY_COMPANION
 from splatseg.methods._trained_options import check_rate
 
 Correspondence = Literal["scale", "overlap", "none"]
@@ -23,7 +25,13 @@ PUBLISHED_CORRESPONDENCE_WEIGHT = 1.0
 PUBLISHED_SPARSITY_WEIGHT = 0.1
 PUBLISHED_SPARSITY_SHARE = 0.1
 PUBLISHED_STEPS = 30_000
-"""Each with one whole picture."""
+"""Each with the grid of one view."""
+
+PUBLISHED_GRID = 64
+"""Cells a side of the grid of a view: that of SAM's features."""
+
+SHORT_STEPS = 300
+"""Steps that `SagaOptions.published` takes instead, at 100 times the rate: decision 0048."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,8 +39,9 @@ class SagaOptions:
     """How affinity features are trained."""
 
     guidance: str | None = None
-    """Name of evidence of features (such as features_dino) whose projection queries the masks.
-    None takes masks alone: a mask is queried by the mean of what is rendered in it."""
+    """Name of evidence of features (such as features_dino) whose projection queries the masks;
+    any takes what the scene has, SAM's before others. None takes masks alone: a mask is queried by
+    the mean of what is rendered in it, which is not the published loss."""
 
     guidance_weight: float = 0.0
     """Weight of the SAM-guidance loss; 0 is without."""
@@ -102,6 +111,11 @@ class SagaOptions:
     epsilon: float = 1e-8
     """What Adam adds to the root of the mean of squared gradients."""
 
+    adam: Moving = "rows"
+    """Which Gaussians a step of Adam moves. rows: those that its pixels show, each on a clock of
+    its own. dense: all on one clock, as published: what a view does not show goes on along its
+    fading mean gradient."""
+
     steps: int = 200
     """Steps of Adam at most."""
 
@@ -113,6 +127,10 @@ class SagaOptions:
 
     pixels: int = 4096
     """Pixels of each view that are drawn at a time."""
+
+    grid: int = 0
+    """Cells a side of the grid over a view that is learnt on instead of its pixels, as published
+    with 64: a cell shows all Gaussians in it. 0 learns from pixels."""
 
     sampling: Sampling = "groups"
     """uniform: all pixels alike. groups: equally many of each mask, and of what is in none."""
@@ -165,6 +183,10 @@ class SagaOptions:
         check_choice("gate", self.gate, get_args(GateStart))
         check_choice("start", self.start, get_args(Start))
         check_choice("mask_scale", self.mask_scale, get_args(MaskScale))
+        if self.grid < 0:
+            raise RangeError(f"grid: expected 0 or more, got {self.grid}.")
+        if self.grid and self.sampling == "groups":
+            raise InputError("grid: expected --sampling uniform, cells have no groups; got groups.")
         for name in ("channels", "smoothing"):
             if getattr(self, name) < 1:
                 raise RangeError(f"{name}: expected at least 1, got {getattr(self, name)}.")
@@ -200,6 +222,32 @@ class SagaOptions:
         return self.correspondence == "none" or self.correspondence_weight == 0
 
     @property
+    def setting(self) -> str:
+        """What the record of a layer says of the setting.
+
+        Features that start at random, are free and have no gate are those of the paper: selections
+        compare them as it does, see `trained_as_published`.
+        """
+        if self.start != "normal" or self.unit or self.correspondence == "scale":
+            return "own"
+        left_out = [
+            name
+            for name, missing in (
+                ("2D features", self.guidance is None and self.guidance_weight > 0),
+                ("guidance", self.guidance_weight == 0),
+                ("correspondence", self._without_correspondence),
+            )
+            if missing
+        ]
+        without = f" without {' and '.join(left_out)}" if left_out else ""
+        rate = (
+            ""
+            if self.rate == PUBLISHED_RATE
+            else f" at {self.rate / PUBLISHED_RATE:g} times its rate"
+        )
+        return f"published{without}, {self.steps} steps{rate} (paper: {PUBLISHED_STEPS})"
+
+    @property
     def by_level(self) -> bool:
         """Whether scales of masks are levels; without a gate, none is asked for."""
         return self.mask_scale == "level" and self.correspondence == "scale"
@@ -210,14 +258,23 @@ class SagaOptions:
         return self.start == "association" or self.by_level
 
     @classmethod
-    def published(cls, *, steps: int = 2000) -> "SagaOptions":
-        """The published setting: its two losses and rates, features free and not smoothed.
+    def published(
+        cls, *, steps: int = SHORT_STEPS, guidance: str | None = ANY_COMPANION
+    ) -> "SagaOptions":
+        """The published setting: its losses, whole grids of views, and Adam of all Gaussians.
 
-        Nothing is held out and all steps are done. A step takes one view, as there, but sampled
-        pixels where the published code takes its 64 x 64 grid, and there are fewer of them
-        (`PUBLISHED_STEPS` there), so that it ends within minutes.
+        A step has the 64 x 64 cells of one view. Nothing is held out and all steps are done. Rate
+        times steps stays 75, as published (0.0025 times 30 000): Adam moves a feature by about
+        the rate each time that it is shown, whatever the gradient, so that fewer steps reach as
+        far at a higher rate. ``steps=30_000`` is the paper's own setting.
+
+        Args:
+            steps: How many.
+            guidance: As the option says; None is without 2D features.
         """
+        rate = PUBLISHED_RATE * PUBLISHED_STEPS / steps
         return cls(
+            guidance=guidance,
             guidance_weight=1.0,
             correspondence="overlap",
             sparsity_weight=PUBLISHED_SPARSITY_WEIGHT,
@@ -227,12 +284,17 @@ class SagaOptions:
             unit=False,
             norm_weight=0.0,
             smoothing=1,
-            rate=PUBLISHED_RATE,
+            rate=rate,
+            projector_rate=PUBLISHED_RATE,
             epsilon=PUBLISHED_EPSILON,
+            adam="dense",
             steps=steps,
-            batch=2048,
+            batch=PUBLISHED_GRID**2,
             views_per_batch=1,
+            pixels=PUBLISHED_GRID**2,
+            grid=PUBLISHED_GRID,
             sampling="uniform",
+            passes=0,
             min_weight=0.0,
             schedule="constant",
             held_out=0.0,
@@ -248,6 +310,7 @@ class SagaOptions:
             schedule=self.schedule,
             final_rate=self.final_rate,
             epsilon=self.epsilon,
+            adam=self.adam,
             held_out=self.held_out,
             score_every=self.score_every,
             score_start=True,
@@ -263,3 +326,8 @@ class SagaOptions:
             views_per_batch=self.views_per_batch,
             memory=self.memory,
         )
+
+
+def trained_as_published(info: LayerInfo) -> bool:
+    """Whether a layer's record says that its features are those of SAGA's paper."""
+    return info.method == "saga" and str(info.details.get("setting", "")).startswith("published")

@@ -51,6 +51,8 @@ class SagaTargets:
         views: The views to learn from, in the order of their names.
         first: The number of each view's first mask.
         features: 2D features of the same views.
+        grid: Cells a side of the grid that views are learnt on: a cell has the masks of the pixel
+            in its middle, and the features of its centre. 0 learns from the pixels of the masks.
 
     Raises:
         InputError: If these views have no mask with a pixel, or one has no features.
@@ -63,7 +65,10 @@ class SagaTargets:
         views: Sequence[View],
         first: Mapping[str, int],
         features: FeatureSource | None = None,
+        *,
+        grid: int = 0,
     ) -> None:
+        self._grid = grid
         self._masks = MaskTargets(evidence, [view.name for view in views])
         self._views = {view.name: view for view in views}
         self._first = first
@@ -72,15 +77,15 @@ class SagaTargets:
         digest = hashlib.sha256(self._masks.fingerprint.encode())
         if features is not None:
             for view in voting_views(views, features, "2D features"):
-                grid = features.features(view.name)
-                self._channels = self._channels or grid.channels
-                if grid.channels != self._channels:
+                found = features.features(view.name)
+                self._channels = self._channels or found.channels
+                if found.channels != self._channels:
                     raise ShapeError(
                         f"guidance: expected {self._channels} channels of view {view.name}, as of "
-                        f"view {views[0].name}, got {grid.channels}."
+                        f"view {views[0].name}, got {found.channels}."
                     )
-                digest.update(repr((view.name, grid.stride, grid.height, grid.width)).encode())
-                digest.update(grid.features.float().cpu().numpy().tobytes())
+                digest.update(repr((view.name, found.stride, found.height, found.width)).encode())
+                digest.update(found.features.float().cpu().numpy().tobytes())
         self._fingerprint = digest.hexdigest()
 
     @property
@@ -99,8 +104,11 @@ class SagaTargets:
         return self._fingerprint
 
     def choice(self, name: str) -> PixelChoice:
-        """All pixels."""
-        return self._masks.choice(name)
+        """All pixels, or all cells of the grid."""
+        if not self._grid:
+            return self._masks.choice(name)
+        cells = torch.arange(self._grid**2)
+        return PixelChoice(height=self._grid, width=self._grid, pixels=cells, grid=True)
 
     def groups(self, name: str) -> Ragged:
         """Pixels by mask, and those outside all masks."""
@@ -115,14 +123,14 @@ class SagaTargets:
 
     def targets(self, name: str, pixels: Int64[Tensor, "p"]) -> Targets:
         """``masks`` of some pixels, and their ``guidance``."""
-        local = self._masks.targets(name, pixels)["masks"]
+        choice = self.choice(name)
+        local = self._masks.targets(name, self._read_at(name, pixels))["masks"]
         if not isinstance(local, Ragged):
             raise TypeError("masks: expected any number of them a pixel.")
         found: dict[str, Target] = {
             "masks": Ragged(starts=local.starts, values=local.values + self._first[name])
         }
         if self._features is not None:
-            choice = self._masks.choice(name)
             found["guidance"] = read_features_at(
                 self._views[name],
                 self._features.features(name),
@@ -130,3 +138,12 @@ class SagaTargets:
                 pixels=pixels,
             ).half()
         return found
+
+    def _read_at(self, name: str, cells: Int64[Tensor, "p"]) -> Int64[Tensor, "p"]:
+        """The pixels of the masks that cells have: those in the middle; of pixels themselves."""
+        if not self._grid:
+            return cells
+        whole = self._masks.choice(name)
+        row = (2 * (cells // self._grid) + 1) * whole.height // (2 * self._grid)
+        column = (2 * (cells % self._grid) + 1) * whole.width // (2 * self._grid)
+        return row * whole.width + column

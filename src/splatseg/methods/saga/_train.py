@@ -7,9 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.core import LEARNED_BYTES, Features, FeatureSource, Gaussians, LayerInfo, View
+from splatseg.core import JSON, LEARNED_BYTES, Features, FeatureSource, Gaussians, LayerInfo, View
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
+from splatseg.errors import InputError
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training import MaskSets, RowSampler, TrainingResult, train
@@ -24,6 +25,10 @@ from splatseg.methods.saga._targets import KeptMasks, SagaTargets
 
 _START = 0x5A6A
 """What the generator of first values is seeded with besides the seed."""
+
+
+_CURVE = 50
+"""Points of the curve of losses in a record."""
 
 
 @boundary
@@ -61,6 +66,11 @@ def train_saga(
         KeyboardInterrupt: If it was cancelled.
     """
     options, context = options or SagaOptions(), context or TrainingContext()
+    if options.guidance is not None and features is None:
+        raise InputError(
+            f"features: expected 2D features, as guidance by {options.guidance} was asked for, "
+            "got none; guidance=None trains without."
+        )
     ordered = voting_views(views, evidence, "masks")
     kept = KeptMasks(evidence)
     # Sums in one order, and no threads for the many small ones.
@@ -72,7 +82,7 @@ def train_saga(
             render_options=context.render_options,
             backend=context.backend,
         )
-        source = SagaTargets(kept, ordered, masks.first, features)
+        source = SagaTargets(kept, ordered, masks.first, features, grid=options.grid)
     rng = np.random.default_rng((context.seed, _START))
     start, masks = _started(
         gaussians, ordered, kept, masks, options=options, context=context, rng=rng
@@ -186,6 +196,8 @@ def _info(
         seed=seed,
         head=head.to_json(),
         details={
+            "setting": options.setting,
+            "losses": loss_curve(result.losses),
             "loss": float(np.mean(result.losses[-20:])),
             "steps": len(result.losses),
             "best_step": result.best_step,
@@ -194,3 +206,10 @@ def _info(
             LEARNED_BYTES: result.learned_bytes,
         },
     )
+
+
+def loss_curve(losses: Sequence[float]) -> list[JSON]:
+    """The last step of each of at most 50 equal stretches of a training, and its mean loss."""
+    parts = np.array_split(np.asarray(losses, dtype=np.float64), min(len(losses), _CURVE))
+    ends = np.cumsum([len(part) for part in parts]).tolist()
+    return [[int(end), float(part.mean())] for end, part in zip(ends, parts, strict=True)]
