@@ -67,7 +67,7 @@ def test_features_alone_grow_among_what_is_nearly_similar(gaussians, view, field
     assert not more[field < 0.5].any(), "what is unlike does not join"
 
 
-def test_section_3_5_to_the_letter(gaussians, view, field, monkeypatch) -> None:
+def test_section_3_5_to_the_letter(gaussians, view, field, rng, monkeypatch) -> None:
     """All neighbours count, the farthest pair is the radius, and whatever lies in it joins."""
     index = NeighbourIndex(gaussians)
     usual = context(gaussians, view, "features")
@@ -86,10 +86,12 @@ def test_section_3_5_to_the_letter(gaussians, view, field, monkeypatch) -> None:
         filtered(confidence, one)
     assert [options.max_neighbours for options in asked] == [None, 32]
     some = field.clone()
-    some[torch.nonzero(members)[::2, 0]] = 0.1
+    some[members & torch.from_numpy(rng.random(len(some)) < 0.7)] = 0.1
     more = grown(some, letter) > 0.5
     assert torch.equal(more, ball_grow(index, some > 0.5, GrowOptions.published()))
     assert not torch.equal(more, grown(some, usual) > 0.5), "that is of what is nearly similar"
+    median = GrowOptions(radius_quantile=0.5)
+    assert not torch.equal(more, ball_grow(index, some > 0.5, median))
     mask = torch.zeros(30, 40, dtype=torch.bool)
     mask[11:19, 2:18] = True
     shown = context(gaussians, view, "features", mask=mask)

@@ -1,5 +1,6 @@
 """Methods: evidence to layers, each named as its paper or the field names it."""
 
+from splatseg.methods._method import ANY_COMPANION as ANY_COMPANION
 from splatseg.methods._method import Method as Method
 from splatseg.methods._method import MethodInputs as MethodInputs
 from splatseg.methods._method import Refined as Refined

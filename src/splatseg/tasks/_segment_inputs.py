@@ -9,8 +9,7 @@ from splatseg.core import Features, Layer, Scene
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence, evidence_names, find_evidence, open_evidence
-from splatseg.methods import Method
-from splatseg.methods._method import ANY_COMPANION
+from splatseg.methods import ANY_COMPANION, Method
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.named_models import model_of
 from splatseg.tasks.scene_parts import layer_of

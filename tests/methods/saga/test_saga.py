@@ -354,7 +354,7 @@ def test_cells_have_the_masks_and_features_in_their_middle(walls) -> None:
     source = SagaTargets(walls.evidence, walls.views, first(walls), walls.grids, grid=8)
     choice = source.choice("v1")
     assert (choice.height, choice.width, len(choice.pixels), choice.grid) == (8, 8, 64, True)
-    cells = torch.tensor([63, 0, 27, 35])
+    cells = torch.tensor([63, 0, 27, 35, 42])
     found = source.targets("v1", cells)
     masks = walls.evidence.masks("v1")
     offset = first(walls)["v1"]
