@@ -38,7 +38,8 @@ from splatseg.methods.saga._options import trained_as_published as trained_as_pu
 from splatseg.methods.saga._train import train_saga as train_saga
 
 PUBLISHED_DIFFERS = (
-    f"It differs: {SHORT_STEPS} steps where the paper has 30 000, at {30_000 // SHORT_STEPS} times its rate; "
+    f"It differs: {SHORT_STEPS} steps where the paper has 30 000, at {30_000 // SHORT_STEPS} times "
+    "its rate; "
     "both losses on the 64 x 64 grid; 2D features are those at hand, not SAM's alone."
 )
 
