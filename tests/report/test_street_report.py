@@ -56,7 +56,8 @@ def whole(**changes) -> StreetReportData:
         "depth": (error("a", 0.4, 0.1), error("b", 0.6, 0.3), error("c", None, None)),
         "shaping": shaped, "training": trained(3), "psnr": {"a": 20.0, "b": 23.0},
         "points": PointCounts(
-            folder="labels", by="the vertices of the mesh field", scans=2, points=1000,
+            folder="labels", by="the vertices of the mesh field", vertex_rule="weighed",
+            scans=2, points=1000,
             unlabelled=100, ids={1: 300, 7: 600},
         ),
         "timings": {"points": 1.0, "field": 2.5}, "command": "splatseg street drive --report",

@@ -63,10 +63,11 @@ def save_mesh_field(field: MeshField, path: Path) -> None:
         "ids": list(field.model.ids),
         "layer": field.layer_names[0],
         "radius": field.radius,
-        "vertex_rule": field.vertex_rule,
         "options": asdict(field.model.options),
         "info": layer_info_to_json(field.info),
     }
+    if field.seen is not None:  # else all vertices are asked: nothing tells them apart
+        about["vertex_rule"] = field.vertex_rule
     metadata = {"format": FORMAT, "version": VERSION, "about": json_text(f"{path}: about", about)}
     write_tensors(tensors, path, metadata=metadata)
 
