@@ -182,6 +182,10 @@ METHOD = Method(
     returns="features",
     seeded=True,
     published=PUBLISHED,
+    published_differs=(
+        "It differs: features are those at hand, not LSeg's; Gaussians are filtered by opacity and "
+        "density alone, as the published code does, and not by scale."
+    ),
     words="span",
     published_words="cosines",
     complete=False,

@@ -105,4 +105,8 @@ METHOD = Method(
     keeps_ids=True,
     seeded=True,
     published=PUBLISHED,
+    published_differs=(
+        "It differs: shapes are decoded by our own weights, surfaces come from scans or the depth "
+        "of Gaussians instead of multi-view stereo, and labels are those at hand."
+    ),
 )

@@ -119,6 +119,10 @@ METHOD = Method(
     returns="selection",
     seeded=True,
     published=PUBLISHED,
+    published_differs=(
+        "It differs: words are found by cells of the language features at hand and masks are those "
+        "at hand, unless --grounder and --prompter name networks (LangSAM and SAM in the paper)."
+    ),
     companions={"masks": ("masks", "panoptic", "tracked")},
     models={"grounder": GroundedMasks, "prompter": PromptableMasks, "encoder": TextFeatures},
     complete=False,
