@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from splatseg.core.threads import one_torch_thread
+
 SCRIPT = Path(__file__).parents[2] / "scripts" / "train_point_network"
 
 
@@ -76,8 +78,18 @@ def test_other_domain_has_no_say(script):
     assert float(shares[1, : script.ROOMS].sum()) == 0
 
 
+@pytest.fixture
+def one_thread():
+    """As the script trains by default: torch adds gradients up by its threads in any order."""
+    with one_torch_thread():
+        yield
+
+
+@pytest.mark.bits
 @pytest.mark.parametrize("at", [3, 8])
-def test_what_was_interrupted_ends_the_same(script, recipe, clouds, at, tmp_path, monkeypatch):
+def test_what_was_interrupted_ends_the_same(
+    script, recipe, clouds, at, tmp_path, monkeypatch, one_thread
+):
     """In the first part, and in the second, which begins at step 4 + 2."""
     monkeypatch.setattr(script, "CHECKPOINT_EVERY", 2)
     monkeypatch.setattr(script, "CALIBRATION", 2)
