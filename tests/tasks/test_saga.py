@@ -70,7 +70,7 @@ def test_the_published_setting_is_guided_by_what_is_at_hand(scene, capsys) -> No
     layer = load_layer(scene / "layers" / "paper.npz")
     assert layer.info.options["guidance"] == "features_dino"
     assert AffinityHead.of(layer).projector
-    assert str(layer.info.details["setting"]).startswith("published, 3 steps")
+    assert str(layer.info.details["trained"]).startswith("published, 3 steps")
     status, said = run(capsys, *asked, *few, "--layer", "alone", "--guidance", "None")
     assert status == 0, said
     assert not AffinityHead.of(load_layer(scene / "layers" / "alone.npz")).projector

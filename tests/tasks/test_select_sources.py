@@ -209,7 +209,7 @@ def test_features_trained_as_published_are_asked_as_published(room) -> None:
     scene = load_scene(room)
     count = len(scene.gaussians)
     own = affinity(count)
-    details = {"setting": "published, 30000 steps (paper: 30000)"}
+    details = {"published": True}
     paper = with_info(own, replace(own.info, method="saga", details=details))
     layers = {"own": own, "paper": paper}
 

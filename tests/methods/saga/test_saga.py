@@ -17,10 +17,9 @@ from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.heads import ClassifierHead
 from splatseg.lift.training import RowSampler
 from splatseg.methods import MethodInputs, find_method
-from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods._trained_labels import TrainingContext, loss_curve
 from splatseg.methods.saga import SagaOptions, train_saga, trained_as_published
 from splatseg.methods.saga._targets import SagaTargets
-from splatseg.methods.saga._train import loss_curve
 from splatseg.render import weights
 
 from .conftest import Grids, Masks
@@ -377,30 +376,30 @@ def test_guidance_that_was_asked_for_has_to_be_there(walls) -> None:
 
 
 def test_the_record_says_which_setting_and_how_the_loss_fell(walls, plain) -> None:
-    assert plain.info.details["setting"] == "own"
+    assert plain.info.details["trained"] == "60 steps, not the published setting"
     assert not trained_as_published(plain.info)
-    steps, losses = zip(*plain.info.details["losses"], strict=True)
-    assert (len(steps), steps[-1]) == (50, 60)
+    steps, losses = zip(*plain.info.details["loss_curve"], strict=True)
+    assert (len(steps), steps[-1]) == (60, 60)
     assert 0 < min(losses) < max(losses)
     options = replace(SagaOptions.published(steps=3, guidance=None), grid=8, pixels=64, batch=64)
     features = train_saga(
         walls.gaussians, walls.views, walls.evidence, options=options, context=context()
     )
-    assert features.info.details["setting"] == (
-        "published without 2D features, 3 steps at 10000 times its rate (paper: 30000)"
+    assert features.info.details["trained"] == (
+        "published without 2D features, 3 steps at 10000 times the rate of 30000"
     )
     assert trained_as_published(features.info)
-    assert SagaOptions.published(steps=30_000).setting == "published, 30000 steps (paper: 30000)"
+    assert SagaOptions.published().trained(7) == "published, 7 steps at 100 times the rate of 30000"
     alone = replace(SagaOptions.published(steps=30_000), correspondence="none")
-    assert alone.setting == "published without correspondence, 30000 steps (paper: 30000)"
+    assert alone.trained(30_000) == "published without correspondence, 30000 steps of 30000"
     masks = replace(SagaOptions.published(steps=30_000, guidance=None), guidance_weight=0.0)
-    assert masks.setting == "published without guidance, 30000 steps (paper: 30000)"
+    assert masks.trained(30_000) == "published without guidance, 30000 steps of 30000"
 
 
 def test_losses_are_means_of_stretches() -> None:
     assert loss_curve([4.0, 2.0]) == [[1, 4.0], [2, 2.0]]
-    curve = loss_curve([float(i) for i in range(100)])
-    assert (len(curve), curve[0], curve[-1]) == (50, [2, 0.5], [100, 98.5])
+    curve = loss_curve([float(i) for i in range(200)])
+    assert (len(curve), curve[0], curve[-1]) == (100, [2, 0.5], [200, 198.5])
 
 
 def first(walls) -> dict[str, int]:

@@ -67,7 +67,7 @@ def affinity(count: int) -> Features:
 def published(count: int) -> Features:
     """The same, said to be trained as published."""
     layer = affinity(count)
-    details = {"setting": "published, 30000 steps (paper: 30000)"}
+    details = {"published": True}
     return replace(layer, info=replace(layer.info, method="saga", details=details))
 
 

@@ -222,14 +222,17 @@ class SagaOptions:
         return self.correspondence == "none" or self.correspondence_weight == 0
 
     @property
-    def setting(self) -> str:
-        """What the record of a layer says of the setting.
+    def is_published(self) -> bool:
+        """Whether features are those of the paper: free, without a gate, begun at random.
 
-        Features that start at random, are free and have no gate are those of the paper: selections
-        compare them as it does, see `trained_as_published`.
+        Selections compare them as it does, see `trained_as_published`.
         """
-        if self.start != "normal" or self.unit or self.correspondence == "scale":
-            return "own"
+        return self.start == "normal" and not self.unit and self.correspondence != "scale"
+
+    def trained(self, steps: int) -> str:
+        """How long features were trained, beside what was published."""
+        if not self.is_published:
+            return f"{steps} steps, not the published setting"
         left_out = [
             name
             for name, missing in (
@@ -240,12 +243,9 @@ class SagaOptions:
             if missing
         ]
         without = f" without {' and '.join(left_out)}" if left_out else ""
-        rate = (
-            ""
-            if self.rate == PUBLISHED_RATE
-            else f" at {self.rate / PUBLISHED_RATE:g} times its rate"
-        )
-        return f"published{without}, {self.steps} steps{rate} (paper: {PUBLISHED_STEPS})"
+        times = self.rate / PUBLISHED_RATE
+        rate = "" if times == 1 else f" at {times:g} times the rate"
+        return f"published{without}, {steps} steps{rate} of {PUBLISHED_STEPS}"
 
     @property
     def by_level(self) -> bool:
@@ -330,4 +330,4 @@ class SagaOptions:
 
 def trained_as_published(info: LayerInfo) -> bool:
     """Whether a layer's record says that its features are those of SAGA's paper."""
-    return info.method == "saga" and str(info.details.get("setting", "")).startswith("published")
+    return info.method == "saga" and info.details.get("published") is True

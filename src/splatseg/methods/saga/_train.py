@@ -7,14 +7,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseg.core import JSON, LEARNED_BYTES, Features, FeatureSource, Gaussians, LayerInfo, View
+from splatseg.core import (
+    LEARNED_BYTES,
+    LOSS_CURVE,
+    Features,
+    FeatureSource,
+    Gaussians,
+    LayerInfo,
+    View,
+)
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.mass.adjoint import voting_views
 from splatseg.lift.training import MaskSets, RowSampler, TrainingResult, train
-from splatseg.methods._trained_labels import TrainingContext
+from splatseg.methods._trained_labels import TrainingContext, loss_curve
 from splatseg.methods.associate import associate_masks
 from splatseg.methods.saga._association import MaskSegments, association_start
 from splatseg.methods.saga._mask_table import MaskTable, mask_table
@@ -25,10 +33,6 @@ from splatseg.methods.saga._targets import KeptMasks, SagaTargets
 
 _START = 0x5A6A
 """What the generator of first values is seeded with besides the seed."""
-
-
-_CURVE = 50
-"""Points of the curve of losses in a record."""
 
 
 @boundary
@@ -196,8 +200,9 @@ def _info(
         seed=seed,
         head=head.to_json(),
         details={
-            "setting": options.setting,
-            "losses": loss_curve(result.losses),
+            "published": options.is_published,
+            "trained": options.trained(len(result.losses)),
+            LOSS_CURVE: loss_curve(result.losses),
             "loss": float(np.mean(result.losses[-20:])),
             "steps": len(result.losses),
             "best_step": result.best_step,
@@ -206,10 +211,3 @@ def _info(
             LEARNED_BYTES: result.learned_bytes,
         },
     )
-
-
-def loss_curve(losses: Sequence[float]) -> list[JSON]:
-    """The last step of each of at most 50 equal stretches of a training, and its mean loss."""
-    parts = np.array_split(np.asarray(losses, dtype=np.float64), min(len(losses), _CURVE))
-    ends = np.cumsum([len(part) for part in parts]).tolist()
-    return [[int(end), float(part.mean())] for end, part in zip(ends, parts, strict=True)]
