@@ -194,21 +194,25 @@ def replace_views(halves):
     return Changed()
 
 
-@pytest.mark.bits
-def test_what_was_interrupted_goes_on_to_the_same_bits(halves, encoder_file, tmp_path) -> None:
-    whole = trained(halves, encoder_file)
-    path = tmp_path / "training.npz"
+def interrupted(halves, encoder_file, folder, **setting):
+    """The layer of a training that was interrupted and went on, and the context it went on with."""
+    path = folder / "training.npz"
 
     def stop(state) -> None:
         if state.step == 11:
             raise KeyboardInterrupt
 
+    stopped = context(checkpoints=Checkpoints(path=path), progress=stop)
     with pytest.raises(KeyboardInterrupt):
-        trained(
-            halves, encoder_file, given=context(checkpoints=Checkpoints(path=path), progress=stop)
-        )
+        trained(halves, encoder_file, given=stopped, **setting)
     resumed = context(checkpoints=Checkpoints(path=path, resume=True))
-    assert torch.equal(trained(halves, encoder_file, given=resumed).values, whole.values)
+    return trained(halves, encoder_file, given=resumed, **setting), resumed
+
+
+@pytest.mark.bits
+def test_what_was_interrupted_goes_on_to_the_same_bits(halves, encoder_file, tmp_path) -> None:
+    again, resumed = interrupted(halves, encoder_file, tmp_path)
+    assert torch.equal(again.values, trained(halves, encoder_file).values)
     with pytest.raises(InputError, match="distilled"):
         trained(halves, encoder_file, given=resumed, components=2)
 
@@ -273,19 +277,7 @@ def test_what_was_interrupted_under_the_published_setting_goes_on(
     """With running statistics and drop-out; the layer knows its loss curve."""
     setting = VISIBLE | {"dropout": 0.5, "blend": "features", "sampling": "strata"}
     whole = trained(halves, encoder_file, **setting)
-    path = tmp_path / "training.npz"
-
-    def stop(state) -> None:
-        if state.step == 11:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        trained(
-            halves, encoder_file, **setting,
-            given=context(checkpoints=Checkpoints(path=path), progress=stop),
-        )  # fmt: skip
-    resumed = context(checkpoints=Checkpoints(path=path, resume=True))
-    again = trained(halves, encoder_file, **setting, given=resumed)
+    again, _ = interrupted(halves, encoder_file, tmp_path, **setting)
     assert torch.equal(again.values, whole.values)
     curve = whole.info.details["loss_curve"]
     assert again.info.details["loss_curve"] == curve

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import Camera
+from splatseg.lift.points.sight import seen_points
 
 _NEAR = 1e-3
 """z-depth, as a part of the length in which views count in full, below which nothing is seen."""
@@ -60,19 +61,17 @@ def view_votes(
     flat = votes.view(-1)
     at = points.double()
     for view in views:
-        camera = view.camera
-        pixels, z = camera.project(at)
-        size = pixels.new_tensor([camera.width, camera.height])
-        inside = (z > _NEAR * full_distance) & ((pixels >= 0) & (pixels < size)).all(dim=1)
-        rows = torch.nonzero(inside).squeeze(1)
-        column, row = pixels[rows].long().unbind(dim=1)
-        depth = z[rows]
-        surface = view.depth[row, column].double()
-        label = view.columns[row, column].long()
-        seen = (
-            (label >= 0) & (surface > 0) & (depth <= (1 + relative_tolerance) * surface + tolerance)
+        seen = seen_points(
+            at,
+            view.camera,
+            view.depth,
+            tolerance=tolerance,
+            relative_tolerance=relative_tolerance,
+            near=_NEAR * full_distance,
         )
-        weight = (full_distance / depth[seen]).clamp_max(1).float()
+        label = view.columns[seen.rows, seen.columns].long()
+        named = label >= 0
+        weight = (full_distance / seen.depth[named]).clamp_max(1).float()
         # A view names each point once, so that nothing is added twice to one number.
-        flat[rows[seen] * labels + label[seen]] += weight
+        flat[seen.points[named] * labels + label[named]] += weight
     return votes
