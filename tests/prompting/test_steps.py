@@ -7,7 +7,7 @@ import torch
 
 from splatseg.neighbours import NeighbourIndex
 from splatseg.prompting import steps
-from splatseg.prompting.context import SceneIndex, SelectionContext
+from splatseg.prompting.context import PostProcessing, SceneIndex, SelectionContext
 from splatseg.prompting.filtering import FilterOptions, statistical_filter
 from splatseg.prompting.growing import GrowOptions, ball_grow
 from splatseg.prompting.prompts import ViewPrompt
@@ -71,7 +71,7 @@ def test_section_3_5_to_the_letter(gaussians, view, field, rng, monkeypatch) -> 
     """All neighbours count, the farthest pair is the radius, and whatever lies in it joins."""
     index = NeighbourIndex(gaussians)
     usual = context(gaussians, view, "features")
-    letter = replace(usual, published=True)
+    letter = replace(usual, post_processing=PostProcessing.published())
     members = field > 0.5
     scattered = members.clone()
     scattered[torch.nonzero(field < 0.5)[::40, 0]] = True
@@ -96,9 +96,10 @@ def test_section_3_5_to_the_letter(gaussians, view, field, rng, monkeypatch) -> 
     mask[11:19, 2:18] = True
     shown = context(gaussians, view, "features", mask=mask)
     seeds = filtered(confidence, shown) > 0.5
-    whole = filtered(confidence, replace(shown, published=True)) > 0.5
+    letter = replace(shown, post_processing=PostProcessing.published())
+    whole = filtered(confidence, letter) > 0.5
     assert int(whole.sum()) >= int(seeds.sum())
-    assert not (grown(field, replace(shown, published=True)) > 0.5)[excluded(gaussians)].any()
+    assert not (grown(field, letter) > 0.5)[excluded(gaussians)].any()
 
 
 def excluded(gaussians) -> torch.Tensor:

@@ -8,12 +8,38 @@ from torch import Tensor
 
 from splatseg.core import Gaussians, Selection, View
 from splatseg.neighbours import NeighbourIndex
+from splatseg.prompting.filtering import FilterOptions
 from splatseg.prompting.graph import NeighbourGraph, build_graph
+from splatseg.prompting.growing import GrowOptions
 from splatseg.prompting.seen import SeenPrompt
 from splatseg.prompting.view_cache import ViewCache
 
 _POINTED_AT = 0.1
 """Least blending weight of a Gaussian in a pixel that points at it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PostProcessing:
+    """How what features select is filtered and grown (SAGA, section 3.5)."""
+
+    filtering: FilterOptions = FilterOptions()
+    """Of members far from the others, where no mask confirms any."""
+
+    region: GrowOptions = GrowOptions()
+    """How far members that a mask confirms reach among the others."""
+
+    balls: GrowOptions = GrowOptions(radius_quantile=0.5)
+    """How far all of them grow at last: no farther than their usual distance, so that what is
+    beside a thing does not join."""
+
+    joining: float = 0.25
+    """Confidence above which a Gaussian may be grown into; below 0 all may."""
+
+    @classmethod
+    def published(cls) -> "PostProcessing":
+        """Section 3.5 to the letter."""
+        growing = GrowOptions.published()
+        return cls(filtering=FilterOptions.published(), region=growing, balls=growing, joining=-1.0)
 
 
 class SceneIndex:
@@ -68,8 +94,8 @@ class SelectionContext:
     unseen: Bool[Tensor, "n"] | None = None
     """Gaussians of which the source knows nothing; None where it knows of all."""
 
-    published: bool = False
-    """Whether what follows features is SAGA's section 3.5 to the letter."""
+    post_processing: PostProcessing = PostProcessing()
+    """How what features select is filtered and grown."""
 
     granularity: float | None = None
     """What was asked for, see `sources.MembershipSource`."""

@@ -1,8 +1,8 @@
 """The steps that clean a selection, joined: what each source needs of them.
 
 Features match Gaussians one by one, so that what they select is thin and has specks: it is filtered
-and grown as SAGA's section 3.5 says, with distances that one stray Gaussian does not decide, or to
-the letter where the context says so (`SelectionContext.published`). Masks and layers have
+and grown as SAGA's section 3.5 says, by default with distances that one stray Gaussian does not
+decide (`SelectionContext.post_processing`). Masks and layers have
 memberships that were solved for through the pixels; of these only specks, holes and what no view
 shows is left to mend.
 """
@@ -14,8 +14,8 @@ from torch import Tensor
 from splatseg.core import LabelMap, Selection
 from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.prompting.context import SelectionContext
-from splatseg.prompting.filtering import FilterOptions, statistical_filter
-from splatseg.prompting.growing import GrowOptions, ball_grow, region_grow
+from splatseg.prompting.filtering import statistical_filter
+from splatseg.prompting.growing import ball_grow, region_grow
 from splatseg.prompting.holes import complete_membership, holes, specks
 from splatseg.prompting.next_click import NextClick, next_click
 from splatseg.prompting.refine import refine
@@ -29,10 +29,6 @@ _OUT = 0.499
 _INSIDE = 0.5
 """Share of what a view sees of a Gaussian that has to lie in its mask."""
 
-_GROWTH = GrowOptions(radius_quantile=0.5)
-"""How far the members of features grow: no farther than their usual distance, so that what is
-beside a thing does not join."""
-
 
 def filtered(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[Tensor, "n"]:
     """Without outliers and specks."""
@@ -44,10 +40,9 @@ def filtered(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float
         index = context.neighbours.index
         seeds = None if validated is None else validated & mask
         if seeds is not None and bool(seeds.any()):
-            kept = region_grow(index, seeds, mask, _published_growth(context) or GrowOptions())
+            kept = region_grow(index, seeds, mask, context.post_processing.region)
         else:
-            filtering = FilterOptions.published() if context.published else FilterOptions()
-            kept = statistical_filter(index, mask, filtering)
+            kept = statistical_filter(index, mask, context.post_processing.filtering)
         return _with_mask(confidence, kept)
     selection = Selection(mask=mask)
     clicked = context.pointed_at(positive=True) & selection
@@ -62,11 +57,12 @@ def grown(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[Te
         return confidence
     mask = confidence > 0.5
     _, excluded = _by_masks(context)
-    among = torch.ones_like(mask) if context.published else confidence > 0.25
+    growth = context.post_processing
+    among = confidence > growth.joining
     if excluded is not None:
         among &= ~excluded
-    growth = _published_growth(context) or _GROWTH
-    return _with_mask(confidence, ball_grow(context.neighbours.index, mask, growth, among=among))
+    kept = ball_grow(context.neighbours.index, mask, growth.balls, among=among)
+    return _with_mask(confidence, kept)
 
 
 def refined(confidence: Float[Tensor, "n"], context: SelectionContext) -> Float[Tensor, "n"]:
@@ -106,10 +102,6 @@ def advised(confidence: Float[Tensor, "n"], context: SelectionContext) -> NextCl
         rejected=context.pointed_at(positive=False),
         backend=context.views.backend,
     )
-
-
-def _published_growth(context: SelectionContext) -> GrowOptions | None:
-    return GrowOptions.published() if context.published else None
 
 
 def _with_mask(confidence: Tensor, mask: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from splatseg.core import JSON, Gaussians, Layer, LayerInfo, PromptableMasks, Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, ShapeError
-from splatseg.prompting.context import SceneIndex
+from splatseg.prompting.context import PostProcessing, SceneIndex
 from splatseg.prompting.pipeline import (
     NextClickHint,
     SelectionContext,
@@ -172,7 +172,7 @@ class SelectionSession:
         context = self._seen(shown, options, seconds)
         confidence = self._membership(context, similar, seconds)
         if shown or similar:
-            enabled = _steps(options, published=context.published)
+            enabled = _steps(options, published=self._published(options))
             confidence, steps = postprocess(confidence, context, enabled=enabled)
             seconds |= steps
         confidence = within(confidence, solids, self._scene.gaussians)
@@ -245,7 +245,9 @@ class SelectionSession:
             unseen=None if self._opened is None else getattr(self._opened.source, "unseen", None),
             scene_views=self._scene.train_views,
             source="" if self._opened is None else self._opened.name,
-            published=self._published(options),
+            post_processing=(
+                PostProcessing.published() if self._published(options) else PostProcessing()
+            ),
             granularity=options.level,
             seed=options.seed,
         )
