@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
@@ -50,8 +51,6 @@ def project_root() -> Path:
 @pytest.fixture(autouse=True)
 def _draws_begin_anew() -> None:
     """Torch draws the same numbers in a test, whatever ran before it."""
-    import torch
-
     torch.manual_seed(20240817)
 
 
