@@ -1,8 +1,11 @@
 """What a notebook does with values: shows them, opens their pictures and layers, moves them."""
 
+from typing import Any, TypeVar
+
 import numpy as np
 import pytest
 import torch
+from typing_extensions import TypeAliasType
 
 from splatseg.core import (
     Gaussians,
@@ -14,6 +17,7 @@ from splatseg.core import (
     Selection,
     TreeNode,
 )
+from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.layers import load_layer
 from splatseg.render import back_project, render
@@ -106,6 +110,25 @@ def test_arrays_are_taken_where_tensors_are(world) -> None:
         back_project(g, poison.CAMERA, np.zeros((9, 12), np.uint8))
     with pytest.raises(InputError, match=r"means: expected a tensor or an array .* got None"):
         g.replace(means=None)
+
+
+def test_annotations_that_are_named_are_checked_as_what_they_name() -> None:
+    """NumPy 2.5 made `NDArray` such a name, and nothing that it annotates was checked there."""
+    element = TypeVar("element", bound=np.generic)
+    array = TypeAliasType("array", np.ndarray[Any, np.dtype[element]], type_params=(element,))
+    count = TypeAliasType("count", int)
+
+    def taken(runs: Any, height: Any) -> tuple[Any, Any]:
+        return runs, height
+
+    taken.__annotations__.update(runs=array[np.uint32], height=count)
+    taken = boundary(taken)
+    runs, height = taken([3, 4], np.int64(7))
+    assert (runs.dtype, runs.tolist(), type(height)) == (np.uint32, [3, 4], int)
+    with pytest.raises(InputError, match="runs"):
+        taken(None, 7)
+    with pytest.raises(InputError, match="height: expected a whole number"):
+        taken([3, 4], "seven")
 
 
 def test_rows_are_chosen_by_masks_lists_and_arrays(world) -> None:

@@ -44,6 +44,7 @@ def _benches() -> list[Bench]:
                 defaults={"alpha_max": 0.999},
                 image_tolerance=1e-4,
                 adjoint_tolerance=1e-3,
+                sum_tolerance=1e-5,
             )
         )
     return benches

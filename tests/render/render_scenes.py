@@ -24,6 +24,17 @@ class Bench:
     defaults: dict[str, Any] = field(default_factory=dict)
     image_tolerance: float = 2e-5
     adjoint_tolerance: float = 1e-5
+    sum_tolerance: float = 0.0
+    """How far two runs may be apart, of the largest: 0 where sums have one order."""
+
+    def same(self, one: Tensor, other: Tensor) -> bool:
+        """Whether two runs of one product gave the same."""
+        if self.sum_tolerance == 0 or not one.is_floating_point():
+            return torch.equal(one, other)
+        if one.shape != other.shape:
+            return False
+        bound = self.sum_tolerance * other.abs().amax() if other.numel() else 0
+        return bool(((one - other).abs() <= bound).all())
 
     def options(self, **changes: Any) -> RenderOptions:
         return RenderOptions(**(self.defaults | changes))

@@ -122,6 +122,7 @@ def converters(owner: Any, names: tuple[str, ...]) -> dict[str, Converter]:
 
 def _converter(annotation: Any) -> Converter | None:
     """What makes a value of an annotation, None where anything will do."""
+    annotation = _unaliased(annotation)
     if annotation in _SCALARS:
         return _SCALARS[annotation]
     origin, args = typing.get_origin(annotation), typing.get_args(annotation)
@@ -148,6 +149,15 @@ def _converter(annotation: Any) -> Converter | None:
             return _tensor_of(annotation)
         return functools.partial(_instance, annotation) if _is_checkable(annotation) else None
     return None
+
+
+def _unaliased(annotation: Any) -> Any:
+    """What a `type` statement gave a name to; NumPy's `NDArray` is such a name from 2.5 on."""
+    alias = typing.get_origin(annotation) or annotation
+    if not hasattr(alias, "__value__"):
+        return annotation
+    args = typing.get_args(annotation)
+    return _unaliased(alias.__value__[args] if args else alias.__value__)
 
 
 def _is_checkable(annotation: type[Any]) -> bool:
