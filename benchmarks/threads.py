@@ -1,9 +1,10 @@
-"""What a second thread brings: wall time with one and with two, alternated, least of the repeats.
+"""What more threads bring: wall time with one and with more, alternated, least of the repeats.
 
     python benchmarks/threads.py --repeats 15
+    python benchmarks/threads.py --threads 1 2 4 8 16
 
-On a shared machine the second core is seldom free: run it in a quiet moment. The results of one
-and two threads are compared as well; they must be the same to the bit.
+On a shared machine the second core is seldom free: run it in a quiet moment. The results are
+compared as well; they must be the same to the bit, whatever the number.
 """
 
 import argparse
@@ -21,7 +22,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     args = parser.parse_args()
+    counts: list[int] = args.threads
     scene, view_camera = room(args.gaussians, 0), camera()
     cloud = (scene.means, scene.rotations, scene.scales, scene.opacities)
     options = RenderOptions()
@@ -68,23 +71,24 @@ def main() -> None:
         "backward 2D": backward,
     }
     print(f"{args.gaussians} Gaussians, {size[1]}x{size[0]}, {isa()}; wall milliseconds")
+    print(f"{'threads':14}" + "".join(f"{count:8}" for count in counts))
     for name, call in stages.items():
-        best, found = [float("inf")] * 2, [torch.zeros(())] * 2
+        best = {count: float("inf") for count in counts}
+        found: dict[int, torch.Tensor] = {}
         for _ in range(args.repeats):
-            for count in (1, 2):
+            for count in counts:
                 set_threads(count)
                 if name == "backward 2D":
                     view.render(record=True)
                     forward = view._forward
                 begin = time.perf_counter()
                 result = call()
-                best[count - 1] = min(best[count - 1], (time.perf_counter() - begin) * 1e3)
-                found[count - 1] = result.clone()
-        same = torch.equal(*found)
-        print(
-            f"{name:14}{best[0]:8.1f}{best[1]:8.1f}   {best[0] / best[1]:.2f}x"
-            f"   {'same bits' if same else 'BITS DIFFER'}"
-        )
+                best[count] = min(best[count], (time.perf_counter() - begin) * 1e3)
+                found[count] = result.clone()
+        same = all(torch.equal(found[counts[0]], other) for other in found.values())
+        times = "".join(f"{best[count]:8.1f}" for count in counts)
+        gain = best[counts[0]] / best[counts[-1]]
+        print(f"{name:14}{times}   {gain:.2f}x   {'same bits' if same else 'BITS DIFFER'}")
 
 
 if __name__ == "__main__":
