@@ -42,7 +42,7 @@ def run(folder: Path, project_root: Path, monkeypatch, ends: str, *words: str) -
         monkeypatch.delenv(name, raising=False)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-ra", *words]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    return done.returncode, done.stdout + done.stderr
+    return done.returncode, done.stderr + done.stdout
 
 
 @pytest.mark.parametrize("words", [(), ("-n", "2", "--dist", "worksteal")])
