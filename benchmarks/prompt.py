@@ -14,7 +14,7 @@ phrases whose own instance has the largest plain cosine. `classes` asks for name
 objects of each. `true` gives true masks of the initial views instead of words: what is lost after
 words are found. `seen_often` are phrases whose instance more than 60 % of the train views show.
 `boundaries` are phrases that were found, by pooled IoU: as selected (`usual`), without confidence
-(`hard`), decomposed at the masks of five views as SA-GS does it, and split by `cut_masks`.
+(`hard`), and split by `cut_masks`.
 """
 
 import argparse
@@ -38,7 +38,6 @@ from splatseg.core import LabelMap, Rle, Scene, Selection, View
 from splatseg.io.evidence import FeatureEvidence, load_text_embeddings, open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift.boundaries.cut import cut_masks
-from splatseg.lift.boundaries.decompose_masks import decompose_at_masks
 from splatseg.lift.vocabulary import vocabulary_of
 from splatseg.methods.prompt import (
     PUBLISHED,
@@ -302,11 +301,8 @@ class _ObjectMaps:
         return LabelMap(ids=torch.where(self.masks[name], 1, 2).int())
 
 
-DECOMPOSED_VIEWS = 5
-
-
 def boundaries(bench: Bench) -> None:
-    """Decomposition at masks (SA-GS), and our own splitting, of phrases that were found."""
+    """Gaussians at rims of phrases that were found: as they are, and split."""
     session = bench.session(PromptOptions())
     rows: list[list[float]] = []
     for one in bench.phrases:
@@ -317,10 +313,6 @@ def boundaries(bench: Bench) -> None:
         masks = [(view, rle.decode()) for view, rle in made.masks]
         usual = Selection.of_confidence(made.confidence)
         hard = Selection(mask=usual.mask)
-        step = max(1, len(masks) // DECOMPOSED_VIEWS)
-        edited, inside = decompose_at_masks(
-            bench.scene.gaussians, hard, masks[::step][:DECOMPOSED_VIEWS]
-        )
         cut = cut_masks(
             bench.scene.gaussians,
             [view for view, _ in masks],
@@ -330,7 +322,6 @@ def boundaries(bench: Bench) -> None:
         scenes = (
             (bench.scene.gaussians, usual),
             (bench.scene.gaussians, hard),
-            (edited.gaussians, inside),
             (cut.edited.gaussians, cut.inside),
         )
         rows.append([])
@@ -338,7 +329,7 @@ def boundaries(bench: Bench) -> None:
             views = TestViews(replace(bench.scene, gaussians=gaussians), bench.data)
             rows[-1].append(float(views.scores([selection], [one.id]).pooled[0]))
         print(one.words, [round(value, 4) for value in rows[-1]], flush=True)
-    names = ("usual", "hard", "decomposed", "cut")
+    names = ("usual", "hard", "cut")
     said = {name: float(value) for name, value in zip(names, np.mean(rows, axis=0), strict=True)}
     bench.results["boundaries"] = said | {"phrases": len(rows)}
     print("boundaries", len(rows), {k: round(v, 4) for k, v in said.items()}, flush=True)
