@@ -1,7 +1,7 @@
 """Words voted into 3D: phrases of instances and names of classes, on test views (issue 16, item 1).
 
-    python benchmarks/prompt.py SCENE ../shared/data/office [--rows default single random ...]
-        [--limit N] [--check N] [--json FILE] [--work DIR]
+    python benchmarks/prompt.py SCENE ../shared/data/office [--rows default published+true ...]
+        [--seeds 0 1 2] [--limit N] [--check N] [--json FILE]
 
 Every phrase of `text_embeddings` whose instance at least three test views show is asked for, the
 selection is rendered into the test views as `splatseg render --what SELECTION` does it, and scored
@@ -9,10 +9,18 @@ as `score.py binary` does it. `found`: phrases whose masks in the initial views 
 instance that is meant. IoU is the mean over views (a view in which neither is anything counts 1),
 `pooled` sums over views first. A phrase without an answer has a selection of nothing.
 
+With several seeds numbers are means over them; `spread` is the standard deviation of the IoU over
+seeds, and `interval` holds 95 % of the means of phrases drawn anew (bootstrap).
+
+A row of options is followed by what is true in it: `+words` gives true masks of the initial views
+instead of what words find, `+masks` lets an oracle segmenter answer points (`TrueMasks`: the
+smallest true part or thing that holds them, ragged, 8 % missing) instead of recorded masks. So
+`published`, `published+words`, `published+masks` and `published+words+masks` tell what words and
+masks cost, `published-weight` and `published-visible` beside them what eq. 6 and eq. 8 do.
+
 `oracle` is the ceiling: mean features of the true instances in train views, and the share of the
 phrases whose own instance has the largest plain cosine. `classes` asks for names of classes, all
-objects of each. `true` gives true masks of the initial views instead of words: what is lost after
-words are found. `seen_often` are phrases whose instance more than 60 % of the train views show.
+objects of each. `seen_often` are phrases whose instance more than 60 % of the train views show.
 `boundaries` are phrases that were found, by pooled IoU: as selected (`usual`), without confidence
 (`hard`), and split by `cut_masks`.
 """
@@ -23,7 +31,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +39,11 @@ import numpy as np
 import torch
 from click_targets import MIN_TEST_VIEWS
 from numpy.typing import NDArray
-from PIL import Image
-from selected_views import TestViews
+from selected_views import Scores, TestViews
+from true_masks import TrueMasks, id_map
 
 from splatseg.core import LabelMap, Rle, Scene, Selection, View
+from splatseg.errors import InputError
 from splatseg.io.evidence import FeatureEvidence, load_text_embeddings, open_evidence
 from splatseg.io.scene import load_scene
 from splatseg.lift.boundaries.cut import cut_masks
@@ -48,6 +57,7 @@ from splatseg.methods.prompt import (
 )
 
 SEEN_OFTEN = 0.6
+LEAST_PIXELS = 16
 AT_ONCE = 32
 
 
@@ -83,14 +93,16 @@ class Bench:
         self.tests = TestViews(self.scene, self.data)
         self.phrases = self._phrases()
         self.results: dict[str, Any] = {}
-        self.found: dict[tuple[str, str, int], tuple[list[list[FoundObject]], float]] = {}
-        evidence = open_evidence(self.data / "features_text")
+        self.found: dict[
+            tuple[str, str, int, int, bool], tuple[list[list[FoundObject]], float]
+        ] = {}
+        evidence = open_evidence(self.args.features or self.data / "features_text")
         if not isinstance(evidence, FeatureEvidence):
             raise SystemExit("features_text: expected features")
         self.sources = PromptSources(features=evidence, masks=open_evidence(self.data / args.masks))
 
     def truth(self, view: View, level: str = "instance") -> NDArray[np.int64]:
-        return _map(self.data / level / f"{view.name}.png")
+        return id_map(self.data / level / f"{view.name}.png")
 
     def _phrases(self) -> list[Phrase]:
         shown: dict[int, int] = {}
@@ -108,13 +120,15 @@ class Bench:
             found = [found[place] for place in places]
         return found
 
-    def session(self, options: PromptOptions) -> PromptSession:
+    def session(self, options: PromptOptions, seed: int, *, masks: bool = False) -> PromptSession:
+        """A session; with `masks` true ones answer points."""
+        prompter = TrueMasks(self.scene, self.data, seed) if masks else None
         return PromptSession(
             self.scene.gaussians,
             self.scene.train_views,
-            self.sources,
+            replace(self.sources, prompter=prompter),
             options=options,
-            seed=self.args.seed,
+            seed=seed,
         )
 
     def right(self, found: FoundObject, id: int) -> bool:
@@ -126,16 +140,31 @@ class Bench:
             total += int(mask.sum())
         return inside > 0.5 * total
 
-    def asked(self, options: PromptOptions) -> tuple[list[Answered], dict[str, float]]:
-        """All phrases, each by itself."""
-        session = self.session(options)
+    def asked(
+        self, options: PromptOptions, seed: int, *, words: bool, masks: bool
+    ) -> tuple[list[Answered], dict[str, float]]:
+        """All phrases, each by itself; with `words` and `masks` those are true."""
+        session = self.session(options, seed, masks=masks)
         # What is found depends on these alone; it is kept from row to row.
-        key = (options.region, options.initial, options.initial_views)
+        key = (options.region, options.initial, options.initial_views, seed, words)
         if key not in self.found:
             began = time.perf_counter()
-            found = [session.find(one.words)[:1] for one in self.phrases]
+            if words:
+                found = [self.true_object(session.initial, one) for one in self.phrases]
+            else:
+                found = [session.find(one.words)[:1] for one in self.phrases]
             self.found[key] = (found, time.perf_counter() - began)
         return self.voted(session, *self.found[key])
+
+    def true_object(self, views: Sequence[View], phrase: Phrase) -> list[FoundObject]:
+        """What a phrase means, by its true masks."""
+        masks: list[tuple[View, Rle]] = []
+        for view in views:
+            mask = torch.from_numpy(self.truth(view) == phrase.id)
+            if int(mask.sum()) >= LEAST_PIXELS:
+                masks.append((view, Rle.encode(mask)))
+        found = FoundObject(word=phrase.words, probability=1.0, masks=tuple(masks))
+        return [found] if masks else []
 
     def voted(
         self, session: PromptSession, found: Sequence[Sequence[FoundObject]], finding: float
@@ -146,7 +175,12 @@ class Bench:
         there = [place for place, objects in enumerate(found) if objects]
         for start in range(0, len(there), AT_ONCE):
             part = there[start : start + AT_ONCE]
-            made = session.select([found[place][0] for place in part])
+            try:
+                made = session.select([found[place][0] for place in part])
+            except InputError as error:  # no view has a mask of any of them
+                if "masks: expected" not in str(error):
+                    raise
+                continue
             calls += made.mask_calls
             for place, one in zip(part, made.objects, strict=True):
                 views += one.projected
@@ -163,43 +197,59 @@ class Bench:
             "views": views / count,
         }
 
-    def row(self, name: str, answers: Sequence[Answered], facts: dict[str, float]) -> None:
-        """Score what came, print it and keep it."""
-        selections = [one.selection for one in answers]
-        scores = self.tests.scores(selections, [one.id for one in self.phrases])
-        right = np.array([one.right for one in answers])
-        said: dict[str, Any] = {"phrases": len(answers), "found": int(right.sum())}
-        said["share"] = float(right.mean())
-        for kind in ("iou", "pooled", "accuracy"):
-            values = getattr(scores, kind)
-            said[kind] = float(values.mean())
-            said[f"{kind}_found"] = float(values[right].mean()) if right.any() else 0.0
-        often = self.often()
+    def row(self, name: str, options: PromptOptions, *, words: bool, masks: bool) -> None:
+        """Ask with each seed, score what came, print it and keep it."""
+        ids = [one.id for one in self.phrases]
+        ious, pooled, rights = [], [], []
+        facts: list[dict[str, float]] = []
+        for seed in self.args.seeds:
+            answers, said = self.asked(options, seed, words=words, masks=masks)
+            selections = [one.selection for one in answers]
+            scores = self.tests.scores(selections, ids)
+            ious.append(scores.iou)
+            pooled.append(scores.pooled)
+            rights.append(np.array([one.right for one in answers]))
+            facts.append(said | {"accuracy": float(scores.accuracy.mean())})
+            if self.args.check:
+                self.check(selections, scores)
+        iou, right = np.stack(ious), np.stack(rights)
+        said: dict[str, Any] = {
+            "phrases": len(ids),
+            "found": float(right.sum(axis=1).mean()),
+            "share": float(right.mean()),
+            "iou": float(iou.mean()),
+            "spread": float(iou.mean(axis=1).std(ddof=1)) if len(iou) > 1 else 0.0,
+            "interval": [round(float(end), 4) for end in interval(iou.mean(axis=0))],
+            "pooled": float(np.mean(pooled)),
+            "iou_found": float(iou[right].mean()) if right.any() else 0.0,
+            "pooled_found": float(np.stack(pooled)[right].mean()) if right.any() else 0.0,
+        }
+        often = self.often
         if often.any():
             said["seen_often"] = int(often.sum())
-            said["iou_seen_often"] = float(scores.iou[often].mean())
-            both = often & right
-            said["iou_seen_often_found"] = float(scores.iou[both].mean()) if both.any() else 0.0
-        said |= facts
+            said["iou_seen_often"] = float(iou[:, often].mean())
+        said |= {key: float(np.mean([one[key] for one in facts])) for key in facts[0]}
         self.results[name] = said | {
             "by_phrase": [
-                [one.words, bool(right[i]), round(float(scores.iou[i]), 4),
-                 round(float(scores.pooled[i]), 4)]
-                for i, one in enumerate(self.phrases)
+                [one.words, float(right[:, at].mean()), *iou[:, at].round(4).tolist()]
+                for at, one in enumerate(self.phrases)
             ]
-        }  # fmt: skip
-        print(name, {k: round(v, 4) for k, v in said.items()}, flush=True)
-        if self.args.check:
-            with tempfile.TemporaryDirectory() as folder:
-                self.tests.check(
-                    selections,
-                    self.phrases,
-                    Path(folder),
-                    self.args.check,
-                    scores,  # type: ignore[arg-type]
-                )
+        }
+        shown = {k: round(v, 4) if isinstance(v, float) else v for k, v in said.items()}
+        print(name, shown, flush=True)
 
-    @lru_cache(maxsize=1)  # noqa: B019
+    def check(self, selections: Sequence[Selection], scores: Scores) -> None:
+        """Hold some phrases to `score.py`."""
+        with tempfile.TemporaryDirectory() as folder:
+            self.tests.check(
+                selections,
+                self.phrases,  # type: ignore[arg-type]
+                Path(folder),
+                self.args.check,
+                scores,
+            )
+
+    @cached_property
     def often(self) -> NDArray[np.bool_]:
         """Phrases whose instance more than 60 % of the train views show."""
         maps = [set(np.unique(self.truth(view)).tolist()) for view in self.scene.train_views]
@@ -207,9 +257,12 @@ class Bench:
         return np.array(share) > SEEN_OFTEN
 
 
-@lru_cache(maxsize=512)
-def _map(path: Path) -> NDArray[np.int64]:
-    return np.asarray(Image.open(path)).astype(np.int64)
+def interval(values: NDArray[np.float64], draws: int = 2000) -> tuple[float, float]:
+    """Between which 95 % of the means of values drawn anew lie."""
+    rng = np.random.default_rng(0)
+    means = values[rng.integers(0, len(values), (draws, len(values)))].mean(axis=1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(low), float(high)
 
 
 def oracle(bench: Bench) -> None:
@@ -240,22 +293,6 @@ def oracle(bench: Bench) -> None:
     print("oracle", said, flush=True)
 
 
-def true_masks(bench: Bench) -> None:
-    """Selections from the true masks of the initial views."""
-    session = bench.session(PromptOptions())
-    found: list[list[FoundObject]] = []
-    for one in bench.phrases:
-        masks: list[tuple[View, Rle]] = []
-        for view in session.initial:
-            mask = torch.from_numpy(bench.truth(view) == one.id)
-            if int(mask.sum()) >= 16:
-                masks.append((view, Rle.encode(mask)))
-        found.append(
-            [FoundObject(word=one.words, probability=1.0, masks=tuple(masks))] if masks else []
-        )
-    bench.row("true", *bench.voted(session, found, 0.0))
-
-
 def classes(bench: Bench) -> None:
     """Names of the classes that are there, all objects of each."""
     table = json.loads((bench.data / "metadata.json").read_text())["classes"]
@@ -263,7 +300,8 @@ def classes(bench: Bench) -> None:
     views = TestViews(bench.scene, bench.data, level="semantic")  # type: ignore[arg-type]
     for many in ("one", "all"):
         session = bench.session(
-            replace(PromptOptions(), objects=many, min_probability=0.3 if many == "all" else 0.05)
+            replace(DEFAULT, objects=many, min_probability=0.3 if many == "all" else 0.05),
+            bench.args.seeds[0],
         )
         none = torch.zeros(len(bench.scene.gaussians), dtype=torch.bool)
         selections: list[Selection] = []
@@ -303,7 +341,7 @@ class _ObjectMaps:
 
 def boundaries(bench: Bench) -> None:
     """Gaussians at rims of phrases that were found: as they are, and split."""
-    session = bench.session(PromptOptions())
+    session = bench.session(DEFAULT, bench.args.seeds[0])
     rows: list[list[float]] = []
     for one in bench.phrases:
         found = session.find(one.words)[:1]
@@ -361,23 +399,25 @@ OPTIONS: dict[str, PromptOptions] = {
     "published-single": replace(PUBLISHED, initial="single"),
     "published-random": replace(PUBLISHED, initial="random"),
     "published10": replace(PUBLISHED, view_share=0.1),
+    "published-weight": replace(PUBLISHED, lifting="weight"),
+    "published-visible": replace(PUBLISHED, vote="visible"),
+    "published-weight-visible": replace(PUBLISHED, lifting="weight", vote="visible"),
 }
-
-
-def _row_of(name: str) -> Callable[[Bench], None]:
-    def row(bench: Bench) -> None:
-        bench.row(name, *bench.asked(OPTIONS[name]))
-
-    return row
 
 
 ROWS: dict[str, Callable[[Bench], None]] = {
     "oracle": oracle,
-    **{name: _row_of(name) for name in OPTIONS},
-    "true": true_masks,
     "classes": classes,
     "boundaries": boundaries,
 }
+
+
+def ask(bench: Bench, row: str) -> None:
+    """A row of options, and what is true in it."""
+    name, *true = row.split("+")
+    if name not in OPTIONS or not set(true) <= {"words", "masks"}:
+        raise SystemExit(f"rows: expected {', '.join((*ROWS, *OPTIONS))}, got {row!r}.")
+    bench.row(row, OPTIONS[name], words="words" in true, masks="masks" in true)
 
 
 def main() -> None:
@@ -385,16 +425,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--rows", nargs="+", default=[*ROWS, *OPTIONS])
     parser.add_argument("--masks", default="masks_sam")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--features", type=Path, help="in place of DATA/features_text")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--limit", type=int, help="so many phrases, evenly through all")
     parser.add_argument("--check", type=int, default=0, help="so many of each row by score.py")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     bench = Bench(args)
     for name in args.rows:
-        ROWS[name](bench)
+        if name in ROWS:
+            ROWS[name](bench)
+        else:
+            ask(bench, name)
         if args.json is not None:
             args.json.write_text(json.dumps(bench.results, indent=1))
 

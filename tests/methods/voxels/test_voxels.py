@@ -17,6 +17,7 @@ from splatseg.io.npz_writing import save_arrays
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift.vocabulary import vocabulary_of
 from splatseg.lift.voxels import HitOptions, VoxelWords, surface_points, voxelise
+from splatseg.methods import find_method
 from splatseg.methods.voxels import VoxelOptions
 from splatseg.tasks import SegmentOptions, segment
 
@@ -114,11 +115,20 @@ def test_filtering_counts_where_centres_make_cells(scene) -> None:
 
 
 def test_published_is_the_paper(scene) -> None:
+    """Written out from sections 3.2, 3.4 and 3.5 and, where they are silent, its code."""
     found = made(scene, None, published=True)
     assert found.grid.size == 0.04
     assert found.table.precision == "float32"
-    assert found.info.options["cells"] == "centres"
-    assert found.info.options["projection"]["hits"] == "first"
+    options = found.info.options
+    assert options["cells"] == "centres"
+    projection, reading = options["projection"], options["assignment"]
+    assert (projection["hits"], projection["average"]) == ("first", "hits")
+    assert (reading["interpolation"], reading["max_distance"]) == ("nearest", None)
+    kept = options["filtering"]
+    assert (kept["opaque_share"], kept["min_neighbours"], kept["radius"]) == (0.5, 4, 0.2)
+    assert (kept["min_opacity"], kept["max_elongation"], kept["scale_share"]) == (None, None, None)
+    method = find_method("voxels")
+    assert (method.words, method.published_words) == ("span", "cosines")
 
 
 @pytest.mark.parametrize("precision", ["float32", "float16", "int8", "product"])
