@@ -129,6 +129,7 @@ class Bench:
             replace(self.sources, prompter=prompter),
             options=options,
             seed=seed,
+            up=self.scene.up,
         )
 
     def right(self, found: FoundObject, id: int) -> bool:
@@ -380,6 +381,7 @@ OPTIONS: dict[str, PromptOptions] = {
     "kmeans4": replace(DEFAULT, initial_views=4),
     "random4": replace(DEFAULT, initial="random", initial_views=4),
     "random24": replace(DEFAULT, initial="random"),
+    "whole": replace(DEFAULT, phrases="whole"),
     "rounds1": replace(DEFAULT, rounds=1),
     "cells": replace(DEFAULT, region="cells"),
     "views10": replace(DEFAULT, view_share=0.1),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,7 +17,10 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, Features, Labels, Layer, VoxelFeatures
 from splatseg.io.scene import load_scene_layer
 from splatseg.lift import complete
+from splatseg.lift.label_maps import label_map
 from splatseg.lift.vocabulary import Vocabulary
+from splatseg.lift.voxels import VoxelWords
+from splatseg.lift.words import WordIndex
 from splatseg.tasks import QueryOptions, QuerySession
 
 PAPER_CLASSES = (
@@ -63,10 +66,28 @@ class WordScene(ScoredScene):
             raise TypeError(f"{name}: expected voxels.")
         return layer
 
-    def session(self, layer: Features | VoxelFeatures) -> QuerySession:
+    def session(
+        self, layer: Features | VoxelFeatures, *, phrases: Literal["parts", "whole"] = "parts"
+    ) -> QuerySession:
         """To be asked for the likeliest word of each Gaussian."""
-        options = QueryOptions(from_layer="asked", every=True, features="features_text")
+        options = QueryOptions(
+            from_layer="asked", every=True, features="features_text", phrases=phrases
+        )
         return QuerySession(self.scene, options=options, layers={"asked": layer})
+
+    def instances(self, index: WordIndex | VoxelWords) -> list[int]:
+        """The true instance that most pixels of each thing show, in every fourth train view."""
+        if isinstance(index, VoxelWords):
+            raise TypeError("index: expected things.")
+        known = (index.rows >= 0).float()
+        things = Labels(ids=index.rows.int(), confidence=known)
+        counts = np.zeros((len(index), 1 << 12), np.int64)
+        for view in self.scene.train_views[::4]:
+            drawn = label_map(self.scene.gaussians, view.camera, things).ids.numpy()
+            truth = np.asarray(Image.open(self.data / "instance" / f"{view.name}.png"))
+            seen = drawn >= 0
+            np.add.at(counts, (drawn[seen], truth[seen].astype(np.int64)), 1)
+        return (counts[:, 1:].argmax(axis=1) + 1).tolist()
 
     def means(self, own: Features, rows: Tensor) -> Features:
         """Mean features of sets of Gaussians, each given to its Gaussians.

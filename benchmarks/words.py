@@ -15,6 +15,8 @@ row `gaussians`, one of `segment --method features --evidence features_text` cal
   alone, pixels of others left out.
 - `unknown`: how well the probabilities tell which of all classes are there: the area under the
   ROC, and the shares found at 0.5 of those that are there and of those that are not.
+- `phrases`: share of the phrases of instances for which their own object is the likeliest, of those
+  whose instance is mostly one object's, asked whole and by their parts.
 - `speed`: milliseconds of a query of one word, and of ten: of the vectors, of the things, and of
   the probability of each Gaussian.
 """
@@ -94,6 +96,23 @@ def unknown(bench: WordScene) -> None:
     print("unknown", {"area": round(float(area), 4), "there, not there, above": shares}, flush=True)
 
 
+def phrases(bench: WordScene) -> None:
+    words = bench.vocabulary.recorded
+    session = bench.session(bench.features("objects"))
+    own = bench.instances(session.index)
+    rows = zip(words.labels, words.kinds, words.target_ids, strict=True) if words else ()
+    asked = [(label, id) for label, kind, id in rows if kind == "instance" and id in own]
+    for how in ("whole", "parts"):
+        session = bench.session(bench.features("objects"), phrases=how)
+        answers = session.ask([label for label, _ in asked])
+        best = answers.vectors.probabilities.argmax(dim=0).tolist()
+        first = np.mean([own[row] == id for row, (_, id) in zip(best, asked, strict=True)])
+        things = np.mean([len(answers.found[label]) for label, _ in asked])
+        said = {"phrases": len(asked), "own first": round(float(first), 4),
+                "things that answer": round(float(things), 2)}  # fmt: skip
+        print("phrases", how, said, flush=True)
+
+
 def speed(bench: WordScene) -> None:
     session = bench.session(bench.features("objects"))
     names = bench.names
@@ -127,6 +146,7 @@ if __name__ == "__main__":
             "published": published,
             "paper": paper,
             "unknown": unknown,
+            "phrases": phrases,
             "speed": speed,
         },
     )

@@ -11,8 +11,9 @@ from splatseg.core.rigid import (
     quaternion_from_rotation,
     quaternion_multiply,
     rotation_from_quaternion,
+    upright,
 )
-from splatseg.core.sh import evaluate_sh, rotate_sh, sh_basis
+from splatseg.core.sh import base_colours, evaluate_sh, rotate_sh, sh_basis
 from splatseg.errors import RangeError, ShapeError
 
 seeds = st.integers(0, 2**32 - 1)
@@ -130,3 +131,26 @@ def test_harmonics_refuse_odd_counts_and_degrees() -> None:
         evaluate_sh(torch.zeros(1, 5, 3), torch.zeros(1, 3))
     with pytest.raises(RangeError, match="0 to 3"):
         sh_basis(torch.zeros(1, 3), 4)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 2.0), (0, 3.0, 0), (1.0, -2.0, 0.5), (0, 0, -1.0)])
+def test_up_becomes_z(up) -> None:
+    points = torch.eye(3, dtype=torch.float64)
+    turned = upright(points, up)
+    torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
+    assert float(torch.linalg.det(turned)) == pytest.approx(1.0)
+    axis = torch.tensor([up], dtype=torch.float64)
+    found = upright(axis, up)
+    torch.testing.assert_close(found, torch.tensor([[0, 0, 1.0]]).double() * axis.norm())
+    assert upright(points, None) is points
+
+
+def test_up_must_be_a_direction() -> None:
+    with pytest.raises(RangeError, match="up: expected a direction"):
+        upright(torch.eye(3), (0.0, 0.0, 0.0))
+
+
+def test_colours_of_all_directions_are_cut_off() -> None:
+    sh = torch.zeros(3, 4, 3)
+    sh[0, 0], sh[1, 0], sh[:, 1:] = 9.0, -9.0, 5.0
+    torch.testing.assert_close(base_colours(sh)[:, 0], torch.tensor([1.0, 0.0, 0.5]))

@@ -14,9 +14,16 @@ import torch
 from PIL import Image
 
 from splatseg.cli import main
-from splatseg.core import Features, Labels, LayerInfo, Selection
+from splatseg.core import FeatureMap, Features, Labels, LayerInfo, Selection
 from splatseg.errors import InputError, RangeError
-from splatseg.io.evidence import FeatureEvidence, open_evidence
+from splatseg.io.evidence import (
+    FeatureEvidence,
+    TextEmbeddings,
+    create_evidence,
+    open_evidence,
+    save_features,
+    save_text_embeddings,
+)
 from splatseg.io.scene import load_scene, load_scene_layer, save_scene_layer
 from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
 from splatseg.tasks import Found, QueryOptions, QuerySession, draw_answers, draw_heat, query
@@ -94,6 +101,39 @@ def test_things_that_a_word_means(scene, layers, words) -> None:
     assert first.size[0] < float(inside[:, 0].max() - inside[:, 0].min()) + 1e-5
     with pytest.raises(InputError, match="thing: expected one that answers"):
         found.of_thing(words[1], first.thing)
+
+
+def test_phrases_are_asked_by_their_parts(scene, tmp_path) -> None:
+    """Two mugs; as a whole "green mug" means the red one a little more."""
+    place = scene.gaussians.means[:, 0].argsort().argsort() * 3 // len(scene.gaussians)
+    mugs = torch.tensor([[1.0, 0.1, 0.0], [1.0, -0.1, 0.0], [0.0, 0.0, 0.0]])
+    phrase = torch.tensor([[1.0, 0.12, 0.0]])
+    folder = create_evidence(tmp_path / "features_mugs", kind="features")
+    view = scene.train_views[0].camera
+    cells = torch.rand(-(-view.height // 16), -(-view.width // 16), 3)
+    grid = FeatureMap(features=cells, stride=16, height=view.height, width=view.width)
+    save_features(grid, folder, scene.train_views[0].name)
+    words = TextEmbeddings(
+        labels=("mug", "desk", "green mug"),
+        vectors=torch.nn.functional.normalize(torch.cat((torch.eye(3)[[0, 2]], phrase)), dim=1),
+        kinds=("class", "class", "instance"),
+        target_ids=(1, 2, 2),
+    )
+    save_text_embeddings(words, folder)
+    colours = torch.tensor([[0.8, 0.1, 0.1], [0.2, 0.6, 0.25], [0.5, 0.5, 0.5]])
+    sh = scene.gaussians.sh.clone()
+    sh[:, 0] = ((colours - 0.5) / 0.28209479)[place]
+    coloured = replace(scene, gaussians=scene.gaussians.replace(sh=sh))
+    info = LayerInfo(method="objects", evidence=str(folder))
+    layer = Features(values=mugs[place], weights=(place < 2).float(), info=info)
+    for how, meant in (("whole", 0), ("parts", 1)):
+        options = QueryOptions(features=str(folder), phrases=how)
+        found = query(coloured, ["green mug"], options=options, layers={"objects": layer})
+        first = found.found["green mug"][0]
+        assert bool((place[found.of_thing("green mug", first.thing).mask] == meant).all()), how
+        assert len(found.found["green mug"]) == (1 if how == "parts" else 2)
+    with pytest.raises(InputError, match="phrases: expected one of parts, whole"):
+        QueryOptions(phrases="half")
 
 
 def test_layers_of_answers(scene, layers, words) -> None:

@@ -177,3 +177,30 @@ class Similarity:
             translation=self.apply(inner.translation.double()),
             scale=self.scale * inner.scale,
         )
+
+
+def upright(
+    points: Float[Tensor, "n 3"], up: tuple[float, float, float] | None
+) -> Float[Tensor, "n 3"]:
+    """Points turned the shortest way by which `up` becomes z.
+
+    Raises:
+        RangeError: If `up` has no direction.
+    """
+    if up is None:
+        return points
+    axis = torch.tensor(up, dtype=torch.float64)
+    length = float(torch.linalg.vector_norm(axis))
+    if not (length > 0 and length < float("inf")):
+        raise RangeError(f"up: expected a direction, got {up}.")
+    x, y, z = (axis / length).tolist()
+    if z < -1 + 1e-9:  # upside down: half a turn about x
+        turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    else:
+        # Rodrigues' rotation from u to z, with its cosine z.
+        k = 1 / (1 + z)
+        turn = torch.tensor(
+            [[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]],
+            dtype=torch.float64,
+        )
+    return (points.double() @ turn.T).to(points.dtype)

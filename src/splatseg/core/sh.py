@@ -141,3 +141,8 @@ def rotate_sh(
         block = sh[:, level**2 : (level + 1) ** 2]
         parts.append(torch.einsum("ij,njc->nic", matrix.to(sh), block))
     return torch.cat(parts, dim=1)
+
+
+def base_colours(sh: Float[Tensor, "n k 3"]) -> Float[Tensor, "n 3"]:
+    """What harmonics have of all directions, float32, cut to [0, 1]."""
+    return (sh[:, 0].detach().cpu().float() * SH_C0 + 0.5).clamp(0, 1)

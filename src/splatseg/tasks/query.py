@@ -2,7 +2,7 @@
 
 import importlib.metadata
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,7 +23,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.models import TextFeatures
 from splatseg.errors import InputError
 from splatseg.lift.voxels import VoxelWords
-from splatseg.lift.words import WordAnswers, WordIndex
+from splatseg.lift.words import ThingLooks, WordAnswers, WordIndex, answer_phrases, thing_looks
 from splatseg.render import BackendName
 from splatseg.selection import components
 from splatseg.tasks._observer import SILENT, Observer
@@ -259,7 +259,7 @@ class QuerySession:
         Raises:
             InputError: If there are none, one is there twice, or nothing is known of one.
         """
-        asked = self._index.ask(words, options=self._options.answers)
+        asked = self._in_parts(self._index.ask(words, options=self._options.answers))
         for word in asked.words:
             if asked.words.count(word) > 1:
                 raise InputError(f"words: expected distinct words, got {word!r} more than once.")
@@ -279,6 +279,44 @@ class QuerySession:
             options=self._options,
             made_layers=self._source.made_layers,
             pieces=pieces,
+        )
+
+    def _in_parts(self, asked: WordAnswers) -> WordAnswers:
+        """Phrases asked by their parts, where each vector is a thing."""
+        index, options = self._index, self._options.answers
+        if (
+            self._options.phrases == "whole"
+            or self._places is None
+            or isinstance(index, VoxelWords)
+        ):
+            return asked
+
+        def of_word(word: str) -> Tensor:
+            return index.ask([word], options=options).probabilities[:, 0]
+
+        _, probabilities = answer_phrases(
+            asked,
+            lambda: self._looks,
+            index.vocabulary,
+            of_word,
+            temperature=options.temperature,
+        )
+        return replace(asked, probabilities=probabilities)
+
+    @cached_property
+    def _looks(self) -> ThingLooks:
+        """How the things look, where each vector is one."""
+        if isinstance(self._index, VoxelWords):
+            raise InputError("phrases: expected things, got voxels.")
+        rows = self._index.rows
+        there = torch.nonzero(rows >= 0).squeeze(1)
+        return thing_looks(
+            self._scene.gaussians,
+            rows[there],
+            there,
+            torch.ones(len(there)),
+            count=len(self._index),
+            up=self._scene.up,
         )
 
     def _pieces(self, asked: WordAnswers) -> Int64[Tensor, "n words"]:

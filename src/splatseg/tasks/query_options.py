@@ -1,8 +1,9 @@
 """What a scene is asked for words by."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-from splatseg._check import check_range
+from splatseg._check import check_choice, check_range
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import RangeError
 from splatseg.lift.words import AnswerOptions
@@ -34,11 +35,16 @@ class QueryOptions:
     components: int = 32
     """Directions of the scene's features in which words are compared, at most."""
 
+    phrases: Literal["parts", "whole"] = "parts"
+    """How "red mug on the desk" is asked of objects. parts: its name, its colour, and what it is on
+    or near count beside its cosine. whole: the cosine alone."""
+
     answers: AnswerOptions = field(default_factory=AnswerOptions)
     """How cosines become probabilities."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
         check_range("min_probability", self.min_probability, 0.0, 1.0)
+        check_choice("phrases", self.phrases, ("parts", "whole"))
         if self.components < 1:
             raise RangeError(f"components: expected at least 1, got {self.components}.")

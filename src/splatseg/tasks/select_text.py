@@ -123,6 +123,7 @@ def select_text(
         ),
         options=asked,
         seed=chosen.seed,
+        up=scene.up,
         backend=backend,
     )
     seconds = {"open": time.perf_counter() - began}

@@ -1,35 +1,16 @@
-"""Sets of points: upright, in boxes, joined."""
+"""Sets of points: in boxes, joined."""
 
 import pytest
 import torch
 
-from splatseg.errors import InputError, RangeError
+from splatseg.errors import InputError
 from splatseg.lift.point_network import SpatialOptions, load_point_encoder
 from splatseg.methods.cosseg._points import (
     PointSource,
-    base_colours,
     boxes,
     check_decoded,
     joined_blocks,
-    upright,
 )
-
-
-@pytest.mark.parametrize("up", [(0, 0, 2.0), (0, 3.0, 0), (1.0, -2.0, 0.5), (0, 0, -1.0)])
-def test_up_becomes_z(up) -> None:
-    points = torch.eye(3, dtype=torch.float64)
-    turned = upright(points, up)
-    torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
-    assert float(torch.linalg.det(turned)) == pytest.approx(1.0)
-    axis = torch.tensor([up], dtype=torch.float64)
-    found = upright(axis, up)
-    torch.testing.assert_close(found, torch.tensor([[0, 0, 1.0]]).double() * axis.norm())
-    assert upright(points, None) is points
-
-
-def test_up_must_be_a_direction() -> None:
-    with pytest.raises(RangeError, match="up: expected a direction"):
-        upright(torch.eye(3), (0.0, 0.0, 0.0))
 
 
 def test_boxes_hold_all_points_once_and_lie_apart() -> None:
@@ -117,12 +98,6 @@ def test_turned_scenes_are_encoded_alike(halves, encoder_file) -> None:
     second = source(halves, encoder_file, gaussians=lying, up=(0.0, 1.0, 0.0))
     found = second.raw(torch.arange(384))
     torch.testing.assert_close(found.parts[0][0], first.parts[0][0], atol=2e-2, rtol=1e-2)
-
-
-def test_colours_are_cut_off(halves) -> None:
-    found = base_colours(halves.gaussians)
-    assert found.shape == (384, 3)
-    assert 0 <= float(found.min()) <= float(found.max()) <= 1
 
 
 def test_none_left_to_decode() -> None:

@@ -182,7 +182,7 @@ def test_published_is_the_setting_of_the_paper() -> None:
     assert (PUBLISHED.view_share, PUBLISHED.view_choice) == (0.5, "random")
     assert (PUBLISHED.occlusion, PUBLISHED.rounds) == ("none", 1)
     assert (PUBLISHED.vote, PUBLISHED.tau) == ("published", 0.6), "eq. 8"
-    assert (PUBLISHED.region, PUBLISHED.objects) == ("cells", "one")
+    assert (PUBLISHED.region, PUBLISHED.objects, PUBLISHED.phrases) == ("cells", "one", "whole")
     assert PromptOptions(vote="published", point=("v:1,1",)).tau == 0.7
     assert PromptOptions(threshold=0.3).tau == 0.3
     assert PromptOptions(objects="all").least_probability == 0.3

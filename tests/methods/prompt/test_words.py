@@ -10,9 +10,13 @@ from methods.prompt.conftest import APPLE, PEAR, vectors, write_features
 from splatseg.core import MaskSet, Rle
 from splatseg.core.models import TextMasks
 from splatseg.errors import InputError, ShapeError
+from splatseg.io.evidence import TextEmbeddings
+from splatseg.lift import TextSpace
+from splatseg.lift.vocabulary import Vocabulary
 from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources
 from splatseg.methods.prompt._linked import linked
 from splatseg.methods.prompt._table import mask_table, painted
+from splatseg.methods.prompt._words import MaskAnswers
 
 
 @pytest.fixture(scope="module")
@@ -213,3 +217,31 @@ def test_a_grounding_model_finds_words(fruit) -> None:
     prompted = one.ask(["fruit"])
     # Two views for the words, and two in each of two rounds.
     assert prompted.mask_calls == 2 + 2 * 2
+
+
+def test_a_phrase_is_asked_by_its_parts(fruit) -> None:
+    """As a whole it means the apple more; but the apple is pink."""
+    known = vectors()
+    phrase = torch.nn.functional.normalize(0.9 * known[:1] + 0.2 * known[1:2], dim=1)
+    vocabulary = Vocabulary(
+        space=TextSpace(width=known.shape[1]),
+        recorded=TextEmbeddings(
+            labels=("apple", "pear", "wall", "green fruit"),
+            vectors=torch.cat((known[:3], phrase)),
+            kinds=("class", "class", "class", "instance"),
+            target_ids=(1, 2, 3, 2),
+        ),
+    )
+    colours = torch.full((4, 3), 0.5)
+    colours[APPLE], colours[PEAR] = torch.tensor([0.9, 0.0, 0.7]), torch.tensor([0.2, 0.6, 0.25])
+    sh = ((colours[fruit.ids.long()] - 0.5) / 0.28209479)[:, None]
+    table = mask_table(
+        fruit.gaussians.replace(sh=sh), fruit.views[3:6], fruit.features, fruit.masks
+    )
+    for how, id in (("whole", APPLE), ("parts", PEAR)):
+        options = PromptOptions(phrases=how, min_probability=0.0)
+        (found,) = MaskAnswers(table, vocabulary, options).find("green fruit")
+        for view, rle in found.masks:
+            assert torch.equal(rle.decode(), fruit.truth(view) == id), how
+    with pytest.raises(InputError, match="phrases: expected one of parts, whole"):
+        PromptOptions(phrases="half")

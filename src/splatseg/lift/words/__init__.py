@@ -9,5 +9,8 @@ from splatseg.lift.words.index import WordIndex as WordIndex
 from splatseg.lift.words.object_features import ObjectFeatures as ObjectFeatures
 from splatseg.lift.words.object_features import UnmixOptions as UnmixOptions
 from splatseg.lift.words.object_features import object_features as object_features
+from splatseg.lift.words.phrases import ThingLooks as ThingLooks
+from splatseg.lift.words.phrases import answer_phrases as answer_phrases
+from splatseg.lift.words.phrases import thing_looks as thing_looks
 from splatseg.lift.words.span import WordSpan as WordSpan
 from splatseg.lift.words.span import word_span as word_span

@@ -10,6 +10,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from splatseg.core import Gaussians
+from splatseg.core.rigid import upright
 from splatseg.errors import InputError
 from splatseg.lift.point_network import (
     PointEncoder,
@@ -31,7 +32,6 @@ from splatseg.methods.cosseg._points import (
     boxes,
     check_decoded,
     joined_blocks,
-    upright,
 )
 
 

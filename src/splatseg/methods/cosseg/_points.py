@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg.core import Gaussians
-from splatseg.core.sh import SH_C0
-from splatseg.errors import InputError, RangeError
+from splatseg.core.rigid import upright
+from splatseg.core.sh import base_colours
+from splatseg.errors import InputError
 from splatseg.lift.point_network import (
     PointEncoder,
     SpatialOptions,
@@ -63,7 +64,7 @@ class PointSource:
         found = spatial_features(
             self.encoder,
             upright(gaussians.means.detach().cpu()[chosen], self.up),
-            base_colours(gaussians)[chosen],
+            base_colours(gaussians.sh)[chosen],
             options=self.space,
             seed=self.seed,
         )
@@ -116,39 +117,6 @@ class RawPoints:
             rows=rows,
             metres_per_unit=self.metres_per_unit,
         )
-
-
-def upright(
-    points: Float[Tensor, "n 3"], up: tuple[float, float, float] | None
-) -> Float[Tensor, "n 3"]:
-    """Points turned the shortest way by which `up` becomes z.
-
-    Raises:
-        RangeError: If `up` has no direction.
-    """
-    if up is None:
-        return points
-    axis = torch.tensor(up, dtype=torch.float64)
-    length = float(torch.linalg.vector_norm(axis))
-    if not (length > 0 and length < float("inf")):
-        raise RangeError(f"up: expected a direction, got {up}.")
-    x, y, z = (axis / length).tolist()
-    if z < -1 + 1e-9:  # upside down: half a turn about x
-        turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    else:
-        # Rodrigues' rotation from u to z, with its cosine z.
-        k = 1 / (1 + z)
-        turn = torch.tensor(
-            [[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]],
-            dtype=torch.float64,
-        )
-    return (points.double() @ turn.T).to(points.dtype)
-
-
-def base_colours(gaussians: Gaussians) -> Float[Tensor, "n 3"]:
-    """Colours of Gaussians without what depends on the direction, cut to [0, 1]."""
-    base = gaussians.sh[:, 0].detach().cpu().float()
-    return (base * SH_C0 + 0.5).clamp(0, 1)
 
 
 def joined_blocks(raw: Sequence[RawPoints]) -> RawPoints:

@@ -96,6 +96,7 @@ def run(inputs: MethodInputs, options: PromptOptions) -> Selection:
         sources,
         options=options,
         seed=inputs.seed,
+        up=inputs.up,
         backend=inputs.backend,
     )
     points = parsed_points(options.point)

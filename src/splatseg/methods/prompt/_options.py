@@ -61,6 +61,10 @@ class PromptOptions:
     its neighbours', compared in the span of the scene's features, and averaged over the initial
     views. cells: the connected cells more relevant than the negatives, in each view alone."""
 
+    phrases: Literal["parts", "whole"] = "parts"
+    """How masks are asked for "red mug on the desk". parts: its name, its colour, and what it is on
+    or near count beside its cosine. whole: the cosine alone."""
+
     min_probability: float | None = None
     """Probability in [0, 1] from which on an object answers to a word; with cells relevancy, with
     a grounder its score. None is 0.05 for one object and 0.3 for all."""
@@ -128,6 +132,7 @@ class PromptOptions:
         convert_fields(self)
         check_choice("objects", self.objects, ("one", "all"))
         check_choice("region", self.region, ("masks", "cells"))
+        check_choice("phrases", self.phrases, ("parts", "whole"))
         check_choice("initial", self.initial, ("kmeans", "random", "single"))
         check_choice("sampling", self.sampling, ("inside", "random"))
         check_choice("lifting", self.lifting, ("weight", "centre"))
@@ -169,6 +174,7 @@ class PromptOptions:
 
 PUBLISHED = PromptOptions(
     region="cells",
+    phrases="whole",
     initial_views=4,
     rounds=1,
     negatives=0,

@@ -129,6 +129,7 @@ class PromptSession:
         sources: What answers.
         options: How; their words and points by hand are not looked at.
         seed: Of random choices.
+        up: Where up is: only then is something on something.
         backend: Name of the rendering backend.
     """
 
@@ -141,6 +142,7 @@ class PromptSession:
         *,
         options: PromptOptions | None = None,
         seed: int = 0,
+        up: tuple[float, float, float] | None = None,
         backend: str = "auto",
     ) -> None:
         if not views:
@@ -148,7 +150,7 @@ class PromptSession:
         gaussians.check_values()
         self._gaussians, self._sources = gaussians, sources
         self._options = options or PromptOptions()
-        self._seed, self._backend = seed, backend
+        self._seed, self._up, self._backend = seed, up, backend
         self._views = tuple(sorted(views, key=lambda view: view.name))
         self._makers = self._mask_maker()
 
@@ -191,7 +193,12 @@ class PromptSession:
                 "masks: expected evidence of masks, such as masks_sam, to find words by, got none."
             )
         table = mask_table(
-            self._gaussians, self.initial, sources.features, sources.masks, backend=self._backend
+            self._gaussians,
+            self.initial,
+            sources.features,
+            sources.masks,
+            up=self._up,
+            backend=self._backend,
         )
         if options.region == "cells":
             return CellAnswers(table, sources.features, vocabulary, options)

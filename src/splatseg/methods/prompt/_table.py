@@ -30,6 +30,7 @@ from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.lift.mass.features import checked_grid
 from splatseg.lift.mass.segment_masses import ViewMasses, view_masses
+from splatseg.lift.words import ThingLooks, thing_looks
 from splatseg.lift.words.object_features import BLURS, cell_shares
 from splatseg.lift.words.unmixing import NormalEquations, blurred
 
@@ -37,6 +38,9 @@ _MIN_PIXELS = 16
 """Masks with fewer are no candidates."""
 
 _RIDGE = 1.0
+
+_MOSTLY = 0.5
+"""Share of what a view sees of a Gaussian from which on it is of a mask."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,6 +69,9 @@ class MaskTable:
     contained: Float[Tensor, "m m"]
     """Share of what the row's mask holds of these Gaussians that the column's holds, too."""
 
+    looks: ThingLooks
+    """Colour and place of what each mask holds."""
+
     def __len__(self) -> int:
         return len(self.view)
 
@@ -80,6 +87,7 @@ def mask_table(
     features: FeatureSource,
     masks: Evidence,
     *,
+    up: tuple[float, float, float] | None = None,
     backend: str = "auto",
 ) -> MaskTable:
     """The masks of some views.
@@ -89,6 +97,7 @@ def mask_table(
         views: The initial views.
         features: Their feature maps.
         masks: Their masks.
+        up: Where up is; None where nobody knows.
         backend: Name of the rendering backend.
 
     Raises:
@@ -127,7 +136,28 @@ def mask_table(
         cells=cells,
         iou=iou,
         contained=contained,
+        looks=_looks(gaussians, held, rows, up),
     )
+
+
+def _looks(
+    gaussians: Gaussians,
+    held: Sequence[ViewMasses],
+    rows: Sequence[tuple[int, int]],
+    up: tuple[float, float, float] | None,
+) -> ThingLooks:
+    """Of the Gaussians that masks hold for the most part."""
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
+    for at, found in enumerate(held):
+        row_of = torch.full((int(found.segment.max()) + 1 if len(found.segment) else 0,), -1)
+        for row, (view, index) in enumerate(rows):
+            if view == at and index < len(row_of):
+                row_of[index] = row
+        row = row_of[found.segment]
+        mostly = (row >= 0) & (found.weight >= _MOSTLY * found.visible[found.gaussian])
+        parts.append((row[mostly], found.gaussian[mostly], found.weight[mostly]))
+    things, of, weights = (torch.cat(columns) for columns in zip(*parts, strict=True))
+    return thing_looks(gaussians, things, of, weights, count=len(rows), up=up)
 
 
 def painted(masks: MaskSet) -> NDArray[np.int64]:

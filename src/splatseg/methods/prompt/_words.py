@@ -14,6 +14,7 @@ the surest of each view.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -28,7 +29,13 @@ from splatseg.lift.mass.features import checked_grid
 from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.lift.relevancy import relevancy
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.lift.words import answer_words, context_of, word_span
+from splatseg.lift.words import (
+    WordAnswers,
+    answer_phrases,
+    answer_words,
+    context_of,
+    word_span,
+)
 from splatseg.methods.prompt._groups import (
     FoundObject,
     MaskGroups,
@@ -75,19 +82,33 @@ class MaskAnswers:
 
     def find(self, word: str) -> list[FoundObject]:
         """Objects that answer to a word."""
-        answers = answer_words(
-            self._groups.values,
-            [word],
-            self._vocabulary,
-            self._span,
-            options=self._options.answers,
-        )
+        answers = self._asked(word)
+        if self._options.phrases == "parts":
+            tau = self._options.answers.temperature
+            scores, probabilities = answer_phrases(
+                answers,
+                lambda: self._table.looks,
+                self._vocabulary,
+                lambda part: self._asked(part).probabilities[:, 0],
+                temperature=tau,
+            )
+            answers = replace(answers, cosines=scores / tau, probabilities=probabilities)
         return answering(
             self._table,
             self._groups,
             answers,
             several=self._options.objects == "all",
             least=self._options.least_probability,
+        )
+
+    def _asked(self, word: str) -> WordAnswers:
+        """What each group answers to a word, or a phrase as a whole."""
+        return answer_words(
+            self._groups.values,
+            [word],
+            self._vocabulary,
+            self._span,
+            options=self._options.answers,
         )
 
 
