@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from splatseg.core import TREE_LEVELS, InstanceTree, Labels, MaskSet, Rle, View
@@ -367,6 +367,8 @@ def test_names_of_views_are_in_the_info_alone() -> None:
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), min_support=st.sampled_from([0.0, 0.3, 0.6]))
+@example(seed=73, min_support=0.0)
+@example(seed=32767, min_support=0.3)
 def test_whatever_masks_come_cuts_lie_inside_each_other(seed: int, min_support: float) -> None:
     """Part inside object inside group as sets, children inside parents, siblings apart."""
     tree = tree_of(ragged(seed), min_support=min_support)
@@ -379,7 +381,15 @@ def test_whatever_masks_come_cuts_lie_inside_each_other(seed: int, min_support: 
         )
         for node in tree.nodes
     }
-    assert all(members.values()), "a node without a Gaussian says nothing"
+    # One that no Gaussian is mostly of still has shares of some (two of one thing, at seed 73).
+    shared = {
+        above
+        for id in tree.labels.candidates[tree.labels.shares > 0].unique().tolist()
+        if id > 0
+        for above in tree.path(id)
+    }
+    empty = {id for id, of_node in members.items() if not of_node}
+    assert empty <= shared, "a node without a Gaussian says nothing"
     for node in tree.nodes:
         if node.parent > 0:
             assert members[node.id] <= members[node.parent]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from splatseg.core import MaskSet, View
-from splatseg.lift.words import WordAnswers
+from splatseg.lift.words import ThingLooks, WordAnswers
 from splatseg.methods.prompt._groups import answering, mask_groups
 from splatseg.methods.prompt._table import MaskTable
 from support.red_square import SIZE, camera
@@ -34,6 +34,9 @@ def table() -> MaskTable:
         cells=torch.tensor([float(side**2) for side in SIDES]).tile(2),
         iou=same,
         contained=HELD.tile(2, 2),
+        looks=ThingLooks(
+            colours=torch.zeros(8, 3), low=torch.zeros(8, 3), high=torch.ones(8, 3), has_up=False
+        ),
     )
 
 
