@@ -13,7 +13,7 @@ from splatseg.errors import InputError, ShapeError
 from splatseg.io.evidence import TextEmbeddings
 from splatseg.lift import TextSpace
 from splatseg.lift.vocabulary import Vocabulary
-from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources
+from splatseg.methods.prompt import PromptOptions, PromptSession, PromptSources, _table
 from splatseg.methods.prompt._linked import linked
 from splatseg.methods.prompt._table import mask_table, painted
 from splatseg.methods.prompt._words import MaskAnswers
@@ -245,3 +245,15 @@ def test_a_phrase_is_asked_by_its_parts(fruit) -> None:
             assert torch.equal(rle.decode(), fruit.truth(view) == id), how
     with pytest.raises(InputError, match="phrases: expected one of parts, whole"):
         PromptOptions(phrases="half")
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [({}, True), ({"phrases": "whole"}, False), ({"region": "cells"}, False)],
+)
+def test_looks_are_found_where_they_are_asked_for(fruit, monkeypatch, options, wanted) -> None:
+    made = []
+    original = _table._looks
+    monkeypatch.setattr(_table, "_looks", lambda *given: made.append(1) or original(*given))
+    fruit.session(**options, initial_views=2).find("apple")
+    assert bool(made) == wanted

@@ -81,9 +81,7 @@ _OTHERS = ("in front of", "behind", "under", "above", "below", "left of", "right
 """Words that end the name, too, and say what is not read."""
 
 _SPLIT = re.compile(
-    r"\s+("
-    + "|".join(sorted(("in front of", *_RELATIONS, *_OTHERS), key=len, reverse=True))
-    + r")\s+"
+    r"\s+(" + "|".join(sorted((*_RELATIONS, *_OTHERS), key=len, reverse=True)) + r")\s+"
 )
 _ARTICLE = re.compile(r"^(?:the|a|an|some|my|your)\s+", re.IGNORECASE)
 _NUMBER = re.compile(r"\s*\(\d+\)")
@@ -129,9 +127,7 @@ def parse_phrase(text: str) -> Phrase:
         # "the second shelf of the cupboard" is in the cupboard.
         rest = re.split(r"\s+of\s+", said[found.end() :], flags=re.IGNORECASE)[-1]
         reference = parse_phrase(rest)
-        if reference.called.lower().split()[-1:] and (
-            reference.called.lower().split()[-1] in _PLACES
-        ):
+        if reference.called.lower().rpartition(" ")[2] in _PLACES:
             reference = None
     return Phrase(
         text=text,
@@ -267,12 +263,11 @@ def phrase_scores(
         temperature: Tau.
     """
     found = temperature * cosines + _called(phrase, looks, name)
-    if phrase.reference is not None and phrase.relation is not None:
-        if name(phrase.reference.called) is None:
-            return found
-        meant = _called(phrase.reference, looks, name).softmax(dim=0)
-        found = found + _RELATION * (_EPSILON + looks.share(phrase.relation, meant)).log()
-    return found
+    reference, relation = phrase.reference, phrase.relation
+    if reference is None or relation is None or name(reference.called) is None:
+        return found
+    meant = _called(reference, looks, name).softmax(dim=0)
+    return found + _RELATION * (_EPSILON + looks.share(relation, meant)).log()
 
 
 def _called(
@@ -290,6 +285,15 @@ def _called(
     return found
 
 
+def _names(vocabulary: Vocabulary) -> frozenset[str]:
+    """Recorded words that are called so: classes and their synonyms."""
+    recorded = vocabulary.recorded
+    if recorded is None:
+        return frozenset()
+    pairs = zip(recorded.labels, recorded.kinds, strict=True)
+    return frozenset(label for label, kind in pairs if kind in ("class", "synonym"))
+
+
 def known_name(called: str, vocabulary: Vocabulary) -> str | None:
     """The longest end of what something is called that is a word.
 
@@ -300,12 +304,8 @@ def known_name(called: str, vocabulary: Vocabulary) -> str | None:
     if vocabulary.encoder is not None:
         plain = [word for word in words if word.lower() not in (*_COLOURS, *_SHADES)]
         return " ".join(plain) or None
-    recorded = vocabulary.recorded
-    if recorded is None:
-        return None
-    kinds = dict(zip(recorded.labels, recorded.kinds, strict=True))
-    ends = (" ".join(words[at:]) for at in range(len(words)))
-    return next((end for end in ends if kinds.get(end) in ("class", "synonym")), None)
+    names = _names(vocabulary)
+    return next((end for at in range(len(words)) if (end := " ".join(words[at:])) in names), None)
 
 
 def sureness(
@@ -321,14 +321,6 @@ def sureness(
     best = int(scores.argmax())
     sure = phrase[best] if name is None else torch.maximum(phrase[best], name[best])
     return (sure * (scores - scores[best]).exp()).clamp(0, 1)
-
-
-def is_a_word(text: str, vocabulary: Vocabulary) -> bool:
-    """Whether a phrase is the recorded name of a class, which is not taken apart."""
-    recorded = vocabulary.recorded
-    if recorded is None or text not in recorded.labels:
-        return False
-    return recorded.kinds[recorded.labels.index(text)] in ("class", "synonym")
 
 
 def answer_phrases(
@@ -353,6 +345,7 @@ def answer_phrases(
     """
     scores, sure = temperature * answers.cosines, answers.probabilities.clone()
     asked: dict[str, Tensor | None] = {}
+    names = _names(vocabulary)  # "white board" is one, and is not taken apart
 
     def name(called: str) -> Tensor | None:
         if called not in asked:
@@ -362,7 +355,7 @@ def answer_phrases(
 
     for column, text in enumerate(answers.words):
         phrase = parse_phrase(text)
-        if not phrase.is_compound or is_a_word(text, vocabulary):
+        if text in names or not phrase.is_compound:
             continue
         found = phrase_scores(
             phrase, answers.cosines[:, column], looks(), name, temperature=temperature

@@ -197,6 +197,7 @@ class PromptSession:
             self.initial,
             sources.features,
             sources.masks,
+            looks=options.region == "masks" and options.phrases == "parts",
             up=self._up,
             backend=self._backend,
         )

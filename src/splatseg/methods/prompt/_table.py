@@ -69,8 +69,8 @@ class MaskTable:
     contained: Float[Tensor, "m m"]
     """Share of what the row's mask holds of these Gaussians that the column's holds, too."""
 
-    looks: ThingLooks
-    """Colour and place of what each mask holds."""
+    looks: ThingLooks | None
+    """Colour and place of what each mask holds; None where nobody asks."""
 
     def __len__(self) -> int:
         return len(self.view)
@@ -87,6 +87,7 @@ def mask_table(
     features: FeatureSource,
     masks: Evidence,
     *,
+    looks: bool = True,
     up: tuple[float, float, float] | None = None,
     backend: str = "auto",
 ) -> MaskTable:
@@ -97,6 +98,7 @@ def mask_table(
         views: The initial views.
         features: Their feature maps.
         masks: Their masks.
+        looks: Whether colours and places are asked for: a tenth of the time.
         up: Where up is; None where nobody knows.
         backend: Name of the rendering backend.
 
@@ -136,7 +138,7 @@ def mask_table(
         cells=cells,
         iou=iou,
         contained=contained,
-        looks=_looks(gaussians, held, rows, up),
+        looks=_looks(gaussians, held, rows, up) if looks else None,
     )
 
 

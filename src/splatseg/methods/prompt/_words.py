@@ -83,11 +83,12 @@ class MaskAnswers:
     def find(self, word: str) -> list[FoundObject]:
         """Objects that answer to a word."""
         answers = self._asked(word)
-        if self._options.phrases == "parts":
+        looks = self._table.looks
+        if self._options.phrases == "parts" and looks is not None:
             tau = self._options.answers.temperature
             scores, probabilities = answer_phrases(
                 answers,
-                lambda: self._table.looks,
+                lambda: looks,
                 self._vocabulary,
                 lambda part: self._asked(part).probabilities[:, 0],
                 temperature=tau,
