@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ import pytest
 import torch
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
-from hypothesis.internal.conjecture import providers
 
 from support import shared
 from support.drive import write_drive
@@ -35,8 +35,12 @@ settings.register_profile(
 settings.load_profile("splatseg")
 # Hypothesis tries constants of whatever modules are loaded by then, too, which depends on the tests
 # that the worker ran before: then one run in twenty meets an example that no other has.
-if hasattr(providers, "_get_local_constants"):
-    providers._get_local_constants = lambda: providers._local_constants
+# The oldest Hypothesis that is allowed has no such module, and does not.
+with suppress(ImportError):
+    from hypothesis.internal.conjecture import providers
+
+    if hasattr(providers, "_get_local_constants"):
+        providers._get_local_constants = lambda: providers._local_constants
 
 
 def pytest_configure(config: pytest.Config) -> None:
