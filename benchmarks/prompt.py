@@ -94,7 +94,7 @@ class Bench:
         self.phrases = self._phrases()
         self.results: dict[str, Any] = {}
         self.found: dict[
-            tuple[str, str, int, int, bool], tuple[list[list[FoundObject]], float]
+            tuple[str, str, str, int, int, bool], tuple[list[list[FoundObject]], float]
         ] = {}
         evidence = open_evidence(self.args.features or self.data / "features_text")
         if not isinstance(evidence, FeatureEvidence):
@@ -147,7 +147,9 @@ class Bench:
         """All phrases, each by itself; with `words` and `masks` those are true."""
         session = self.session(options, seed, masks=masks)
         # What is found depends on these alone; it is kept from row to row.
-        key = (options.region, options.initial, options.initial_views, seed, words)
+        key = (
+            options.region, options.phrases, options.initial, options.initial_views, seed, words,
+        )  # fmt: skip
         if key not in self.found:
             began = time.perf_counter()
             if words:

@@ -48,6 +48,9 @@ RED, GREEN, GREY = (0.78, 0.12, 0.12), (0.2, 0.59, 0.24), (0.5, 0.5, 0.5)
         ("plant in the corner", "plant", False, None, None),
         ("mug behind the box", "mug", False, None, None),
         ("cat in front of the red sofa", "cat", False, None, None),
+        ("olive mug behind", "olive mug", True, None, None),
+        ("book on the top shelf of the cupboard behind", "book", False, "on", "cupboard"),
+        ("mug on", "mug", False, None, None),
     ],
 )
 def test_what_a_phrase_says(text, called, coloured, relation, reference) -> None:

@@ -81,7 +81,7 @@ _OTHERS = ("in front of", "behind", "under", "above", "below", "left of", "right
 """Words that end the name, too, and say what is not read."""
 
 _SPLIT = re.compile(
-    r"\s+(" + "|".join(sorted((*_RELATIONS, *_OTHERS), key=len, reverse=True)) + r")\s+"
+    r"\s+(" + "|".join(sorted((*_RELATIONS, *_OTHERS), key=len, reverse=True)) + r")(?:\s+|$)"
 )
 _ARTICLE = re.compile(r"^(?:the|a|an|some|my|your)\s+", re.IGNORECASE)
 _NUMBER = re.compile(r"\s*\(\d+\)")
@@ -127,7 +127,7 @@ def parse_phrase(text: str) -> Phrase:
         # "the second shelf of the cupboard" is in the cupboard.
         rest = re.split(r"\s+of\s+", said[found.end() :], flags=re.IGNORECASE)[-1]
         reference = parse_phrase(rest)
-        if reference.called.lower().rpartition(" ")[2] in _PLACES:
+        if reference.called.lower().rpartition(" ")[2] in {"", *_PLACES}:
             reference = None
     return Phrase(
         text=text,
