@@ -64,7 +64,8 @@ def means(bench: WordScene) -> None:
 def _voxels(bench: WordScene, name: str, words: Sequence[str], *, others: bool = True) -> None:
     row = name if others else f"paper {name}"
     _calibrated(bench, f"{row}, span", name, words, others=others)
-    asked = VoxelWords(bench.voxels(name), bench.vocabulary, components=None)
+    layer = bench.voxels(name)
+    asked = VoxelWords(layer, bench.session(layer).index.vocabulary, components=None)
     cosines = asked.of_gaussians(asked.cosines(asked.vocabulary.vectors(words)))
     known = cosines.abs().amax(dim=1) > 0
     bench.scored(f"{row}, cosines", cosines, known, words, others=others)

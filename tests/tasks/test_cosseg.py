@@ -90,7 +90,7 @@ def test_help_says_in_what_the_published_setting_differs(capsys) -> None:
         f"It differs: a step is of {views} views x {pixels} pixels",
         f"without weights below {published.min_weight:g}",
         "trained on generated rooms, not on S3DIS",
-        "rendered from one decoding",
+        "mean of what is decoded of it",
     ):
         assert words in said("cosseg"), words
     assert "It differs" not in said("identity")

@@ -13,6 +13,7 @@ from splatseg.lift.heads import ClassifierHead
 from splatseg.lift.point_network import spatial_features
 from splatseg.methods._trained_labels import TrainingContext
 from splatseg.methods.cosseg import CossegOptions, train_cosseg
+from splatseg.methods.cosseg._decoded_layer import decoded_in_views
 
 from .conftest import Blocks, Maps, camera
 
@@ -221,6 +222,25 @@ def test_points_of_views_lie_in_files_beyond_the_budget(halves, encoder_file) ->
     whole = trained(halves, encoder_file, points="visible")
     spilled = trained(halves, encoder_file, points="visible", memory=0)
     assert torch.equal(whole.values, spilled.values)
+
+
+@pytest.mark.parametrize(
+    ("changes", "views"), [({}, 4), ({"held_out": 0.3}, 3), ({"points": "all"}, None)]
+)
+def test_what_views_decode_is_stored_where_they_were_learnt_from(
+    halves, encoder_file, monkeypatch, changes, views
+) -> None:
+    """The views that were learnt from, not those held out; elsewhere all are decoded together."""
+    found = []
+
+    def spied(points, *given):
+        found.append(len(points := list(points)))
+        return torch.full_like(decoded_in_views(points, *given), 7.0)
+
+    monkeypatch.setattr("splatseg.methods.cosseg._train.decoded_in_views", spied)
+    layer = trained(halves, encoder_file, **VISIBLE | {"steps": 2} | changes)
+    assert found == ([] if views is None else [views])
+    assert bool((layer.values == 7).all()) == (views is not None)
 
 
 def test_views_have_the_coordinates_of_the_scene(halves, encoder_file, monkeypatch) -> None:

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from splatseg.errors import ShapeError
+from splatseg.methods.cosseg._decoded_layer import decoded_in_views, decoded_together
 from splatseg.methods.cosseg._fusion import (
     FusionInputs,
     FusionShape,
@@ -15,6 +16,7 @@ from splatseg.methods.cosseg._fusion import (
     running,
     running_momentum,
 )
+from splatseg.methods.cosseg._points import PointSet
 
 SIZES = (11, 5, 2)
 SHAPE = FusionShape(inputs=(4, 3, 5), decoded=(6, 7, 8), head=(9, 2))
@@ -96,6 +98,24 @@ def test_whole_scenes_are_decoded_in_pieces(monkeypatch) -> None:
     whole = decode_all(given, weights)
     monkeypatch.setattr("splatseg.methods.cosseg._fusion._ROWS", 3)
     torch.testing.assert_close(decode_all(given, weights), whole, rtol=0, atol=1e-6)
+
+
+def test_a_gaussian_is_the_mean_of_what_views_that_show_it_decode() -> None:
+    """Of 5: one in both views, one in each, one in none, and one that is not decoded."""
+    shape = FusionShape(inputs=SHAPE.inputs[:1], decoded=SHAPE.decoded[:1], head=SHAPE.head)
+    weights, rng = some_weights(shape), np.random.default_rng(2)
+
+    def points(*rows: int) -> PointSet:
+        level = torch.from_numpy(rng.normal(size=(max(rows) + 1, 4)).astype(np.float16))
+        return PointSet(inputs=FusionInputs(levels=(level,), up=()), rows=torch.tensor(rows))
+
+    one, two, every = points(1, 0, -1, -1, -1), points(0, -1, 1, -1, -1), points(3, 2, 1, 0, -1)
+    a, b, c = (decode_all(each.inputs, weights) for each in (one, two, every))
+    expected = torch.stack([(a[1] + b[0]) / 2, a[0], b[1], c[0], torch.zeros(2)])
+    found = decoded_in_views((each for each in (one, two)), every, weights)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    together = torch.stack([c[3], c[2], c[1], c[0], torch.zeros(2)])
+    torch.testing.assert_close(decoded_together(every, weights), together, rtol=0, atol=0)
 
 
 def test_batch_norms_are_those_of_torch() -> None:

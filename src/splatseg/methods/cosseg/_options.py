@@ -32,8 +32,8 @@ PUBLISHED_DROPOUT = 0.5
 PUBLISHED_DIFFERS = (
     "It differs: a step is of 8 views x 512 pixels and not of one whole picture, without weights "
     "below 0.01; the point encoder was trained on generated rooms, not on S3DIS, unless --encoder "
-    "names one; Gaussians stay as they are (--joint moves them); views are rendered from one "
-    "decoding of all Gaussians."
+    "names one; Gaussians stay as they are (--joint moves them); a Gaussian has the mean of what "
+    "is decoded of it in the training views that show it."
 )
 
 

@@ -20,7 +20,7 @@ from splatseg.methods._trained_labels import (
 )
 from splatseg.methods.cosseg._agreement import VoteAgreement
 from splatseg.methods.cosseg._blocks import BlockSource
-from splatseg.methods.cosseg._decoded_layer import decoded_layer
+from splatseg.methods.cosseg._decoded_layer import decoded_in_views, decoded_layer, decoded_together
 from splatseg.methods.cosseg._distilled import (
     view_pixel_counts,
 )
@@ -114,8 +114,15 @@ def train_cosseg(
         result = train_labels(
             "cosseg", data, model, options=options, context=context, extra=given.settings
         )
+        if _is_by_view(given):
+            learnt, _ = held_out_views(data.views, options.held_out)
+            shown = (points(view) for view in range(len(learnt)))
+            values = decoded_in_views(shown, everything, result.shared)
+        else:
+            values = decoded_together(everything, result.shared)
     return decoded_layer(
         given,
+        values,
         everything,
         data,
         result,
@@ -146,6 +153,11 @@ def _agreement(
     return VoteAgreement(votes, data.ids)
 
 
+def _is_by_view(given: Given) -> bool:
+    """Whether each view has points of its own; without space a point is what it is anywhere."""
+    return given.options.points == "visible" and given.encoder is not None
+
+
 @contextmanager
 def _points(
     given: Given,
@@ -157,7 +169,7 @@ def _points(
 ) -> Generator[tuple[PointsOf, PointsOf]]:
     """The points of views that are learnt from, and of those that are held out."""
     options = given.options
-    if options.points != "visible" or given.encoder is None:
+    if not _is_by_view(given):
         yield (lambda _: everything), (lambda _: everything)
         return
     gaussians = given.gaussians

@@ -11,7 +11,7 @@ from splatseg.core.threads import one_torch_thread
 from splatseg.lift.training import TrainingResult
 from splatseg.methods._trained_labels import TrainingContext, label_data
 from splatseg.methods.cosseg._blocks import BlockSource
-from splatseg.methods.cosseg._decoded_layer import decoded_layer
+from splatseg.methods.cosseg._decoded_layer import decoded_layer, decoded_together
 from splatseg.methods.cosseg._distilled import pixel_counts
 from splatseg.methods.cosseg._fusion import (
     DROPPED,
@@ -116,6 +116,7 @@ def train_cosseg_jointly(
     steps = len(loss.losses)
     layer = decoded_layer(
         given,
+        decoded_together(everything, result.shared),
         everything,
         data,
         result,
