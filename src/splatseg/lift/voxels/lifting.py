@@ -5,7 +5,8 @@ r"""Features of pixels onto the voxels that their rays hit.
 with :math:`h_{pv}` 1 for the first voxel that the ray of pixel p hits (section 3.4 of the paper),
 the transmittance that reaches it for several voxels of a ray, or the sum of the weights of W over
 the Gaussians that lie nearest to it. Large objects need not outweigh small ones: with means of
-views each view counts once for a voxel, however many of its pixels hit it.
+views each view counts once for a voxel, however many of its pixels hit it. Instead of means, voxels
+may be solved for together (`lift.voxels.solving`).
 
 References:
     End-to-End Pipeline for Open-Vocabulary Semantic Novel View Synthesis with 3D Gaussians,
@@ -14,13 +15,13 @@ References:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
-from splatseg._check import check_choice, check_shape
+from splatseg._check import check_choice, check_range, check_shape
 from splatseg._native import add_hit_features
 from splatseg.core import UNLABELLED, FeatureMap, FeatureSource, Gaussians, View
 from splatseg.core.boundary import boundary, convert_fields
@@ -29,9 +30,10 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.mass.adjoint import RenderAdjoint, voting_views
 from splatseg.lift.mass.features import Taps, camera_of_grid, checked_grid, grid_taps, read_grid
 from splatseg.lift.voxels.grid import MAX_HITS, GridIndex
+from splatseg.lift.voxels.solving import VoxelMixing
 from splatseg.render import options_for
 
-HitRule = Literal["first", "several", "weights"]
+HitRule = Literal["first", "several", "weights", "solved"]
 _CHANNELS = 64
 """Channels whose sums onto Gaussians are held at a time, with the weights of W."""
 
@@ -43,13 +45,21 @@ class HitOptions:
     hits: HitRule = "first"
     """first: the first voxel that the ray hits. several: the first ones, each by the light that
     reaches and stops in it. weights: by the weights with which Gaussians make the pixel, to the
-    voxels that they lie nearest to."""
+    voxels that they lie nearest to. solved: voxels that share cells of feature maps are told apart,
+    all together, with neighbours that look alike alike."""
 
     max_hits: int = 4
     """With several: voxels of a ray, at most."""
 
     average: Literal["hits", "views"] = "hits"
     """hits: every pixel counts. views: every view counts once for a voxel."""
+
+    blur: float = 1.0
+    """With solved: standard deviation by which networks spread what they see, in cells of their
+    feature maps."""
+
+    smoothness: float = 1.0
+    """With solved: how much a voxel is like its neighbours; 1 counts as much as a whole cell."""
 
     near: float = 0.01
     """Distance at which rays begin, scene units."""
@@ -59,10 +69,12 @@ class HitOptions:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("hits", self.hits, ("first", "several", "weights"))
+        check_choice("hits", self.hits, get_args(HitRule))
         check_choice("average", self.average, ("hits", "views"))
         if not 1 <= self.max_hits <= MAX_HITS:
             raise RangeError(f"max_hits: expected 1 to {MAX_HITS}, got {self.max_hits}.")
+        check_range("blur", self.blur, 0.0, 100.0)
+        check_range("smoothness", self.smoothness, 0.0, 1e6)
         far = float("inf") if self.far is None else self.far
         if not 0 <= self.near < far:
             raise RangeError(f"near, far: expected 0 <= near < far, got {self.near} and {far}.")
@@ -121,26 +133,44 @@ def lift_to_voxels(
     options = options or HitOptions()
     if options.hits == "several" and depths is None:
         raise InputError("depths: expected the optical depth of each voxel, got none.")
-    if options.hits == "weights" and (gaussians is None or rows is None):
+    if options.hits in ("weights", "solved") and (gaussians is None or rows is None):
         raise InputError("gaussians, rows: expected Gaussians and their voxels, got none.")
     ordered = voting_views(views, evidence, "features")
     index = GridIndex(grid)
     sums: _Sums | None = None
+    mixing: VoxelMixing | None = None
+    channels: int | None = None
+    if gaussians is not None and rows is not None and options.hits == "solved":
+        check_shape("rows", rows, (len(gaussians),))
+        mixing = VoxelMixing(
+            grid=grid,
+            gaussians=gaussians,
+            rows=rows,
+            blur=options.blur,
+            smoothness=options.smoothness,
+            backend=backend,
+        )
     for done, view in enumerate(ordered):
         features = checked_grid(view, evidence.features(view.name))
-        if sums is None:
-            sums = _Sums(voxels=len(grid), channels=features.channels, options=options)
-        if features.channels != sums.values.shape[1]:
+        channels = features.channels if channels is None else channels
+        if features.channels != channels:
             raise ShapeError(
-                f"evidence: expected {sums.values.shape[1]} channels of view {view.name}, as of "
+                f"evidence: expected {channels} channels of view {view.name}, as of "
                 f"view {ordered[0].name}, got {features.channels}."
             )
-        if gaussians is not None and rows is not None and options.hits == "weights":
-            sums.add_weights(view, features, gaussians, rows, backend)
+        if mixing is not None:
+            mixing.add(view, features)
         else:
-            sums.add_rays(view, features, index, depths)
+            sums = sums or _Sums(voxels=len(grid), channels=channels, options=options)
+            if gaussians is not None and rows is not None and options.hits == "weights":
+                sums.add_weights(view, features, gaussians, rows, backend)
+            else:
+                sums.add_rays(view, features, index, depths)
         if progress is not None:
             progress(done + 1, len(ordered))
+    if mixing is not None and channels is not None:
+        values, totals = mixing.solved()
+        return LiftedVoxels(values=values, totals=totals)
     if sums is None:
         raise InputError("views: expected at least one view with features, got none.")
     return sums.means()

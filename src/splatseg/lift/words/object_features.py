@@ -189,14 +189,20 @@ def cell_shares(
         Rows of objects (u,), ascending, and shares (cell rows, cell columns, u).
     """
     down, right = grid.features.shape[:2]
-    height, width = rows.shape
-    # Pixels beyond the last whole cell belong to it.
-    cell_row = np.minimum(np.arange(height) // grid.stride, down - 1)
-    cell_column = np.minimum(np.arange(width) // grid.stride, right - 1)
     there, local = np.unique(rows, return_inverse=True)
-    cell = cell_row[:, None] * right + cell_column[None, :]
-    index = cell * len(there) + local.reshape(rows.shape)
+    index = pixel_cells(rows.shape, grid) * len(there) + local.reshape(rows.shape)
     counts = np.bincount(index.ravel(), minlength=down * right * len(there)).astype(np.float64)
     counts = counts.reshape(down, right, len(there))
     total = counts.sum(axis=2, keepdims=True)
     return there, counts / np.where(total > 0, total, 1.0)
+
+
+def pixel_cells(size: tuple[int, ...], grid: FeatureMap) -> NDArray[np.int64]:
+    """The cell of each pixel of a picture of this (height, width), row by row.
+
+    Pixels beyond the last whole cell belong to it.
+    """
+    down, right = grid.features.shape[:2]
+    row = np.minimum(np.arange(size[0]) // grid.stride, down - 1)
+    column = np.minimum(np.arange(size[1]) // grid.stride, right - 1)
+    return row[:, None] * right + column[None, :]

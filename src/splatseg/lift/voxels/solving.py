@@ -1,0 +1,260 @@
+r"""Features of voxels solved for together, where cells of feature maps show many of them.
+
+A cell of a feature map is larger than what it shows, and networks spread what they see over the
+cells around it, so that the mean over the cells that a voxel is in mixes it with all that is beside
+it, in every view. So the features x of all voxels are solved for together, each alike those of its
+neighbours that look alike:
+
+.. math:: \min_x \sum_p \Bigl\| f_p - \bar f - \sum_v a_{pv} x_v \Bigr\|^2
+          + \mu \sum_{u \sim v} w_{uv} \| x_u - x_v \|^2 + \lambda \sum_v \| x_v \|^2,
+          \qquad a = G_\sigma * s
+
+over the cells p of all views, with :math:`s_{pv}` the share of voxel v in the pixels of cell p,
+blurred by a Gaussian of :math:`\sigma` cells, w the strengths of the neighbour graph of places and
+colours (`lift.completion.graph`), and :math:`\bar f` the mean of all cells. Without neighbours it
+is the mixing model by which objects are told apart (`lift.words.object_features`); there are far
+more voxels than objects, and what single cells do not settle, neighbours do. Solved by conjugate
+gradients, some channels at a time; the matrix is never formed.
+
+References:
+    Keshava and Mustard, Spectral Unmixing, IEEE Signal Processing Magazine 19 (2002), eq. 2.
+    Hestenes and Stiefel, Methods of Conjugate Gradients (1952).
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+from splatseg.core import UNLABELLED, FeatureMap, Gaussians, Labels, View
+from splatseg.core.sh import base_colours
+from splatseg.core.threads import one_torch_thread
+from splatseg.core.voxels import VoxelGrid
+from splatseg.lift.completion.graph import NodeAttributes, neighbour_graph
+from splatseg.lift.label_maps import label_map
+from splatseg.lift.mass.features import camera_of_grid
+from splatseg.lift.words.object_features import pixel_cells
+
+NEIGHBOURS = 8
+COLOUR_WIDTH = 0.2
+"""Standard deviation of colours, in [0, 1], that count as alike."""
+
+RIDGE = 0.05
+"""Lambda, in cells: a voxel that is in fewer, and has no neighbours, is drawn to the mean."""
+
+_STEPS = 60
+_TOLERANCE = 1e-3
+"""Residual over the right side at which conjugate gradients end."""
+
+_CHANNELS = 64
+"""Channels that are solved for at a time."""
+
+Array = NDArray[np.float32]
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class VoxelMixing:
+    """The mixing model of all views; take in views, then solve.
+
+    Voxels are seen where their Gaussians make most of a pixel.
+    """
+
+    grid: VoxelGrid
+    gaussians: Gaussians
+    rows: Int64[Tensor, "n"]
+    """The voxel of each Gaussian, -1 for none."""
+
+    blur: float
+    """Sigma, in cells."""
+
+    smoothness: float
+    """Mu."""
+
+    backend: str = "auto"
+    _right: Array | None = None
+    _features: NDArray[np.float64] | None = None
+    _cells: int = 0
+    _parts: list["_ViewShares"] = field(default_factory=list)
+    _totals: NDArray[np.float64] | None = None
+
+    def add(self, view: View, features: FeatureMap) -> None:
+        """Take in the cells of a view; memory is that of the shares of the voxels that it shows."""
+        _, camera = camera_of_grid(view, features)
+        labels = Labels(
+            ids=self.rows.int(),
+            confidence=(self.rows != UNLABELLED).float(),
+            background=UNLABELLED,
+        )
+        drawn = label_map(self.gaussians, camera, labels, backend=self.backend).ids
+        part = _ViewShares.of(drawn.cpu().numpy(), features, len(self.grid), self.blur)
+        values = features.features.float().cpu().flatten(0, 1)
+        if self._right is None or self._features is None or self._totals is None:
+            self._right = np.zeros((len(self.grid), features.channels), np.float32)
+            self._features = np.zeros(features.channels)
+            self._totals = np.zeros(len(self.grid))
+        with one_torch_thread():
+            self._right += part.back @ part.blurred(values, once=True).numpy()
+        self._features += values.double().sum(dim=0).numpy()
+        self._totals += part.seen
+        self._cells += len(values)
+        self._parts.append(part)
+
+    def solved(self) -> tuple[Float[Tensor, "m channels"], Float[Tensor, "m"]]:
+        """X and the mean added, and in how many cells each voxel is, all its shares together."""
+        if self._right is None or self._features is None or self._totals is None:
+            raise ValueError("no view was taken in")
+        mean = (self._features / max(self._cells, 1)).astype(np.float32)
+        right, totals = self._right, self._totals
+        right -= totals[:, None].astype(np.float32) * mean
+        smooth, degree = self._smoothing()
+        diagonal = sum(part.squares for part in self._parts) + degree + RIDGE
+        scale = (1 / diagonal).astype(np.float32)[:, None]
+
+        def applied(x: Array) -> Array:
+            found = smooth @ x + np.float32(RIDGE) * x
+            for part in self._parts:
+                seen = torch.from_numpy(part.forth @ x)
+                found += part.back @ part.blurred(seen, once=False).numpy()
+            return found
+
+        with one_torch_thread():
+            for start in range(0, right.shape[1], _CHANNELS):
+                part = slice(start, start + _CHANNELS)
+                right[:, part] = conjugate_gradients(
+                    applied, np.ascontiguousarray(right[:, part]), scale
+                )
+        right += mean
+        return torch.from_numpy(right), torch.from_numpy(totals)
+
+    def _smoothing(self) -> tuple[Any, NDArray[np.float64]]:
+        """Mu times the Laplacian of the neighbour graph, and its diagonal."""
+        there = self.rows != UNLABELLED
+        rows = self.rows[there]
+        colours = torch.zeros(len(self.grid), 4, dtype=torch.float64)
+        own = base_colours(self.gaussians.sh).detach().cpu().double()[there]
+        colours.index_add_(0, rows, torch.cat((own, torch.ones(len(own), 1)), dim=1))
+        graph = neighbour_graph(
+            NodeAttributes(
+                positions=self.grid.centres.numpy(),
+                colours=(colours[:, :3] / colours[:, 3:].clamp_min(1)).float().numpy(),
+            ),
+            neighbours=NEIGHBOURS,
+            colour_width=COLOUR_WIDTH,
+            feature_width=1.0,
+        )
+        degree = self.smoothness * np.asarray(graph.sum(axis=1), dtype=np.float64).reshape(-1)
+        laplacian = sparse.diags(degree) - self.smoothness * graph
+        return sparse.csr_matrix(laplacian, dtype=np.float32), degree
+
+
+def conjugate_gradients(applied: Any, right: Array, scale: Array) -> Array:
+    """X with applied(X) = right, column by column.
+
+    Args:
+        applied: A symmetric positive definite matrix times columns.
+        right: (m, k).
+        scale: (m, 1), about the inverse of the diagonal.
+    """
+    x = np.zeros_like(right)
+    residual, goal = right.copy(), _TOLERANCE * np.sqrt(_dots(right, right))
+    scaled = scale * residual
+    direction, before = scaled.copy(), _dots(residual, scaled)
+    for _ in range(_STEPS):
+        if bool((np.sqrt(_dots(residual, residual)) <= goal).all()):
+            break
+        moved = applied(direction)
+        step = _quotient(before, _dots(direction, moved))
+        x += step * direction
+        residual -= step * moved
+        scaled = scale * residual
+        now = _dots(residual, scaled)
+        direction = scaled + _quotient(now, before) * direction
+        before = now
+    return x
+
+
+def _dots(a: Array, b: Array) -> NDArray[np.float64]:
+    return (a * b).sum(axis=0, dtype=np.float64)
+
+
+def _quotient(a: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
+    """0 where a column is solved already."""
+    return np.divide(a, b, out=np.zeros_like(a), where=b > 0).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _ViewShares:
+    """Which voxels the cells of a view show, and how what they show is blurred."""
+
+    forth: Any
+    """Shares (cells, m), scipy sparse rows, float32."""
+
+    back: Any
+    """The transpose, as sparse rows."""
+
+    down: tuple[Tensor, Tensor]
+    """The blur of rows of cells, and its square; symmetric."""
+
+    right: tuple[Tensor, Tensor]
+    """Of columns."""
+
+    seen: NDArray[np.float64]
+    """Cells that each voxel makes, all shares together (m,)."""
+
+    squares: NDArray[np.float64]
+    """About the diagonal of the normal equations (m,): as if each voxel had one cell of a view."""
+
+    @classmethod
+    def of(cls, ids: NDArray[Any], grid: FeatureMap, count: int, blur: float) -> "_ViewShares":
+        """Those of a drawn view.
+
+        Args:
+            ids: The voxel of each pixel (height, width), -1 for none.
+            grid: The cells.
+            count: How many voxels there are.
+            blur: Sigma, in cells.
+        """
+        cells = grid.features.shape[0] * grid.features.shape[1]
+        cell = pixel_cells(ids.shape, grid).ravel()
+        pixels = np.bincount(cell, minlength=cells)
+        there = ids.ravel() >= 0
+        at = (cell[there], ids.ravel()[there].astype(np.int64))
+        part = (1 / pixels[at[0]]).astype(np.float32)
+        forth = sparse.csr_matrix(sparse.coo_matrix((part, at), shape=(cells, count)))
+        matrices = [
+            _blur_matrices(size, blur) for size in (grid.features.shape[0], grid.features.shape[1])
+        ]
+        kept = [float(both[1].diagonal().mean()) for both in matrices]
+        return cls(
+            forth=forth,
+            back=forth.T.tocsr(),
+            down=matrices[0],
+            right=matrices[1],
+            seen=np.asarray(forth.sum(axis=0), dtype=np.float64).reshape(-1),
+            squares=kept[0]
+            * kept[1]
+            * np.asarray(forth.multiply(forth).sum(axis=0), dtype=np.float64).reshape(-1),
+        )
+
+    def blurred(
+        self, values: Float[Tensor, "cells channels"], *, once: bool
+    ) -> Float[Tensor, "cells channels"]:
+        """Values of cells blurred once, or twice."""
+        down, right = (one[0 if once else 1] for one in (self.down, self.right))
+        grid = values.reshape(len(down), len(right), -1)
+        rows = (down @ grid.flatten(1)).reshape(grid.shape)
+        return (right @ rows).flatten(0, 1)
+
+
+def _blur_matrices(size: int, blur: float) -> tuple[Tensor, Tensor]:
+    """A Gaussian over cells in a row, symmetric as it is mirrored at the ends, and its square."""
+    one = np.eye(size)
+    if blur > 0:
+        one = gaussian_filter1d(one, blur, axis=0, mode="reflect")
+    return torch.from_numpy(one).float(), torch.from_numpy(one @ one).float()
