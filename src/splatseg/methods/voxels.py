@@ -1,9 +1,8 @@
 """Open-vocabulary sparse voxels: features of pixels onto the voxels that their rays hit.
 
-Gaussians that stand for surfaces make a sparse grid of a number of cells, the features of all views
-go to the cells by the weights with which their Gaussians make the pixels, or to the first cell that
-the ray of each pixel hits, as published, and every Gaussian reads the nearest cell; words are asked
-of the cells (`splatseg query`).
+Gaussians that stand for surfaces make a sparse grid of a number of cells, which are solved for
+together from the features of all views, or are the means of what first hits them, as published, and
+every Gaussian reads the nearest cell; words are asked of the cells (`splatseg query`).
 """
 
 from dataclasses import asdict, dataclass, field, replace
@@ -54,7 +53,7 @@ class VoxelOptions:
     filtering: FilterOptions = field(default_factory=FilterOptions)
     """Which Gaussians make cells, where their centres do."""
 
-    projection: HitOptions = field(default_factory=lambda: HitOptions(hits="weights"))
+    projection: HitOptions = field(default_factory=lambda: HitOptions(hits="solved"))
     """Which cells a pixel's feature goes to."""
 
     assignment: AssignmentOptions = field(default_factory=AssignmentOptions)
@@ -114,12 +113,13 @@ def run(inputs: MethodInputs, options: VoxelOptions) -> VoxelFeatures:
     if projection.hits != "first":
         one = replace(options.assignment, interpolation="nearest")
         nearest = assign_voxels(grid, means, options=one).rows[:, 0].long()
+    depths_of = nearest if projection.hits == "several" else None
     lifted = lift_to_voxels(
         grid,
         inputs.views,
         inputs.evidence,  # pyright: ignore[reportArgumentType]  (of the kind that it takes)
         options=projection,
-        depths=None if nearest is None else optical_depths(grid, gaussians, nearest),
+        depths=None if depths_of is None else optical_depths(grid, gaussians, depths_of),
         gaussians=gaussians,
         rows=nearest,
         backend=inputs.backend,
@@ -174,7 +174,7 @@ def _grid(inputs: MethodInputs, options: VoxelOptions) -> VoxelGrid:
 
 METHOD = Method(
     name="voxels",
-    summary="sparse voxels take the mean of the features that their pixels show",
+    summary="sparse voxels are solved for from the features of the pixels that show them",
     reference="Open-vocabulary semantic novel view synthesis, sections 3.2 to 3.5",
     evidence=("features",),
     options=VoxelOptions,

@@ -61,7 +61,7 @@ def test_against_the_dense_equations(rng, scene, blur, smoothness) -> None:
     colours = np.stack([own[rows.numpy() == k].mean(axis=0) for k in range(count)])
     graph = neighbour_graph(
         NodeAttributes(positions=grid.centres.numpy(), colours=colours.astype(np.float32)),
-        neighbours=8,
+        neighbours=16,
         colour_width=0.2,
         feature_width=1.0,
     ).toarray()
@@ -114,6 +114,20 @@ def test_each_option_makes_a_difference(rng, scene) -> None:
         assert not torch.allclose(solve(scene, grids, replace(SOLVED, **changes)).values, usual)
 
 
+def test_progress_counts_views_and_parts_of_channels(rng, scene, monkeypatch) -> None:
+    monkeypatch.setattr("splatseg.lift.voxels.solving._CHANNELS", 2)
+    gaussians, grid, rows, views = scene
+    told = []
+    grids = random_grids(rng, views)
+    found = lift_to_voxels(
+        grid, views, grids, options=SOLVED, gaussians=gaussians, rows=rows, backend=BACKEND,
+        progress=lambda *one: told.append(one),
+    )  # fmt: skip
+    assert told == [(done, 6) for done in range(1, 7)]
+    monkeypatch.undo()
+    torch.testing.assert_close(solve(scene, grids).values, found.values, atol=1e-3, rtol=0)
+
+
 def test_what_is_refused(rng, scene) -> None:
     gaussians, grid, rows, views = scene
     grids = random_grids(rng, views)
@@ -152,7 +166,7 @@ def test_a_voxel_that_no_view_shows_is_as_its_neighbours(rng, scene) -> None:
     assert float(found.totals[hidden]) == 0
     graph = neighbour_graph(
         NodeAttributes(positions=grid.centres.numpy()),
-        neighbours=8, colour_width=1.0, feature_width=1.0,
+        neighbours=16, colour_width=1.0, feature_width=1.0,
     )  # fmt: skip
     near = graph[hidden].indices
     beside, own = found.values[near], found.values[hidden]

@@ -85,6 +85,7 @@ def test_cells_of_few_points_are_left_out() -> None:
         {"min_points": 40, "cells": "depth"},
         {"projection": HitOptions(hits="first")},
         {"projection": HitOptions(hits="several")},
+        {"projection": HitOptions(hits="weights")},
         {"precision": "int8"},
         {"precision": "product", "parts": 2},
     ],

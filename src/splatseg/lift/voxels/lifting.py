@@ -30,7 +30,7 @@ from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift.mass.adjoint import RenderAdjoint, voting_views
 from splatseg.lift.mass.features import Taps, camera_of_grid, checked_grid, grid_taps, read_grid
 from splatseg.lift.voxels.grid import MAX_HITS, GridIndex
-from splatseg.lift.voxels.solving import VoxelMixing
+from splatseg.lift.voxels.solving import VoxelMixing, parts_of
 from splatseg.render import options_for
 
 HitRule = Literal["first", "several", "weights", "solved"]
@@ -58,7 +58,7 @@ class HitOptions:
     """With solved: standard deviation by which networks spread what they see, in cells of their
     feature maps."""
 
-    smoothness: float = 1.0
+    smoothness: float = 0.7
     """With solved: how much a voxel is like its neighbours; 1 counts as much as a whole cell."""
 
     near: float = 0.01
@@ -123,7 +123,8 @@ def lift_to_voxels(
         gaussians: With weights: the Gaussians of the scene.
         rows: With weights: the voxel of each Gaussian, -1 for none.
         backend: With weights: name of the rendering backend.
-        progress: Called with the views done and all there are.
+        progress: Called with the steps done and all there are, one a view, and with solved some
+            more.
 
     Raises:
         InputError: If there are no views, one has no features, a feature is not finite, or what
@@ -139,7 +140,7 @@ def lift_to_voxels(
     index = GridIndex(grid)
     sums: _Sums | None = None
     mixing: VoxelMixing | None = None
-    channels: int | None = None
+    channels, steps = None, len(ordered)
     if gaussians is not None and rows is not None and options.hits == "solved":
         check_shape("rows", rows, (len(gaussians),))
         mixing = VoxelMixing(
@@ -166,10 +167,13 @@ def lift_to_voxels(
                 sums.add_weights(view, features, gaussians, rows, backend)
             else:
                 sums.add_rays(view, features, index, depths)
+        steps = len(ordered) + (0 if mixing is None else parts_of(channels))
         if progress is not None:
-            progress(done + 1, len(ordered))
-    if mixing is not None and channels is not None:
-        values, totals = mixing.solved()
+            progress(done + 1, steps)
+    if mixing is not None:
+        values, totals = mixing.solved(
+            lambda part: None if progress is None else progress(len(ordered) + part, steps)
+        )
         return LiftedVoxels(values=values, totals=totals)
     if sums is None:
         raise InputError("views: expected at least one view with features, got none.")

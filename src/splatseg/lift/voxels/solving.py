@@ -21,12 +21,13 @@ References:
     Hestenes and Stiefel, Methods of Conjugate Gradients (1952).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.ndimage import gaussian_filter1d
@@ -41,7 +42,7 @@ from splatseg.lift.label_maps import label_map
 from splatseg.lift.mass.features import camera_of_grid
 from splatseg.lift.words.object_features import pixel_cells
 
-NEIGHBOURS = 8
+NEIGHBOURS = 16
 COLOUR_WIDTH = 0.2
 """Standard deviation of colours, in [0, 1], that count as alike."""
 
@@ -99,14 +100,20 @@ class VoxelMixing:
             self._features = np.zeros(features.channels)
             self._totals = np.zeros(len(self.grid))
         with one_torch_thread():
-            self._right += part.back @ part.blurred(values, once=True).numpy()
+            self._right += part.forth.T @ part.blurred(values, once=True).numpy()
         self._features += values.double().sum(dim=0).numpy()
         self._totals += part.seen
         self._cells += len(values)
         self._parts.append(part)
 
-    def solved(self) -> tuple[Float[Tensor, "m channels"], Float[Tensor, "m"]]:
-        """X and the mean added, and in how many cells each voxel is, all its shares together."""
+    def solved(
+        self, told: Callable[[int], None]
+    ) -> tuple[Float[Tensor, "m channels"], Float64[Tensor, "m"]]:
+        """X and the mean added, and in how many cells each voxel is, all its shares together.
+
+        Args:
+            told: Called with the number of the parts of the channels that are done, of `parts_of`.
+        """
         if self._right is None or self._features is None or self._totals is None:
             raise ValueError("no view was taken in")
         mean = (self._features / max(self._cells, 1)).astype(np.float32)
@@ -115,20 +122,24 @@ class VoxelMixing:
         smooth, degree = self._smoothing()
         diagonal = sum(part.squares for part in self._parts) + degree + RIDGE
         scale = (1 / diagonal).astype(np.float32)[:, None]
+        # Views on top of each other: one sum over cells a product and not one a view.
+        forth: Any = sparse.vstack([part.forth for part in self._parts], format="csr")
+        back = forth.T.tocsr()
 
         def applied(x: Array) -> Array:
-            found = smooth @ x + np.float32(RIDGE) * x
+            cells, start = torch.from_numpy(forth @ x), 0
             for part in self._parts:
-                seen = torch.from_numpy(part.forth @ x)
-                found += part.back @ part.blurred(seen, once=False).numpy()
-            return found
+                own = slice(start, start := start + part.forth.shape[0])
+                cells[own] = part.blurred(cells[own], once=False)
+            return smooth @ x + np.float32(RIDGE) * x + back @ cells.numpy()
 
         with one_torch_thread():
-            for start in range(0, right.shape[1], _CHANNELS):
-                part = slice(start, start + _CHANNELS)
+            for done in range(parts_of(right.shape[1])):
+                part = slice(done * _CHANNELS, (done + 1) * _CHANNELS)
                 right[:, part] = conjugate_gradients(
                     applied, np.ascontiguousarray(right[:, part]), scale
                 )
+                told(done + 1)
         right += mean
         return torch.from_numpy(right), torch.from_numpy(totals)
 
@@ -151,6 +162,11 @@ class VoxelMixing:
         degree = self.smoothness * np.asarray(graph.sum(axis=1), dtype=np.float64).reshape(-1)
         laplacian = sparse.diags(degree) - self.smoothness * graph
         return sparse.csr_matrix(laplacian, dtype=np.float32), degree
+
+
+def parts_of(channels: int) -> int:
+    """How many times some channels are solved for."""
+    return -(-channels // _CHANNELS)
 
 
 def conjugate_gradients(applied: Any, right: Array, scale: Array) -> Array:
@@ -195,9 +211,6 @@ class _ViewShares:
     forth: Any
     """Shares (cells, m), scipy sparse rows, float32."""
 
-    back: Any
-    """The transpose, as sparse rows."""
-
     down: tuple[Tensor, Tensor]
     """The blur of rows of cells, and its square; symmetric."""
 
@@ -233,7 +246,6 @@ class _ViewShares:
         kept = [float(both[1].diagonal().mean()) for both in matrices]
         return cls(
             forth=forth,
-            back=forth.T.tocsr(),
             down=matrices[0],
             right=matrices[1],
             seen=np.asarray(forth.sum(axis=0), dtype=np.float64).reshape(-1),
