@@ -24,8 +24,10 @@ SOLVED = HitOptions(hits="solved")
 
 @pytest.fixture
 def scene(rng):
-    """A cloud of Gaussians, its voxels, which of them each reads, and views."""
+    """A cloud of Gaussians of many colours, its voxels, which of them each reads, and views."""
     gaussians = random_gaussians(rng, 60)
+    colours = rng.normal(size=gaussians.sh.shape, scale=0.5)
+    gaussians = replace(gaussians, sh=torch.from_numpy(colours).to(gaussians.sh.dtype))
     grid = voxelise(gaussians.means, 0.4)
     rows = assign_voxels(grid, gaussians.means, options=AssignmentOptions()).rows[:, 0].long()
     return gaussians, grid, rows, views_of(3)
