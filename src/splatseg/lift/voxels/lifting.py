@@ -137,20 +137,10 @@ def lift_to_voxels(
     if options.hits in ("weights", "solved") and (gaussians is None or rows is None):
         raise InputError("gaussians, rows: expected Gaussians and their voxels, got none.")
     ordered = voting_views(views, evidence, "features")
-    index = GridIndex(grid)
+    index = GridIndex(grid) if options.hits in ("first", "several") else None
     sums: _Sums | None = None
     mixing: VoxelMixing | None = None
     channels, steps = None, len(ordered)
-    if gaussians is not None and rows is not None and options.hits == "solved":
-        check_shape("rows", rows, (len(gaussians),))
-        mixing = VoxelMixing(
-            grid=grid,
-            gaussians=gaussians,
-            rows=rows,
-            blur=options.blur,
-            smoothness=options.smoothness,
-            backend=backend,
-        )
     for done, view in enumerate(ordered):
         features = checked_grid(view, evidence.features(view.name))
         channels = features.channels if channels is None else channels
@@ -159,14 +149,24 @@ def lift_to_voxels(
                 f"evidence: expected {channels} channels of view {view.name}, as of "
                 f"view {ordered[0].name}, got {features.channels}."
             )
-        if mixing is not None:
+        if gaussians is not None and rows is not None and options.hits == "solved":
+            check_shape("rows", rows, (len(gaussians),))
+            mixing = mixing or VoxelMixing(
+                grid=grid,
+                gaussians=gaussians,
+                rows=rows,
+                blur=options.blur,
+                smoothness=options.smoothness,
+                channels=channels,
+                backend=backend,
+            )
             mixing.add(view, features)
         else:
             sums = sums or _Sums(voxels=len(grid), channels=channels, options=options)
-            if gaussians is not None and rows is not None and options.hits == "weights":
-                sums.add_weights(view, features, gaussians, rows, backend)
-            else:
+            if index is not None:
                 sums.add_rays(view, features, index, depths)
+            elif gaussians is not None and rows is not None:
+                sums.add_weights(view, features, gaussians, rows, backend)
         steps = len(ordered) + (0 if mixing is None else parts_of(channels))
         if progress is not None:
             progress(done + 1, steps)

@@ -77,12 +77,18 @@ class VoxelMixing:
     smoothness: float
     """Mu."""
 
+    channels: int
     backend: str = "auto"
-    _right: Array | None = None
-    _features: NDArray[np.float64] | None = None
     _cells: int = 0
     _parts: list["_ViewShares"] = field(default_factory=list)
-    _totals: NDArray[np.float64] | None = None
+    _right: Array = field(init=False)
+    _features: NDArray[np.float64] = field(init=False)
+    _totals: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._right = np.zeros((len(self.grid), self.channels), np.float32)
+        self._features = np.zeros(self.channels)
+        self._totals = np.zeros(len(self.grid))
 
     def add(self, view: View, features: FeatureMap) -> None:
         """Take in the cells of a view; memory is that of the shares of the voxels that it shows."""
@@ -95,10 +101,6 @@ class VoxelMixing:
         drawn = label_map(self.gaussians, camera, labels, backend=self.backend).ids
         part = _ViewShares.of(drawn.cpu().numpy(), features, len(self.grid), self.blur)
         values = features.features.float().cpu().flatten(0, 1)
-        if self._right is None or self._features is None or self._totals is None:
-            self._right = np.zeros((len(self.grid), features.channels), np.float32)
-            self._features = np.zeros(features.channels)
-            self._totals = np.zeros(len(self.grid))
         with one_torch_thread():
             self._right += part.forth.T @ part.blurred(values, once=True).numpy()
         self._features += values.double().sum(dim=0).numpy()
@@ -114,8 +116,6 @@ class VoxelMixing:
         Args:
             told: Called with the number of the parts of the channels that are done, of `parts_of`.
         """
-        if self._right is None or self._features is None or self._totals is None:
-            raise ValueError("no view was taken in")
         mean = (self._features / max(self._cells, 1)).astype(np.float32)
         right, totals = self._right, self._totals
         right -= totals[:, None].astype(np.float32) * mean
