@@ -7,6 +7,7 @@ from typing import Any
 
 from splatseg.errors import FileFormatError, RangeError
 from splatseg.models._family import Loading
+from splatseg.models.networks._config import offline, refused_by_library
 from splatseg.models.networks._library import library
 
 _FILES = (
@@ -31,29 +32,16 @@ class Tokens:
 
     Args:
         place: The weights.
+        config: The network's, as the library has it: it says which tokenizer goes with it.
         longest: Most tokens that the network takes, those of begin and end included.
 
     Raises:
         FileFormatError: If there is none, or it cannot be read.
     """
 
-    def __init__(self, place: Loading, *, longest: int) -> None:
+    def __init__(self, place: Loading, config: Any, *, longest: int) -> None:
         folder = place.folder
-        if not any((folder / name).is_file() for name in _VOCABULARIES):
-            raise FileFormatError(
-                f"{folder}: expected a tokenizer beside the weights (tokenizer.json), got none."
-            )
-        try:
-            self._tokenizer = library().AutoTokenizer.from_pretrained(
-                folder, local_files_only=True, use_fast=True
-            )
-        except Exception as error:
-            # The library of the tokenizers raises Exception itself for a broken file.
-            words = str(error).strip().splitlines()
-            raise FileFormatError(
-                f"{folder}: the tokenizer cannot be read "
-                f"({words[0][:160] if words else type(error).__name__})."
-            ) from error
+        self._tokenizer = load_tokenizer(folder, config)
         self._longest = longest
         self._device = place.device
         self.digest = _digest(folder)
@@ -108,6 +96,26 @@ class Tokens:
                 raise RangeError(
                     f"words: expected at most {self._longest} tokens, got {count} for {text!r:.60}."
                 )
+
+
+def load_tokenizer(folder: Path, config: Any) -> Any:
+    """The library's tokenizer of a folder of weights.
+
+    Args:
+        folder: The weights.
+        config: The network's, as the library has it; it reads config.json itself without.
+
+    Raises:
+        FileFormatError: If there is none, or it cannot be read.
+    """
+    if not any((folder / name).is_file() for name in _VOCABULARIES):
+        raise FileFormatError(
+            f"{folder}: expected a tokenizer beside the weights (tokenizer.json), got none."
+        )
+    with offline(), refused_by_library(folder, "the tokenizer of the weights"):
+        return library().AutoTokenizer.from_pretrained(
+            folder, config=config, local_files_only=True, trust_remote_code=False
+        )
 
 
 def _digest(folder: Path) -> str:

@@ -60,12 +60,10 @@ class _ClipTowers(Towers):
     """
 
     def __init__(self, options: ClipOptions, place: Loading) -> None:
-        configuration(place, ("clip",))
-        self._network = network(place, "CLIPModel")
-        vision = self._network.config.vision_config
-        self._tokens = Tokens(
-            place, longest=int(self._network.config.text_config.max_position_embeddings)
-        )
+        self._network = network(place, "CLIPModel", configuration(place, ("clip",)))
+        known = self._network.config
+        vision = known.vision_config
+        self._tokens = Tokens(place, known, longest=int(known.text_config.max_position_embeddings))
         self._patches = options.patches
         self.patch, self.size = int(vision.patch_size), int(vision.image_size)
         self.width = int(self._network.config.projection_dim)

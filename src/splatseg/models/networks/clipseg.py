@@ -60,21 +60,20 @@ class ClipSeg:
 
     def __init__(self, name: str, options: ClipSegOptions, place: Loading) -> None:
         words = checked_words(options.words, needed=name)
-        configuration(place, ("clipseg",))
+        config = configuration(place, ("clipseg",))
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together
         self._options = options
         self._place = place
-        self._network = network(place, "CLIPSegForImageSegmentation")
-        patch = int(self._network.config.vision_config.patch_size)
+        self._network = network(place, "CLIPSegForImageSegmentation", config)
+        known = self._network.config
+        patch = int(known.vision_config.patch_size)
         self._size = place.size or input_side(place.folder, "height", _DEFAULT_SIZE)
         if self._size % patch:
             raise RangeError(f"size: expected a multiple of {patch}, got {self._size}.")
         self._normalisation = Normalisation.of(place.folder)
-        tokens = Tokens(
-            place, longest=int(self._network.config.text_config.max_position_embeddings)
-        )
+        tokens = Tokens(place, known, longest=int(known.text_config.max_position_embeddings))
         self._tokenizer = tokens.digest
         self._classes = word_classes(words)
         self._conditions = self._encode_words(tokens, in_sentences(words, options.template))

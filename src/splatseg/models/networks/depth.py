@@ -82,7 +82,7 @@ class DepthNetwork:
         convert_fields(options)
         config = configuration(place, tuple(_CLASSES[name]))
         self._network = network(
-            place, _CLASSES[name][str(config["model_type"])], unused=UNUSED_OF_DPT
+            place, _CLASSES[name][str(config["model_type"])], config, unused=UNUSED_OF_DPT
         )
         kind = getattr(self._network.config, "depth_estimation_type", "relative")
         self._is_metric = kind == "metric"

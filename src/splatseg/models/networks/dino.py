@@ -49,14 +49,15 @@ class Dino:
 
     def __init__(self, name: str, options: DinoOptions, place: Loading) -> None:
         classes = _CLASSES[name]
-        kind = str(configuration(place, tuple(classes))["model_type"])
+        content = configuration(place, tuple(classes))
+        kind = str(content["model_type"])
         extra: dict[str, Any] = {"add_pooling_layer": False} if kind == "vit" else {}
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together
         self._options = options
         self._place = place
-        self._network = network(place, classes[kind], **extra)
+        self._network = network(place, classes[kind], content, **extra)
         config = self._network.config
         self._patch = int(config.patch_size)
         self._size = place.size or _trained_size(config)

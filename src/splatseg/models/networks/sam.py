@@ -87,7 +87,8 @@ class Sam:
 
     def __init__(self, name: str, options: SamOptions, place: Loading) -> None:
         convert_fields(options)
-        held = str(configuration(place, _TYPES[name])["model_type"])
+        content = configuration(place, _TYPES[name])
+        held = str(content["model_type"])
         kind = held.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
         parts: dict[str, Any] = {"key_mapping": _SAM3_PARTS} if held == "sam3_video" else {}
         self.name = name
@@ -96,7 +97,7 @@ class Sam:
         self._kind = _KINDS[kind]
         self._options = options
         self._place = place
-        self._network = network(place, self._kind.class_name, **parts)
+        self._network = network(place, self._kind.class_name, content, **parts)
         self._size = self._trained_size()
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")

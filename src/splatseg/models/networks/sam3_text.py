@@ -51,13 +51,13 @@ class _Sam3(Finder):
     """The detector of SAM 3. The image is encoded once, and asked about each word."""
 
     def __init__(self, options: Sam3TextOptions, place: Loading) -> None:
-        configuration(place, ("sam3", "sam3_video"))
+        content = configuration(place, ("sam3", "sam3_video"))
         self._options = options
         self._place = place
-        self._network = network(place, "Sam3Model")
+        self._network = network(place, "Sam3Model", content)
         config = self._network.config
         self._longest = int(config.text_config.max_position_embeddings)
-        self._tokens = Tokens(place, longest=self._longest)
+        self._tokens = Tokens(place, config, longest=self._longest)
         self._size = _side(config.vision_config.backbone_config.image_size)
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")

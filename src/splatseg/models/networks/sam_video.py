@@ -69,13 +69,13 @@ class SamVideo:
     def __init__(self, name: str, options: SamVideoOptions, place: Loading) -> None:
         convert_fields(options)
         kind = _KINDS[name]
-        configuration(place, kind.types)
+        content = configuration(place, kind.types)
         self.name = name
         self.note = f"weights {place.name}"
         self._kind = kind
         self._options = options
         self._place = place
-        self._network = network(place, f"{kind.library_name}Model")
+        self._network = network(place, f"{kind.library_name}Model", content)
         self._size = int(self._network.image_size)
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")

@@ -61,8 +61,9 @@ class _SiglipTowers(Towers):
     """
 
     def __init__(self, place: Loading) -> None:
-        kind = str(configuration(place, tuple(_CLASSES))["model_type"])
-        self._network = network(place, _CLASSES[kind])
+        content = configuration(place, tuple(_CLASSES))
+        kind = str(content["model_type"])
+        self._network = network(place, _CLASSES[kind], content)
         vision, text = self._network.config.vision_config, self._network.config.text_config
         if not getattr(vision, "vision_use_head", True):
             raise FileFormatError(
@@ -70,7 +71,7 @@ class _SiglipTowers(Towers):
                 "words, got one without."
             )
         self._longest = int(text.max_position_embeddings)
-        self._tokens = Tokens(place, longest=self._longest)
+        self._tokens = Tokens(place, self._network.config, longest=self._longest)
         self._is_flexible = kind == "siglip2"
         self.patch = int(vision.patch_size)
         self.size = (
