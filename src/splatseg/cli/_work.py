@@ -14,6 +14,7 @@ from splatseg.cli._fit_progress import fit_progress, pose_progress
 from splatseg.cli._progress import progress
 from splatseg.cli._streams import tell
 from splatseg.core import Scene
+from splatseg.errors import visible
 from splatseg.fit import FitProgress
 from splatseg.io.scene import load_scene
 from splatseg.pose import PoseProgress
@@ -41,7 +42,7 @@ def print_result(facts: Mapping[str, Any], lines: Sequence[str], *, json: bool) 
         lines: The same in sentences.
         json: Which of the two.
     """
-    sys.stdout.write(_json_line(facts) if json else "".join(f"{line}\n" for line in lines))
+    sys.stdout.write(_json_line(facts) if json else "".join(f"{visible(line)}\n" for line in lines))
     sys.stdout.flush()
 
 
@@ -98,13 +99,13 @@ class ConsoleObserver(Observer):
     def note(self, message: str) -> None:
         """A line of its own on stderr."""
         if not self._quiet:
-            tell(sys.stderr, f"note: {message}\n")
+            tell(sys.stderr, f"note: {visible(message)}\n")
 
     @override
     def info(self, message: str) -> None:
         """A line of its own."""
         if not self._quiet:
-            tell(sys.stderr if self._json else sys.stdout, f"{message}\n")
+            tell(sys.stderr if self._json else sys.stdout, f"{visible(message)}\n")
 
 
 def _nothing(now: object) -> None:
