@@ -157,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
     except KeyboardInterrupt as error:
         how = f": {error}" if error.args else ""
-        tell(sys.stderr, f"interrupted{how}\n")
+        tell(sys.stderr, f"interrupted{visible(how)}\n")
         return EXIT_FAILED
     except InputError as error:
         return _report(error, str(error), status=EXIT_USAGE, debug=debug)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rich.text import Text
 from typing_extensions import override
 
 from splatseg.cli._fit_progress import fit_progress, pose_progress
@@ -44,6 +45,11 @@ def print_result(facts: Mapping[str, Any], lines: Sequence[str], *, json: bool) 
     """
     sys.stdout.write(_json_line(facts) if json else "".join(f"{visible(line)}\n" for line in lines))
     sys.stdout.flush()
+
+
+def plain(value: object) -> Text:
+    """A value as a table of the terminal shows it: brackets in names are no markup."""
+    return Text(visible(str(value)))
 
 
 def _json_line(facts: Mapping[str, Any]) -> str:

@@ -7,7 +7,7 @@ import pytest
 
 from splatseg.errors import FileFormatError
 from splatseg.io.scans import read_scans
-from splatseg.io.scans._las_sizes import check_las_sizes, decoding
+from splatseg.io.scans._las_sizes import check_las_sizes
 from support.fuzz.targets.lasers import COUNT, write
 
 RECORDS, DATA, FORMAT, POINT_BYTES = 100, 96, 104, 105
@@ -111,12 +111,3 @@ def test_chunks_and_their_layers(file) -> None:
         change(path, at, layout, value)
         with pytest.raises(FileFormatError, match=words):
             read_scans(path)
-
-
-def test_a_panic_of_the_decoder_is_damage_and_an_interrupt_is_not(tmp_path) -> None:
-    panic = type("PanicException", (BaseException,), {})
-    damage = pytest.raises(FileFormatError, match="a.laz: expected compressed points")
-    with damage, decoding(tmp_path / "a.laz"):
-        raise panic("index out of range")
-    with pytest.raises(KeyboardInterrupt), decoding(tmp_path / "a.laz"):
-        raise KeyboardInterrupt

@@ -8,13 +8,12 @@ Specification 1.4 R15; Isenburg, LASzip (2013), and its format's layers.
 
 import importlib
 import struct
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from splatseg.errors import FileFormatError, MissingPackageError, reason
+from splatseg.errors import FileFormatError, MissingPackageError
 from splatseg.io.foreign import reading
 from splatseg.io.limits import check_unpacked
 
@@ -71,26 +70,6 @@ def check_las_sizes(path: Path) -> None:
                 raise FileFormatError(f"{path}: expected {what}, but the file ends early.")
         elif sizes.points:
             _check_packed(path, file, sizes, records)
-
-
-@contextmanager
-def decoding(path: Path) -> Generator[None]:
-    """Raise the documented error for what the decompressor does not expect.
-
-    It is written in Rust, whose panics come as a class of exceptions that no module names, beside
-    `Exception`.
-
-    Raises:
-        FileFormatError: For a panic.
-    """
-    try:
-        yield
-    except BaseException as error:
-        if type(error).__name__ != "PanicException":
-            raise
-        raise FileFormatError(
-            f"{path}: expected compressed points, but they cannot be read ({reason(error)})."
-        ) from error
 
 
 def _header(path: Path, file: BinaryIO) -> tuple[_Sizes, dict[tuple[bytes, int], bytes]]:
@@ -213,10 +192,7 @@ def _chunks(
             "install 'splatseg[las]'."
         ) from error
     file.seek(sizes.data)
-    with decoding(path):
-        chunks = [
-            (int(n), int(size)) for n, size in lazrs.read_chunk_table(file, lazrs.LazVlr(record))
-        ]
+    chunks = [(int(n), int(size)) for n, size in lazrs.read_chunk_table(file, lazrs.LazVlr(record))]
     held = chunk * len(chunks) if chunk != _ANY_SIZE else sum(n for n, _ in chunks)
     if held < sizes.points:
         raise FileFormatError(

@@ -15,7 +15,7 @@ import numpy as np
 
 from splatseg.errors import FileFormatError, MissingPackageError
 from splatseg.io.foreign import reading
-from splatseg.io.scans._las_sizes import check_las_sizes, decoding
+from splatseg.io.scans._las_sizes import check_las_sizes
 from splatseg.io.scans._source import RawScan
 from splatseg.io.scans.clouds import Piece, whole_ids
 
@@ -48,7 +48,7 @@ def open_las(path: Path) -> Generator[Any]:
     """
     laspy = laspy_for(path)
     check_las_sizes(path)
-    with reading(path, _KIND), path.open("rb") as file, decoding(path):
+    with reading(path, _KIND), path.open("rb") as file:
         try:
             with laspy.open(file, closefd=False) as reader:
                 yield reader
