@@ -1,8 +1,10 @@
 """Every family of networks with a tiny checkpoint, and one question to what is loaded from it."""
 
+import json
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file, save_file
 
 from splatseg.core import LabelMap
 from splatseg.models import LoadOptions, find_family, find_model
@@ -36,6 +38,22 @@ def checkpoint(family: str, kind: str, folder: Path) -> Path:
     if family == "oneformer":
         save_tokenizer(path)
     return path
+
+
+def in_parts(folder: Path) -> list[Path]:
+    """Give weights in one file as two with an index; the two files."""
+    whole = folder / "model.safetensors"
+    tensors = sorted(load_file(whole).items())
+    index: dict[str, str] = {}
+    parts = [folder / f"model-0000{i + 1}-of-00002.safetensors" for i in range(2)]
+    for i, part in enumerate(parts):
+        held = dict(tensors[i::2])
+        save_file(held, part, metadata={"format": "pt"})
+        index |= dict.fromkeys(held, part.name)
+    content = {"metadata": {"total_size": whole.stat().st_size}, "weight_map": index}
+    whole.unlink()
+    (folder / f"{whole.name}.index.json").write_text(json.dumps(content))
+    return parts
 
 
 def asked(family: str, weights: Path) -> object:

@@ -15,13 +15,18 @@ from splatseg.errors import (
     InputError,
     MissingFileError,
     MissingPackageError,
+    brief,
     quoted,
 )
+from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json
 from splatseg.models._family import Checkpoint, LoadOptions, ModelFamily
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _WEIGHTS = ("*.safetensors", "*.bin", "*.pt", "*.ckpt")
+_WHOLE = ("model.safetensors", "pytorch_model.bin")
+"""Files that hold all weights, the one before the other; in several parts, an index goes by it."""
+
 _CONFIGURATION = "*config.json"
 _FILES = ("*.json", "*.txt", "*.model")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -71,6 +76,7 @@ def find_weights(
         found = _fetched(asked, report, flag)
     if found is not None:
         _check_entries(found)
+        _check_parts(found)
     else:
         raise MissingFileError(
             f"weights: {asked} is not on this machine ({_described(known)}); --download fetches "
@@ -151,6 +157,7 @@ def _single_file(family: ModelFamily, options: LoadOptions) -> tuple[Path, str]:
 
 def _check_folder(folder: Path) -> None:
     _check_entries(folder)
+    _check_parts(folder)
     if not (folder / "config.json").is_file() or not weight_files(folder):
         raise MissingFileError(
             f"{folder}: expected weights as save_pretrained writes them (config.json and "
@@ -161,19 +168,43 @@ def _check_folder(folder: Path) -> None:
 def _check_entries(folder: Path) -> None:
     """Refuse a folder in which something else stands where a file is read: that may never end.
 
-    A pipe or a device waits for whoever writes; so does a link to one. An index of several files
-    names those of the folder alone.
+    A pipe or a device waits for whoever writes; so does a link to one. Adapters are refused: with
+    the package peft the library puts one into the network, and imports what it names.
     """
+    adapter = folder / "adapter_config.json"
+    if adapter.exists():
+        raise FileFormatError(f"{adapter}: expected the weights of a network, got an adapter.")
     for path in sorted(folder.iterdir()):
         expected = any(path.match(pattern) for pattern in (*_WEIGHTS, *_FILES))
         if not path.is_file() and (expected or (path.exists() and not path.is_dir())):
             raise FileFormatError(f"{path}: expected a regular file, got something else.")
+
+
+def _check_parts(folder: Path) -> None:
+    """Refuse weights in several parts of which some are not there, or lie elsewhere.
+
+    Raises:
+        FileFormatError: If an index names files that are not beside it.
+        MissingFileError: If a file that the index of the weights names is not there.
+    """
     for index in sorted(folder.glob("*.index.json")):
         for name in _parts(index):
             if name != Path(name).name:
                 raise FileFormatError(
                     f"{index}: weight_map: expected names of files beside it, got {quoted(name)}."
                 )
+    for whole in _WHOLE:
+        index = folder / f"{whole}.index.json"
+        if (folder / whole).is_file():
+            return
+        if index.is_file():
+            lacking = sorted(name for name in _parts(index) if not is_file(folder / name))
+            if lacking:
+                raise MissingFileError(
+                    f"{index}: expected the files that it names beside it, but there is no "
+                    f"{brief(', '.join(lacking))}."
+                )
+            return
 
 
 def _in_cache(id: str) -> Path | None:

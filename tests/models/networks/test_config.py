@@ -10,11 +10,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import torch
 
-from splatseg.errors import FileFormatError, InputError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.models import LoadOptions, find_model
 from splatseg.models.networks._config_keys import FLAGS, NUMBERS, WORDS
-from support.networks import KINDS, asked, checkpoint
+from splatseg.models.networks._library import side_of
+from support.networks import IMAGE, KINDS, asked, checkpoint, in_parts
 
 LOAD = """
 import sys
@@ -215,3 +217,104 @@ def test_parts_of_weights_lie_beside_their_index(checkpoints, tmp_path) -> None:
     index.write_text(json.dumps({"weight_map": {"a": "../../other.safetensors"}}))
     with pytest.raises(FileFormatError, match="weight_map: expected names of files beside it"):
         load(folder)
+
+
+def test_a_tokenizer_that_ends_in_a_panic(checkpoints, tmp_path, capfd) -> None:
+    """Parts of words that are longer than the words: the library counts below zero."""
+    folder = Path(shutil.copytree(checkpoint("oneformer", "oneformer", tmp_path), tmp_path / "w"))
+    content = json.loads((folder / "tokenizer.json").read_text())
+    words = ["<pad>", "<unk>", "a", "b", "ab"]
+    content["model"] = {
+        "type": "BPE", "continuing_subword_prefix": "x" * 9, "merges": [["a", "b"]],
+        "vocab": {word: i for i, word in enumerate(words)}, "unk_token": "<unk>",
+    }  # fmt: skip
+    (folder / "tokenizer.json").write_text(json.dumps(content))
+    match = r"w: expected the tokenizer of the weights, but it cannot be read \(range end index"
+    with pytest.raises(FileFormatError, match=match):
+        asked("oneformer", folder)
+
+
+def test_a_tokenizer_that_fails_when_it_is_asked(checkpoints, tmp_path) -> None:
+    """What it says of words that it does not know is in no vocabulary either."""
+    folder = Path(shutil.copytree(checkpoint("oneformer", "oneformer", tmp_path), tmp_path / "w"))
+    content = json.loads((folder / "tokenizer.json").read_text())
+    content["model"]["unk_token"] = "nowhere"
+    content["model"]["vocab"] = {"<pad>": 0, "<unk>": 1}
+    (folder / "tokenizer.json").write_text(json.dumps(content))
+    with pytest.raises(FileFormatError, match="w: expected the tokenizer of the weights, but it"):
+        asked("oneformer", folder)
+
+
+def test_weights_in_parts(checkpoints, tmp_path) -> None:
+    folder = Path(shutil.copytree(checkpoints("dinov2"), tmp_path / "weights"))
+    whole = load(folder)
+    first, second = in_parts(folder)
+    found, wanted = (model.features(IMAGE).class_token for model in (load(folder), whole))
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    second.unlink()
+    match = f"safetensors.index.json: expected the files .*, but there is no {second.name}.$"
+    with pytest.raises(MissingFileError, match=match):
+        load(folder)
+    first.unlink()
+    with pytest.raises(MissingFileError, match=f"there is no {first.name}, {second.name}.$"):
+        load(folder)
+    index = folder / "model.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": {"a": "x" * 5000}}))
+    with pytest.raises(MissingFileError, match="there is no x") as caught:
+        load(folder)
+    assert len(str(caught.value)) < 600
+
+
+def test_an_index_beside_whole_weights_is_not_followed(checkpoints, tmp_path) -> None:
+    folder = Path(shutil.copytree(checkpoints("dinov2"), tmp_path / "weights"))
+    index = {"weight_map": {"a": "model-00001-of-00002.safetensors"}}
+    (folder / "model.safetensors.index.json").write_text(json.dumps(index))
+    load(folder)
+
+
+def test_an_adapter_is_no_network(checkpoints, tmp_path) -> None:
+    """With the package peft the library would put it in, and import what it names."""
+    folder = Path(shutil.copytree(checkpoints("dinov2"), tmp_path / "weights"))
+    (folder / "adapter_config.json").write_text('{"peft_type": "LORA"}')
+    with pytest.raises(FileFormatError, match="adapter_config.json: expected the weights of a net"):
+        load(folder)
+
+
+@pytest.mark.parametrize(
+    ("family", "kind", "values", "words"),
+    [
+        ("dinov3", "dinov3", {"image_size": 0}, "expected sides in pixels, got 0"),
+        ("clipseg", "clipseg", {"extract_layers": [0, 77]}, r"some of \d+ blocks, got \[0, 77\]"),
+        ("clipseg", "clipseg", {"extract_layers": [-1]}, r"some of \d+ blocks, got \[-1\]"),
+    ],
+)
+def test_sizes_that_are_none(changed, family, kind, values, words) -> None:
+    with pytest.raises(FileFormatError, match=f"config.json: .*{words}"):
+        asked(family, changed(kind, **values))
+
+
+@pytest.mark.parametrize(("value", "side"), [(14, 14), ([14, 16], 16), ((3,), 3)])
+def test_a_side(value, side) -> None:
+    assert side_of(Path("a"), value) == side
+
+
+@pytest.mark.parametrize("value", [0, -1, 2.0, None, [], [4, 0], "8"])
+def test_no_side(value) -> None:
+    with pytest.raises(FileFormatError, match=r"a/config.json: expected sides in pixels, got "):
+        side_of(Path("a"), value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"size": {"height": 1 << 15}}, "size: height: expected a number of pixels up to 16384"),
+        ({"size": {"height": True}}, "size: height: expected a number of pixels up to 16384"),
+        ({"image_std": [0.5, 0.0, 0.5]}, r"image_std: expected three numbers in \[0.001, 1\]"),
+        ({"image_mean": [0.5, -0.1, 0.5]}, r"image_mean: expected three numbers in \[0, 1\]"),
+    ],
+)
+def test_what_is_said_of_pictures(checkpoints, tmp_path, content, words) -> None:
+    folder = Path(shutil.copytree(checkpoints("clipseg"), tmp_path / "weights"))
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
+    with pytest.raises(FileFormatError, match=f"preprocessor_config.json: {words}"):
+        asked("clipseg", folder)

@@ -113,7 +113,7 @@ _WORDS = """
 _KNOWN_WORDS = """
     absolute add axial basic bottleneck default gelu gelu_fast gelu_new gelu_pytorch_tanh GN ignore
     learned leaky_relu metric mish preactivation project quick_gelu relative relu relu2 relu6 same
-    sigmoid silu sine swish tanh valid
+    SAME sigmoid silu sine swish tanh valid VALID
 """
 
 NUMBERS = {

@@ -12,7 +12,13 @@ from typing import Any, cast
 import torch
 
 from splatseg.core.models import Model
-from splatseg.errors import FileFormatError, MissingPackageError, SplatsegError, reason
+from splatseg.errors import (
+    FileFormatError,
+    MissingPackageError,
+    SplatsegError,
+    quoted,
+    reason,
+)
 from splatseg.models._encoded import is_lack_of_memory
 from splatseg.models._family import Checkpoint, Loading, ModelFamily
 from splatseg.models._sources import What
@@ -157,6 +163,25 @@ def _check_size(
             f"{path}: expected a network of the size of its weights, got one of {count} numbers "
             f"for {most - _FREE} bytes."
         )
+
+
+def side_of(folder: Path, value: object) -> int:
+    """A side in pixels of what a network takes, or of its patches, out of its configuration.
+
+    Args:
+        folder: The weights.
+        value: One number, or those of rows and columns, of which the larger counts.
+
+    Raises:
+        FileFormatError: If it is none above 0.
+    """
+    sides = cast("Sequence[object]", value) if isinstance(value, list | tuple) else [value]
+    whole = [side for side in sides if isinstance(side, int) and side > 0]
+    if not whole or len(whole) < len(sides):
+        raise FileFormatError(
+            f"{folder / 'config.json'}: expected sides in pixels, got {quoted(value)}."
+        )
+    return max(whole)
 
 
 def network_family(

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ _VOCABULARIES = ("tokenizer.json", "vocab.json", "vocab.txt", "tokenizer.model",
 """One of these holds the tokens. Without any the library makes a tokenizer that knows no word."""
 
 
+_EXPECTED = "the tokenizer of the weights"
+
+
 class Tokens:
     """The tokenizer that lies beside a network's weights.
 
@@ -40,7 +44,7 @@ class Tokens:
     """
 
     def __init__(self, place: Loading, config: Any, *, longest: int) -> None:
-        folder = place.folder
+        folder = self._folder = place.folder
         self._tokenizer = load_tokenizer(folder, config)
         self._longest = longest
         self._device = place.device
@@ -67,7 +71,8 @@ class Tokens:
             if padded_to is None
             else {"padding": "max_length", "max_length": padded_to}
         )
-        found = self._tokenizer(list(texts), return_tensors="pt", **padding)
+        with self._reading():
+            found = self._tokenizer(list(texts), return_tensors="pt", **padding)
         return {name: values.to(self._device) for name, values in found.items()}
 
     def spans(self, text: str) -> list[tuple[int, int]]:
@@ -85,17 +90,23 @@ class Tokens:
                 "tokenizer: expected one that tells where tokens stand (tokenizer.json), got one "
                 "that does not."
             )
-        found = self._tokenizer(text, return_offsets_mapping=True)["offset_mapping"]
+        with self._reading():
+            found = self._tokenizer(text, return_offsets_mapping=True)["offset_mapping"]
         return [(int(start), int(end)) for start, end in found]
 
     def _check_lengths(self, texts: Sequence[str]) -> None:
         for text in texts:
             # Longer than the tokenizer's own limit is news to the library, and an error here.
-            count = len(self._tokenizer(text, verbose=False)["input_ids"])
+            with self._reading():
+                count = len(self._tokenizer(text, verbose=False)["input_ids"])
             if count > self._longest:
                 raise RangeError(
                     f"words: expected at most {self._longest} tokens, got {count} for {text!r:.60}."
                 )
+
+    def _reading(self) -> AbstractContextManager[None]:
+        """What is damaged in a tokenizer may show when it is asked."""
+        return refused_by_library(self._folder, _EXPECTED)
 
 
 def load_tokenizer(folder: Path, config: Any) -> Any:
@@ -112,7 +123,7 @@ def load_tokenizer(folder: Path, config: Any) -> Any:
         raise FileFormatError(
             f"{folder}: expected a tokenizer beside the weights (tokenizer.json), got none."
         )
-    with offline(), refused_by_library(folder, "the tokenizer of the weights"):
+    with offline(), refused_by_library(folder, _EXPECTED):
         return library().AutoTokenizer.from_pretrained(
             folder, config=config, local_files_only=True, trust_remote_code=False
         )

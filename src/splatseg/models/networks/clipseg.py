@@ -15,12 +15,18 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, ClassTable, LabelMap
 from splatseg.core.boundary import convert_fields
 from splatseg.core.models import Image
-from splatseg.errors import RangeError
+from splatseg.errors import FileFormatError, RangeError, quoted
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import Normalisation, frame_of, input_side, network_input
 from splatseg.models._words import checked_template, checked_words, in_sentences, word_classes
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 from splatseg.models.networks._tokens import Tokens
 
 _DEFAULT_SIZE = 352
@@ -68,7 +74,13 @@ class ClipSeg:
         self._place = place
         self._network = network(place, "CLIPSegForImageSegmentation", config)
         known = self._network.config
-        patch = int(known.vision_config.patch_size)
+        count = int(known.vision_config.num_hidden_layers)
+        if not all(0 <= block < count for block in known.extract_layers):
+            raise FileFormatError(
+                f"{place.folder / 'config.json'}: extract_layers: expected some of {count} blocks, "
+                f"got {quoted(known.extract_layers)}."
+            )
+        patch = side_of(place.folder, known.vision_config.patch_size)
         self._size = place.size or input_side(place.folder, "height", _DEFAULT_SIZE)
         if self._size % patch:
             raise RangeError(f"size: expected a multiple of {patch}, got {self._size}.")

@@ -21,7 +21,13 @@ from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Frame, Normalisation, frame_of, network_input
 from splatseg.models._mask_generator import Decode, MaskGeneratorOptions, automatic_masks
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,9 +213,7 @@ class Sam:
         """Side of the input that the weights were made for, pixels."""
         vision = self._network.config.vision_config
         size = getattr(getattr(vision, "backbone_config", vision), "image_size", None)
-        if isinstance(size, list | tuple):
-            size = max(cast("Sequence[int]", size))
-        return int(size or self._kind.default_size)
+        return side_of(self._place.folder, size or self._kind.default_size)
 
     def _frame(self, height: int, width: int) -> Frame:
         return frame_of(height, width, size=self._size, shape=self._kind.shape)
@@ -282,7 +286,8 @@ class Sam:
     def _mask_hint(self, mask: Tensor, frame: Frame) -> Tensor:
         """A rough mask as logits of the decoder's input size, out of the image surely not."""
         hints = self._network.config.prompt_encoder_config
-        size = 4 * (hints.image_size // hints.patch_size)
+        folder = self._place.folder
+        size = 4 * (side_of(folder, hints.image_size) // side_of(folder, hints.patch_size))
         inner = F.interpolate(
             mask[:, None].float(), (frame.inner_height, frame.inner_width), mode="bilinear"
         )

@@ -18,7 +18,13 @@ from splatseg.core.models import Image
 from splatseg.errors import RangeError
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Normalisation, frame_of, network_input
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 from splatseg.models.networks._video_memory import VideoMemory, session_of
 
 _CUT = 0.0
@@ -76,7 +82,7 @@ class SamVideo:
         self._options = options
         self._place = place
         self._network = network(place, f"{kind.library_name}Model", content)
-        self._size = int(self._network.image_size)
+        self._size = side_of(place.folder, self._network.image_size)
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
         self._normalisation = Normalisation.of(place.folder, self._kind.colours)

@@ -37,8 +37,9 @@ from splatseg.models.networks._library import (
     network,
     network_family,
     settings_of,
+    side_of,
 )
-from splatseg.models.networks._tokens import load_tokenizer
+from splatseg.models.networks._tokens import Tokens
 
 Task = Literal["semantic", "panoptic"]
 
@@ -87,7 +88,9 @@ class Segmenter:
         self._options = options
         self._place = place
         self._normalisation = Normalisation.of(place.folder)
-        self._side = int(self._network.config.image_size) if name == "eomt" else None
+        self._side = (
+            side_of(place.folder, self._network.config.image_size) if name == "eomt" else None
+        )
         if self._side is not None and place.size not in (None, self._side):
             raise InputError(
                 f"size: expected {self._side}, the only one that {place.name} takes, got "
@@ -224,11 +227,9 @@ class Segmenter:
 
     def _task_tokens(self, task: Task) -> Int64[Tensor, "1 length"]:
         """The sentence that tells OneFormer its task, as numbers; 0 after its end."""
-        tokenizer = load_tokenizer(self._place.folder, self._network.config)
-        found = tokenizer(
-            [f"the task is {task}"], padding="max_length", truncation=True,
-            max_length=int(self._network.config.task_seq_len), return_tensors="pt",
-        )  # fmt: skip
+        longest = int(self._network.config.task_seq_len)
+        tokens = Tokens(self._place, self._network.config, longest=longest)
+        found = tokens.of([f"the task is {task}"], padded_to=longest)
         return found["input_ids"] * found["attention_mask"]
 
 
