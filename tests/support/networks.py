@@ -67,7 +67,9 @@ def asked(family: str, weights: Path) -> object:
         return list(model.track([("a", IMAGE), ("b", IMAGE)], seeds))
     if hasattr(model, "boxes"):
         return model.boxes(IMAGE, ["chair"])
-    for question in ("features", "text_features", "depth_map", "label_map", "panoptic", "masks"):
+    if hasattr(model, "encode_text"):
+        return model.text_features(IMAGE), model.encode_text(["chair"])
+    for question in ("features", "depth_map", "label_map", "panoptic", "masks"):
         if hasattr(model, question):
             return getattr(model, question)(IMAGE)
     raise ValueError(family)

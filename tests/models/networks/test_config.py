@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import socket
-import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,23 +15,6 @@ from splatseg.models import LoadOptions, find_model
 from splatseg.models.networks._config_keys import FLAGS, NUMBERS, WORDS
 from splatseg.models.networks._library import side_of
 from support.networks import IMAGE, KINDS, asked, checkpoint, in_parts
-
-LOAD = """
-import sys
-from splatseg.errors import FileFormatError
-from splatseg.models import LoadOptions, find_model
-try:
-    find_model("dinov2", loading=LoadOptions(weights=sys.argv[1], device="cpu"))
-    print("loaded")
-except FileFormatError as error:
-    print(error)
-"""
-FAKE = """
-from pathlib import Path
-def __getattr__(name):
-    Path(__file__).with_name("called").touch()
-    raise AttributeError(name)
-"""
 
 
 @pytest.fixture
@@ -180,24 +161,6 @@ def test_nothing_is_asked_of_the_network(name, tmp_path, monkeypatch) -> None:
     assert seen == []
 
 
-def test_no_code_is_fetched_for_attention(changed, tmp_path) -> None:
-    """transformers asks the package `kernels`, where there is one, for what the file names."""
-    packages = tmp_path / "packages"
-    (packages / "kernels").mkdir(parents=True)
-    (packages / "kernels" / "__init__.py").write_text(FAKE)
-    about = packages / "kernels-0.99.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: kernels\nVersion: 0.99.0\n")
-    folder = changed("dinov2", attn_implementation="kernels-community/flash-attn2")
-    paths = os.pathsep.join([str(packages), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-c", LOAD, str(folder)], capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": paths},
-    )  # fmt: skip
-    assert "attn_implementation: expected eager or sdpa" in done.stdout
-    assert not (packages / "kernels" / "called").exists()
-
-
 @pytest.mark.parametrize("name", ["config.json", "model.safetensors", "preprocessor_config.json"])
 def test_pipes_and_folders_in_place_of_files(checkpoints, tmp_path, name) -> None:
     folder = Path(shutil.copytree(checkpoints("dinov2"), tmp_path / "weights"))
@@ -243,6 +206,38 @@ def test_a_tokenizer_that_fails_when_it_is_asked(checkpoints, tmp_path) -> None:
     (folder / "tokenizer.json").write_text(json.dumps(content))
     with pytest.raises(FileFormatError, match="w: expected the tokenizer of the weights, but it"):
         asked("oneformer", folder)
+
+
+@pytest.mark.parametrize("name", ["tokenizer.json", "tokenizer.5.0.0.json"])
+@pytest.mark.parametrize(
+    "steps",
+    [
+        {"normalizer": {"type": "Sequence", "normalizers": [
+            {"type": "Replace", "pattern": {"String": "a"}, "content": "a" * 1000}] * 4}},
+        {"normalizer": {"type": "Sequence", "normalizers": [
+            {"type": "Sequence", "normalizers": [{"type": "Prepend", "prepend": "a"}] * 9}] * 9}},
+        {"post_processor": {"type": "Sequence", "processors": [
+            {"type": "TemplateProcessing", "single": [{"Sequence": {"id": "A", "type_id": 0}}] * 99,
+             "pair": [], "special_tokens": {}}] * 9}},
+    ],
+)  # fmt: skip
+def test_a_tokenizer_whose_texts_fill_the_memory(checkpoints, tmp_path, steps, name) -> None:
+    """Where none is left the library ends the process."""
+    folder = Path(shutil.copytree(checkpoint("oneformer", "oneformer", tmp_path), tmp_path / "w"))
+    content = json.loads((folder / "tokenizer.json").read_text())
+    (folder / name).write_text(json.dumps(content | steps))
+    with pytest.raises(FileFormatError, match=f"{name}: expected steps that make a text at most "):
+        asked("oneformer", folder)
+
+
+@pytest.mark.parametrize("family", ["clipseg", "clip"])
+def test_a_tokenizer_of_a_network_that_knows_more(checkpoints, tmp_path, family) -> None:
+    """A GPU would read beside its memory."""
+    folder = Path(shutil.copytree(checkpoints(family), tmp_path / "w"))
+    content = json.loads((folder / "tokenizer_config.json").read_text())
+    (folder / "tokenizer_config.json").write_text(json.dumps(content | {"bos_token": "<new>"}))
+    with pytest.raises(FileFormatError, match=r"w: expected the tokenizer of a network that knows"):
+        asked(family, folder)
 
 
 def test_weights_in_parts(checkpoints, tmp_path) -> None:

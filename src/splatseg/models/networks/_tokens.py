@@ -1,12 +1,14 @@
 """Tokenizers: from words to the numbers that a text encoder takes."""
 
 import hashlib
+import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from splatseg.errors import FileFormatError, RangeError
+from splatseg.io.json_files import read_json
 from splatseg.models._family import Loading
 from splatseg.models.networks._config import offline, refused_by_library
 from splatseg.models.networks._library import library
@@ -27,6 +29,8 @@ _FILES = (
 _VOCABULARIES = ("tokenizer.json", "vocab.json", "vocab.txt", "tokenizer.model", "spiece.model")
 """One of these holds the tokens. Without any the library makes a tokenizer that knows no word."""
 
+_MOST_GROWTH = 1 << 16
+"""How many times as long a text may become on its way through a tokenizer."""
 
 _EXPECTED = "the tokenizer of the weights"
 
@@ -47,6 +51,7 @@ class Tokens:
         folder = self._folder = place.folder
         self._tokenizer = load_tokenizer(folder, config)
         self._longest = longest
+        self._known = getattr(getattr(config, "text_config", None), "vocab_size", None)
         self._device = place.device
         self.digest = _digest(folder)
         """SHA-256 over the tokenizer's files."""
@@ -64,6 +69,7 @@ class Tokens:
 
         Raises:
             RangeError: If a text has more tokens than the network takes.
+            FileFormatError: If the tokenizer fails, or is of a network that knows more tokens.
         """
         self._check_lengths(texts)
         padding: dict[str, Any] = (
@@ -73,6 +79,12 @@ class Tokens:
         )
         with self._reading():
             found = self._tokenizer(list(texts), return_tensors="pt", **padding)
+        largest = int(found["input_ids"].max())
+        if self._known is not None and largest >= self._known:
+            raise FileFormatError(
+                f"{self._folder}: expected the tokenizer of a network that knows {self._known} "
+                f"tokens, got one that gives number {largest}."
+            )
         return {name: values.to(self._device) for name, values in found.items()}
 
     def spans(self, text: str) -> list[tuple[int, int]]:
@@ -123,9 +135,36 @@ def load_tokenizer(folder: Path, config: Any) -> Any:
         raise FileFormatError(
             f"{folder}: expected a tokenizer beside the weights (tokenizer.json), got none."
         )
+    # A tokenizer of one version of the library may lie beside that of all others.
+    for path in sorted(folder.glob("tokenizer*.json")):
+        _check_growth(path)
     with offline(), refused_by_library(folder, _EXPECTED):
         return library().AutoTokenizer.from_pretrained(
             folder, config=config, local_files_only=True, trust_remote_code=False
+        )
+
+
+def _check_growth(path: Path) -> None:
+    """Refuse steps that each make a text longer, so that no memory holds what comes out.
+
+    The library of tokenizers is written in Rust, and ends the process where there is none left.
+    """
+    content = read_json(path)
+    steps: list[object] = [content.get("normalizer"), content.get("post_processor")]
+    growth = 1.0
+    while steps:
+        step = steps.pop()
+        if isinstance(step, list):
+            steps += cast("list[object]", step)
+        elif isinstance(step, dict):
+            known = cast("dict[str, Any]", step)
+            steps += [known.get("normalizers"), known.get("processors")]
+            pieces = [known.get(name) for name in ("content", "prepend", "single")]
+            growth *= math.prod(1.0 + len(one) for one in pieces if isinstance(one, str | list))
+    if growth > _MOST_GROWTH:
+        raise FileFormatError(
+            f"{path}: expected steps that make a text at most {_MOST_GROWTH} times as long, got "
+            f"such as make it {growth:.3g} times as long."
         )
 
 
