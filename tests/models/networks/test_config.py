@@ -267,6 +267,14 @@ def test_an_index_beside_whole_weights_is_not_followed(checkpoints, tmp_path) ->
     load(folder)
 
 
+def test_a_size_that_a_file_gives_is_a_multiple_of_the_patch_too(checkpoints, tmp_path) -> None:
+    folder = Path(shutil.copytree(checkpoints("clipseg"), tmp_path / "weights"))
+    (folder / "preprocessor_config.json").write_text(json.dumps({"size": {"height": 65}}))
+    match = "weights: expected a size of images that is a multiple of 16, got 65"
+    with pytest.raises(FileFormatError, match=match):
+        asked("clipseg", folder)
+
+
 def test_an_adapter_is_no_network(checkpoints, tmp_path) -> None:
     """With the package peft the library would put it in, and import what it names."""
     folder = Path(shutil.copytree(checkpoints("dinov2"), tmp_path / "weights"))

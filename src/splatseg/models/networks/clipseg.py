@@ -82,6 +82,11 @@ class ClipSeg:
             )
         patch = side_of(place.folder, known.vision_config.patch_size)
         self._size = place.size or input_side(place.folder, "height", _DEFAULT_SIZE)
+        if self._size % patch and place.size is None:
+            raise FileFormatError(
+                f"{place.folder}: expected a size of images that is a multiple of {patch}, got "
+                f"{self._size}."
+            )
         if self._size % patch:
             raise RangeError(f"size: expected a multiple of {patch}, got {self._size}.")
         self._normalisation = Normalisation.of(place.folder)
