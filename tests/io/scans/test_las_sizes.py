@@ -99,12 +99,13 @@ def test_what_laszip_says_of_points(file, place, layout, value, words) -> None:
 def test_chunks_and_their_layers(file) -> None:
     path = file("laz")
     sound, data = path.read_bytes(), number(path, DATA, "I")
-    table = number(path, data, "q")
+    table, layer = number(path, data, "q"), number(path, data + 8 + 40 + 4, "I")
     for at, layout, value, words in (
         (data, "q", 2**40, "expected a table of chunks in the file"),
         (table + 4, "I", 2**31 - 1, "at most a chunk a point, got 2147483647"),
         (table + 4, "I", 0, "at most a chunk a point, got 0"),
         (data + 8 + 40 + 4, "I", 2**32 - 1, "layers of points within their chunks"),
+        (data + 8 + 40 + 4, "I", layer + 1, "layers of points within their chunks"),
         (POINTS, "Q", 50_001, "got chunks that hold 50000"),
     ):
         path.write_bytes(sound)
