@@ -12,9 +12,11 @@
 
 Each class is also the builtin that fits, so ``except ValueError`` works. A message is one
 sentence that names the argument or the file, what was expected and what came. What came is foreign
-text, of any length and with any characters: `quoted` and `reason` make it fit for a message.
+text, of any length and with any characters: `quoted` and `reason` make it fit for a message, and
+`visible` for people.
 """
 
+import re
 import reprlib
 
 _QUOTED = 60
@@ -95,6 +97,29 @@ def brief(text: str, limit: int = _REASON) -> str:
     """
     clean = "".join(c if c.isprintable() else "?" for c in text[: limit + 1])
     return clean if len(clean) <= limit else f"{clean[: limit - 3]}..."
+
+
+_TURNING = "\u061c\u200b\u200e\u200f\u202a-\u202e\u2060-\u206f\ufeff\U000e0000-\U000e007f"
+"""Marks of direction and of nothing: text that holds them reads otherwise than it is. The joiners
+that scripts and emoji need (U+200C, U+200D) are none of them."""
+
+# Control characters, line and paragraph ends, and halves of pairs besides.
+_HIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff{_TURNING}]")
+
+
+def visible(text: str) -> str:
+    r"""Text of others as people are to see it, in a page and on a terminal.
+
+    Nothing in it moves the cursor, colours or turns what follows: control characters and marks of
+    direction become escapes, as Python writes them.
+
+    Example:
+        >>> visible("chair\x1b[31m"), visible("a\u202eb\nc")
+        ('chair\\x1b[31m', 'a\\u202eb\\nc')
+        >>> visible("Stühle und 椅子")
+        'Stühle und 椅子'
+    """
+    return _HIDDEN.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 class _Shown(reprlib.Repr):

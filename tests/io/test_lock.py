@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from splatseg.errors import InputError, OutputError
+from splatseg.errors import InputError
 from splatseg.io.atomic import TEMPORARY, check_writable, sweep
 from splatseg.io.lock import LOCK_FILE, lock_owner, scene_lock
 from splatseg.io.scene_folder import work_on_scene
@@ -93,7 +93,7 @@ def test_a_lock_file_of_another_kind_bars_nobody_and_leads_nowhere(tmp_path: Pat
     precious.write_text("content")
     (tmp_path / LOCK_FILE).symlink_to(precious)
     assert lock_owner(tmp_path) is None
-    with pytest.raises(OutputError, match="cannot be written"), scene_lock(tmp_path, "see"):
+    with pytest.raises(InputError, match="cannot be written"), scene_lock(tmp_path, "see"):
         pass
     assert precious.read_text() == "content"
 
@@ -233,5 +233,5 @@ def test_a_folder_that_cannot_be_written_is_found_before(
     with pytest.raises(InputError, match=r"cannot be written: there is no permission .* change it"):
         check_writable(tmp_path)
     monkeypatch.setattr("os.open", refused)
-    with pytest.raises(OutputError, match="no permission"), work_on_scene(tmp_path, "see"):
+    with pytest.raises(InputError, match="no permission"), work_on_scene(tmp_path, "see"):
         pass

@@ -20,7 +20,7 @@ from splatseg.cli._pages import kept_page
 from splatseg.cli._signals import interrupted_by_signals
 from splatseg.cli._streams import prepare_streams, silence, tell
 from splatseg.cli._words import field_names, option_names, with_flags
-from splatseg.errors import InputError, SplatsegError
+from splatseg.errors import InputError, SplatsegError, visible
 
 _MAX_UNPACKED = re.compile("--max-unpacked(=.*)?")
 
@@ -157,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
     except KeyboardInterrupt as error:
         how = f": {error}" if error.args else ""
-        tell(sys.stderr, f"interrupted{how}\n")
+        tell(sys.stderr, f"interrupted{visible(how)}\n")
         return EXIT_FAILED
     except InputError as error:
         return _report(error, str(error), status=EXIT_USAGE, debug=debug)
@@ -296,5 +296,5 @@ def _report(error: Exception, sentence: str, *, status: int, debug: bool) -> int
         import traceback
 
         traceback.print_exception(error, file=sys.stderr)
-    tell(sys.stderr, f"error: {sentence}\n")
+    tell(sys.stderr, f"error: {visible(sentence)}\n")
     return status

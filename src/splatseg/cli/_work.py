@@ -8,12 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rich.text import Text
 from typing_extensions import override
 
 from splatseg.cli._fit_progress import fit_progress, pose_progress
 from splatseg.cli._progress import progress
 from splatseg.cli._streams import tell
 from splatseg.core import Scene
+from splatseg.errors import visible
 from splatseg.fit import FitProgress
 from splatseg.io.scene import load_scene
 from splatseg.pose import PoseProgress
@@ -41,8 +43,13 @@ def print_result(facts: Mapping[str, Any], lines: Sequence[str], *, json: bool) 
         lines: The same in sentences.
         json: Which of the two.
     """
-    sys.stdout.write(_json_line(facts) if json else "".join(f"{line}\n" for line in lines))
+    sys.stdout.write(_json_line(facts) if json else "".join(f"{visible(line)}\n" for line in lines))
     sys.stdout.flush()
+
+
+def plain(value: object) -> Text:
+    """A value as a table of the terminal shows it: brackets in names are no markup."""
+    return Text(visible(str(value)))
 
 
 def _json_line(facts: Mapping[str, Any]) -> str:
@@ -98,13 +105,13 @@ class ConsoleObserver(Observer):
     def note(self, message: str) -> None:
         """A line of its own on stderr."""
         if not self._quiet:
-            tell(sys.stderr, f"note: {message}\n")
+            tell(sys.stderr, f"note: {visible(message)}\n")
 
     @override
     def info(self, message: str) -> None:
         """A line of its own."""
         if not self._quiet:
-            tell(sys.stderr if self._json else sys.stdout, f"{message}\n")
+            tell(sys.stderr if self._json else sys.stdout, f"{visible(message)}\n")
 
 
 def _nothing(now: object) -> None:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from splatseg.cli._types import Backend, Json, Quiet, Seed
 from splatseg.cli._words import listed
-from splatseg.cli._work import ConsoleObserver, print_result, typed
+from splatseg.cli._work import ConsoleObserver, plain, print_result, typed
 from splatseg.evaluate.protocols import PROTOCOLS
 from splatseg.fit import Preset
 from splatseg.tasks.benchmark import BenchOptions, BenchRun, bench, bench_table, write_tables
@@ -170,10 +170,12 @@ def _facts(done: BenchRun, paths: tuple[Path, ...]) -> dict[str, object]:
 
 def _print_table(done: BenchRun) -> None:
     columns, rows = bench_table(done, notes=False, classes=False)
-    table = Table(*columns, title=f"{done.protocol.name}: {done.protocol.summary}")
+    table = Table(title=f"{done.protocol.name}: {done.protocol.summary}")
+    for name in columns:
+        table.add_column(plain(name))
     for column in table.columns[1:-1]:
         column.justify = "right"
         column.no_wrap = True  # a figure that is cut off is another figure
     for row in rows:
-        table.add_row(*(f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row))
+        table.add_row(*(plain(f"{cell:.3f}" if isinstance(cell, float) else cell) for cell in row))
     Console(highlight=False).print(table)

@@ -88,4 +88,4 @@ def _print_tables(made: Demo) -> None:
     for name, value in seconds.items():
         times.add_row(name, f"{value:.1f}")
     console.print(times)
-    console.print(f"\nOpen {made.folder / 'report.html'} in a browser.", soft_wrap=True)
+    print_result({}, ["", f"Open {made.folder / 'report.html'} in a browser."], json=False)

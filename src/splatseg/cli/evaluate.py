@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from splatseg.cli._types import Backend, Data, Field, Json, Quiet, SceneFolder, Split
-from splatseg.cli._work import ConsoleObserver, open_scene, print_result
+from splatseg.cli._work import ConsoleObserver, open_scene, plain, print_result
 from splatseg.core import Scene
 from splatseg.io.json_files import write_json
 from splatseg.tasks import EvaluationOptions, evaluate_scene
@@ -105,11 +105,11 @@ def run(command: Command) -> None:
 
 def _print_tables(figures: Mapping[str, Any], scene: Scene) -> None:
     console = Console(highlight=False)
-    table = Table("measure", "value", title=f"{figures['scene']}, {figures['split']} views")
+    table = Table("measure", "value", title=plain(f"{figures['scene']}, {figures['split']} views"))
     table.columns[1].justify = "right"
     for key, value in figures.items():
         if key not in ("scene", "split", "learned_from") and not isinstance(value, dict):
-            table.add_row(key, f"{value:.4f}" if isinstance(value, float) else str(value))
+            table.add_row(key, plain(f"{value:.4f}" if isinstance(value, float) else value))
     console.print(table)
     for key, title in _PER_CLASS.items():
         if key in figures:
@@ -140,5 +140,5 @@ def _class_table(
         other = "" if scene.classes is None else scene.classes.name_of(int(key))
         name = known.get(key, other)
         shown = (f"{v:.4f}" if isinstance(v, float) else str(v) for v in values)
-        table.add_row(key, name, *shown)
+        table.add_row(key, plain(name), *shown)
     return table

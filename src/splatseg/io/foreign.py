@@ -43,6 +43,7 @@ def reading(where: object, expected: str) -> Generator[None]:
     """Raise the documented error for whatever a decoder raises inside the block.
 
     Only calls of other libraries belong inside: faults of our own should stay what they are.
+    Panics of decoders in Rust come as a class that no module names, beside `Exception`.
 
     Args:
         where: The file; starts the message.
@@ -62,7 +63,9 @@ def reading(where: object, expected: str) -> Generator[None]:
         raise FileFormatError(
             f"{where}: expected {expected}; memory is too small for it."
         ) from error
-    except _DAMAGED as error:
+    except BaseException as error:
+        if not isinstance(error, _DAMAGED) and type(error).__name__ != "PanicException":
+            raise
         raise FileFormatError(
             f"{where}: expected {expected}, but it cannot be read ({reason(error)})."
         ) from error

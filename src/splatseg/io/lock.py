@@ -19,7 +19,7 @@ from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import TEMPORARY, is_running
 from splatseg.io.file_locks import try_lock
 from splatseg.io.json_files import parse_object
-from splatseg.io.write_errors import named_write_failures
+from splatseg.io.write_errors import failure_to_write
 
 LOCK_FILE = f"{TEMPORARY}lock"
 
@@ -65,8 +65,8 @@ def scene_lock(root: Path, work: str) -> Generator[None]:
         work: What is done, for the message to others.
 
     Raises:
-        InputError: If another process works on it.
-        OutputError: If the folder cannot be written to.
+        InputError: If another process works on it, or the folder cannot be written to: nothing
+            was done yet.
     """
     key = root.resolve()
     if key in _held:
@@ -76,8 +76,10 @@ def scene_lock(root: Path, work: str) -> Generator[None]:
         finally:
             _held[key] -= 1
         return
-    with named_write_failures(root):
+    try:
         handle = _taken(root / LOCK_FILE)
+    except OSError as error:
+        raise InputError(failure_to_write(root, error)) from error
     _held[key] = 1
     try:
         me = LockOwner(work=work, process=os.getpid(), host=socket.gethostname(), since=time.time())

@@ -12,6 +12,13 @@ from splatseg.models._content import image_digest
 _A = TypeVar("_A")
 
 
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Whether an error says that there is no memory for a tensor."""
+    return isinstance(error, torch.OutOfMemoryError | MemoryError) or (
+        isinstance(error, RuntimeError) and "allocate memory" in str(error)
+    )
+
+
 class LastImages(Generic[_A]):
     """Encodes images, several at a time if they are announced, and keeps the last ones.
 
@@ -44,9 +51,7 @@ class LastImages(Generic[_A]):
         try:
             return list(self._run(images))
         except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
-            if not isinstance(error, torch.OutOfMemoryError | MemoryError) and (
-                "allocate memory" not in str(error)
-            ):
+            if not is_lack_of_memory(error):
                 raise
             height, width = (int(side) for side in images[0].shape[:2])
             if len(images) == 1:

@@ -11,11 +11,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core.models import Image
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, quoted
 from splatseg.io.json_files import read_json
 
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 """Mean and standard deviation of the channels, in [0, 1]."""
+
+_MAX_SIDE = 1 << 14
+_SMALLEST_STD = 1e-3
+"""Colours are divided by it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,13 +38,13 @@ class Normalisation:
             otherwise: The one where it says none; None takes ImageNet's.
 
         Raises:
-            FileFormatError: If it does not hold three numbers each.
+            FileFormatError: If it does not hold three numbers in range each.
         """
         known = cls() if otherwise is None else otherwise
         path, content = image_settings(folder)
         return cls(
             mean=_three(path, content, "image_mean", known.mean),
-            std=_three(path, content, "image_std", known.std),
+            std=_three(path, content, "image_std", known.std, least=_SMALLEST_STD),
         )
 
 
@@ -70,30 +74,44 @@ def input_side(folder: Path, name: str, otherwise: int) -> int:
         otherwise: The side where they say none.
 
     Raises:
-        FileFormatError: If it is no positive whole number.
+        FileFormatError: If it is no whole number from 1 to 16384.
     """
     path, content = image_settings(folder)
     size = content.get("size")
     value = cast("dict[str, Any]", size).get(name) if isinstance(size, dict) else None
     if value is None:
         return otherwise
-    if not isinstance(value, int) or value < 1:
+    return pixels(path, f"size: {name}", value)
+
+
+def pixels(path: Path, name: str, value: object) -> int:
+    """A number of pixels that a file gives.
+
+    Raises:
+        FileFormatError: If it is no whole number from 1 to 16384.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
         raise FileFormatError(
-            f"{path}: size: {name}: expected a number of pixels, got {value!r:.40}."
+            f"{path}: {name}: expected a number of pixels up to {_MAX_SIDE}, got {quoted(value)}."
         )
     return value
 
 
 def _three(
-    path: Path, content: dict[str, Any], name: str, otherwise: tuple[float, float, float]
+    path: Path,
+    content: dict[str, Any],
+    name: str,
+    otherwise: tuple[float, float, float],
+    *,
+    least: float = 0.0,
 ) -> tuple[float, float, float]:
     found = content.get(name)
     if found is None:
         return otherwise
     if not isinstance(found, list) or len(found) != 3 or not all(  # pyright: ignore[reportUnknownArgumentType]
-        isinstance(x, int | float) and 0 <= x <= 1 for x in found  # pyright: ignore[reportUnknownVariableType]
+        isinstance(x, int | float) and least <= x <= 1 for x in found  # pyright: ignore[reportUnknownVariableType]
     ):  # fmt: skip
-        raise FileFormatError(f"{path}: {name}: expected three numbers in [0, 1].")
+        raise FileFormatError(f"{path}: {name}: expected three numbers in [{least:g}, 1].")
     red, green, blue = (float(x) for x in found)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
     return red, green, blue
 

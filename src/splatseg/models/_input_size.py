@@ -7,9 +7,8 @@ from typing import Any, cast
 
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.json_files import read_json
-from splatseg.models._images import Frame, frame_of
+from splatseg.models._images import Frame, frame_of, pixels
 
-_MAX_SIDE = 1 << 14
 _MULTIPLES = ("size_divisor", "size_divisibility", "ensure_multiple_of")
 """What the multiple of sides is called in the files of the several networks."""
 
@@ -56,22 +55,20 @@ class InputSize:
         multiple = otherwise.multiple
         for name in _MULTIPLES:
             if content.get(name):
-                multiple = _pixels(path, name, content[name])
+                multiple = pixels(path, name, content[name])
         if size is None:
             return cls(
                 shortest=otherwise.shortest, longest=otherwise.longest, sides=otherwise.sides,
                 keeps_proportions=otherwise.keeps_proportions, multiple=multiple,
             )  # fmt: skip
         given = cast(dict[str, Any], size) if isinstance(size, dict) else {}
-        numbers = {
-            key: _pixels(path, f"size {key}", value) for key, value in given.items() if value
-        }
+        numbers = {key: pixels(path, f"size {key}", value) for key, value in given.items() if value}
         if not isinstance(size, dict):
-            one = _pixels(path, "size", size)
+            one = pixels(path, "size", size)
             square = otherwise.sides is not None
             numbers = {"height": one, "width": one} if square else {"shortest_edge": one}
             if not square and content.get("max_size"):
-                numbers["longest_edge"] = _pixels(path, "max_size", content["max_size"])
+                numbers["longest_edge"] = pixels(path, "max_size", content["max_size"])
         if "height" in numbers and "width" in numbers:
             return cls(
                 sides=(numbers["height"], numbers["width"]),
@@ -124,11 +121,3 @@ class InputSize:
     def _whole(self, sides: Sequence[float]) -> tuple[int, int]:
         rows, columns = (max(1, int(side / self.multiple + 0.5)) * self.multiple for side in sides)
         return rows, columns
-
-
-def _pixels(path: Path, name: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MAX_SIDE:
-        raise FileFormatError(
-            f"{path}: {name}: expected a number of pixels up to {_MAX_SIDE}, got {quoted(value)}."
-        )
-    return value

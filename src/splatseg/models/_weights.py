@@ -10,12 +10,23 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatseg.errors import InputError, MissingFileError, MissingPackageError
+from splatseg.errors import (
+    FileFormatError,
+    InputError,
+    MissingFileError,
+    MissingPackageError,
+    brief,
+    quoted,
+)
+from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json
 from splatseg.models._family import Checkpoint, LoadOptions, ModelFamily
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _WEIGHTS = ("*.safetensors", "*.bin", "*.pt", "*.ckpt")
+_WHOLE = ("model.safetensors", "pytorch_model.bin")
+"""Files that hold all weights, the one before the other; in several parts, an index goes by it."""
+
 _CONFIGURATION = "*config.json"
 _FILES = ("*.json", "*.txt", "*.model")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -63,7 +74,10 @@ def find_weights(
     found = _in_cache(asked)
     if found is None and options.download:
         found = _fetched(asked, report, flag)
-    if found is None:
+    if found is not None:
+        _check_entries(found)
+        _check_parts(found)
+    else:
         raise MissingFileError(
             f"weights: {asked} is not on this machine ({_described(known)}); --download fetches "
             f"it, or {flag} FOLDER takes a copy."
@@ -130,6 +144,7 @@ def _single_file(family: ModelFamily, options: LoadOptions) -> tuple[Path, str]:
             f"{path}: there is no such file or folder of weights, expected {known.id} "
             f"({_described(known)}) or its tensors as safetensors{instead}."
         )
+    _check_entries(path)
     found = [one for one in weight_files(path) if not one.match(_CONFIGURATION)]
     if len(found) != 1:
         names = ", ".join(one.name for one in found[:3]) or "none"
@@ -141,11 +156,55 @@ def _single_file(family: ModelFamily, options: LoadOptions) -> tuple[Path, str]:
 
 
 def _check_folder(folder: Path) -> None:
+    _check_entries(folder)
+    _check_parts(folder)
     if not (folder / "config.json").is_file() or not weight_files(folder):
         raise MissingFileError(
             f"{folder}: expected weights as save_pretrained writes them (config.json and "
             "model.safetensors), got a folder without."
         )
+
+
+def _check_entries(folder: Path) -> None:
+    """Refuse a folder in which something else stands where a file is read: that may never end.
+
+    A pipe or a device waits for whoever writes; so does a link to one. Adapters are refused: with
+    the package peft the library puts one into the network, and imports what it names.
+    """
+    adapter = folder / "adapter_config.json"
+    if adapter.exists():
+        raise FileFormatError(f"{adapter}: expected the weights of a network, got an adapter.")
+    for path in sorted(folder.iterdir()):
+        expected = any(path.match(pattern) for pattern in (*_WEIGHTS, *_FILES))
+        if not path.is_file() and (expected or (path.exists() and not path.is_dir())):
+            raise FileFormatError(f"{path}: expected a regular file, got something else.")
+
+
+def _check_parts(folder: Path) -> None:
+    """Refuse weights in several parts of which some are not there, or lie elsewhere.
+
+    Raises:
+        FileFormatError: If an index names files that are not beside it.
+        MissingFileError: If a file that the index of the weights names is not there.
+    """
+    for index in sorted(folder.glob("*.index.json")):
+        for name in _parts(index):
+            if name != Path(name).name:
+                raise FileFormatError(
+                    f"{index}: weight_map: expected names of files beside it, got {quoted(name)}."
+                )
+    for whole in _WHOLE:
+        index = folder / f"{whole}.index.json"
+        if (folder / whole).is_file():
+            return
+        if index.is_file():
+            lacking = sorted(name for name in _parts(index) if not is_file(folder / name))
+            if lacking:
+                raise MissingFileError(
+                    f"{index}: expected the files that it names beside it, but there is no "
+                    f"{brief(', '.join(lacking))}."
+                )
+            return
 
 
 def _in_cache(id: str) -> Path | None:
@@ -162,7 +221,11 @@ def _in_cache(id: str) -> Path | None:
 def _shards(folder: Path) -> set[str]:
     """The files that weights in several parts are in, by their index."""
     index = folder / "model.safetensors.index.json"
-    parts = read_json(index).get("weight_map") if index.is_file() else None
+    return _parts(index) if index.is_file() else set()
+
+
+def _parts(index: Path) -> set[str]:
+    parts = read_json(index).get("weight_map")
     return set(map(str, parts.values())) if isinstance(parts, dict) else set()  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 

@@ -4,13 +4,15 @@ import html
 import re
 from typing import Any
 
+from splatseg.errors import visible
+
 _LONG = 24
 _BREAKS = re.compile(r"(?<=[_/\-])(?=\w)|(?<=\.)(?=[A-Za-z])")
 
 
 def text(words: str) -> str:
-    """Words, escaped."""
-    return html.escape(words, quote=True)
+    """Words, escaped; control characters and marks of direction are seen (`errors.visible`)."""
+    return html.escape(visible(words), quote=True)
 
 
 def name_text(name: str) -> str:

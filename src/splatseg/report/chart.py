@@ -1,11 +1,11 @@
 """Lines over an axis, as SVG inside a page: no scripts, and colours that follow the page's."""
 
-import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from splatseg.errors import InputError, RangeError
+from splatseg.report._words import text
 
 _WIDTH, _HEIGHT = 380, 220
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 10, 34
@@ -96,7 +96,7 @@ def chart_svg(chart: Chart) -> str:
         )
     parts.append(
         f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2:.0f}" y="{_HEIGHT - 4}" text-anchor="middle">'
-        f"{html.escape(chart.across)}</text>"
+        f"{text(chart.across)}</text>"
     )
     for i, line in enumerate(chart.lines):
         spots = [to_pixels(x, y) for x, y in _thinned(line.points)]
@@ -109,7 +109,7 @@ def chart_svg(chart: Chart) -> str:
                 f'<polyline class="line{i}" fill="none" stroke="currentColor" points="{path}"/>'
             )
     named = [line.name for line in chart.lines]
-    summary = html.escape(f"{chart.title}: {', '.join(named)}", quote=True)
+    summary = text(f"{chart.title}: {', '.join(named)}")
     return (
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" font-size="11" aria-label="{summary}">'
         f"{''.join(parts)}</svg>"

@@ -21,6 +21,13 @@ Cell = str | int | float | None
 _TALL = 40
 """Tables of more rows scroll within the page."""
 
+_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
+    "form-action 'none'"
+)
+"""What a browser may do for a page: show its own pictures and styles. There are no scripts, and
+nothing is asked of another place, whatever a name in it holds."""
+
 _MIN_CONTENTS = 3
 """From so many sections on, a page begins with links to them."""
 
@@ -181,6 +188,7 @@ def report_html(report: Report) -> str:
     body = "\n".join(parts)
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{text(report.title)}</title>\n<style>{PAGE_STYLE}</style>\n</head>\n"
         f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
@@ -232,7 +240,7 @@ def _block(block: Block, pictures: PictureHtml) -> str:
     elif isinstance(block, Scale):
         inner = pictures.scale(block)
     else:
-        inner = f"<pre>{text(chr(10).join(block.lines))}</pre>"
+        inner = f"<pre>{chr(10).join(map(text, block.lines))}</pre>"
     note = "" if isinstance(block, Legend) or not block.note else block.note
     intro = f'<p class="note">{text(note)}</p>' if note else ""
     return f"{intro}{inner}"

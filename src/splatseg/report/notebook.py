@@ -1,7 +1,6 @@
 """How a notebook shows our values: a few words, a small picture, a short table."""
 
 import base64
-import html
 import io
 from collections.abc import Mapping, Sequence
 
@@ -25,6 +24,7 @@ from splatseg.core import (
 from splatseg.errors import InputError, SplatsegError
 from splatseg.io.images import load_image
 from splatseg.render import render
+from splatseg.report._words import text
 from splatseg.report.legend import colour_labels, colour_of
 
 _SIDE = 240
@@ -62,14 +62,14 @@ def preview_html(value: object) -> str:
             shown = _tree(value)
         case _:
             raise InputError(f"value: expected one that has a preview, got {type(value).__name__}.")
-    return f"<div><code>{html.escape(repr(value))}</code><br>{shown}</div>"
+    return f"<div><code>{text(repr(value))}</code><br>{shown}</div>"
 
 
 def _picture(pixels: UInt8[Tensor, "height width 3"], title: str) -> str:
     file = io.BytesIO()
     Image.fromarray(pixels.cpu().numpy()).save(file, format="PNG")
     data = base64.b64encode(file.getvalue()).decode("ascii")
-    words = html.escape(title, quote=True)
+    words = text(title)
     return f'<img alt="{words}" title="{words}" src="data:image/png;base64,{data}"> '
 
 
@@ -80,7 +80,7 @@ def _photographs(views: Sequence[View]) -> str:
         try:
             shown += _picture(load_image(view, longest=_SIDE), view.name)
         except SplatsegError as error:
-            shown += f"<em>{html.escape(str(error))}</em> "
+            shown += f"<em>{text(str(error))}</em> "
     return shown
 
 
@@ -97,7 +97,7 @@ def _render(scene: Scene) -> str:
         with torch.no_grad():
             image = render(scene.gaussians, small).image
     except SplatsegError as error:
-        return f"<em>{html.escape(str(error))}</em>"
+        return f"<em>{text(str(error))}</em>"
     pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8)
     return _picture(pixels, f"{scene.views[0].name}, rendered")
 
@@ -144,7 +144,7 @@ def _ids(labels: Labels, names: Mapping[int, str]) -> str:
     order = torch.argsort(counts, descending=True, stable=True).tolist()
     rows = "".join(
         f"<tr><td>{_swatch(int(ids[i]))}</td><td>{int(ids[i])}</td>"
-        f"<td>{html.escape(names.get(int(ids[i]), ''))}</td><td>{int(counts[i]):,}</td></tr>"
+        f"<td>{text(names.get(int(ids[i]), ''))}</td><td>{int(counts[i]):,}</td></tr>"
         for i in order[:_ROWS]
     )
     further = f"<p>and {len(order) - _ROWS} further ids</p>" if len(order) > _ROWS else ""
@@ -157,7 +157,7 @@ def _tree(tree: InstanceTree) -> str:
     nodes = sorted(tree.nodes, key=lambda node: tree.path(node.id))
     rows = "".join(
         f"<li style='margin-left:{len(tree.path(node.id)) - 1}em'>{_swatch(node.id)} "
-        f"{node.level} {node.id} {html.escape(node.name)}</li>"
+        f"{node.level} {node.id} {text(node.name)}</li>"
         for node in nodes[:_ROWS]
     )
     further = f"<p>and {len(nodes) - _ROWS} further nodes</p>" if len(nodes) > _ROWS else ""

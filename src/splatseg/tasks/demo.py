@@ -261,7 +261,8 @@ class _MainJob:
         chosen = [] if self.backend == "auto" or name == "see" else ["--backend", self.backend]
         line = shlex.join(["splatseg", name, *map(str, words), *chosen])
         self.lines.append(line)
-        self.observer.info(f"\n$ {line}")
+        self.observer.info("")
+        self.observer.info(f"$ {line}")
         begin = time.monotonic()
         yield
         seconds = time.monotonic() - begin

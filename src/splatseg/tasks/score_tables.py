@@ -1,20 +1,25 @@
 """Tables of scores as files: CSV, Markdown or LaTeX, by their ending."""
 
-import csv
-import io
+import html
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.csv_files import csv_text
 
 Cell = str | int | float
 
 _LATEX = str.maketrans(
     {c: f"\\{c}" for c in "&%$#_{}"}
+    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
     | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
 )
+_MARKUP = re.compile(r"[\\`|\[\]]")
+"""What Markdown makes code, cells, links and pictures of."""
+
 _ENDINGS = (".csv", ".md", ".tex")
 
 
@@ -76,7 +81,7 @@ def write_table(rows: Sequence[Sequence[Cell]], path: Path, *, columns: Sequence
         InputError: If the ending is none of a table's, or the folder is not there.
     """
     check_table_file("table", path)
-    made = {".csv": _csv, ".md": _markdown, ".tex": _latex}[path.suffix.lower()]
+    made = {".csv": csv_text, ".md": _markdown, ".tex": _latex}[path.suffix.lower()]
     with atomic_file(path) as temporary:
         temporary.write_text(made(columns, rows), encoding="utf-8", newline="\n")
 
@@ -85,17 +90,12 @@ def _shown(cell: Cell) -> str:
     return f"{cell:.4f}" if isinstance(cell, float) else str(cell)
 
 
-def _csv(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    return text.getvalue()
-
-
 def _markdown(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
     def line(cells: Sequence[Cell]) -> str:
-        shown = (" ".join(_shown(cell).split()).replace("|", "\\|") for cell in cells)
+        shown = (
+            _MARKUP.sub(r"\\\g<0>", html.escape(" ".join(_shown(cell).split()), quote=False))
+            for cell in cells
+        )
         return "| " + " | ".join(shown) + " |"
 
     rule = "| " + " | ".join(_rules(columns, rows, "---", "---:")) + " |"

@@ -235,7 +235,7 @@ def damaged(folder, kind):
         ("npz-labels", "4 values in semantic, one a point, got 3"),
         ("npz-shape", "xyz of shape (n, 3)"),
         ("npy-inf", "NaN or infinite"),
-        ("las-short", "a LAS file"),
+        ("las-short", "expected 4 points, but the file ends early"),
         ("las-header", "a LAS file"),
     ],
 )

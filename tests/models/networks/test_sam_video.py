@@ -335,7 +335,7 @@ def test_settings_and_refusals(checkpoints, monkeypatch, tmp_path) -> None:
         find_model("sam2-video", loading=LoadOptions(weights=weights, size=128))
     broken = shutil.copytree(weights, tmp_path / "broken")
     (broken / "model.safetensors").write_bytes(b"no weights")
-    with pytest.raises(FileFormatError, match="the weights cannot be loaded as Sam2VideoModel"):
+    with pytest.raises(FileFormatError, match="expected weights of Sam2VideoModel"):
         find_model("sam2-video", loading=LoadOptions(weights=str(broken)))
 
 

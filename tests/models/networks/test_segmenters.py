@@ -160,10 +160,12 @@ def test_oneformer_without_its_tokenizer(checkpoints, tmp_path) -> None:
     folder = tmp_path / "weights"
     names = shutil.ignore_patterns("tokenizer*", "special*")
     shutil.copytree(checkpoints("oneformer"), folder, ignore=names)
-    with pytest.raises(FileFormatError, match="expected the tokenizer of the weights beside them"):
+    with pytest.raises(FileFormatError, match="expected a tokenizer beside the weights"):
         find_model("oneformer", loading=LoadOptions(weights=str(folder), device="cpu"))
     (folder / "tokenizer.json").write_text("{}")
-    with pytest.raises(FileFormatError, match="the tokenizer of the weights cannot be loaded"):
+    with pytest.raises(
+        FileFormatError, match="expected the tokenizer of the weights, but it cannot be read"
+    ):
         find_model("oneformer", loading=LoadOptions(weights=str(folder), device="cpu"))
 
 
@@ -220,5 +222,5 @@ def test_what_is_refused(checkpoints, tmp_path) -> None:
     folder = tmp_path / "weights"
     shutil.copytree(checkpoints("mask2former"), folder)
     (folder / "model.safetensors").write_bytes(b"nothing")
-    with pytest.raises(FileFormatError, match="cannot be loaded as Mask2FormerForUniversal"):
+    with pytest.raises(FileFormatError, match="expected weights of Mask2FormerForUniversal"):
         made(folder, "mask2former")

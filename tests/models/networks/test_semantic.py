@@ -92,7 +92,7 @@ def test_images_together_are_as_one_by_one(checkpoints, rng) -> None:
 
 
 def test_weights_of_the_other_head_are_refused(checkpoints) -> None:
-    with pytest.raises(FileFormatError, match="cannot be loaded as DPTForSemantic"):
+    with pytest.raises(FileFormatError, match="expected weights of DPTForSemantic"):
         made(checkpoints("dpt"), "dpt-semantic")
     with pytest.raises(FileFormatError, match="expected weights of segformer, got those of 'dpt'"):
         made(checkpoints("dpt"), "segformer")

@@ -252,7 +252,10 @@ def test_settings_tell_answers_apart(checkpoints, tmp_path, family, kind) -> Non
 def test_tokenizers_that_are_not_there_or_broken(checkpoints, tmp_path) -> None:
     folder = Path(shutil.copytree(checkpoints("clip"), tmp_path / "copy"))
     (folder / "tokenizer.json").write_text("{}")
-    with pytest.raises(FileFormatError, match=f"{folder}: the tokenizer cannot be read"):
+    with pytest.raises(
+        FileFormatError,
+        match=f"{folder}: expected the tokenizer of the weights, but it cannot be read",
+    ):
         find_model("clip", loading=LoadOptions(weights=str(folder)))
     (folder / "tokenizer.json").unlink()
     with pytest.raises(FileFormatError, match=f"{folder}: expected a tokenizer beside the weights"):

@@ -74,7 +74,7 @@ def test_folders_that_hold_no_weights(checkpoints, tmp_path) -> None:
     weights = folder / "model.safetensors"
     whole = weights.read_bytes()
     weights.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FileFormatError, match=f"{folder}: the weights cannot be loaded as Dinov2"):
+    with pytest.raises(FileFormatError, match=f"{folder}: expected weights of Dinov2Model"):
         load(weights=str(folder))
     weights.write_bytes(whole)
     config = json.loads((folder / "config.json").read_text())

@@ -1,6 +1,5 @@
 """The table of objects as CSV, for spreadsheets, and as JSON, for programs."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.rigid import quaternion_from_rotation
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.csv_files import csv_text
 from splatseg.io.export._objects import ObjectRow
 from splatseg.io.json_files import write_json
 
@@ -75,14 +75,12 @@ def object_content(row: ObjectRow) -> dict[str, Any]:
 
 
 def _write_csv(rows: Sequence[ObjectRow], path: Path, files: Mapping[int, str]) -> None:
-    with (
-        atomic_file(path) as temporary,
-        # The byte order mark is what makes spreadsheets read names as UTF-8.
-        temporary.open("w", encoding="utf-8-sig", newline="") as file,
-    ):
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_HEADER)
-        writer.writerows([*_cells(object_content(row)), files.get(row.id, "")] for row in rows)
+    text = csv_text(
+        _HEADER, ([*_cells(object_content(row)), files.get(row.id, "")] for row in rows)
+    )
+    # The byte order mark is what makes spreadsheets read names as UTF-8.
+    with atomic_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8-sig", newline="")
 
 
 _HEADER = (
@@ -94,18 +92,12 @@ _HEADER = (
 
 def _cells(content: Mapping[str, Any]) -> list[Any]:
     box = content["box"]
-    cells = [
-        content["id"], _text(content["name"]), content["class_id"], _text(content["class"]),
+    return [
+        content["id"], content["name"], content["class_id"], content["class"],
         content["gaussians"], *content["centroid"],
         *box["centre"], *box["size"], *box["rotation"], content["volume"],
         *content["colour"], content["confidence"], content["evidence"], content["inferred"],
     ]  # fmt: skip
-    return ["" if cell is None else cell for cell in cells]
-
-
-def _text(name: str) -> str:
-    """A name that no spreadsheet takes for a formula: names may come from files of others."""
-    return f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
 
 
 def _rounded(values: Sequence[float]) -> list[float]:

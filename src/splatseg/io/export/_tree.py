@@ -1,6 +1,5 @@
 """The nodes of a tree of instances as a table: CSV for spreadsheets, JSON for programs."""
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from splatseg.core import InstanceTree, node_row
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file
+from splatseg.io.csv_files import csv_text
 from splatseg.io.json_files import write_json
 
 _COLUMNS = (
@@ -50,14 +50,10 @@ def write_node_table(
         case ".json":
             write_json(dict(about or {}) | {"nodes": rows}, path)
         case ".csv":
-            with (
-                atomic_file(path) as temporary,
-                # The byte order mark is what makes spreadsheets read names as UTF-8.
-                temporary.open("w", encoding="utf-8-sig", newline="") as file,
-            ):
-                writer = csv.writer(file, lineterminator="\n")
-                writer.writerow(_COLUMNS)
-                writer.writerows([row[column] for column in _COLUMNS] for row in rows)
+            text = csv_text(_COLUMNS, ([row[column] for column in _COLUMNS] for row in rows))
+            # The byte order mark is what makes spreadsheets read names as UTF-8.
+            with atomic_file(path) as temporary:
+                temporary.write_text(text, encoding="utf-8-sig", newline="")
         case _:
             raise InputError(f"{path}: expected a table's name to end in .csv or .json.")
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from splatseg.errors import FileFormatError, MissingPackageError
 from splatseg.io.foreign import reading
-from splatseg.io.limits import check_unpacked
+from splatseg.io.scans._las_sizes import check_las_sizes
 from splatseg.io.scans._source import RawScan
 from splatseg.io.scans.clouds import Piece, whole_ids
 
@@ -34,8 +34,6 @@ def las_points(path: Path) -> Piece:
     """
     with open_las(path) as reader:
         count = int(reader.header.point_count)
-        size = int(reader.header.point_format.size) * count
-    check_unpacked(path, size, packed=path.stat().st_size, what="points")
     return count, partial(_rows, path)
 
 
@@ -49,6 +47,7 @@ def open_las(path: Path) -> Generator[Any]:
         MissingPackageError: If laspy, or for LAZ lazrs, is not installed.
     """
     laspy = laspy_for(path)
+    check_las_sizes(path)
     with reading(path, _KIND), path.open("rb") as file:
         try:
             with laspy.open(file, closefd=False) as reader:

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
+from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.models._weights import cached_file
+from splatseg.models.networks._config import offline, refused_by_library
 from splatseg.models.networks._library import library
 
 _WHOLE = "tokenizer.json"
@@ -64,19 +65,10 @@ class Tokenizer:
         Raises:
             FileFormatError: If the vocabulary is broken, or of another network.
         """
-        try:
-            self._tokenizer: Any = library().CLIPTokenizer.from_pretrained(
-                folder, local_files_only=True
-            )
+        cls = library().CLIPTokenizer
+        with offline(), refused_by_library(folder, "the vocabulary of CLIP"):
+            self._tokenizer: Any = cls.from_pretrained(folder, local_files_only=True)
             size = len(self._tokenizer)
-        except SplatsegError:
-            raise
-        except Exception as error:
-            words = str(error).strip().splitlines()
-            raise FileFormatError(
-                f"{folder}: expected the vocabulary of CLIP, but it cannot be read "
-                f"({words[0][:160] if words else type(error).__name__})."
-            ) from error
         if size != vocabulary:
             raise FileFormatError(
                 f"{folder}: expected a vocabulary of {vocabulary} tokens, as the weights have, "

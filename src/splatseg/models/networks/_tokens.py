@@ -1,12 +1,16 @@
 """Tokenizers: from words to the numbers that a text encoder takes."""
 
 import hashlib
+import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from splatseg.errors import FileFormatError, RangeError
+from splatseg.io.json_files import read_json
 from splatseg.models._family import Loading
+from splatseg.models.networks._config import offline, refused_by_library
 from splatseg.models.networks._library import library
 
 _FILES = (
@@ -25,36 +29,29 @@ _FILES = (
 _VOCABULARIES = ("tokenizer.json", "vocab.json", "vocab.txt", "tokenizer.model", "spiece.model")
 """One of these holds the tokens. Without any the library makes a tokenizer that knows no word."""
 
+_MOST_GROWTH = 1 << 16
+"""How many times as long a text may become on its way through a tokenizer."""
+
+_EXPECTED = "the tokenizer of the weights"
+
 
 class Tokens:
     """The tokenizer that lies beside a network's weights.
 
     Args:
         place: The weights.
+        config: The network's, as the library has it: it says which tokenizer goes with it.
         longest: Most tokens that the network takes, those of begin and end included.
 
     Raises:
         FileFormatError: If there is none, or it cannot be read.
     """
 
-    def __init__(self, place: Loading, *, longest: int) -> None:
-        folder = place.folder
-        if not any((folder / name).is_file() for name in _VOCABULARIES):
-            raise FileFormatError(
-                f"{folder}: expected a tokenizer beside the weights (tokenizer.json), got none."
-            )
-        try:
-            self._tokenizer = library().AutoTokenizer.from_pretrained(
-                folder, local_files_only=True, use_fast=True
-            )
-        except Exception as error:
-            # The library of the tokenizers raises Exception itself for a broken file.
-            words = str(error).strip().splitlines()
-            raise FileFormatError(
-                f"{folder}: the tokenizer cannot be read "
-                f"({words[0][:160] if words else type(error).__name__})."
-            ) from error
+    def __init__(self, place: Loading, config: Any, *, longest: int) -> None:
+        folder = self._folder = place.folder
+        self._tokenizer = load_tokenizer(folder, config)
         self._longest = longest
+        self._known = getattr(getattr(config, "text_config", None), "vocab_size", None)
         self._device = place.device
         self.digest = _digest(folder)
         """SHA-256 over the tokenizer's files."""
@@ -72,6 +69,7 @@ class Tokens:
 
         Raises:
             RangeError: If a text has more tokens than the network takes.
+            FileFormatError: If the tokenizer fails, or is of a network that knows more tokens.
         """
         self._check_lengths(texts)
         padding: dict[str, Any] = (
@@ -79,7 +77,14 @@ class Tokens:
             if padded_to is None
             else {"padding": "max_length", "max_length": padded_to}
         )
-        found = self._tokenizer(list(texts), return_tensors="pt", **padding)
+        with self._reading():
+            found = self._tokenizer(list(texts), return_tensors="pt", **padding)
+        largest = int(found["input_ids"].max())
+        if self._known is not None and largest >= self._known:
+            raise FileFormatError(
+                f"{self._folder}: expected the tokenizer of a network that knows {self._known} "
+                f"tokens, got one that gives number {largest}."
+            )
         return {name: values.to(self._device) for name, values in found.items()}
 
     def spans(self, text: str) -> list[tuple[int, int]]:
@@ -97,17 +102,70 @@ class Tokens:
                 "tokenizer: expected one that tells where tokens stand (tokenizer.json), got one "
                 "that does not."
             )
-        found = self._tokenizer(text, return_offsets_mapping=True)["offset_mapping"]
+        with self._reading():
+            found = self._tokenizer(text, return_offsets_mapping=True)["offset_mapping"]
         return [(int(start), int(end)) for start, end in found]
 
     def _check_lengths(self, texts: Sequence[str]) -> None:
         for text in texts:
             # Longer than the tokenizer's own limit is news to the library, and an error here.
-            count = len(self._tokenizer(text, verbose=False)["input_ids"])
+            with self._reading():
+                count = len(self._tokenizer(text, verbose=False)["input_ids"])
             if count > self._longest:
                 raise RangeError(
                     f"words: expected at most {self._longest} tokens, got {count} for {text!r:.60}."
                 )
+
+    def _reading(self) -> AbstractContextManager[None]:
+        """What is damaged in a tokenizer may show when it is asked."""
+        return refused_by_library(self._folder, _EXPECTED)
+
+
+def load_tokenizer(folder: Path, config: Any) -> Any:
+    """The library's tokenizer of a folder of weights.
+
+    Args:
+        folder: The weights.
+        config: The network's, as the library has it; it reads config.json itself without.
+
+    Raises:
+        FileFormatError: If there is none, or it cannot be read.
+    """
+    if not any((folder / name).is_file() for name in _VOCABULARIES):
+        raise FileFormatError(
+            f"{folder}: expected a tokenizer beside the weights (tokenizer.json), got none."
+        )
+    # A tokenizer of one version of the library may lie beside that of all others.
+    for path in sorted(folder.glob("tokenizer*.json")):
+        _check_growth(path)
+    with offline(), refused_by_library(folder, _EXPECTED):
+        return library().AutoTokenizer.from_pretrained(
+            folder, config=config, local_files_only=True, trust_remote_code=False
+        )
+
+
+def _check_growth(path: Path) -> None:
+    """Refuse steps that each make a text longer, so that no memory holds what comes out.
+
+    The library of tokenizers is written in Rust, and ends the process where there is none left.
+    """
+    content = read_json(path)
+    steps: list[object] = [content.get("normalizer"), content.get("post_processor")]
+    growth = 1.0
+    while steps:
+        step = steps.pop()
+        if isinstance(step, list):
+            steps += cast("list[object]", step)
+        elif isinstance(step, dict):
+            known = cast("dict[str, Any]", step)
+            steps += [known.get("normalizers"), known.get("processors")]
+            pieces = [known.get(name) for name in ("content", "prepend", "single")]
+            growth *= math.prod(1.0 + len(one) for one in pieces if isinstance(one, str | list))
+    if growth > _MOST_GROWTH:
+        raise FileFormatError(
+            f"{path}: expected steps that make a text at most {_MOST_GROWTH} times as long, got "
+            f"such as make it {growth:.3g} times as long."
+        )
 
 
 def _digest(folder: Path) -> str:

@@ -17,7 +17,7 @@ from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import Normalisation, PatchGrid
 from splatseg.models._words import checked_template, checked_words
 from splatseg.models.networks._joint_space import JointSpace, Towers
-from splatseg.models.networks._library import configuration, network, network_family
+from splatseg.models.networks._library import configuration, network, network_family, side_of
 from splatseg.models.networks._tokens import Tokens
 
 _COLOURS = Normalisation(
@@ -60,14 +60,15 @@ class _ClipTowers(Towers):
     """
 
     def __init__(self, options: ClipOptions, place: Loading) -> None:
-        configuration(place, ("clip",))
-        self._network = network(place, "CLIPModel")
-        vision = self._network.config.vision_config
-        self._tokens = Tokens(
-            place, longest=int(self._network.config.text_config.max_position_embeddings)
-        )
+        self._network = network(place, "CLIPModel", configuration(place, ("clip",)))
+        known = self._network.config
+        vision = known.vision_config
+        self._tokens = Tokens(place, known, longest=int(known.text_config.max_position_embeddings))
         self._patches = options.patches
-        self.patch, self.size = int(vision.patch_size), int(vision.image_size)
+        self.patch, self.size = (
+            side_of(place.folder, vision.patch_size),
+            side_of(place.folder, vision.image_size),
+        )
         self.width = int(self._network.config.projection_dim)
         self.normalisation = Normalisation.of(place.folder, _COLOURS)
         self.tokenizer = self._tokens.digest

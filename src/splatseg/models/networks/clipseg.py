@@ -15,12 +15,18 @@ from torch import Tensor
 from splatseg.core import UNLABELLED, ClassTable, LabelMap
 from splatseg.core.boundary import convert_fields
 from splatseg.core.models import Image
-from splatseg.errors import RangeError
+from splatseg.errors import FileFormatError, RangeError, quoted
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import Normalisation, frame_of, input_side, network_input
 from splatseg.models._words import checked_template, checked_words, in_sentences, word_classes
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 from splatseg.models.networks._tokens import Tokens
 
 _DEFAULT_SIZE = 352
@@ -60,21 +66,31 @@ class ClipSeg:
 
     def __init__(self, name: str, options: ClipSegOptions, place: Loading) -> None:
         words = checked_words(options.words, needed=name)
-        configuration(place, ("clipseg",))
+        config = configuration(place, ("clipseg",))
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together
         self._options = options
         self._place = place
-        self._network = network(place, "CLIPSegForImageSegmentation")
-        patch = int(self._network.config.vision_config.patch_size)
+        self._network = network(place, "CLIPSegForImageSegmentation", config)
+        known = self._network.config
+        count = int(known.vision_config.num_hidden_layers)
+        if not all(0 <= block < count for block in known.extract_layers):
+            raise FileFormatError(
+                f"{place.folder / 'config.json'}: extract_layers: expected some of {count} blocks, "
+                f"got {quoted(known.extract_layers)}."
+            )
+        patch = side_of(place.folder, known.vision_config.patch_size)
         self._size = place.size or input_side(place.folder, "height", _DEFAULT_SIZE)
+        if self._size % patch and place.size is None:
+            raise FileFormatError(
+                f"{place.folder}: expected a size of images that is a multiple of {patch}, got "
+                f"{self._size}."
+            )
         if self._size % patch:
             raise RangeError(f"size: expected a multiple of {patch}, got {self._size}.")
         self._normalisation = Normalisation.of(place.folder)
-        tokens = Tokens(
-            place, longest=int(self._network.config.text_config.max_position_embeddings)
-        )
+        tokens = Tokens(place, known, longest=int(known.text_config.max_position_embeddings))
         self._tokenizer = tokens.digest
         self._classes = word_classes(words)
         self._conditions = self._encode_words(tokens, in_sentences(words, options.template))

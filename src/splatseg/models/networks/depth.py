@@ -21,7 +21,13 @@ from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Normalisation, network_input
 from splatseg.models._input_size import InputSize
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 
 _CLASSES = {
     "depth-anything": {"depth_anything": "DepthAnythingForDepthEstimation"},
@@ -53,7 +59,7 @@ def dpt_input_size(config: Any, folder: Path, *, otherwise: InputSize) -> InputS
     """
     found = InputSize.of(folder, otherwise=otherwise)
     backbone = None if getattr(config, "is_hybrid", False) else config.backbone_config
-    patch = int(getattr(backbone, "patch_size", None) or config.patch_size)
+    patch = side_of(folder, getattr(backbone, "patch_size", None) or config.patch_size)
     found = replace(found, multiple=math.lcm(found.multiple, patch))
     if backbone is not None:
         return found
@@ -82,7 +88,7 @@ class DepthNetwork:
         convert_fields(options)
         config = configuration(place, tuple(_CLASSES[name]))
         self._network = network(
-            place, _CLASSES[name][str(config["model_type"])], unused=UNUSED_OF_DPT
+            place, _CLASSES[name][str(config["model_type"])], config, unused=UNUSED_OF_DPT
         )
         kind = getattr(self._network.config, "depth_estimation_type", "relative")
         self._is_metric = kind == "metric"

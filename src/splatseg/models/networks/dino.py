@@ -18,7 +18,13 @@ from splatseg.errors import RangeError
 from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import Normalisation, patch_grid, patch_input
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 
 _CLASSES = {
     "dino": {"vit": "ViTModel"},
@@ -49,17 +55,18 @@ class Dino:
 
     def __init__(self, name: str, options: DinoOptions, place: Loading) -> None:
         classes = _CLASSES[name]
-        kind = str(configuration(place, tuple(classes))["model_type"])
+        content = configuration(place, tuple(classes))
+        kind = str(content["model_type"])
         extra: dict[str, Any] = {"add_pooling_layer": False} if kind == "vit" else {}
         self.name = name
         self.note = f"weights {place.name}"
         self.batch_size = place.images_together
         self._options = options
         self._place = place
-        self._network = network(place, classes[kind], **extra)
+        self._network = network(place, classes[kind], content, **extra)
         config = self._network.config
-        self._patch = int(config.patch_size)
-        self._size = place.size or _trained_size(config)
+        self._patch = side_of(place.folder, config.patch_size)
+        self._size = place.size or side_of(place.folder, config.image_size)
         self._tokens = 1 + int(getattr(config, "num_register_tokens", 0) or 0)
         self._positions = {"interpolate_pos_encoding": True} if kind == "vit" else {}
         self._normalisation = Normalisation.of(place.folder)
@@ -129,11 +136,6 @@ class Dino:
             return list(states)
         norm = getattr(self._network, "layernorm", None) or self._network.norm
         return [norm(state) for state in states]
-
-
-def _trained_size(config: Any) -> int:
-    size = config.image_size
-    return int(max(size) if isinstance(size, list | tuple) else size)
 
 
 DINO = network_family(

@@ -59,15 +59,15 @@ class GroundingDino:
     """Boxes of what words mean, all words in one pass."""
 
     def __init__(self, name: str, options: GroundingDinoOptions, place: Loading) -> None:
-        kind = str(configuration(place, tuple(_CLASSES))["model_type"])
+        content = configuration(place, tuple(_CLASSES))
         self.name = name
         self.note = f"weights {place.name}"
         self._options = options
         self._place = place
-        self._network = network(place, _CLASSES[kind])
+        self._network = network(place, _CLASSES[str(content["model_type"])], content)
         config = self._network.config
         longest = min(int(config.max_text_len), int(config.text_config.max_position_embeddings))
-        self._tokens = Tokens(place, longest=longest)
+        self._tokens = Tokens(place, config, longest=longest)
         self._shortest = input_side(place.folder, "shortest_edge", _SHORTEST)
         self._longest = input_side(place.folder, "longest_edge", _LONGEST)
         self._normalisation = Normalisation.of(place.folder)

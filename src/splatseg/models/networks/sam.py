@@ -21,7 +21,13 @@ from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Frame, Normalisation, frame_of, network_input
 from splatseg.models._mask_generator import Decode, MaskGeneratorOptions, automatic_masks
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +93,8 @@ class Sam:
 
     def __init__(self, name: str, options: SamOptions, place: Loading) -> None:
         convert_fields(options)
-        held = str(configuration(place, _TYPES[name])["model_type"])
+        content = configuration(place, _TYPES[name])
+        held = str(content["model_type"])
         kind = held.replace("sam2_video", "sam2").replace("sam3_video", "sam3_tracker")
         parts: dict[str, Any] = {"key_mapping": _SAM3_PARTS} if held == "sam3_video" else {}
         self.name = name
@@ -96,7 +103,7 @@ class Sam:
         self._kind = _KINDS[kind]
         self._options = options
         self._place = place
-        self._network = network(place, self._kind.class_name, **parts)
+        self._network = network(place, self._kind.class_name, content, **parts)
         self._size = self._trained_size()
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
@@ -206,9 +213,7 @@ class Sam:
         """Side of the input that the weights were made for, pixels."""
         vision = self._network.config.vision_config
         size = getattr(getattr(vision, "backbone_config", vision), "image_size", None)
-        if isinstance(size, list | tuple):
-            size = max(cast("Sequence[int]", size))
-        return int(size or self._kind.default_size)
+        return side_of(self._place.folder, size or self._kind.default_size)
 
     def _frame(self, height: int, width: int) -> Frame:
         return frame_of(height, width, size=self._size, shape=self._kind.shape)
@@ -281,7 +286,8 @@ class Sam:
     def _mask_hint(self, mask: Tensor, frame: Frame) -> Tensor:
         """A rough mask as logits of the decoder's input size, out of the image surely not."""
         hints = self._network.config.prompt_encoder_config
-        size = 4 * (hints.image_size // hints.patch_size)
+        folder = self._place.folder
+        size = 4 * (side_of(folder, hints.image_size) // side_of(folder, hints.patch_size))
         inner = F.interpolate(
             mask[:, None].float(), (frame.inner_height, frame.inner_width), mode="bilinear"
         )

@@ -20,7 +20,13 @@ from splatseg.models._encoded import LastImages
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Normalisation, frame_of, network_input
 from splatseg.models._words import checked_words
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 from splatseg.models.networks._tokens import Tokens
 from splatseg.models.networks._word_masks import Finder, WordMasks, text_masks
 
@@ -51,14 +57,14 @@ class _Sam3(Finder):
     """The detector of SAM 3. The image is encoded once, and asked about each word."""
 
     def __init__(self, options: Sam3TextOptions, place: Loading) -> None:
-        configuration(place, ("sam3", "sam3_video"))
+        content = configuration(place, ("sam3", "sam3_video"))
         self._options = options
         self._place = place
-        self._network = network(place, "Sam3Model")
+        self._network = network(place, "Sam3Model", content)
         config = self._network.config
         self._longest = int(config.text_config.max_position_embeddings)
-        self._tokens = Tokens(place, longest=self._longest)
-        self._size = _side(config.vision_config.backbone_config.image_size)
+        self._tokens = Tokens(place, config, longest=self._longest)
+        self._size = side_of(place.folder, config.vision_config.backbone_config.image_size)
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
         self._normalisation = Normalisation.of(place.folder, HALVES)
@@ -124,10 +130,6 @@ class _Sam3(Finder):
                 scores.append(float(fits[i]))
                 words.append(word)
         return text_masks(masks, scores, words, size)
-
-
-def _side(size: Any) -> int:
-    return int(max(size) if isinstance(size, list | tuple) else size)
 
 
 def _sam3_text(name: str, options: Sam3TextOptions, place: Loading) -> WordMasks:

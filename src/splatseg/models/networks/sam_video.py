@@ -18,7 +18,13 @@ from splatseg.core.models import Image
 from splatseg.errors import RangeError
 from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Normalisation, frame_of, network_input
-from splatseg.models.networks._library import configuration, network, network_family, settings_of
+from splatseg.models.networks._library import (
+    configuration,
+    network,
+    network_family,
+    settings_of,
+    side_of,
+)
 from splatseg.models.networks._video_memory import VideoMemory, session_of
 
 _CUT = 0.0
@@ -69,14 +75,14 @@ class SamVideo:
     def __init__(self, name: str, options: SamVideoOptions, place: Loading) -> None:
         convert_fields(options)
         kind = _KINDS[name]
-        configuration(place, kind.types)
+        content = configuration(place, kind.types)
         self.name = name
         self.note = f"weights {place.name}"
         self._kind = kind
         self._options = options
         self._place = place
-        self._network = network(place, f"{kind.library_name}Model")
-        self._size = int(self._network.image_size)
+        self._network = network(place, f"{kind.library_name}Model", content)
+        self._size = side_of(place.folder, self._network.image_size)
         if place.size not in (None, self._size):
             raise RangeError(f"size: {place.name} takes {self._size} alone, got {place.size}.")
         self._normalisation = Normalisation.of(place.folder, self._kind.colours)

@@ -17,7 +17,7 @@ from torch import Tensor
 from splatseg.core import ClassTable, LabelMap
 from splatseg.core.boundary import convert_fields
 from splatseg.core.models import Image, Panoptic
-from splatseg.errors import FileFormatError, InputError
+from splatseg.errors import InputError
 from splatseg.io.json_files import read_json
 from splatseg.models._class_names import network_classes
 from splatseg.models._encoded import LastImages
@@ -34,11 +34,12 @@ from splatseg.models._queries import (
 )
 from splatseg.models.networks._library import (
     configuration,
-    library,
     network,
     network_family,
     settings_of,
+    side_of,
 )
+from splatseg.models.networks._tokens import Tokens
 
 Task = Literal["semantic", "panoptic"]
 
@@ -77,7 +78,7 @@ class Segmenter:
         kind = str(config["model_type"])
         # Text of the things in an image is read while OneFormer learns, and not afterwards.
         extra: dict[str, Any] = {"is_training": False} if kind == "oneformer" else {}
-        self._network = network(place, _CLASSES[name][kind], **extra)
+        self._network = network(place, _CLASSES[name][kind], config, **extra)
         self._classes = network_classes(
             config, count=int(self._network.config.num_labels), things=True
         )
@@ -87,7 +88,9 @@ class Segmenter:
         self._options = options
         self._place = place
         self._normalisation = Normalisation.of(place.folder)
-        self._side = int(self._network.config.image_size) if name == "eomt" else None
+        self._side = (
+            side_of(place.folder, self._network.config.image_size) if name == "eomt" else None
+        )
         if self._side is not None and place.size not in (None, self._side):
             raise InputError(
                 f"size: expected {self._side}, the only one that {place.name} takes, got "
@@ -224,28 +227,13 @@ class Segmenter:
 
     def _task_tokens(self, task: Task) -> Int64[Tensor, "1 length"]:
         """The sentence that tells OneFormer its task, as numbers; 0 after its end."""
-        folder = self._place.folder
-        # Without these the library makes a tokenizer that knows no word, and does not say so.
-        if not any((folder / name).is_file() for name in _TOKENIZER_FILES):
-            raise FileFormatError(
-                f"{folder}: expected the tokenizer of the weights beside them "
-                f"({' or '.join(_TOKENIZER_FILES)}), got none."
-            )
-        try:
-            tokenizer = library().AutoTokenizer.from_pretrained(folder, local_files_only=True)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise FileFormatError(
-                f"{folder}: the tokenizer of the weights cannot be loaded ({type(error).__name__})."
-            ) from error
-        found = tokenizer(
-            [f"the task is {task}"], padding="max_length", truncation=True,
-            max_length=int(self._network.config.task_seq_len), return_tensors="pt",
-        )  # fmt: skip
+        longest = int(self._network.config.task_seq_len)
+        tokens = Tokens(self._place, self._network.config, longest=longest)
+        found = tokens.of([f"the task is {task}"], padded_to=longest)
         return found["input_ids"] * found["attention_mask"]
 
 
 _TASKS: tuple[Task, ...] = ("semantic", "panoptic")
-_TOKENIZER_FILES = ("tokenizer.json", "vocab.json")
 
 
 def window_starts(length: int, side: int) -> list[int]:

@@ -39,7 +39,7 @@ class SemanticNetwork:
         convert_fields(options)
         config = configuration(place, tuple(_CLASSES[name]))
         self._network = network(
-            place, _CLASSES[name][str(config["model_type"])], unused=UNUSED_OF_DPT
+            place, _CLASSES[name][str(config["model_type"])], config, unused=UNUSED_OF_DPT
         )
         self._classes = network_classes(
             config, count=int(self._network.config.num_labels), things=False

@@ -21,7 +21,7 @@ from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Normalisation, PatchGrid
 from splatseg.models._words import checked_template, checked_words
 from splatseg.models.networks._joint_space import JointSpace, Towers
-from splatseg.models.networks._library import configuration, network, network_family
+from splatseg.models.networks._library import configuration, network, network_family, side_of
 from splatseg.models.networks._tokens import Tokens
 
 _CLASSES = {"siglip": "SiglipModel", "siglip2": "Siglip2Model"}
@@ -61,8 +61,9 @@ class _SiglipTowers(Towers):
     """
 
     def __init__(self, place: Loading) -> None:
-        kind = str(configuration(place, tuple(_CLASSES))["model_type"])
-        self._network = network(place, _CLASSES[kind])
+        content = configuration(place, tuple(_CLASSES))
+        kind = str(content["model_type"])
+        self._network = network(place, _CLASSES[kind], content)
         vision, text = self._network.config.vision_config, self._network.config.text_config
         if not getattr(vision, "vision_use_head", True):
             raise FileFormatError(
@@ -70,13 +71,13 @@ class _SiglipTowers(Towers):
                 "words, got one without."
             )
         self._longest = int(text.max_position_embeddings)
-        self._tokens = Tokens(place, longest=self._longest)
+        self._tokens = Tokens(place, self._network.config, longest=self._longest)
         self._is_flexible = kind == "siglip2"
-        self.patch = int(vision.patch_size)
+        self.patch = side_of(place.folder, vision.patch_size)
         self.size = (
             self.patch * isqrt(int(vision.num_patches))
             if self._is_flexible
-            else int(vision.image_size)
+            else side_of(place.folder, vision.image_size)
         )
         self.width = int(vision.hidden_size)
         self.normalisation = Normalisation.of(place.folder, HALVES)

@@ -56,6 +56,7 @@ from splatseg.tasks.benchmark.sight import (
 )
 from splatseg.tasks.benchmark.streets import Drive, point_rules
 from splatseg.tasks.benchmark.targets import TargetRun
+from splatseg.tasks.new_scene import check_parent_writable
 
 _Scorer = Callable[[Job], tuple[dict[str, float], Sequence[Mapping[str, Any]], list[str]]]
 """Scores, rows and notes of a job."""
@@ -119,6 +120,7 @@ def bench(
             "companions: expected a method that takes more than its evidence, got "
             f"{', '.join(options.methods)}."
         )
+    check_parent_writable(folder)
     scenes = asked_scenes(chosen, data, options)
     with named_write_failures(folder):
         folder.mkdir(parents=True, exist_ok=True)

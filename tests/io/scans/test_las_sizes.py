@@ -1,0 +1,114 @@
+"""Sizes and counts of LAS and LAZ that are no longer those of the file, each by one number."""
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from splatseg.errors import FileFormatError
+from splatseg.io.scans import read_scans
+from splatseg.io.scans._las_sizes import check_las_sizes
+from support.fuzz.targets.lasers import COUNT, write
+
+RECORDS, DATA, FORMAT, POINT_BYTES = 100, 96, 104, 105
+EXTENDED, POINTS = 243, 247
+VERSIONS = {"las": ("1.4", 6), "laz": ("1.4", 7), "old.laz": ("1.2", 3)}
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A sound file of a kind."""
+
+    def make(kind: str) -> Path:
+        path = tmp_path / f"a.{kind}"
+        version, point_format = VERSIONS[kind]
+        write(path, version=version, point_format=point_format)
+        return path
+
+    return make
+
+
+def change(path: Path, at: int, layout: str, value: int) -> None:
+    content = bytearray(path.read_bytes())
+    struct.pack_into(f"<{layout}", content, at, value)
+    path.write_bytes(content)
+
+
+def number(path: Path, at: int, layout: str) -> int:
+    return struct.unpack_from(f"<{layout}", path.read_bytes(), at)[0]
+
+
+def laszip(path: Path) -> int:
+    """Where the content of LASzip's record begins."""
+    return path.read_bytes().index(b"laszip encoded") - 2 + 54
+
+
+@pytest.mark.parametrize("kind", VERSIONS)
+def test_sound_files_pass(file, kind) -> None:
+    path = file(kind)
+    check_las_sizes(path)
+    assert len(read_scans(path).scan("a" if kind != "old.laz" else "a.old").points) == COUNT
+
+
+@pytest.mark.parametrize(
+    ("at", "layout", "value", "words"),
+    [
+        (RECORDS, "I", 2**32 - 1, "got 4294967295 of them"),
+        (EXTENDED, "I", 2**32 - 1, "got them at 375, 680 and 0"),
+        (POINTS, "Q", COUNT + 1, "expected 41 points, but the file ends early"),
+        (POINTS, "Q", 2**40, "--max-unpacked"),
+        (DATA, "I", 2**31, "one after the other"),
+        (94, "H", 9, "one after the other"),
+        (POINT_BYTES, "H", 29, "got format 6 of 29 bytes"),
+        (FORMAT, "B", 11, "got format 11"),
+        (375 + 20, "H", 60_000, "records that end before byte"),
+    ],
+)
+def test_what_does_not_fit_the_file(file, at, layout, value, words) -> None:
+    path = file("las")
+    change(path, at, layout, value)
+    with pytest.raises(FileFormatError, match=words):
+        read_scans(path)
+
+
+def test_records_behind_the_points_are_counted_too(file) -> None:
+    path = file("las")
+    change(path, 235, "Q", path.stat().st_size)
+    change(path, EXTENDED, "I", 2**32 - 1)
+    with pytest.raises(FileFormatError, match="of 60 bytes or more, got 4294967295 of them in 0"):
+        read_scans(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "layout", "value", "words"),
+    [
+        (0, "H", 1, "in chunks, got parts of 40 in compression 1"),
+        (0, "H", 2, "parts that fit compression 2"),
+        (12, "I", 2**32 - 2, "chunks of 4294967294 points, which is"),
+        (32, "H", 60_000, "expected 60000 parts of a point"),
+        (36, "H", 31, "in compression 3"),
+    ],
+)
+def test_what_laszip_says_of_points(file, place, layout, value, words) -> None:
+    path = file("laz")
+    change(path, laszip(path) + place, layout, value)
+    with pytest.raises(FileFormatError, match=words):
+        read_scans(path)
+
+
+def test_chunks_and_their_layers(file) -> None:
+    path = file("laz")
+    sound, data = path.read_bytes(), number(path, DATA, "I")
+    table, layer = number(path, data, "q"), number(path, data + 8 + 40 + 4, "I")
+    for at, layout, value, words in (
+        (data, "q", 2**40, "expected a table of chunks in the file"),
+        (table + 4, "I", 2**31 - 1, "at most a chunk a point, got 2147483647"),
+        (table + 4, "I", 0, "at most a chunk a point, got 0"),
+        (data + 8 + 40 + 4, "I", 2**32 - 1, "layers of points within their chunks"),
+        (data + 8 + 40 + 4, "I", layer + 1, "layers of points within their chunks"),
+        (POINTS, "Q", 50_001, "got chunks that hold 50000"),
+    ):
+        path.write_bytes(sound)
+        change(path, at, layout, value)
+        with pytest.raises(FileFormatError, match=words):
+            read_scans(path)
