@@ -293,7 +293,8 @@ class _TextRows:
 
     def __init__(self, path: Path, header: PlyHeader) -> None:
         self._path = path
-        self._lines = read_bytes(path, _KIND)[header.offset :].split(b"\n")
+        lines = read_bytes(path, _KIND)[header.offset :].split(b"\n")
+        self._lines = [line for line in lines if line and not line.isspace()]
         self._at = 0
 
     def next(self, element: PlyElement) -> PlyTable:
@@ -311,7 +312,31 @@ class _TextRows:
             ) from error
 
 
+def text_table(lines: list[bytes], columns: int) -> NDArray[np.float64]:
+    """Numbers of lines of text (rows, columns), parted by spaces, as PLY files in ASCII have them.
+
+    Raises:
+        ValueError: If a word is no number, or a line has more or fewer of them.
+    """
+    if not lines:
+        return np.empty((0, columns))
+    table = np.loadtxt([line.decode("latin-1") for line in lines], ndmin=2, comments=None)
+    if table.shape != (len(lines), columns):
+        raise ValueError(f"lines of {table.shape[1]} numbers")
+    return table
+
+
 def _parsed(element: PlyElement, lines: list[bytes]) -> PlyTable:
+    if all(one.count_code is None for one in element.properties):
+        table = text_table(lines, len(element.properties))
+        numbers: dict[str, NDArray[Any]] = {}
+        for one, values in zip(element.properties, table.T, strict=True):
+            numbers[one.name] = values.copy() if one.code[0] == "f" else _whole(values, one)
+        return PlyTable(count=element.count, numbers=numbers)
+    return _parsed_lists(element, lines)
+
+
+def _parsed_lists(element: PlyElement, lines: list[bytes]) -> PlyTable:
     columns: list[list[float]] = [[] for _ in element.properties]
     starts = [[0] for _ in element.properties]
     for line in lines:

@@ -12,6 +12,7 @@ from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import Metadata as Metadata
 from splatseg.io.captures._metadata import read_metadata as read_metadata
+from splatseg.io.captures._points import read_ply_points as read_ply_points
 from splatseg.io.captures.blender import find_blender, read_blender
 from splatseg.io.captures.colmap import find_colmap, read_colmap
 from splatseg.io.captures.idr import FILES as _IDR_FILES
@@ -42,9 +43,11 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     """Read a capture: cameras, split, start points and classes, not the photographs themselves.
 
     Views are sorted by name. The split is the capture's own, else every 8th view by sorted
-    name (0, 8, 16, ...) is a test view. Photographs are checked to be there and to have the
-    size their intrinsics say, or a uniform scale of it, which is noted. Those that are listed
-    and not there are left out, which is noted too, as long as half of them are there.
+    name (0, 8, 16, ...) is a test view. Photographs are checked to be there, under their name or
+    their stem, and to have the size their intrinsics say, or a uniform scale of it, which is
+    noted. Where fewer than half are there, folders of smaller copies (``images_2``, ``images_4``,
+    ``images_8``) stand for theirs. Those that are not there, cannot be opened or are of another
+    shape are left out, which is noted too, as long as half of them can be used.
 
     Args:
         path: The capture's folder, or its transforms.json, poses_bounds.npy,
@@ -52,7 +55,7 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             segment of Waymo, or of KITTI-360 a drive, a camera or a window of frames of one
             (see `kitti360_drive`).
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
-        strict: Refuse a capture that lists a photograph which is not there.
+        strict: Refuse a capture that lists a photograph which would be left out.
 
     Returns:
         The capture, with `notes` on what a person should know of how it was read.
@@ -60,8 +63,9 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     Raises:
         MissingFileError: If there is no such folder, or more than half of the photographs (with
             `strict` any) are missing.
-        InputError: If no layout is found, or what it says cannot be; one sentence with the
-            reason.
+        InputError: If no layout is found, what it says cannot be, or more than half of the
+            photographs (with `strict` any) cannot be used; one sentence with the reason.
+        MissingPackageError: If a lens needs pycolmap, and that is not installed.
     """
     check_choice("format", format, ("auto", *FORMATS))
     folder = Path(path)

@@ -7,9 +7,10 @@ the same mistakes in the same words.
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -18,8 +19,9 @@ from numpy.typing import NDArray
 from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
 from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.core.view_names import clean_view_names
-from splatseg.errors import InputError, MissingFileError, quoted
+from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.captures._metadata import read_metadata
+from splatseg.io.captures._photographs import SMALLER, Photographs, smaller
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
 from splatseg.io.paths import check_utf8
@@ -61,6 +63,10 @@ class Intrinsics:
     height: int | None
 
 
+OfSize: TypeAlias = Callable[[int, int], Intrinsics]
+"""Intrinsics of a photograph by its width and height, where the layout does not tell its size."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RawView:
     """One photograph as a layout describes it, unchecked."""
@@ -71,9 +77,12 @@ class RawView:
     relative: str
     """The photograph's path as the layout writes it; names come from it."""
 
-    intrinsics: Intrinsics
+    intrinsics: Intrinsics | OfSize
     cam_from_world: NDArray[np.float64]
     """4 x 4, OpenCV axes."""
+
+    copy_of: int = 1
+    """Pixels of the photograph that the intrinsics are of for one of `image`, a smaller copy."""
 
     split: str | None = None
     mask: Path | None = None
@@ -93,13 +102,14 @@ def build_capture(
 ) -> Capture:
     """Check what a reader found and make the capture of it.
 
-    Photographs that are listed and not there are left out, and a note names them. They are
-    left out before views are split, and after they are named: a view keeps its name when the
-    others come back.
+    Photographs are sought by their stem too, and in folders of smaller copies where fewer than
+    half are in their own. Those that are not there, cannot be opened, or are of another shape than
+    their intrinsics are left out, and a note names them. They are left out before views are split,
+    and after they are named: a view keeps its name when the others come back.
 
     Raises:
         InputError: If there is no photograph, one is listed twice, a pose or focal length is
-            impossible, or a photograph's size is not that of its intrinsics.
+            impossible, or more than half of the photographs, any with `strict`, cannot be used.
         MissingFileError: If more than half of the photographs are missing, or any with
             `strict`, or masks or depth maps of those that are there.
     """
@@ -107,6 +117,7 @@ def build_capture(
         raise InputError(
             f"{path}: expected photographs with poses, got a {format} capture of none."
         )
+    raw, found_notes = _located(path, raw)
     with made_from(path):
         names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
@@ -114,11 +125,14 @@ def build_capture(
     _check_missing(path, missing, listed=len(raw), strict=strict)
     order = [i for i in order if is_file(raw[i].image)]
     left_out = [_left_out(missing, listed=len(raw))] if missing else []
+    sizes, unfit = _fitting(raw, order, missing=len(missing), strict=strict)
+    order = [i for i in order if i in sizes]
+    left_out += [*unfit, *found_notes]
     raw, names = [raw[i] for i in order], [names[i] for i in order]
     _check_paths(path, raw)
     _check_files(path, raw)
     splits, split_note = _splits(raw)
-    views, scaled = _made_views(path, raw, names, splits)
+    views, scaled = _made_views(path, raw, names, splits, [sizes[i] for i in order])
     metadata = read_metadata(path)
     found = (*left_out, *notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
     with made_from(path):
@@ -136,17 +150,120 @@ def build_capture(
         )
 
 
+def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[str]]:
+    """Views with the photographs that are there instead of the paths that are listed, and notes."""
+    photographs = Photographs()
+    there = photographs.find_all([view.image for view in raw])
+    notes: list[str] = []
+    number = 1
+    if sum(file is not None for file in there) < MIN_THERE * len(raw):
+        for copies in SMALLER:
+            found = [_copy(photographs, view.image, copies, below=path) for view in raw]
+            if sum(file is not None for file in found) >= MIN_THERE * len(raw):
+                there, number = found, copies
+                folder = next(file for file in found if file is not None).parent
+                where = folder.relative_to(path) if folder.is_relative_to(path) else folder
+                notes.append(
+                    f"photographs were read from {_first([str(where)])}, as they are not where the "
+                    "capture lists them"
+                )
+                break
+    located: list[RawView] = []
+    others: list[str] = []
+    for view, file in zip(raw, there, strict=True):
+        if file is None:
+            located.append(view)
+            continue
+        suffix = file.suffix if file.stem == view.image.name else ""
+        if not suffix and file.name != view.image.name:
+            others.append(view.relative)
+        if number > 1:
+            mask, depth = (
+                next((c for c in smaller(f, number, below=path) if is_file(c)), f) if f else None
+                for f in (view.mask, view.depth)
+            )
+            view = replace(view, mask=mask, depth=depth, copy_of=number)
+        located.append(replace(view, image=file, relative=view.relative + suffix))
+    if others:
+        notes.append(
+            f"{len(others)} photographs have another suffix than the capture lists "
+            f"({_first(others)})"
+        )
+    return located, notes
+
+
+def _copy(photographs: Photographs, listed: Path, number: int, *, below: Path) -> Path | None:
+    """A smaller copy of a photograph, None where there is none."""
+    for candidate in smaller(listed, number, below=below):
+        if (file := photographs.find(candidate)) is not None:
+            return file
+    return None
+
+
+def _fitting(
+    raw: Sequence[RawView], order: Sequence[int], *, missing: int, strict: bool
+) -> tuple[dict[int, tuple[int, int]], list[str]]:
+    """Sizes of the photographs that can be used, by index, and notes of the others.
+
+    Raises:
+        InputError: The complaint about the first that cannot, if it is one of more than half
+            with those that are not there, or with `strict`.
+    """
+    sizes: dict[int, tuple[int, int]] = {}
+    closed: list[int] = []
+    turned: list[int] = []
+    first: InputError | None = None
+    for i in order:
+        view = raw[i]
+        try:
+            size = image_size(view.image)
+        except FileFormatError as error:
+            closed.append(i)
+            first = first or error
+            continue
+        intrinsics = _of_size(view, size)
+        if _same_shape(intrinsics, size):
+            sizes[i] = size
+        else:
+            turned.append(i)
+            first = first or _other_shape(intrinsics, size, where=str(view.image))
+    if first is not None and (strict or len(sizes) < MIN_THERE * len(raw)):
+        raise first
+    notes: list[str] = []
+    for rows, what in (
+        (closed, "cannot be opened"),
+        (turned, "are of another shape than their intrinsics say"),
+    ):
+        if rows:
+            listed = _first([raw[i].relative for i in rows], _NAMED)
+            notes.append(
+                f"{len(rows)} of {len(raw)} photographs {what} and are left out ({listed})"
+            )
+    return sizes, notes
+
+
+def _of_size(view: RawView, size: tuple[int, int]) -> Intrinsics:
+    """The intrinsics of a view whose photograph has this size."""
+    if callable(view.intrinsics):
+        return view.intrinsics(size[0] * view.copy_of, size[1] * view.copy_of)
+    return view.intrinsics
+
+
 def _made_views(
-    path: Path, raw: Sequence[RawView], names: Sequence[str], splits: Sequence[str]
+    path: Path,
+    raw: Sequence[RawView],
+    names: Sequence[str],
+    splits: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
 ) -> tuple[list[View], tuple[str, ...]]:
     """Views of photographs that are there, and notes of intrinsics that were scaled to them."""
     scaled: list[str] = []
     views: list[View] = []
-    for view, name, split in zip(raw, names, splits, strict=True):
-        width, height = image_size(view.image)
-        intrinsics = scaled_to(view.intrinsics, (width, height), where=str(view.image))
-        if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
-            before = f"{view.intrinsics.width}x{view.intrinsics.height}"
+    for view, name, split, (width, height) in zip(raw, names, splits, sizes, strict=True):
+        written = _of_size(view, (width, height))
+        intrinsics = scaled_to(written, (width, height), where=str(view.image))
+        if intrinsics is not written and written.width is not None:
+            before = f"{written.width}x{written.height}"
             scaled.append(f"intrinsics of {before} were scaled to photographs of {width}x{height}")
         where = f"{path}: {view.relative}"
         camera = _camera(view, intrinsics, width, height, where=where)
@@ -222,17 +339,9 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
         )
     if (intrinsics.width, intrinsics.height) == size:
         return intrinsics
+    if not _same_shape(intrinsics, size):
+        raise _other_shape(intrinsics, size, where=where)
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
-    uniform = (
-        abs(sx * intrinsics.height - size[1]) <= 1 or abs(sy * intrinsics.width - size[0]) <= 1
-    )
-    if not uniform:
-        turned = abs(size[1] / intrinsics.width * intrinsics.height - size[0]) <= 1
-        hint = "; turned by its EXIF orientation, perhaps" if turned else ""
-        raise InputError(
-            f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or "
-            f"a uniform scale of it, as its intrinsics say, got {size[0]}x{size[1]}{hint}."
-        )
     return replace(
         intrinsics,
         width=size[0],
@@ -241,6 +350,29 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
         fy=intrinsics.fy * sy,
         cx=intrinsics.cx * sx,
         cy=intrinsics.cy * sy,
+    )
+
+
+def _same_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:
+    """Whether a uniform scale leads from the size of intrinsics to another, up to one pixel.
+
+    True where intrinsics have no size, or one that no picture has, which is refused elsewhere.
+    """
+    width, height = intrinsics.width, intrinsics.height
+    if width is None or height is None or min(width, height) < 1:
+        return True
+    across, down = size[0] / width * height - size[1], size[1] / height * width - size[0]
+    return abs(across) <= 1 or abs(down) <= 1
+
+
+def _other_shape(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> InputError:
+    """The complaint about a photograph of another shape than its intrinsics."""
+    width, height = intrinsics.width or 1, intrinsics.height or 1
+    turned = abs(size[1] / width * height - size[0]) <= 1
+    hint = "; turned by its EXIF orientation, perhaps" if turned else ""
+    return InputError(
+        f"{where}: expected a photograph of {width}x{height} pixels or a uniform scale of it, as "
+        f"its intrinsics say, got {size[0]}x{size[1]}{hint}."
     )
 
 
@@ -298,7 +430,8 @@ def _camera(
     if not all(math.isfinite(value) for value in rest):
         raise InputError(f"{where}: expected finite intrinsics, got {rest}.")
     pose = checked_pose(view.cam_from_world, where=where)
-    distorted = intrinsics.model == "fisheye" or any(intrinsics.distortion)
+    angular = intrinsics.model in ("fisheye", "thin_prism_fisheye")
+    distorted = angular or any(intrinsics.distortion)
     return Camera(
         width=width,
         height=height,

@@ -17,6 +17,7 @@ from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import (
     MAX_SIDE,
     Intrinsics,
+    OfSize,
     RawView,
     build_capture,
     opencv_from_opengl,
@@ -38,6 +39,7 @@ _MODELS: dict[str, CameraModel] = {
     "FULL_OPENCV": "opencv",
     "OPENCV_FISHEYE": "fisheye",
     "MEI": "mei",
+    "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
 }
 _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE = ("k1", "k2", "k3", "k4")
@@ -45,6 +47,7 @@ _KEYS: dict[CameraModel, tuple[str, ...]] = {
     "opencv": _OPENCV,
     "fisheye": _FISHEYE,
     "mei": ("xi", "k1", "k2", "p1", "p2"),
+    "thin_prism_fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
 }
 
 
@@ -52,7 +55,8 @@ def read_nerfstudio(folder: Path, *, file: str = FILE, strict: bool = False) -> 
     """Read a capture with a transforms.json; see `read_capture`.
 
     Intrinsics stand at the top or in a frame, which wins: ``fl_x fl_y cx cy w h`` in pixels
-    (or ``camera_angle_x`` in radians), ``camera_model``, and distortion as OpenCV names it.
+    (or ``camera_angle_x`` in radians; without ``w h`` the photograph's size is taken),
+    ``camera_model``, and distortion as OpenCV names it.
     ``transform_matrix`` is world_from_cam with OpenGL axes (x right, y up, z backwards).
     ``mask_path``, ``depth_file_path`` and ``split`` of a frame are taken over. Start points
     come from ``ply_file_path``, else from points3D.ply, sparse_pc.ply or points3D.bin beside
@@ -158,32 +162,28 @@ def _beside(path: Path, name: object) -> Path | None:
     return path.parent / name.replace("\\", "/") if isinstance(name, str) and name else None
 
 
-def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics:
-    """The lens of a frame, or of a file that has one lens.
+def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics | OfSize:
+    """The lens of a frame, or of a file that has one lens; by its size where that is not said.
 
     Args:
         source: The keys of the frame over those of the file.
         where: The file and the frame; starts the message.
 
     Raises:
-        FileFormatError: If the size or a focal length lacks, or the camera model is not one that
-            can be undistorted.
+        FileFormatError: If a focal length lacks, or the camera model is not one that can be
+            undistorted.
     """
     model, distortion = lens_of(source, where=where)
     if "w" not in source or "h" not in source:
-        raise FileFormatError(f"{where}: expected the image size as w and h, got none.")
+
+        def of_size(width: int, height: int) -> Intrinsics:
+            found = intrinsics_of_frame({**source, "w": width, "h": height}, where=where)
+            return found(width, height) if callable(found) else found
+
+        _focals(source, (1, 1), where=where)
+        return of_size
     width, height = size_of(source, where=where)
-    if "fl_x" in source:
-        fx = number(source, "fl_x", None, where=where)
-    else:
-        angle = number(source, "camera_angle_x", None, where=where)
-        fx = focal_of(angle, width)
-    if "fl_y" in source:
-        fy = number(source, "fl_y", None, where=where)
-    elif "camera_angle_y" in source and "fl_x" not in source:
-        fy = focal_of(number(source, "camera_angle_y", None, where=where), height)
-    else:
-        fy = fx
+    fx, fy = _focals(source, (width, height), where=where)
     return Intrinsics(
         model=model,
         fx=fx,
@@ -194,6 +194,21 @@ def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics:
         width=width,
         height=height,
     )
+
+
+def _focals(source: Mapping[str, Any], size: tuple[int, int], *, where: str) -> tuple[float, float]:
+    """Focal lengths in pixels, from ``fl_x fl_y`` or ``camera_angle_x camera_angle_y``.
+
+    Either axis stands for both where only it is said; focal lengths come before angles.
+    """
+    for keys, angles in ((("fl_x", "fl_y"), False), (("camera_angle_x", "camera_angle_y"), True)):
+        found = [number(source, key, None, where=where) for key in keys if key in source]
+        if angles:
+            sides = [side for key, side in zip(keys, size, strict=True) if key in source]
+            found = [focal_of(angle, side) for angle, side in zip(found, sides, strict=True)]
+        if found:
+            return found[0], found[-1]
+    raise FileFormatError(f"{where}: expected a focal length (fl_x or camera_angle_x), got none.")
 
 
 def size_of(source: Mapping[str, Any], *, where: str) -> tuple[int, int]:

@@ -69,7 +69,7 @@ class _Header:
         return (9, 1, 3, 3, rotation, rest) if rest else (9, 1, 3, 3, rotation)
 
 
-def read_spz(path: Path) -> Gaussians:
+def read_spz(path: Path, *, strict: bool = False) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, turned to the axes of PLY files.
 
     Extensions (limits for a viewer's camera, for example) are not kept; the flag of a file made
@@ -105,7 +105,8 @@ def read_spz(path: Path) -> Gaussians:
         if rest is not None:
             signs = _FLIP_SH[: coefficients - 1, None]
             rows.sh[part, 1:] = (rest[part].astype(np.float32) - 128) / 128 * signs
-    return finish(path, rows, drawn=Filter(antialiased=bool(header.flags & _ANTIALIASED)))
+    drawn = Filter(antialiased=bool(header.flags & _ANTIALIASED))
+    return finish(path, rows, strict=strict, drawn=drawn)
 
 
 def _header(path: Path, data: bytes) -> _Header:
