@@ -163,7 +163,10 @@ def test_photographs_of_a_uniform_scale_are_taken_and_it_is_said(nerfstudio) -> 
         ({"fl_x": 0}, "positive focal length, got fx = 0"),
         ({"fl_y": -3}, "positive focal length, got fy = -3"),
         ({"cx": "left"}, "cx: expected a finite number, got 'left'"),
-        ({"w": None}, "expected the image size as w and h"),
+        (
+            {"fl_x": None, "fl_y": None},
+            "expected a focal length .fl_x or camera_angle_x., got none",
+        ),
         ({"camera_model": "EQUIRECTANGULAR"}, "got 'EQUIRECTANGULAR'"),
         ({"ply_file_path": "gone.ply"}, r"transforms.json: the start points .* \('gone.ply'\)"),
         ({"k1": float("nan")}, "k1: expected a finite number, got nan"),

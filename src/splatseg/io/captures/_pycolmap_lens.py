@@ -19,6 +19,7 @@ from splatseg.io.captures.build import Intrinsics
 WORST = 0.5
 """Pixels that the lens may be off anywhere in the picture."""
 
+_ONE_FOCAL = ("SIMPLE_DIVISION",)
 _GRID = 41
 _SECONDS = 120
 _PROGRAM = """
@@ -56,7 +57,10 @@ def lens_by_pycolmap(
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
     plane = _plane(model, width, height, parameters, pixels, where=where)
     sound = np.isfinite(plane[:, 0])
-    lens, error = _fitted(plane[sound], pixels[sound], width, height)
+    # Where a model has two focal lengths, they are its first two parameters.
+    ratio = parameters[0] / parameters[1] if model not in _ONE_FOCAL and parameters[1] else 1.0
+    ratio = ratio if 1e-3 < ratio < 1e3 else 1.0
+    lens, error = _fitted(plane[sound], pixels[sound], (width, height), ratio=ratio)
     if not sound.mean() > 0.5 or error > WORST:
         raise InputError(
             f"{where}: expected a lens that is within {WORST:g} pixels of one that can be "
@@ -101,13 +105,18 @@ def _plane(
 
 
 def _fitted(
-    plane: NDArray[np.float64], pixels: NDArray[np.float64], width: int, height: int
+    plane: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    size: tuple[int, int],
+    *,
+    ratio: float,
 ) -> tuple[Intrinsics, float]:
     """The lens of `core._distortion` nearest to these pixels, and pixels it is off at most.
 
-    With (u, v) the equidistant coordinates and r their length, the pixel is linear in f, f k, f p
-    and f s once the principal point is: both are solved for together.
+    With (u, v) the equidistant coordinates, the pixel is linear in f, f k, f p, f s and the
+    principal point, where ``ratio`` = fx / fy is known and pixels down are multiplied by it.
     """
+    width, height = size
     radius = np.linalg.norm(plane, axis=1)
     factor = np.where(radius > 1e-12, np.arctan(radius) / np.maximum(radius, 1e-12), 1.0)
     u, v = plane[:, 0] * factor, plane[:, 1] * factor
@@ -119,21 +128,22 @@ def _fitted(
     of_x = np.stack([*across, 2 * u * v, r2 + 2 * u * u, r2, zero, one, zero], axis=1)
     of_y = np.stack([*down, r2 + 2 * v * v, 2 * u * v, zero, r2, zero, one], axis=1)
     system = np.concatenate([of_x, of_y])
-    target = np.concatenate([pixels[:, 0], pixels[:, 1]])
+    target = np.concatenate([pixels[:, 0], pixels[:, 1] * ratio])
     if len(target) < system.shape[1]:
         return Intrinsics(fx=1, fy=1, cx=0, cy=0, width=width, height=height), float("inf")
     # Columns of one length, so that high powers of small angles count.
     lengths = np.maximum(np.linalg.norm(system, axis=0), 1e-300)
     found = np.linalg.lstsq(system / lengths, target, rcond=1e-12)[0] / lengths
-    error = float(np.abs(system @ found - target).max())
+    off = np.abs(system @ found - target).reshape(2, -1) / [[1.0], [ratio]]
+    error = float(off.max())
     focal = float(found[0])
     k1, k2, k3, k4, p1, p2, s1, s2 = (float(value) / focal for value in found[1:9])
     return Intrinsics(
         model="thin_prism_fisheye",
         fx=focal,
-        fy=focal,
+        fy=focal / ratio,
         cx=float(found[9]),
-        cy=float(found[10]),
+        cy=float(found[10]) / ratio,
         distortion=(k1, k2, p1, p2, k3, k4, s1, s2),
         width=width,
         height=height,

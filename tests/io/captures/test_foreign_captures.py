@@ -1,0 +1,273 @@
+"""Captures as other programs leave them, made here by plain code.
+
+Cases after reports of users of other tools (gaussian-splatting 272 among them): photographs under
+other suffixes or in folders of smaller copies, sizes that nobody wrote, models of COLMAP beside
+each other, photographs that stand on their side.
+"""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatseg.core import Gaussians, Scene
+from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.captures import read_capture
+from splatseg.io.scene import load_scene, save_scene
+
+NAMES = tuple(f"images/{i:02d}.png" for i in range(8))
+
+
+@pytest.mark.parametrize("listed", ["./images/{}", "images/{}", "images\\{}"])
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".JPG", ".tiff"])
+def test_file_paths_without_a_suffix(nerfstudio, write_image, listed, suffix) -> None:
+    stems = [f"frame.{i:04d}" for i in range(3)]
+    folder = nerfstudio(tuple(listed.format(stem) for stem in stems), images=False)
+    for stem in stems:
+        write_image(folder / "images" / f"{stem}{suffix}")
+        write_image(folder / "images" / f"{stem}_depth{suffix}", 5, 5)
+    capture = read_capture(folder, strict=True)
+    assert [view.name for view in capture.views] == stems
+    assert [view.image.name for view in capture.views] == [f"{stem}{suffix}" for stem in stems]
+    assert not any("suffix" in note for note in capture.notes), "nothing else was listed"
+
+
+def test_other_suffixes_are_found_and_said(nerfstudio, write_image) -> None:
+    folder = nerfstudio(NAMES[:4])
+    for name in NAMES[:2]:
+        (folder / name).rename((folder / name).with_suffix(".jpeg"))
+    capture = read_capture(folder)
+    assert [view.image.suffix for view in capture.views] == [".jpeg"] * 2 + [".png"] * 2
+    assert capture.notes[0] == (
+        "2 photographs have another suffix than the capture lists (images/00.png, images/01.png)"
+    )
+
+
+def test_no_photograph_is_that_of_two_paths(nerfstudio) -> None:
+    folder = nerfstudio(("images/a.png", "images/a.jpg", "images/b.png"))
+    (folder / "images/a.jpg").unlink()
+    assert read_capture(folder).missing == ("images/a.jpg",)
+
+
+def test_a_number_is_no_suffix(nerfstudio, write_image) -> None:
+    """frame.0001 is not the photograph of frame.0002, nor frame.png that of either."""
+    folder = nerfstudio(("i/frame.0001", "i/frame.0002"), images=False)
+    write_image(folder / "i/frame.0001.png")
+    write_image(folder / "i/frame.png")
+    assert read_capture(folder).missing == ("i/frame.0002",)
+
+
+def test_png_comes_before_jpeg(nerfstudio, write_image) -> None:
+    folder = nerfstudio(("images/a",), images=False)
+    for suffix in (".jpg", ".webp", ".png"):
+        write_image(folder / f"images/a{suffix}")
+    assert read_capture(folder).views[0].image.name == "a.png"
+
+
+@pytest.mark.parametrize("keys", [("camera_angle_x",), ("camera_angle_x", "camera_angle_y"),
+                                  ("camera_angle_y",)])  # fmt: skip
+def test_angles_and_no_size(nerfstudio, keys) -> None:
+    angles = {"camera_angle_x": 2 * math.atan(32 / 50), "camera_angle_y": 2 * math.atan(24 / 50)}
+    gone = dict.fromkeys(("w", "h", "fl_x", "fl_y", "cx", "cy"))
+    camera = read_capture(nerfstudio(top=gone | {k: angles[k] for k in keys})).views[0].camera
+    assert (camera.fx, camera.fy) == pytest.approx((50, 50))
+    assert (camera.cx, camera.cy, camera.width, camera.height) == (32, 24, 64, 48)
+
+
+def test_focal_lengths_and_no_size(nerfstudio) -> None:
+    camera = read_capture(nerfstudio(top=dict.fromkeys(("w", "h", "cx", "fl_x")))).views[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (51, 51, 32, 24.25)
+    with pytest.raises(FileFormatError, match="expected a focal length"):
+        read_capture(nerfstudio(top=dict.fromkeys(("w", "h", "fl_x", "fl_y"))))
+
+
+@pytest.mark.parametrize("number", [2, 4, 8])
+@pytest.mark.parametrize("sized", [True, False])
+def test_folders_of_smaller_copies(nerfstudio, write_image, number, sized) -> None:
+    gone = {} if sized else dict.fromkeys(("w", "h"))
+    folder = nerfstudio(NAMES, top=gone, images=False, frames={0: {"mask_path": "masks/0.png"}})
+    write_image(folder / "masks/0.png")
+    write_image(folder / f"masks_{number}/0.png", 64 // number, 48 // number)
+    for name in NAMES:
+        copy = Path(name.replace("images", f"images_{number}")).with_suffix(".jpg")
+        write_image(folder / copy, 64 // number, 48 // number)
+    capture = read_capture(folder)
+    camera = capture.views[0].camera
+    assert (camera.width, camera.height) == (64 // number, 48 // number)
+    found = (camera.fx, camera.fy, camera.cx, camera.cy)
+    assert found == pytest.approx([v / number for v in (50, 51, 31.5, 24.25)])
+    assert capture.views[0].mask == folder / f"masks_{number}/0.png"
+    assert f"images_{number}" in capture.notes[0]
+
+
+def test_the_listed_folder_comes_first_where_it_has_half(nerfstudio, write_image) -> None:
+    folder = nerfstudio(NAMES)
+    for name in NAMES:
+        write_image(folder / name.replace("images", "images_2"), 32, 24)
+    for name in NAMES[:4]:
+        (folder / name).unlink()
+    assert [view.camera.width for view in read_capture(folder).views] == [64] * 4
+    (folder / NAMES[4]).unlink()
+    assert [view.camera.width for view in read_capture(folder).views] == [32] * 8
+
+
+def test_photographs_on_their_side_are_left_out_and_named(nerfstudio, write_image) -> None:
+    folder = nerfstudio(NAMES)
+    for name in NAMES[::3]:
+        write_image(folder / name, 48, 64)
+    capture = read_capture(folder)
+    assert [view.name for view in capture.views] == ["01", "02", "04", "05", "07"]
+    assert capture.notes[0] == (
+        "3 of 8 photographs are of another shape than their intrinsics say and are left out "
+        "(images/00.png, images/03.png, images/06.png)"
+    )
+    with pytest.raises(InputError, match=r"00.png: expected a photograph of 64x48 .* got 48x64"):
+        read_capture(folder, strict=True)
+
+
+def test_photographs_that_cannot_be_opened_are_left_out_and_named(nerfstudio) -> None:
+    folder = nerfstudio(NAMES)
+    (folder / NAMES[1]).write_bytes(b"")
+    (folder / NAMES[2]).write_bytes(b"no photograph")
+    capture = read_capture(folder)
+    assert len(capture.views) == 6
+    assert capture.notes[0].startswith("2 of 8 photographs cannot be opened and are left out (")
+    with pytest.raises(FileFormatError, match=r"01.png: expected an image"):
+        read_capture(folder, strict=True)
+
+
+@pytest.mark.parametrize(("unusable", "read"), [(4, True), (5, False)])
+def test_half_of_the_photographs_must_be_left(nerfstudio, write_image, unusable, read) -> None:
+    """Whatever the reason: here one is not there and the others stand on their side."""
+    folder = nerfstudio(NAMES)
+    (folder / NAMES[0]).unlink()
+    for name in NAMES[1:unusable]:
+        write_image(folder / name, 48, 64)
+    if read:
+        assert len(read_capture(folder).views) == 4
+        return
+    with pytest.raises(InputError, match="expected a photograph of 64x48"):
+        read_capture(folder)
+
+
+# Models of COLMAP.
+
+
+def colmap(folder: Path, names, lens: str = "PINHOLE 64 48 50 51 32 24") -> None:
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(f"# a comment\n7 {lens}\n")
+    lines = [f"{i + 1} 1 0 0 0 {i} 0 0 7 {name}\n\n" for i, name in enumerate(names)]
+    (folder / "images.txt").write_text("".join(lines))
+
+
+def test_the_largest_model_is_read_and_said(tmp_path, write_image) -> None:
+    names = [f"{i}.png" for i in range(6)]
+    for name in names:
+        write_image(tmp_path / "images" / name)
+    colmap(tmp_path / "sparse/0", names[:2])
+    colmap(tmp_path / "sparse/1", names)
+    colmap(tmp_path / "sparse/2", names[:3])
+    (tmp_path / "sparse/2/images.txt").write_text("damaged\n")
+    capture = read_capture(tmp_path)
+    assert len(capture.views) == 6
+    assert capture.notes[0] == (
+        "sparse holds 3 models; 1, of 6 photographs, was read as the largest (0 of 2, 2 of 0 were "
+        "not)"
+    )
+    named = read_capture(tmp_path / "sparse/0")
+    assert len(named.views) == 2, "one that is named is read, whatever its size"
+    assert "0, of 2 photographs, was read (1 of 6" in named.notes[0]
+
+
+def test_a_model_need_not_be_called_0(tmp_path, write_image) -> None:
+    write_image(tmp_path / "images/a.png")
+    colmap(tmp_path / "sparse/aligned", ["a.png"])
+    assert len(read_capture(tmp_path).views) == 1
+
+
+@pytest.mark.parametrize("place", ["distorted/sparse/0", "distorted/sparse"])
+def test_what_convert_of_3dgs_starts_from(tmp_path, write_image, place) -> None:
+    """`input` goes with `distorted`; `images`, where it is, goes with another model."""
+    names = [f"{i}.jpg" for i in range(3)]
+    lens = "OPENCV 64 48 50 51 32 24 0.01 0 0 0"
+    colmap(tmp_path / place, names, lens)
+    for name in names:
+        write_image(tmp_path / "input" / name)
+    capture = read_capture(tmp_path)
+    assert {view.camera.model for view in capture.views} == {"opencv"}
+    assert {view.image.parent.name for view in capture.views} == {"input"}
+    assert len(read_capture(tmp_path / place).views) == 3
+    colmap(tmp_path / "sparse/0", names)
+    assert {view.camera.model for view in read_capture(tmp_path).views} == {"opencv"}, (
+        "the photographs of the undistorted model are not there"
+    )
+    for name in names:
+        write_image(tmp_path / "images" / name)
+    whole = read_capture(tmp_path)
+    assert {(v.camera.model, v.image.parent.name) for v in whole.views} == {("pinhole", "images")}
+
+
+def test_colmap_photographs_of_another_suffix(tmp_path, write_image) -> None:
+    colmap(tmp_path / "sparse/0", ["a/1.JPG", "a/2.JPG"])
+    for i in (1, 2):
+        write_image(tmp_path / f"images_4/a/{i}.png", 16, 12)
+    capture = read_capture(tmp_path)
+    assert [view.camera.fx for view in capture.views] == [12.5, 12.5]
+
+
+def test_nothing_there_is_still_said(tmp_path) -> None:
+    colmap(tmp_path / "distorted/sparse/0", ["a.png"])
+    with pytest.raises(MissingFileError, match=r"1 of 1 photographs .*\(a.png\)"):
+        read_capture(tmp_path)
+
+
+def test_thin_prisms_are_kept_in_a_scene(tmp_path, write_image) -> None:
+    """Their lens is written to cameras/transforms.json and read again."""
+    colmap(
+        tmp_path / "c/sparse/0",
+        ["a.png", "b.png"],
+        "THIN_PRISM_FISHEYE 64 48 50 51 32 24 0.01 0.002 0.003 -0.001 0.004 0.0005 0.006 -0.002",
+    )
+    for name in "ab":
+        write_image(tmp_path / f"c/images/{name}.png")
+    capture = read_capture(tmp_path / "c")
+    camera = capture.views[0].camera
+    assert camera.model == "thin_prism_fisheye"
+
+    one = Gaussians(
+        means=torch.zeros(1, 3), rotations=torch.eye(4)[:1], scales=torch.ones(1, 3),
+        opacities=torch.ones(1), sh=torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    save_scene(Scene(gaussians=one, views=capture.views, source=capture.path), tmp_path / "s")
+    back = load_scene(tmp_path / "s").views[0].camera
+    assert (back.model, back.distortion) == (camera.model, camera.distortion)
+    pixels = torch.tensor([[0.0, 0.0], [63.0, 47.0]], dtype=torch.float64)
+    rays = back.unproject(pixels, torch.ones(2, dtype=torch.float64))
+    np.testing.assert_allclose(back.project(rays)[0], pixels, atol=1e-8)
+
+
+def test_a_blender_file_with_other_intrinsics(tmp_path, write_image) -> None:
+    frames = [
+        {"file_path": f"./train/r_{i}", "transform_matrix": np.eye(4).tolist()} for i in (0, 1)
+    ]
+    content = {"fl_x": 70.0, "cx": 30.0, "w": 128, "h": 96, "frames": frames}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
+    for i in (0, 1):
+        write_image(tmp_path / f"train/r_{i}.jpg")
+    camera = read_capture(tmp_path).views[0].camera
+    assert (camera.fx, camera.cx, camera.width) == (35, 15, 64)
+
+
+def test_all_of_it_on_a_copy_of_a_generated_room(generated_room, tmp_path) -> None:
+    folder = tmp_path / "room"
+    shutil.copytree(generated_room, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["file_path"] = frame["file_path"].rsplit(".", 1)[0]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    want, found = read_capture(generated_room), read_capture(folder, strict=True)
+    assert [v.name for v in found.views] == [v.name for v in want.views]
