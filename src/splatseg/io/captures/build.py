@@ -359,7 +359,7 @@ def _same_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:
     True where intrinsics have no size, or one that no picture has, which is refused elsewhere.
     """
     width, height = intrinsics.width, intrinsics.height
-    if width is None or height is None or min(width, height) < 1:
+    if width is None or height is None or min(width, height) < 1 or max(width, height) > MAX_SIDE:
         return True
     across, down = size[0] / width * height - size[1], size[1] / height * width - size[0]
     return abs(across) <= 1 or abs(down) <= 1

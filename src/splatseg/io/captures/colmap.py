@@ -79,7 +79,8 @@ def read_colmap(folder: Path, *, strict: bool = False) -> Capture:
     for id, image in model.images.items():
         if image.camera_id not in lenses:
             raise InputError(
-                f"{model_folder}: image {quoted(image.name)} names camera {image.camera_id}, "
+                f"{model_folder}: image {quoted(image.name)} names camera "
+                f"{quoted(image.camera_id)}, "
                 "which is not there."
             )
         relative = image.name.replace("\\", "/")

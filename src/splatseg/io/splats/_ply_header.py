@@ -92,6 +92,15 @@ def read_ply_header(path: Path) -> PlyHeader:
         if lists and not ascii:
             break
         at += (count if fields or lists else 0) if ascii else count * row.itemsize
+    # A value takes a digit and what parts it from the next, a list its length.
+    least = sum(
+        2 * one.count * len((*(one.row.names or ()), *one.lists)) for one in elements.values()
+    )
+    if ascii and size - start < least - 1:
+        raise FileFormatError(
+            f"{path}: expected lines of values of at least {least - 1} bytes, got {size - start}: "
+            "the file is truncated."
+        )
     if not ascii and (size < at or (size > at and not lists)):
         raise FileFormatError(
             f"{path}: expected {at} bytes as its header promises, got {size}: the file is "
@@ -122,13 +131,12 @@ def _text_rows(
     path: Path, header: PlyHeader, element: PlyElement, size: int
 ) -> Iterator[tuple[slice, np.ndarray]]:
     names = element.row.names or ()
-    least = 2 * len(names) * element.count - 1  # a digit and what parts it from the next
     total = sum(one.count for one in header.elements.values() if one.row.names or one.lists)
     with path.open("rb") as file:
         file.seek(header.start)
         lines = (line for line in file if not line.isspace())
         before = sum(1 for _ in itertools.islice(lines, element.offset))
-        if path.stat().st_size - header.start < least or before < element.offset:
+        if before < element.offset:
             raise FileFormatError(f"{path}: expected {total} lines of values, got fewer.")
         for part in blocks(element.count, size):
             wanted = part.stop - part.start
