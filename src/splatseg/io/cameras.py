@@ -34,8 +34,8 @@ _DISTORTION = {
     "mei": ("xi", "k1", "k2", "p1", "p2"),
     "thin_prism_fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
 }
-_LENS = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "xi", *_DISTORTION["opencv"])
-_LENS += ("sx1", "sy1")
+_SIZES = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy")
+_LENS = (*_SIZES, "xi", *_DISTORTION["opencv"], "sx1", "sy1")
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _FILES = {"image": "file_path", "mask": "mask_path", "depth": "depth_file_path"}
 

@@ -244,9 +244,9 @@ def _fitting(
 
 def _of_size(view: RawView, size: tuple[int, int]) -> Intrinsics:
     """The intrinsics of a view whose photograph has this size."""
-    if callable(view.intrinsics):
-        return view.intrinsics(size[0] * view.copy_of, size[1] * view.copy_of)
-    return view.intrinsics
+    if isinstance(view.intrinsics, Intrinsics):
+        return view.intrinsics
+    return view.intrinsics(size[0] * view.copy_of, size[1] * view.copy_of)
 
 
 def _made_views(

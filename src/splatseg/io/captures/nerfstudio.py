@@ -178,7 +178,7 @@ def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics 
 
         def of_size(width: int, height: int) -> Intrinsics:
             found = intrinsics_of_frame({**source, "w": width, "h": height}, where=where)
-            return found(width, height) if callable(found) else found
+            return found if isinstance(found, Intrinsics) else found(width, height)
 
         _focals(source, (1, 1), where=where)
         return of_size
