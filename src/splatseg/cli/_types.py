@@ -72,9 +72,10 @@ Strict: TypeAlias = Annotated[
     _named(
         None,
         "Refuse a splat file with Gaussians that cannot be rendered (NaN, infinite), and a capture "
-        "that lists a photograph which is not there, cannot be opened or is of another shape than "
-        "its intrinsics. Without it they are left out and counted or named, as long as a Gaussian "
-        "and half of the photographs are left.",
+        "with photographs that are not there, cannot be opened, are of another shape than their "
+        "intrinsics or mask or have an impossible pose, or with start points that are not finite. "
+        "Without it they are left out and counted or named, as long as a Gaussian and half of the "
+        "photographs are left.",
     ),
 ]
 

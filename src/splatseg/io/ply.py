@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
 from splatseg.io.foreign import read_bytes, reading
+from splatseg.io.text_numbers import number_table
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -312,23 +313,9 @@ class _TextRows:
             ) from error
 
 
-def text_table(lines: list[bytes], columns: int) -> NDArray[np.float64]:
-    """Numbers of lines of text (rows, columns), parted by spaces, as PLY files in ASCII have them.
-
-    Raises:
-        ValueError: If a word is no number, or a line has more or fewer of them.
-    """
-    if not lines:
-        return np.empty((0, columns))
-    table = np.loadtxt([line.decode("latin-1") for line in lines], ndmin=2, comments=None)
-    if table.shape != (len(lines), columns):
-        raise ValueError(f"lines of {table.shape[1]} numbers")
-    return table
-
-
 def _parsed(element: PlyElement, lines: list[bytes]) -> PlyTable:
     if all(one.count_code is None for one in element.properties):
-        table = text_table(lines, len(element.properties))
+        table = number_table(lines, len(element.properties))
         numbers: dict[str, NDArray[Any]] = {}
         for one, values in zip(element.properties, table.T, strict=True):
             numbers[one.name] = values.copy() if one.code[0] == "f" else _whole(values, one)

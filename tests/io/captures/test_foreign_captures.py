@@ -8,6 +8,7 @@ each other, photographs that stand on their side.
 import json
 import math
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -154,7 +155,149 @@ def test_half_of_the_photographs_must_be_left(nerfstudio, write_image, unusable,
         read_capture(folder)
 
 
+def broken(pose: np.ndarray, kind: str) -> list[list[object]]:
+    pose = pose.astype(object)
+    if kind == "singular":
+        pose[:3, :3] = 0.0
+    elif kind == "twice as large":
+        pose[:3, :3] *= 2
+    else:
+        pose[1, 3] = {"nan": math.nan, "infinite": math.inf, "null": None}[kind]
+    return pose.tolist()
+
+
+@pytest.mark.parametrize("kind", ["nan", "infinite", "null", "singular", "twice as large"])
+def test_a_pose_that_cannot_be_is_left_out_and_named(nerfstudio, kind) -> None:
+    folder = nerfstudio(NAMES, frames={2: {"transform_matrix": broken(np.eye(4), kind)}})
+    capture = read_capture(folder)
+    assert [view.name for view in capture.views] == ["00", "01", "03", "04", "05", "06", "07"]
+    assert capture.notes[0] == (
+        "1 of 8 photographs have a pose or a lens that no camera has and are left out "
+        "(images/02.png)"
+    )
+    with pytest.raises(InputError, match=r"images/02.png'?: expected a (finite pose|rotation)"):
+        read_capture(folder, strict=True)
+
+
+def test_a_lens_that_cannot_be_is_left_out_and_named(nerfstudio) -> None:
+    folder = nerfstudio(NAMES, frames={2: {"fl_x": -50.0}})
+    assert len(read_capture(folder).views) == 7
+    with pytest.raises(InputError, match=r"images/02.png: expected a positive focal length"):
+        read_capture(folder, strict=True)
+
+
+@pytest.mark.parametrize("kind", ["nan", "singular"])
+def test_a_pose_of_other_layouts_that_cannot_be(tmp_path, write_image, kind) -> None:
+    frames = []
+    for i in range(4):
+        pose = np.eye(4).tolist() if i else broken(np.eye(4), kind)
+        frames.append({"file_path": f"./train/r_{i}", "transform_matrix": pose})
+        write_image(tmp_path / f"b/train/r_{i}.png")
+        write_image(tmp_path / f"c/images/{i}.png")
+    content = {"camera_angle_x": 0.8, "frames": frames}
+    (tmp_path / "b/transforms_train.json").write_text(json.dumps(content))
+    colmap(tmp_path / "c/sparse/0", [f"{i}.png" for i in range(4)])
+    images = tmp_path / "c/sparse/0/images.txt"
+    bad = "1 nan 0 0 0" if kind == "nan" else "1 0 0 0 0"
+    images.write_text(images.read_text().replace("1 1 0 0 0", bad, 1))
+    for folder in (tmp_path / "b", tmp_path / "c"):
+        capture = read_capture(folder)
+        assert len(capture.views) == 3
+        assert "1 of 4 photographs have a pose" in capture.notes[0]
+
+
+def test_a_mask_of_another_shape_leaves_its_photograph_out(nerfstudio, write_image) -> None:
+    masks = {i: {"mask_path": f"masks/{i}.png"} for i in range(8)}
+    folder = nerfstudio(NAMES, frames=masks)
+    for i in range(8):
+        write_image(folder / f"masks/{i}.png", 32, 24)
+    write_image(folder / "masks/3.png", 48, 64)
+    (folder / "masks/4.png").write_bytes(b"no picture")
+    capture = read_capture(folder)
+    assert [view.name for view in capture.views] == ["00", "01", "02", "05", "06", "07"]
+    assert capture.notes[:2] == (
+        "2 of 8 photographs have a mask that cannot be opened or is of another shape and are left "
+        "out (images/03.png, images/04.png)",
+        "masks of 32x24 were scaled to photographs of 64x48",
+    )
+    with pytest.raises(InputError, match=r"3.png: expected a mask of 64x48 .* got 48x64"):
+        read_capture(folder, strict=True)
+
+
+def write_points(path: Path, rows: str, colours: str = "") -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + colours
+    path.write_text(f"{head}end_header\n{rows}")
+
+
+def test_start_points_that_are_not_finite_are_left_out_and_counted(nerfstudio) -> None:
+    folder = nerfstudio(top={"ply_file_path": "p.ply"})
+    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    write_points(folder / "p.ply", "0 1 2 9 8 7\n0 nan 0 1 1 1\n3 4 5 6 5 4\n", colours)
+    capture = read_capture(folder)
+    assert capture.points.points.tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert capture.points.colours.tolist() == [[9, 8, 7], [6, 5, 4]]
+    assert "1 of 3 start points are not finite and are left out" in capture.notes
+    with pytest.raises(InputError, match="1 of 3 start points are not finite"):
+        read_capture(folder, strict=True)
+    write_points(folder / "p.ply", "inf 0 0\n0 nan 0\n0 0 1e99\n")
+    with pytest.raises(InputError, match="3 of 3 start points are not finite"):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize("suffix", ["txt", "bin"])
+def test_points_of_colmap_that_are_not_finite(tmp_path, write_image, suffix) -> None:
+    write_image(tmp_path / "images/a.png")
+    colmap(tmp_path / "sparse/0", ["a.png"])
+    write_colmap_points(tmp_path / "sparse/0", suffix, [(0, 1, 2), (math.nan, 0, 0)])
+    assert read_capture(tmp_path).points.points.tolist() == [[0, 1, 2]]
+
+
+def test_start_points_that_are_not_there_are_said(nerfstudio) -> None:
+    folder = nerfstudio(top={"ply_file_path": "gone.ply"})
+    capture = read_capture(folder)
+    assert capture.points is None
+    assert "the start points that it names are not there ('gone.ply')" in capture.notes
+    with pytest.raises(MissingFileError, match="start points .*gone.ply"):
+        read_capture(folder, strict=True)
+
+
+@pytest.mark.parametrize("keys", [("x_fov",), ("x_fov", "y_fov"), ("y_fov",)])
+def test_fields_of_view_in_degrees(nerfstudio, keys) -> None:
+    """As instant-ngp takes them."""
+    angles = {"x_fov": math.degrees(2 * math.atan(32 / 50))}
+    angles["y_fov"] = math.degrees(2 * math.atan(24 / 50))
+    gone = dict.fromkeys(("fl_x", "fl_y"))
+    camera = read_capture(nerfstudio(top=gone | {k: angles[k] for k in keys})).views[0].camera
+    assert (camera.fx, camera.fy) == pytest.approx((50, 50))
+
+
+@pytest.mark.parametrize("key", ["ftheta_p0", "latlong", "equirectangular"])
+def test_other_lenses_of_instant_ngp_are_refused(nerfstudio, key) -> None:
+    with pytest.raises(FileFormatError, match=f"a lens that can be undistorted, got one .*{key}"):
+        read_capture(nerfstudio(top={key: True}))
+    read_capture(nerfstudio(top={key: False}))
+
+
 # Models of COLMAP.
+
+
+def write_colmap_points(folder: Path, suffix: str, points) -> None:
+    if suffix == "txt":
+        rows = (f"{i} {x} {y} {z} 1 2 3 0.5\n" for i, (x, y, z) in enumerate(points))
+        (folder / "points3D.txt").write_text("".join(rows))
+        return
+    for name in ("cameras", "images"):
+        (folder / f"{name}.txt").unlink()
+    row = struct.Struct("<Q3d3BdQ")
+    (folder / "points3D.bin").write_bytes(
+        struct.pack("<Q", len(points))
+        + b"".join(row.pack(i, *xyz, 1, 2, 3, 0.5, 0) for i, xyz in enumerate(points))
+    )
+    camera = struct.pack("<QIiQQ4d", 1, 7, 1, 64, 48, 50, 51, 32, 24)
+    (folder / "cameras.bin").write_bytes(camera)
+    image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 7) + b"a.png\0" + struct.pack("<Q", 0)
+    (folder / "images.bin").write_bytes(image)
 
 
 def colmap(folder: Path, names, lens: str = "PINHOLE 64 48 50 51 32 24") -> None:

@@ -14,6 +14,7 @@ from splatseg.io.captures._metadata import Metadata as Metadata
 from splatseg.io.captures._metadata import read_metadata as read_metadata
 from splatseg.io.captures._points import read_ply_points as read_ply_points
 from splatseg.io.captures.blender import find_blender, read_blender
+from splatseg.io.captures.build import finite_points as finite_points
 from splatseg.io.captures.colmap import find_colmap, read_colmap
 from splatseg.io.captures.idr import FILES as _IDR_FILES
 from splatseg.io.captures.idr import find_idr, read_idr
@@ -46,8 +47,9 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     name (0, 8, 16, ...) is a test view. Photographs are checked to be there, under their name or
     their stem, and to have the size their intrinsics say, or a uniform scale of it, which is
     noted. Where fewer than half are there, folders of smaller copies (``images_2``, ``images_4``,
-    ``images_8``) stand for theirs. Those that are not there, cannot be opened or are of another
-    shape are left out, which is noted too, as long as half of them can be used.
+    ``images_8``) stand for theirs. Those that are not there, cannot be opened, are of another
+    shape than their intrinsics or mask, or have an impossible pose or lens are left out, which is
+    noted too, as long as half of them can be used; so are start points that are not finite.
 
     Args:
         path: The capture's folder, or its transforms.json, poses_bounds.npy,
@@ -55,7 +57,8 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             segment of Waymo, or of KITTI-360 a drive, a camera or a window of frames of one
             (see `kitti360_drive`).
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
-        strict: Refuse a capture that lists a photograph which would be left out.
+        strict: Refuse a capture of which a photograph or a start point would be left out, or
+            whose ``ply_file_path`` is not there.
 
     Returns:
         The capture, with `notes` on what a person should know of how it was read.

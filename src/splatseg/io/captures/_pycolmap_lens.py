@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import InputError, MissingPackageError, quoted, reason
 from splatseg.io.captures.build import Intrinsics
+from splatseg.io.json_files import parse_object
 
 WORST = 0.5
 """Pixels that the lens may be off anywhere in the picture."""
@@ -91,14 +92,14 @@ def _plane(
             check=True,
             timeout=_SECONDS,
         )
-        told = json.loads(run.stdout)
-    except (subprocess.SubprocessError, OSError, ValueError) as error:
+    except (subprocess.SubprocessError, OSError) as error:
         said = getattr(error, "stderr", None) or str(error)
         line = next((line for line in reversed(str(said).splitlines()) if line.strip()), "")
         raise InputError(
             f"{where}: pycolmap cannot undistort a {quoted(model)} lens "
             f"({reason(ValueError(line))})."
         ) from error
+    told = parse_object(run.stdout, where=f"{where}: rays of pycolmap")
     plane = np.array(told["plane"], np.float64)
     plane[~np.array(told["sound"], bool)] = np.nan
     return plane

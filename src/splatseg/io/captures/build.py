@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
 from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.core.view_names import clean_view_names
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures._metadata import read_metadata
 from splatseg.io.captures._photographs import SMALLER, Photographs, smaller
 from splatseg.io.foreign import is_file, made_from
-from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
+from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size, same_shape
 from splatseg.io.paths import check_utf8
 
 TEST_EVERY = 8
@@ -103,13 +103,15 @@ def build_capture(
     """Check what a reader found and make the capture of it.
 
     Photographs are sought by their stem too, and in folders of smaller copies where fewer than
-    half are in their own. Those that are not there, cannot be opened, or are of another shape than
-    their intrinsics are left out, and a note names them. They are left out before views are split,
-    and after they are named: a view keeps its name when the others come back.
+    half are in their own. Those that are not there, cannot be opened, are of another shape than
+    their intrinsics or their mask, or have an impossible pose or lens are left out, and a note
+    names them. They are left out before views are split, and after they are named: a view keeps
+    its name when the others come back. Start points that are not finite are left out and counted.
 
     Raises:
-        InputError: If there is no photograph, one is listed twice, a pose or focal length is
-            impossible, or more than half of the photographs, any with `strict`, cannot be used.
+        InputError: If there is no photograph, one is listed twice, more than half of the
+            photographs, any with `strict`, cannot be used, or all points, any with `strict`, are
+            not finite.
         MissingFileError: If more than half of the photographs are missing, or any with
             `strict`, or masks or depth maps of those that are there.
     """
@@ -125,16 +127,29 @@ def build_capture(
     _check_missing(path, missing, listed=len(raw), strict=strict)
     order = [i for i in order if is_file(raw[i].image)]
     left_out = [_left_out(missing, listed=len(raw))] if missing else []
-    sizes, unfit = _fitting(raw, order, missing=len(missing), strict=strict)
-    order = [i for i in order if i in sizes]
-    left_out += [*unfit, *found_notes]
-    raw, names = [raw[i] for i in order], [names[i] for i in order]
-    _check_paths(path, raw)
-    _check_files(path, raw)
-    splits, split_note = _splits(raw)
-    views, scaled = _made_views(path, raw, names, splits, [sizes[i] for i in order])
+    cameras, camera_notes = _cameras(path, raw, order, strict=strict)
+    order = [i for i in order if i in cameras]
+    used = [raw[i] for i in order]
+    _check_paths(path, used)
+    _check_files(path, used)
+    splits, split_note = _splits(used)
+    with made_from(path):
+        views = [
+            View(
+                name=names[i],
+                camera=cameras[i],
+                image=raw[i].image,
+                split=split,
+                mask=raw[i].mask,
+                depth=raw[i].depth,
+                depth_unit=raw[i].depth_unit,
+            )
+            for i, split in zip(order, splits, strict=True)
+        ]
     metadata = read_metadata(path)
-    found = (*left_out, *notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
+    points, point_notes = finite_points(points, where=path, strict=strict)
+    found = (*left_out, *found_notes, *camera_notes, *point_notes, *notes)
+    found += (*([split_note] if split_note else []), *_size_notes(views))
     with made_from(path):
         return Capture(
             path=path,
@@ -148,6 +163,27 @@ def build_capture(
             notes=found,
             missing=missing,
         )
+
+
+def finite_points(
+    points: PointCloud | None, *, where: Path, strict: bool
+) -> tuple[PointCloud | None, tuple[str, ...]]:
+    """Start points without those that are NaN or infinite, and a note that counts them.
+
+    Raises:
+        InputError: If all are, or any with `strict`; `where` starts the message.
+    """
+    if points is None:
+        return None, ()
+    kept = torch.isfinite(points.points).all(dim=1)
+    lost = int((~kept).sum())
+    if lost == 0:
+        return points, ()
+    if strict or lost == len(points):
+        raise InputError(f"{where}: {lost} of {len(points)} start points are not finite.")
+    colours = None if points.colours is None else points.colours[kept]
+    note = f"{lost} of {len(points)} start points are not finite and are left out"
+    return PointCloud(points=points.points[kept], colours=colours), (note,)
 
 
 def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[str]]:
@@ -200,46 +236,66 @@ def _copy(photographs: Photographs, listed: Path, number: int, *, below: Path) -
     return None
 
 
-def _fitting(
-    raw: Sequence[RawView], order: Sequence[int], *, missing: int, strict: bool
-) -> tuple[dict[int, tuple[int, int]], list[str]]:
-    """Sizes of the photographs that can be used, by index, and notes of the others.
+def _cameras(
+    path: Path, raw: Sequence[RawView], order: Sequence[int], *, strict: bool
+) -> tuple[dict[int, Camera], list[str]]:
+    """Cameras of the photographs that can be used, by index, and notes of them and the others.
 
     Raises:
         InputError: The complaint about the first that cannot, if it is one of more than half
             with those that are not there, or with `strict`.
     """
-    sizes: dict[int, tuple[int, int]] = {}
-    closed: list[int] = []
-    turned: list[int] = []
+    cameras: dict[int, Camera] = {}
+    unfit: dict[str, list[str]] = {}
+    scaled: list[str] = []
     first: InputError | None = None
     for i in order:
-        view = raw[i]
+        view, fault = raw[i], "cannot be opened"
         try:
             size = image_size(view.image)
-        except FileFormatError as error:
-            closed.append(i)
+            fault = "are of another shape than their intrinsics say"
+            written = _of_size(view, size)
+            intrinsics = scaled_to(written, size, where=str(view.image))
+            fault = "have a mask that cannot be opened or is of another shape"
+            mask = _mask_size(view, size)
+            fault = "have a pose or a lens that no camera has"
+            with made_from(where := f"{path}: {view.relative}"):
+                cameras[i] = _camera(view, intrinsics, size, where=where)
+        except InputError as error:
+            unfit.setdefault(fault, []).append(view.relative)
             first = first or error
             continue
-        intrinsics = _of_size(view, size)
-        if _same_shape(intrinsics, size):
-            sizes[i] = size
-        else:
-            turned.append(i)
-            first = first or _other_shape(intrinsics, size, where=str(view.image))
-    if first is not None and (strict or len(sizes) < MIN_THERE * len(raw)):
+        for what, (width, height) in (
+            ("intrinsics", (written.width or size[0], written.height or size[1])),
+            ("masks", mask),
+        ):
+            if (width, height) != size:
+                to = f"photographs of {size[0]}x{size[1]}"
+                scaled.append(f"{what} of {width}x{height} were scaled to {to}")
+    if first is not None and (strict or len(cameras) < MIN_THERE * len(raw)):
         raise first
-    notes: list[str] = []
-    for rows, what in (
-        (closed, "cannot be opened"),
-        (turned, "are of another shape than their intrinsics say"),
-    ):
-        if rows:
-            listed = _first([raw[i].relative for i in rows], _NAMED)
-            notes.append(
-                f"{len(rows)} of {len(raw)} photographs {what} and are left out ({listed})"
-            )
-    return sizes, notes
+    notes = [
+        f"{len(names)} of {len(raw)} photographs {fault} and are left out ({_first(names, _NAMED)})"
+        for fault, names in unfit.items()
+    ]
+    return cameras, [*notes, *dict.fromkeys(scaled)]
+
+
+def _mask_size(view: RawView, size: tuple[int, int]) -> tuple[int, int]:
+    """The size of a view's mask, that of its photograph where it has none or it is missing.
+
+    Raises:
+        InputError: If it is no uniform scale of the photograph's, or it cannot be opened.
+    """
+    if view.mask is None or not is_file(view.mask):
+        return size
+    mask = image_size(view.mask)
+    if not same_shape(size, mask):
+        raise InputError(
+            f"{view.mask}: expected a mask of {size[0]}x{size[1]} pixels as its photograph has, or "
+            f"a uniform scale of it, got {mask[0]}x{mask[1]}."
+        )
+    return mask
 
 
 def _of_size(view: RawView, size: tuple[int, int]) -> Intrinsics:
@@ -247,38 +303,6 @@ def _of_size(view: RawView, size: tuple[int, int]) -> Intrinsics:
     if isinstance(view.intrinsics, Intrinsics):
         return view.intrinsics
     return view.intrinsics(size[0] * view.copy_of, size[1] * view.copy_of)
-
-
-def _made_views(
-    path: Path,
-    raw: Sequence[RawView],
-    names: Sequence[str],
-    splits: Sequence[str],
-    sizes: Sequence[tuple[int, int]],
-) -> tuple[list[View], tuple[str, ...]]:
-    """Views of photographs that are there, and notes of intrinsics that were scaled to them."""
-    scaled: list[str] = []
-    views: list[View] = []
-    for view, name, split, (width, height) in zip(raw, names, splits, sizes, strict=True):
-        written = _of_size(view, (width, height))
-        intrinsics = scaled_to(written, (width, height), where=str(view.image))
-        if intrinsics is not written and written.width is not None:
-            before = f"{written.width}x{written.height}"
-            scaled.append(f"intrinsics of {before} were scaled to photographs of {width}x{height}")
-        where = f"{path}: {view.relative}"
-        camera = _camera(view, intrinsics, width, height, where=where)
-        with made_from(where):
-            made = View(
-                name=name,
-                camera=camera,
-                image=view.image,
-                split=split,
-                mask=view.mask,
-                depth=view.depth,
-                depth_unit=view.depth_unit,
-            )
-        views.append(made)
-    return views, tuple(dict.fromkeys(scaled))
 
 
 def view_names(relatives: Sequence[str]) -> list[str]:
@@ -339,8 +363,13 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
         )
     if (intrinsics.width, intrinsics.height) == size:
         return intrinsics
-    if not _same_shape(intrinsics, size):
-        raise _other_shape(intrinsics, size, where=where)
+    if not same_shape((intrinsics.width, intrinsics.height), size):
+        turned = same_shape((intrinsics.height, intrinsics.width), size)
+        hint = "; turned by its EXIF orientation, perhaps" if turned else ""
+        raise InputError(
+            f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or a "
+            f"uniform scale of it, as its intrinsics say, got {size[0]}x{size[1]}{hint}."
+        )
     sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
     return replace(
         intrinsics,
@@ -350,29 +379,6 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
         fy=intrinsics.fy * sy,
         cx=intrinsics.cx * sx,
         cy=intrinsics.cy * sy,
-    )
-
-
-def _same_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:
-    """Whether a uniform scale leads from the size of intrinsics to another, up to one pixel.
-
-    True where intrinsics have no size, or one that no picture has, which is refused elsewhere.
-    """
-    width, height = intrinsics.width, intrinsics.height
-    if width is None or height is None or min(width, height) < 1 or max(width, height) > MAX_SIDE:
-        return True
-    across, down = size[0] / width * height - size[1], size[1] / height * width - size[0]
-    return abs(across) <= 1 or abs(down) <= 1
-
-
-def _other_shape(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> InputError:
-    """The complaint about a photograph of another shape than its intrinsics."""
-    width, height = intrinsics.width or 1, intrinsics.height or 1
-    turned = abs(size[1] / width * height - size[0]) <= 1
-    hint = "; turned by its EXIF orientation, perhaps" if turned else ""
-    return InputError(
-        f"{where}: expected a photograph of {width}x{height} pixels or a uniform scale of it, as "
-        f"its intrinsics say, got {size[0]}x{size[1]}{hint}."
     )
 
 
@@ -410,18 +416,18 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
 def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back).
 
-    A singular one comes back as it is: no rotation, which `checked_pose` refuses in its own words.
+    One that is singular or not finite comes back as it is: no pose, which `checked_pose` refuses in
+    its own words.
     """
-    world_from_opencv = world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
+    if not np.isfinite(world_from_cam).all():
+        return world_from_cam
     try:
-        return np.linalg.inv(world_from_opencv).astype(np.float64)
+        return np.linalg.inv(world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).astype(np.float64)
     except np.linalg.LinAlgError:
-        return world_from_opencv
+        return world_from_cam
 
 
-def _camera(
-    view: RawView, intrinsics: Intrinsics, width: int, height: int, *, where: str
-) -> Camera:
+def _camera(view: RawView, intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Camera:
     for name in ("fx", "fy"):
         value = float(getattr(intrinsics, name))
         if not (math.isfinite(value) and value > 0):
@@ -433,8 +439,8 @@ def _camera(
     angular = intrinsics.model in ("fisheye", "thin_prism_fisheye")
     distorted = angular or any(intrinsics.distortion)
     return Camera(
-        width=width,
-        height=height,
+        width=size[0],
+        height=size[1],
         fx=intrinsics.fx,
         fy=intrinsics.fy,
         cx=intrinsics.cx,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
-from splatseg.io.ply import text_table
 from splatseg.io.splats._common import blocks, check_file
+from splatseg.io.text_numbers import number_table
 
 MAX_HEADER = 1 << 20
 """Bytes in which the header must end; real ones have two or three thousand."""
@@ -141,7 +141,7 @@ def _text_rows(
         for part in blocks(element.count, size):
             wanted = part.stop - part.start
             try:
-                table = text_table(list(itertools.islice(lines, wanted)), len(names))
+                table = number_table(list(itertools.islice(lines, wanted)), len(names))
             except ValueError as error:
                 raise FileFormatError(
                     f"{path}: expected lines of {len(names)} numbers for the element "
