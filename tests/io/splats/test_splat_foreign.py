@@ -4,6 +4,7 @@ Cases after reports of users of other tools: supersplat 189, 360 and 975, UnityG
 179, and the files that Mip-Splatting, 2DGS and exporters of parameters write.
 """
 
+import gzip
 import json
 import math
 import struct
@@ -24,6 +25,7 @@ from splatseg.io.splats._common import SOURCE_ROW
 Columns = dict[str, list[float]]
 _KINDS = {"float": "f", "double": "d", "uchar": "B", "ushort": "H", "int": "i", "uint": "I"}
 COUNT = 40
+MEANS = ("x", "y", "z")
 
 
 def columns(count: int = COUNT) -> Columns:
@@ -230,15 +232,120 @@ def test_colours_instead_of_harmonics(tmp_path: Path) -> None:
     assert "red green blue as f_dc_0 f_dc_1 f_dc_2" in said
 
 
-def test_harmonics_of_another_name(tmp_path: Path) -> None:
-    rest = [[math.cos(i * c) for i in range(COUNT)] for c in range(9)]
-    ours = columns() | {f"f_rest_{c}": values for c, values in enumerate(rest)}
-    theirs = columns() | {f"features_rest_{c}": values for c, values in enumerate(rest)}
-    want = read_splats(write_ply(tmp_path / "a.ply", ours))
+def rest(count: int, prefix: str = "f_rest") -> Columns:
+    return {f"{prefix}_{c}": [math.cos(i * c) for i in range(COUNT)] for c in range(count)}
+
+
+@pytest.mark.parametrize("prefix", ["features_rest", "shN"])
+def test_harmonics_of_unknown_order_are_kept_as_columns_and_said(
+    tmp_path: Path, usual: Gaussians, prefix: str
+) -> None:
+    read, said = told(write_ply(tmp_path / "a.ply", columns() | rest(9, prefix)))
+    assert same(read, usual)
+    assert len(read.extra) == 9
+    assert f"{prefix}_0 and others look like harmonics" in said
+
+
+def test_names_of_cloudcompare(tmp_path: Path) -> None:
+    ours = columns() | rest(9) | {"filter_3D": [0.01] * COUNT}
+    theirs = {n if n in MEANS else f"scalar_{n}": values for n, values in ours.items()}
+    want = told(write_ply(tmp_path / "a.ply", ours))[0]
     read, said = told(write_ply(tmp_path / "b.ply", theirs))
     assert want.sh_degree == 1
     assert same(read, want)
-    assert "features_rest_0 as f_rest_0" in said
+    assert not read.extra
+    assert "scalar_f_rest_0 as f_rest_0" in said
+    del theirs["scalar_scale_2"]
+    assert "surfels" in told(write_ply(tmp_path / "c.ply", theirs))[1]
+
+
+def test_degree_4_is_left_out_and_said(tmp_path: Path) -> None:
+    """Of 24 coefficients a channel the first 15 are those of degrees 1 to 3."""
+    made = rest(72)
+    first = [f"f_rest_{24 * channel + i}" for channel in range(3) for i in range(15)]
+    renamed = {f"f_rest_{i}": made[name] for i, name in enumerate(first)}
+    want = read_splats(write_ply(tmp_path / "a.ply", columns() | renamed))
+    path = write_ply(tmp_path / "b.ply", columns() | made)
+    read, said = told(path)
+    assert same(read, want)
+    assert not read.extra
+    assert "harmonics of degree 4, of which those up to 3 are rendered" in said
+    with pytest.raises(FileFormatError, match="harmonics of degree 4"):
+        read_splats(path, strict=True)
+
+
+def test_degree_4_of_spz(tmp_path: Path) -> None:
+    def spz(degree: int) -> Path:
+        count = (degree + 1) ** 2 - 1
+        body = bytes(9) + bytes([255, 9, 8, 7, 90, 91, 92, 128, 128, 128])
+        body += bytes(range(100, 100 + 3 * min(count, 15))) + bytes(3 * max(count - 15, 0))
+        head = struct.pack("<4sIIBBBB", b"NGSP", 2, 1, degree, 12, 0, 0)
+        path = tmp_path / f"{degree}.spz"
+        path.write_bytes(gzip.compress(head + body))
+        return path
+
+    read, said = told(spz(4))
+    assert same(read, read_splats(spz(3)))
+    assert "harmonics of degree 4" in said
+    with pytest.raises(FileFormatError, match="harmonics of degree 4"):
+        read_splats(spz(4), strict=True)
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        (["SplatRenderMode: mip"], True),
+        (["SPLATRENDERMODE:  Mip"], True),
+        (["SplatRenderMode: default"], False),
+        (["antialiased 1"], True),
+        (["antialiased 0"], False),
+        (["antialiased 1", "SplatRenderMode: default"], False),
+        (["SH degree: 0", "Exported from Brush"], False),
+    ],
+)
+def test_comments_of_brush_and_postshot(
+    tmp_path: Path, comments: list[str], antialiased: bool
+) -> None:
+    before = "\n".join(f"comment {line}" for line in comments)
+    read, said = told(write_ply(tmp_path / "a.ply", columns(), before=before))
+    assert read.antialiased is antialiased
+    assert said == ""
+
+
+@pytest.mark.parametrize(
+    "names", [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")]
+)
+def test_colours_of_other_names(tmp_path: Path, names: tuple[str, ...]) -> None:
+    made = columns()
+    for i in range(3):
+        made[names[i]] = [(0.0, 0.5, 1.0)[i]] * COUNT
+        del made[f"f_dc_{i}"]
+    path = write_ply(tmp_path / "a.ply", made)
+    np.testing.assert_allclose(told(path)[0].colours, [[0, 0.5, 1]] * COUNT, atol=1e-6)
+    made[names[1]] = [200.0] * COUNT
+    with pytest.raises(FileFormatError, match=rf"real colours {names[0]} .* in \[0, 1\]"):
+        read_splats(write_ply(tmp_path / "a.ply", made))
+
+
+@pytest.mark.parametrize("lengths", [(3, 3), (3, 5)])
+def test_lists_before_gaussians_are_stepped_over(
+    tmp_path: Path, usual: Gaussians, lengths: tuple[int, int]
+) -> None:
+    path = write_ply(
+        tmp_path / "a.ply",
+        columns(),
+        before="element face 2\nproperty uchar kind\nproperty list uchar int indices",
+    )
+    faces = b"".join(struct.pack(f"<BB{n}i", 7, n, *range(n)) for n in lengths)
+    head, mark, body = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes(head + mark + faces + body)
+    assert same(read_splats(path), usual)
+    path.write_bytes(head + mark + faces + body[:-1])
+    with pytest.raises(FileFormatError, match="truncated"):
+        read_splats(path)
+    path.write_bytes(head + mark + faces[:5])
+    with pytest.raises(FileFormatError, match="a.ply"):
+        read_splats(path)
 
 
 def test_filter_3d_of_mip_splatting(tmp_path: Path, usual: Gaussians) -> None:

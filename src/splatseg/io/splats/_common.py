@@ -23,6 +23,7 @@ from torch import Tensor
 from splatseg.core import Gaussians
 from splatseg.core.activations import exponential, sigmoid
 from splatseg.core.gaussians import LOW_PASS
+from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.foreign import is_file, is_folder, read_bytes
 from splatseg.io.limits import check_unpacked
@@ -75,6 +76,21 @@ def check_size(path: Path, count: int, degree: int, *, packed: int) -> None:
         FileFormatError: If these are too many, see `io.limits`.
     """
     check_unpacked(path, count * bytes_in_memory(degree), packed=packed, what=f"{count} Gaussians")
+
+
+def rendered_degree(path: Path, degree: int, *, strict: bool) -> int:
+    """The degree of harmonics up to which they are read.
+
+    Raises:
+        FileFormatError: If there are more in the file, with `strict`.
+    """
+    if degree <= MAX_DEGREE:
+        return degree
+    said = f"harmonics of degree {degree}, of which those up to {MAX_DEGREE} are rendered"
+    if strict:
+        raise FileFormatError(f"{path}: {said}.")
+    warn(path, f"{said}; the others were left out.")
+    return MAX_DEGREE
 
 
 def bytes_in_memory(degree: int) -> int:
@@ -163,6 +179,15 @@ class Rows:
 ANTIALIASED = "splatseg antialiased"
 """Comment line of a PLY file whose Gaussians are meant for antialiased rendering."""
 
+_ANTIALIASED = {
+    ANTIALIASED: True,
+    "splatrendermode: mip": True,
+    "splatrendermode: default": False,
+    "antialiased 1": True,
+    "antialiased 0": False,
+}
+"""The same as Brush and Postshot say it, in lower case; the last line counts."""
+
 _VARIANCE_LINE = "splatseg low_pass "
 
 
@@ -181,11 +206,12 @@ class Filter:
     @classmethod
     def from_comments(cls, path: Path, comments: Sequence[str]) -> "Filter":
         """Read the lines that `comments` writes; without one, what 3DGS draws with."""
-        low_pass = LOW_PASS
+        low_pass, antialiased = LOW_PASS, False
         for line in comments:
             if line.startswith(_VARIANCE_LINE):
                 low_pass = _variance(path, line.removeprefix(_VARIANCE_LINE))
-        return cls(antialiased=ANTIALIASED in comments, low_pass=low_pass)
+            antialiased = _ANTIALIASED.get(" ".join(line.lower().split()), antialiased)
+        return cls(antialiased=antialiased, low_pass=low_pass)
 
     def comments(self) -> list[str]:
         """Lines for the header; none for what 3DGS draws with."""

@@ -21,11 +21,22 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
 OPACITY = ("opacity",)
-COLOURS = ("red", "green", "blue")
+COLOURS = (
+    ("red", "green", "blue"),
+    ("r", "g", "b"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+)
 REST = re.compile(r"f_rest_(0|[1-9]\d*)")
 
 _GROUPS = (MEANS, DC, OPACITY, SCALES, ROTATIONS)
 _FILTERS = ("filter_3D", "filter_3d")
+_UNORDERED = re.compile(r"(shN|sh_rest|features_rest)_\d+")
+"""Harmonics from degree 1 on as gsplat and 3DGS have them in memory, coefficient by coefficient,
+which files have channel by channel: the name does not tell which, and one of both is wrong."""
+
+_CLOUDCOMPARE = "scalar_"
+"""What CloudCompare puts before the names of columns that are not those of points."""
+
 _SHOWN = 100
 
 
@@ -53,8 +64,6 @@ _OTHERS: dict[tuple[str, ...], tuple[tuple[str, ...], ...]] = {
 """Other names of each group: parameters of 3DGS (``scaling``, ``features_dc``) and of gsplat
 (``scales``, ``quats``, ``opacities``, ``sh0``) written as they are called, and letters for axes."""
 
-_OTHER_REST = ("features_rest",)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Columns:
@@ -70,6 +79,14 @@ class Columns:
 
     rotations: tuple[str, ...]
     rest: tuple[str, ...]
+    """Harmonics from degree 1 on, channel by channel."""
+
+    beyond: tuple[str, ...]
+    """Harmonics of degree 4, which are not rendered."""
+
+    unordered: tuple[str, ...]
+    """Columns that look like harmonics and are not read, see `_UNORDERED`."""
+
     coloured: bool
     """Whether the file has red, green and blue instead of harmonics of degree 0."""
 
@@ -81,7 +98,7 @@ class Columns:
         """All of them."""
         filters = () if self.filter_3d is None else (self.filter_3d,)
         names = (*self.means, *self.dc, *self.opacity, *self.scales, *self.rotations)
-        return (*names, *self.rest, *filters)
+        return (*names, *self.rest, *self.beyond, *filters)
 
     @property
     def renamed(self) -> tuple[str, ...]:
@@ -112,19 +129,20 @@ def find_columns(path: Path, header: PlyHeader, *, own: bool) -> Columns:
         found = quoted(", ".join(header.elements), _SHOWN) if header.elements else "none"
         raise FileFormatError(
             f"{path}: expected Gaussians, got a PLY file without an element vertex that has no "
-            f"lists in it or before it (elements {found})."
+            f"lists in it (elements {found})."
         )
     names = vertex.row.names or ()
     found = {group: _group(group, names) for group in _GROUPS}
-    coloured = found[DC] is None and set(COLOURS) <= set(names)
+    colours = next((group for group in COLOURS if set(group) <= set(names)), None)
+    coloured = found[DC] is None and colours is not None
     if coloured:
-        found[DC] = COLOURS
+        found[DC] = colours
     lacking = [group for group, columns in found.items() if columns is None]
     if lacking:
         raise FileFormatError(f"{path}: {_nothing(path, header, lacking, coloured=coloured)}")
     means, dc, opacity, scales, rotations = (found[group] or () for group in _GROUPS)
-    rest = _rest(path, names)
-    filters = [name for name in _FILTERS if name in names and not own]
+    rest, beyond = _rest(path, names)
+    filters = [p + name for p in ("", _CLOUDCOMPARE) for name in _FILTERS if p + name in names]
     columns = Columns(
         means=means,
         dc=dc,
@@ -132,8 +150,10 @@ def find_columns(path: Path, header: PlyHeader, *, own: bool) -> Columns:
         scales=scales,
         rotations=rotations,
         rest=rest,
+        beyond=beyond,
+        unordered=() if rest else tuple(name for name in names if _UNORDERED.fullmatch(name)),
         coloured=coloured,
-        filter_3d=filters[0] if filters else None,
+        filter_3d=filters[0] if filters and not own else None,
     )
     _check_types(path, vertex, columns)
     return columns
@@ -141,30 +161,29 @@ def find_columns(path: Path, header: PlyHeader, *, own: bool) -> Columns:
 
 def _group(group: tuple[str, ...], names: Sequence[str]) -> tuple[str, ...] | None:
     """Which columns stand for those of a group: all of them, or two scales of surfels."""
-    for columns in (group, *_OTHERS[group]):
-        if set(columns) <= set(names):
-            return columns
-    if group == SCALES:
-        for columns in (group, *_OTHERS[group]):
-            if set(columns[:2]) <= set(names):
-                return columns[:2]
-    return None
+    others = [tuple(_CLOUDCOMPARE + name for name in group), *_OTHERS[group]]
+    whole = [columns for columns in (group, *others) if set(columns) <= set(names)]
+    if group == SCALES and not whole:
+        return next((c[:2] for c in (group, *others) if set(c[:2]) <= set(names)), None)
+    return whole[0] if whole else None
 
 
-def _rest(path: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """The names of the harmonics from degree 1 on, in order."""
-    prefixes = [p for p in _OTHER_REST if any(name.startswith(f"{p}_") for name in names)]
+def _rest(path: Path, names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names of the harmonics from degree 1 on, in order, and of those of degree 4."""
     own = any(REST.fullmatch(name) for name in names)
-    prefix = "f_rest" if own or not prefixes else prefixes[0]
+    prefix = "f_rest" if own else f"{_CLOUDCOMPARE}f_rest"
     count = sum(re.fullmatch(rf"{prefix}_(0|[1-9]\d*)", name) is not None for name in names)
     rest = tuple(f"{prefix}_{i}" for i in range(count))
-    known = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
+    known = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 2)]
     if count not in known or not set(rest) <= set(names):
         raise FileFormatError(
-            f"{path}: expected {', '.join(map(str, known[:-1]))} or {known[-1]} columns "
+            f"{path}: expected {', '.join(map(str, known[:-2]))} or {known[-2]} columns "
             f"{prefix}_0, {prefix}_1 and so on, got {count}."
         )
-    return rest
+    if count < known[-1]:
+        return rest, ()
+    kept = tuple(name for i, name in enumerate(rest) if i % (count // 3) < known[-2] // 3)
+    return kept, tuple(name for name in rest if name not in kept)
 
 
 def _check_types(path: Path, vertex: PlyElement, columns: Columns) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
+from splatseg.io.ply import end_of_rows
 from splatseg.io.splats._common import blocks, check_file
 from splatseg.io.text_numbers import number_table
 
@@ -50,8 +51,8 @@ class PlyElement:
     """Byte in the file at which its rows start; in an ASCII file the row, from its first."""
 
     lists: tuple[str, ...] = ()
-    """Properties that are lists. Where they are in a binary file, nobody knows where the next
-    element starts: the header ends with the element that has them."""
+    """Properties that are lists. In a binary file the header ends with the element that has them,
+    unless that of the Gaussians is still to come."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +91,10 @@ def read_ply_header(path: Path) -> PlyHeader:
         row: np.dtype[np.void] = np.dtype(fields)
         elements[name] = PlyElement(name=name, count=count, row=row, offset=at, lists=lists)
         if lists and not ascii:
-            break
+            if "vertex" in elements:
+                break
+            at, lists = end_of_rows(path, name), ()
+            continue
         at += (count if fields or lists else 0) if ascii else count * row.itemsize
     # A value takes a digit and what parts it from the next, a list its length.
     least = sum(

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import Gaussians
-from splatseg.core.sh import SH_C0
-from splatseg.errors import InputError
+from splatseg.core.sh import MAX_DEGREE, SH_C0
+from splatseg.errors import FileFormatError, InputError
 from splatseg.io.splats._common import (
     BLOCK,
     Filter,
@@ -26,6 +26,7 @@ from splatseg.io.splats._common import (
     finish,
     logits,
     logs,
+    rendered_degree,
     to_rows,
     warn,
 )
@@ -112,6 +113,7 @@ def read_ply(
     header = read_ply_header(path)
     columns = find_columns(path, header, own=own)
     vertex = header.elements["vertex"]
+    rendered_degree(path, MAX_DEGREE + 1 if columns.beyond else 0, strict=strict)
     others = [name for name in vertex.row.names or () if name not in columns.used]
     rows = Rows.empty(vertex.count, 1 + len(columns.rest) // 3)
     filters = np.zeros(vertex.count, np.float32)
@@ -122,6 +124,10 @@ def read_ply(
             filters[part] = block[columns.filter_3d]
         for name, column in extra.items():
             column[part] = block[name]
+    if columns.coloured and bool((rows.sh[:, 0] > 0.5 / SH_C0 + 1e-3).any()):
+        raise FileFormatError(
+            f"{path}: expected real colours {' '.join(columns.dc)} in [0, 1], got larger ones."
+        )
     bytes_of_alpha = vertex.row[columns.opacity[0]].kind == "u"
     asked = {*linear, *(["opacities"] if bytes_of_alpha else [])}
     if not own:
@@ -161,6 +167,11 @@ def _tell(path: Path, rows: Rows, columns: Columns, linear: Collection[str]) -> 
         said.append(
             "surfels of 2DGS, which have two scales: made Gaussians that are flat along the third "
             f"axis, {_FLAT:g} times as thick as their smaller scale"
+        )
+    if columns.unordered:
+        said.append(
+            f"{columns.unordered[0]} and others look like harmonics and are kept as columns, as "
+            "their names do not tell whether they go by coefficient or by channel"
         )
     if columns.filter_3d is not None:
         said.append(

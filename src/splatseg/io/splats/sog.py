@@ -131,6 +131,7 @@ def _read(path: Path, load: Load, meta_name: str, *, packed: int, strict: bool) 
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
     antialiased = "antialias" in meta and meta["antialias"].value is True
+    antialiased |= "model" in meta and meta["model"].value == "antialiased"
     return finish(path, rows, strict=strict, drawn=Filter(antialiased=antialiased))
 
 
