@@ -44,8 +44,50 @@ def test_other_suffixes_are_found_and_said(nerfstudio, write_image) -> None:
     capture = read_capture(folder)
     assert [view.image.suffix for view in capture.views] == [".jpeg"] * 2 + [".png"] * 2
     assert capture.notes[0] == (
-        "2 photographs have another suffix than the capture lists (images/00.png, images/01.png)"
+        "2 photographs have another suffix or case than the capture lists "
+        "(images/00.png, images/01.png)"
     )
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        "/home/somebody/scene/images/{}",
+        "C:\\Users\\Some Body\\scene\\images\\{}",
+        "../images/{}",
+        "frames/images/{}",
+        "{}",
+        "Images/{}",
+    ],
+)
+def test_photographs_in_the_folders_of_the_capture(nerfstudio, write_image, listed) -> None:
+    """Paths of the machine on which it was made, or below another folder."""
+    names = tuple(listed.format(Path(name).name) for name in NAMES)
+    mask = listed.format("0.png").replace("images", "masks")
+    there = mask if listed in ("{}", "Images/{}") else "masks/0.png"
+    folder = nerfstudio(names, images=False, frames={0: {"mask_path": mask}})
+    for name in NAMES:
+        write_image(folder / name)
+    write_image(folder / there)
+    capture = read_capture(folder, strict=True)
+    assert [view.image for view in capture.views] == [folder / name for name in NAMES]
+    assert capture.views[0].mask == folder / there
+    assert [view.name for view in capture.views] == [Path(name).stem for name in NAMES]
+    assert capture.notes[0].startswith("photographs were read from images, as they are not where")
+
+
+@pytest.mark.parametrize(
+    ("listed", "there"), [("IMG_1.JPG", "img_1.jpg"), ("caf\u00e9.png", "cafe\u0301.png")]
+)
+def test_case_and_accents_of_other_systems(nerfstudio, write_image, listed, there) -> None:
+    folder = nerfstudio((f"images/{listed}", "images/b.png"))
+    (folder / "images" / listed).unlink()
+    write_image(folder / "images" / there)
+    assert there in [view.image.name for view in read_capture(folder, strict=True).views]
+    own = str(Path(listed).with_suffix(".webp"))
+    write_image(folder / "images" / own)
+    found = [view.image.name for view in read_capture(folder, strict=True).views]
+    assert own in found, "its own spelling comes first"
 
 
 def test_no_photograph_is_that_of_two_paths(nerfstudio) -> None:

@@ -46,10 +46,11 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     Views are sorted by name. The split is the capture's own, else every 8th view by sorted
     name (0, 8, 16, ...) is a test view. Photographs are checked to be there, under their name or
     their stem, and to have the size their intrinsics say, or a uniform scale of it, which is
-    noted. Where fewer than half are there, folders of smaller copies (``images_2``, ``images_4``,
-    ``images_8``) stand for theirs. Those that are not there, cannot be opened, are of another
-    shape than their intrinsics or mask, or have an impossible pose or lens are left out, which is
-    noted too, as long as half of them can be used; so are start points that are not finite.
+    noted. Where fewer than half are there, the capture's own folders stand for those of another
+    machine, and folders of smaller copies (``images_2``, ``images_4``, ``images_8``) for theirs.
+    Those that are not there, cannot be opened, are of another shape than their intrinsics or mask,
+    or have an impossible pose or lens are left out, which is noted too, as long as half of them can
+    be used; so are start points that are not finite.
 
     Args:
         path: The capture's folder, or its transforms.json, poses_bounds.npy,

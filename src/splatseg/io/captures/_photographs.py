@@ -1,10 +1,13 @@
 """Where the photographs of a capture are, which are not always where it says.
 
-Blender and instant-ngp leave the suffix out, converters change it, and what makes smaller copies
-puts them beside the folder under its name with a number, as in ``images_4``.
+Blender and instant-ngp leave the suffix out, converters change it, Windows does not mind case and
+macOS decomposes accents; paths are those of the machine that a capture was made on, and what makes
+smaller copies puts them beside the folder under its name with a number, as in ``images_4``.
 """
 
-from collections.abc import Iterable, Sequence
+import unicodedata
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 from splatseg.io.foreign import is_file, is_folder
@@ -14,6 +17,9 @@ SMALLER = (2, 4, 8)
 """Numbers of the folders of smaller copies: pixels of the photograph for one of a copy."""
 
 _FIRST = (".png", ".jpg", ".jpeg")
+_FOLDERS = ("", "images", "input", "rgb")
+_DEEPEST = 16
+"""Folders that may be left out of the front of a path."""
 
 
 class Photographs:
@@ -27,11 +33,12 @@ class Photographs:
         if is_file(listed):
             return listed
         stems = self._stems(listed.parent)
-        found = stems.get(listed.name, [])
+        found = stems.get(_key(listed.name), [])
         suffix = listed.suffix[1:]
         if not found and suffix.isalnum() and not suffix.isdigit():
-            found = stems.get(listed.stem, [])
-        return min(found, key=_rank, default=None)
+            found = stems.get(_key(listed.stem), [])
+        own = (listed.name, listed.stem)
+        return min(found, key=lambda file: (file.stem not in own, *_rank(file)), default=None)
 
     def find_all(self, listed: Sequence[Path]) -> list[Path | None]:
         """The photograph of each path; no file is that of two of them."""
@@ -54,18 +61,38 @@ class Photographs:
             stems: dict[str, list[Path]] = {}
             for file in folder.iterdir() if is_folder(folder) else ():
                 if file.suffix.lower() in IMAGE_SUFFIXES and is_file(file):
-                    stems.setdefault(file.stem, []).append(file)
+                    stems.setdefault(_key(file.stem), []).append(file)
             self._by_stem[folder] = stems
         return self._by_stem[folder]
 
 
-def smaller(path: Path, number: int, *, below: Path) -> list[Path]:
-    """Where a smaller copy of a file may lie: a folder of its path with a number at its name.
+def moves(below: Path) -> list[tuple[int, Callable[[Path], list[Path]]]]:
+    """Where files of a capture may lie instead of where it lists them, in the order to look.
+
+    Each comes with how many pixels of the photograph one of what lies there stands for.
 
     Args:
-        path: The file.
-        number: One of `SMALLER`.
-        below: The capture's folder, whose own name stays.
+        below: The capture's folder.
+    """
+    found: list[tuple[int, Callable[[Path], list[Path]]]] = [
+        (1, partial(_moved, dropped=dropped, folder=folder, below=below))
+        for dropped in range(_DEEPEST + 1)
+        for folder in _FOLDERS
+    ]
+    return found + [(number, partial(_smaller, number=number, below=below)) for number in SMALLER]
+
+
+def _moved(path: Path, *, dropped: int, folder: str, below: Path) -> list[Path]:
+    """A path in a folder of the capture, without its first folders."""
+    parts = path.relative_to(below).parts if path.is_relative_to(below) else path.parts[1:]
+    parts = tuple(part for part in parts if part != "..")
+    return [below.joinpath(folder, *parts[dropped:])] if dropped < len(parts) else []
+
+
+def _smaller(path: Path, *, number: int, below: Path) -> list[Path]:
+    """Where a smaller copy of a file may lie: a folder of its path with a number at its name.
+
+    The name of the capture's folder stays.
     """
     parts = path.relative_to(below).parts if path.is_relative_to(below) else path.parts[-2:]
     base = path.parents[len(parts) - 1] if len(parts) <= len(path.parents) else path.parent
@@ -74,6 +101,11 @@ def smaller(path: Path, number: int, *, below: Path) -> list[Path]:
         if part not in (".", ".."):
             copies.append(base.joinpath(*parts[:i], f"{part}_{number}", *parts[i + 1 :]))
     return copies
+
+
+def _key(stem: str) -> str:
+    """What stems have in common that differ in case or in how accents are written."""
+    return unicodedata.normalize("NFC", stem).casefold()
 
 
 def _rank(file: Path) -> tuple[int, str]:

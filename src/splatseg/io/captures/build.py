@@ -21,7 +21,7 @@ from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.core.view_names import clean_view_names
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures._metadata import read_metadata
-from splatseg.io.captures._photographs import SMALLER, Photographs, smaller
+from splatseg.io.captures._photographs import Photographs, moves
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size, same_shape
 from splatseg.io.paths import check_utf8
@@ -102,11 +102,12 @@ def build_capture(
 ) -> Capture:
     """Check what a reader found and make the capture of it.
 
-    Photographs are sought by their stem too, and in folders of smaller copies where fewer than
-    half are in their own. Those that are not there, cannot be opened, are of another shape than
-    their intrinsics or their mask, or have an impossible pose or lens are left out, and a note
-    names them. They are left out before views are split, and after they are named: a view keeps
-    its name when the others come back. Start points that are not finite are left out and counted.
+    Photographs are sought by their stem too, and where fewer than half are where they are listed,
+    in the capture's own folders and in folders of smaller copies. Those that are not there, cannot
+    be opened, are of another shape than their intrinsics or their mask, or have an impossible pose
+    or lens are left out, and a note names them. They are left out before views are split, and after
+    they are named: a view keeps its name when the others come back. Start points that are not
+    finite are left out and counted.
 
     Raises:
         InputError: If there is no photograph, one is listed twice, more than half of the
@@ -191,12 +192,12 @@ def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[st
     photographs = Photographs()
     there = photographs.find_all([view.image for view in raw])
     notes: list[str] = []
-    number = 1
+    number, move = 1, None
     if sum(file is not None for file in there) < MIN_THERE * len(raw):
-        for copies in SMALLER:
-            found = [_copy(photographs, view.image, copies, below=path) for view in raw]
+        for pixels, candidates in moves(path):
+            found = [_moved(photographs, candidates(view.image)) for view in raw]
             if sum(file is not None for file in found) >= MIN_THERE * len(raw):
-                there, number = found, copies
+                there, number, move = found, pixels, candidates
                 folder = next(file for file in found if file is not None).parent
                 where = folder.relative_to(path) if folder.is_relative_to(path) else folder
                 notes.append(
@@ -213,24 +214,24 @@ def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[st
         suffix = file.suffix if file.stem == view.image.name else ""
         if not suffix and file.name != view.image.name:
             others.append(view.relative)
-        if number > 1:
+        if move is not None:
             mask, depth = (
-                next((c for c in smaller(f, number, below=path) if is_file(c)), f) if f else None
+                next((c for c in move(f) if is_file(c)), f) if f else None
                 for f in (view.mask, view.depth)
             )
             view = replace(view, mask=mask, depth=depth, copy_of=number)
         located.append(replace(view, image=file, relative=view.relative + suffix))
     if others:
         notes.append(
-            f"{len(others)} photographs have another suffix than the capture lists "
+            f"{len(others)} photographs have another suffix or case than the capture lists "
             f"({_first(others)})"
         )
     return located, notes
 
 
-def _copy(photographs: Photographs, listed: Path, number: int, *, below: Path) -> Path | None:
-    """A smaller copy of a photograph, None where there is none."""
-    for candidate in smaller(listed, number, below=below):
+def _moved(photographs: Photographs, candidates: Sequence[Path]) -> Path | None:
+    """The first of these that is there, None where none is."""
+    for candidate in candidates:
         if (file := photographs.find(candidate)) is not None:
             return file
     return None

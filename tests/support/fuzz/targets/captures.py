@@ -54,10 +54,23 @@ def without_sizes(folder: Path) -> Target:
     frames = _frames()
     for frame in frames:
         frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
-    content = {"camera_angle_x": 0.8, "k1": 0.01, "frames": frames}
+    frames[0] |= {"x_fov": 50, "y_fov": 40, "mask_path": "images/001.png"}
+    frames[1]["transform_matrix"] = [[None] * 4, *frames[1]["transform_matrix"][1:]]
+    content = {"camera_angle_x": 0.8, "k1": 0.01, "ply_file_path": "p.ply", "frames": frames}
+    (folder / "p.ply").write_bytes(_ascii_ply().replace(b"1 2 3", b"nan 2 3"))
     made = _capture(folder, "transforms.json", json.dumps(content).encode())
     (folder / "images").rename(folder / "images_4")
     return made
+
+
+@target("transforms-elsewhere.json")
+def elsewhere(folder: Path) -> Target:
+    """Paths of another machine."""
+    frames = _frames()
+    for frame in frames:
+        frame["file_path"] = "C:\\scene\\" + frame["file_path"].replace("/", "\\")
+    content = {"w": WIDTH, "h": HEIGHT, "x_fov": 50, "frames": frames}
+    return _capture(folder, "transforms.json", json.dumps(content).encode())
 
 
 @target("doctor-transforms.json")

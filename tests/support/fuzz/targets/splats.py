@@ -1,5 +1,6 @@
 """Splat files."""
 
+import struct
 from pathlib import Path
 
 import torch
@@ -58,6 +59,20 @@ def ply_ascii(folder: Path) -> Target:
     )
     face = b"element face 1\nproperty list uchar int vertex_indices\nend_header"
     return whole(folder / "a.ply", content.replace(b"end_header", face) + b"3 0 1 0\n", read_splats)
+
+
+@target("ply-list-before")
+def ply_list_before(folder: Path) -> Target:
+    """Faces of two lengths before Gaussians, and harmonics of degree 4."""
+    names = "x,y,z,f_dc_0,f_dc_1,f_dc_2,opacity,scale_0,scale_1,scale_2,rot_0,rot_1,rot_2,rot_3"
+    names += "".join(f",f_rest_{i}" for i in range(72))
+    count = names.count(",") + 1
+    lines = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: mip"]
+    lines += ["element face 2", "property list uchar int ids", "element vertex 1"]
+    lines += [*(f"property float {name}" for name in names.split(",")), "end_header", ""]
+    faces = struct.pack("<B3iB2i", 3, 0, 1, 2, 2, 0, 1)
+    body = struct.pack(f"<{count}f", *(0.5 + 0.01 * i for i in range(count)))
+    return whole(folder / "a.ply", "\n".join(lines).encode() + faces + body, read_splats)
 
 
 @target("ply-other-names")
