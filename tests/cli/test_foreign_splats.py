@@ -122,6 +122,11 @@ def test_a_fit_starts_at_points(small, tmp_path) -> None:
     assert found.points.tolist() == [[0, 0, 1], [1, 2, 3]]
     with pytest.raises(InputError, match=r"points: expected none with scans"):
         capture_of(scans=points)
+    points.write_text(points.read_text().replace("0 0 1", "0 nan 1"))
+    assert capture_of().points.points.tolist() == [[1, 2, 3]]
+    assert "1 of 2 start points are not finite and are left out" in capture_of().notes
+    with pytest.raises(InputError, match=r"points.ply: 1 of 2 start points are not finite"):
+        capture_of(strict=True)
 
 
 def test_fit_has_the_option(splatseg, small, tmp_path) -> None:
