@@ -96,6 +96,20 @@ def test_a_scene_whose_file_an_editor_broke_is_refused(small, broken, splatseg) 
     assert "1 of 160 Gaussians hold values" in err
 
 
+def test_a_folder_that_3dgs_trained_in(small, splatseg, tmp_path) -> None:
+    folder = tmp_path / "model" / "point_cloud" / "iteration_30000"
+    folder.mkdir(parents=True)
+    write_splats(load_scene(small.scene).gaussians, folder / "point_cloud.ply")
+    (tmp_path / "model" / "cameras.json").write_text("[]")
+    status, out, err = splatseg("info", tmp_path / "model")
+    assert status == 0, err
+    assert "ply splats, 160 Gaussians" in out
+    assert "iteration_30000/point_cloud.ply was read" in out
+    words = ("import", tmp_path / "model", "-o", tmp_path / "s", "--data", small.scene / "cameras")
+    assert splatseg(*words, "--as-is")[0] == 0
+    assert len(load_scene(tmp_path / "s").gaussians) == 160
+
+
 def write_points(path: Path) -> Path:
     head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
     path.write_text(head + "property float z\nend_header\n0 0 1\n1 2 3\n")

@@ -30,7 +30,7 @@ from splatseg.io.lock import lock_owner
 from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.scene_fields import DRIVE_FILE, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished, training_files
-from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format
+from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format, trained_splats
 from splatseg.tasks.stopped_fit import where_it_stopped
 from splatseg.tasks.stopped_training import where_training_stopped
 
@@ -87,7 +87,7 @@ def _describe_folder(path: Path, format: str, *, strict: bool) -> dict[str, Any]
         return _unfinished_facts(path)
     if format != "auto" or find_formats(path):
         return _capture_facts(read_capture(path, format=format, strict=strict))
-    if (path / "meta.json").is_file():
+    if (path / "meta.json").is_file() or trained_splats(path) is not None:
         return _splat_facts(path, strict=strict, linear=())
     if inside := _captures_inside(path):
         return {"path": str(path), "kind": "folder", "holds": inside}

@@ -19,7 +19,13 @@ import torch
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.captures import read_ply_points
-from splatseg.io.splats import SplatWarning, read_scene_splats, read_splats, write_splats
+from splatseg.io.splats import (
+    SplatWarning,
+    read_scene_splats,
+    read_splats,
+    splat_format,
+    write_splats,
+)
 from splatseg.io.splats._common import SOURCE_ROW
 
 Columns = dict[str, list[float]]
@@ -300,6 +306,7 @@ def test_degree_4_of_spz(tmp_path: Path) -> None:
         (["antialiased 1"], True),
         (["antialiased 0"], False),
         (["antialiased 1", "SplatRenderMode: default"], False),
+        (["SplatRenderMode: mip", "antialiased 0"], False),
         (["SH degree: 0", "Exported from Brush"], False),
     ],
 )
@@ -334,9 +341,10 @@ def test_lists_before_gaussians_are_stepped_over(
     path = write_ply(
         tmp_path / "a.ply",
         columns(),
-        before="element face 2\nproperty uchar kind\nproperty list uchar int indices",
+        before="element camera 1\nproperty ushort f\n"
+        "element face 2\nproperty uchar kind\nproperty list uchar int indices",
     )
-    faces = b"".join(struct.pack(f"<BB{n}i", 7, n, *range(n)) for n in lengths)
+    faces = b"\1\2" + b"".join(struct.pack(f"<BB{n}i", 7, n, *range(n)) for n in lengths)
     head, mark, body = path.read_bytes().partition(b"end_header\n")
     path.write_bytes(head + mark + faces + body)
     assert same(read_splats(path), usual)
@@ -447,6 +455,20 @@ def test_gltf_of_two_meshes_counts_rows_through(tmp_path: Path, project_root: Pa
         (tmp_path / other.name).write_bytes(other.read_bytes())
     assert len(read_splats(tmp_path / "a.gltf")) == len(want) + 3
     assert not read_splats(tmp_path / "a.gltf").extra
+
+
+def test_a_folder_that_3dgs_trained_in(tmp_path: Path, usual: Gaussians) -> None:
+    """By the number of the iteration, not by its spelling."""
+    for name, count in (("7000", 3), ("30000", COUNT), ("x", 2)):
+        folder = tmp_path / f"model/point_cloud/iteration_{name}"
+        folder.mkdir(parents=True)
+        write_ply(folder / "point_cloud.ply", {n: v[:count] for n, v in columns().items()})
+    assert splat_format(tmp_path / "model") == "ply"
+    read, said = told(tmp_path / "model")
+    assert same(read, usual)
+    assert "of which point_cloud/iteration_30000/point_cloud.ply was read" in said
+    with pytest.raises(FileFormatError, match="a folder without the meta.json of SOG or"):
+        read_splats(tmp_path)
 
 
 @pytest.mark.parametrize("linear", [["scales"], ["opacities"], ["scales", "opacities"]])

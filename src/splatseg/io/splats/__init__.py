@@ -17,7 +17,7 @@ from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import is_folder
 from splatseg.io.json_files import read_json
-from splatseg.io.splats._common import Losses, StrPath, check_file
+from splatseg.io.splats._common import Losses, StrPath, check_file, warn
 from splatseg.io.splats._common import SplatWarning as SplatWarning
 
 Values = Literal["scales", "opacities"]
@@ -49,7 +49,8 @@ def read_splats(
     linear, opacities in [0, 1], quaternions wxyz of unit length.
 
     Args:
-        path: The file; for unbundled SOG its ``meta.json`` or the folder of it.
+        path: The file; for unbundled SOG its ``meta.json`` or the folder of it; of a folder that
+            3DGS trained a model in its last iteration.
         strict: Refuse a file with Gaussians that cannot be rendered (NaN, infinite, a log scale
             of minus infinity, zero rotation). Without, they are left out, and
             the extra column ``source_row`` says which row of the file each of the others is.
@@ -72,6 +73,10 @@ def read_splats(
             logits, or the file says something that Gaussians in memory cannot hold.
     """
     source = Path(path)
+    if (trained := trained_splats(source)) is not None:
+        where = trained.relative_to(source).as_posix()
+        warn(source, f"a model of 3DGS, of which {where} was read.")
+        source = trained
     format = splat_format(source)
     if format == "ply":
         from splatseg.io.splats.ply import read_ply
@@ -95,6 +100,19 @@ def read_splats(
         case "gltf":
             from splatseg.io.splats.gltf import read_gltf as read
     return read(source, strict=strict)
+
+
+@boundary
+def trained_splats(folder: StrPath) -> Path | None:
+    """The PLY file of the last iteration of a folder that 3DGS trained a model in, or None."""
+    files = Path(folder).glob("point_cloud/iteration_*/point_cloud.ply")
+    last = max(((_iteration(file), file) for file in files), default=None)
+    return None if last is None else last[1]
+
+
+def _iteration(file: Path) -> int:
+    number = file.parent.name.removeprefix("iteration_")
+    return int(number) if number.isdecimal() and len(number) < 10 else -1
 
 
 @boundary
@@ -200,11 +218,13 @@ def splat_format(path: StrPath) -> SplatFormat:
         MissingFileError: If there is no such file.
     """
     source = Path(path)
+    source = trained_splats(source) or source
     if is_folder(source):
         if (source / "meta.json").is_file():
             return "sog"
         raise FileFormatError(
-            f"{source}: expected a splat file, got a folder without the meta.json of SOG."
+            f"{source}: expected a splat file, got a folder without the meta.json of SOG or the "
+            "point_cloud of a model of 3DGS."
         )
     check_file(source)
     with source.open("rb") as file:
