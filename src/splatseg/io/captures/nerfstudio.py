@@ -49,14 +49,13 @@ _FOCALS = (
 """Keys of focal lengths in pixels, and of fields of view with their unit in radians; the first that
 is there counts. Those in degrees are instant-ngp's."""
 
-_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE = ("k1", "k2", "k3", "k4")
-_KEYS: dict[CameraModel, tuple[str, ...]] = {
-    "opencv": _OPENCV,
-    "fisheye": _FISHEYE,
+LENS_KEYS: dict[CameraModel, tuple[str, ...]] = {
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
     "mei": ("xi", "k1", "k2", "p1", "p2"),
     "thin_prism_fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
 }
+"""Keys of the distortion of a lens model, in the order of `Camera.distortion`."""
 
 
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
@@ -141,7 +140,7 @@ def lens_of(source: Mapping[str, Any], *, where: str) -> tuple[CameraModel, tupl
         known = ", ".join(sorted(_MODELS))
         raise FileFormatError(f"{where}: expected a camera_model of {known}, got {quoted(name)}.")
     model = _MODELS[name]
-    return model, tuple(number(source, key, 0.0, where=where) for key in _KEYS[model])
+    return model, tuple(number(source, key, 0.0, where=where) for key in LENS_KEYS[model])
 
 
 def _frames(content: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
