@@ -76,6 +76,18 @@ def test_photographs_in_the_folders_of_the_capture(nerfstudio, write_image, list
     assert capture.notes[0].startswith("photographs were read from images, as they are not where")
 
 
+def test_folders_that_tell_photographs_apart_are_kept(nerfstudio, write_image) -> None:
+    """One photograph is not that of two cameras."""
+    names = ("/home/x/left/0.png", "/home/x/right/0.png")
+    folder = nerfstudio(names, images=False)
+    write_image(folder / "images/0.png")
+    with pytest.raises(MissingFileError, match="2 of 2 photographs"):
+        read_capture(folder)
+    for side in ("left", "right"):
+        write_image(folder / f"images/{side}/0.png")
+    assert [view.name for view in read_capture(folder).views] == ["left/0", "right/0"]
+
+
 @pytest.mark.parametrize(
     ("listed", "there"), [("IMG_1.JPG", "img_1.jpg"), ("caf\u00e9.png", "cafe\u0301.png")]
 )

@@ -196,9 +196,11 @@ def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[st
     if sum(file is not None for file in there) < MIN_THERE * len(raw):
         for pixels, candidates in moves(path):
             found = [_moved(photographs, candidates(view.image)) for view in raw]
-            if sum(file is not None for file in found) >= MIN_THERE * len(raw):
+            files = [file for file in found if file is not None]
+            # Without its first folders a path may be that of another photograph too.
+            if len(files) >= MIN_THERE * len(raw) and len(set(files)) == len(files):
                 there, number, move = found, pixels, candidates
-                folder = next(file for file in found if file is not None).parent
+                folder = files[0].parent
                 where = folder.relative_to(path) if folder.is_relative_to(path) else folder
                 notes.append(
                     f"photographs were read from {_first([str(where)])}, as they are not where the "
