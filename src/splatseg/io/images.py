@@ -81,15 +81,14 @@ def reduced_size(width: int, height: int, longest: int | None) -> tuple[int, int
 
 
 @boundary
-def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether a uniform scale leads from one width and height to another, up to one pixel.
+def same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
+    """Whether a uniform scale leads from one size to another, up to one pixel of the other.
 
     Example:
-        >>> same_shape((4032, 3024), (1600, 1200)), same_shape((640, 480), (480, 640))
+        >>> same_shape(4032, 3024, 1600, 1200), same_shape(640, 480, 480, 640)
         (True, False)
     """
-    across, down = (other[i] / size[i] * size[1 - i] - other[1 - i] for i in (0, 1))
-    return abs(across) <= 1 or abs(down) <= 1
+    return abs(other_width * height - other_height * width) <= max(width, height)
 
 
 @boundary
@@ -143,7 +142,7 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
     if upright.mode in ("RGBA", "LA"):
         grey = grey[..., -1]
     grey = grey.max(axis=2) if grey.ndim == 3 else grey
-    if not same_shape((camera.width, camera.height), (grey.shape[1], grey.shape[0])):
+    if not same_shape(camera.width, camera.height, grey.shape[1], grey.shape[0]):
         raise FileFormatError(
             f"{view.mask}: expected {camera.width}x{camera.height} pixels as the photograph of "
             f"view {view.name!r} has, or a uniform scale of it, got "

@@ -22,7 +22,7 @@ from splatseg.fit import (
     random_point_count,
     reduction_note,
 )
-from splatseg.io.captures import finite_points, read_ply_points
+from splatseg.io.captures import read_start_points
 from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import save_scene
@@ -262,9 +262,7 @@ def _capture(
             raise InputError("points: expected none where poses are found, whose world is new.")
         if options.scans is not None:
             raise InputError("points: expected none with scans, whose points the fit starts at.")
-        points, notes = finite_points(
-            read_ply_points(options.points), where=options.points, strict=options.strict
-        )
+        points, notes = read_start_points(options.points, strict=options.strict)
         capture = replace(capture, points=points, notes=(*capture.notes, *notes))
     if options.depth_evidence is not None:
         if fit_options.depth == "off":

@@ -18,7 +18,7 @@ import torch
 
 from splatseg.core import Gaussians
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.captures import read_ply_points
+from splatseg.io.captures import read_start_points
 from splatseg.io.splats import (
     SplatWarning,
     read_scene_splats,
@@ -495,6 +495,10 @@ def test_few_values_are_not_judged(tmp_path: Path) -> None:
     assert told(write_ply(tmp_path / "a.ply", made))[1] == ""
 
 
+def test_one_opacity_for_all_is_not_judged(tmp_path: Path) -> None:
+    assert told(write_ply(tmp_path / "a.ply", columns() | {"opacity": [0.5] * COUNT}))[1] == ""
+
+
 def test_linear_is_for_ply(tmp_path: Path, usual: Gaussians) -> None:
     write_splats(usual, tmp_path / "a.splat")
     with pytest.raises(InputError, match="expected a PLY file of 3DGS"):
@@ -523,7 +527,8 @@ def test_points_and_meshes_say_what_they_are(tmp_path: Path, coloured: bool, fac
     what = ("a mesh" if faces else "points") + (" with colours" if coloured else "")
     assert f"got {what}, no Gaussians (found '{', '.join(made)}')" in str(caught.value)
     assert "`splatseg fit CAPTURE --points a.ply`" in str(caught.value)
-    assert read_ply_points(path).points.tolist() == [[0, 0, 0], [1, 2, 3]], "and so it is read"
+    points = read_start_points(path, strict=True)[0].points
+    assert points.tolist() == [[0, 0, 0], [1, 2, 3]], "and so it is read"
 
 
 def test_a_mesh_of_gaussians_is_read(tmp_path: Path, usual: Gaussians) -> None:

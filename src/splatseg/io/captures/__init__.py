@@ -7,14 +7,14 @@ the first of `FORMATS` wins.
 from pathlib import Path
 
 from splatseg._check import check_choice
-from splatseg.core import Capture
+from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import Metadata as Metadata
 from splatseg.io.captures._metadata import read_metadata as read_metadata
-from splatseg.io.captures._points import read_ply_points as read_ply_points
+from splatseg.io.captures._points import read_ply_points
 from splatseg.io.captures.blender import find_blender, read_blender
-from splatseg.io.captures.build import finite_points as finite_points
+from splatseg.io.captures.build import finite_points
 from splatseg.io.captures.colmap import find_colmap, read_colmap
 from splatseg.io.captures.idr import FILES as _IDR_FILES
 from splatseg.io.captures.idr import find_idr, read_idr
@@ -105,6 +105,24 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             return read_scannetpp(folder, strict=strict)
         case _:
             return read_kitti360(folder, strict=strict)
+
+
+@boundary
+def read_start_points(
+    path: Path | str, *, strict: bool = False
+) -> tuple[PointCloud, tuple[str, ...]]:
+    """Points of a PLY file of points or of a mesh, and notes on those that are left out.
+
+    Args:
+        path: The file.
+        strict: Refuse points that are NaN or infinite.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        InputError: If it is no PLY of points, or all of them, any with `strict`, are not finite.
+    """
+    file = Path(path)
+    return finite_points(read_ply_points(file), where=file, strict=strict)
 
 
 @boundary

@@ -148,7 +148,9 @@ def build_capture(
             for i, split in zip(order, splits, strict=True)
         ]
     metadata = read_metadata(path)
-    points, point_notes = finite_points(points, where=path, strict=strict)
+    point_notes: tuple[str, ...] = ()
+    if points is not None:
+        points, point_notes = finite_points(points, where=path, strict=strict)
     found = (*left_out, *found_notes, *camera_notes, *point_notes, *notes)
     found += (*([split_note] if split_note else []), *_size_notes(views))
     with made_from(path):
@@ -167,15 +169,13 @@ def build_capture(
 
 
 def finite_points(
-    points: PointCloud | None, *, where: Path, strict: bool
-) -> tuple[PointCloud | None, tuple[str, ...]]:
+    points: PointCloud, *, where: Path, strict: bool
+) -> tuple[PointCloud, tuple[str, ...]]:
     """Start points without those that are NaN or infinite, and a note that counts them.
 
     Raises:
         InputError: If all are, or any with `strict`; `where` starts the message.
     """
-    if points is None:
-        return None, ()
     kept = torch.isfinite(points.points).all(dim=1)
     lost = int((~kept).sum())
     if lost == 0:
@@ -293,7 +293,7 @@ def _mask_size(view: RawView, size: tuple[int, int]) -> tuple[int, int]:
     if view.mask is None or not is_file(view.mask):
         return size
     mask = image_size(view.mask)
-    if not same_shape(size, mask):
+    if not same_shape(*size, *mask):
         raise InputError(
             f"{view.mask}: expected a mask of {size[0]}x{size[1]} pixels as its photograph has, or "
             f"a uniform scale of it, got {mask[0]}x{mask[1]}."
@@ -366,8 +366,8 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
         )
     if (intrinsics.width, intrinsics.height) == size:
         return intrinsics
-    if not same_shape((intrinsics.width, intrinsics.height), size):
-        turned = same_shape((intrinsics.height, intrinsics.width), size)
+    if not same_shape(intrinsics.width, intrinsics.height, *size):
+        turned = same_shape(intrinsics.height, intrinsics.width, *size)
         hint = "; turned by its EXIF orientation, perhaps" if turned else ""
         raise InputError(
             f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or a "

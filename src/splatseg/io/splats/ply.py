@@ -184,8 +184,9 @@ def _tell(path: Path, rows: Rows, columns: Columns, linear: Collection[str]) -> 
         if "scales" not in linear and (scales[sound] > 0).all():
             doubted.append("scales")
             said.append("all scales are positive, as if they were never logs")
-        within = (opacities[sound] >= 0) & (opacities[sound] <= 1)
-        if "opacities" not in linear and within.all():
+        low, high = opacities[sound].min(), opacities[sound].max()
+        # One opacity for all may be any logit.
+        if "opacities" not in linear and 0 <= low < high <= 1:
             doubted.append("opacities")
             said.append("all opacities lie in [0, 1], as if they were never logits")
         if doubted:
