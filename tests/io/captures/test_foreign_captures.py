@@ -380,6 +380,15 @@ def test_the_largest_model_is_read_and_said(tmp_path, write_image) -> None:
     assert "0, of 2 photographs, was read (1 of 6" in named.notes[0]
 
 
+def test_a_size_of_many_digits_is_cut_in_the_message(tmp_path, write_image) -> None:
+    """As a fuzzed cameras.txt had it."""
+    write_image(tmp_path / "images/a.png")
+    colmap(tmp_path / "sparse/0", ["a.png"], f"PINHOLE {'9' * 400} 48 50 51 32 24")
+    with pytest.raises(InputError, match="expected intrinsics of 1 to") as caught:
+        read_capture(tmp_path)
+    assert len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
 def test_a_model_need_not_be_called_0(tmp_path, write_image) -> None:
     write_image(tmp_path / "images/a.png")
     colmap(tmp_path / "sparse/aligned", ["a.png"])

@@ -362,7 +362,7 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
     if not (1 <= intrinsics.width <= MAX_SIDE and 1 <= intrinsics.height <= MAX_SIDE):
         raise InputError(
             f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got "
-            f"{intrinsics.width}x{intrinsics.height}."
+            f"{quoted(intrinsics.width)}x{quoted(intrinsics.height)}."
         )
     if (intrinsics.width, intrinsics.height) == size:
         return intrinsics
