@@ -132,7 +132,6 @@ def test_bad_input_is_one_sentence(small, splat_file, splatseg, tmp_path) -> Non
         ((splat_file, "-o", layered), "got a scene with layers (mine)"),
         ((splat_file, *out, "--data", tmp_path / "empty"), "expected a capture"),
         ((splat_file, *out, "--as-is"), "--as-is: goes with --data"),
-        ((splat_file, *out, "--strict"), "--strict: goes with --data"),
         ((splat_file, *out, "--max-views", 0), "--max-views: expected at least 1"),
     ]:
         status, _, err = splatseg("import", *words)

@@ -5,6 +5,7 @@ from typing import Annotated, Any, TypeAlias
 
 import tyro
 
+from splatseg.io.splats import Values
 from splatseg.render import BackendName
 
 
@@ -70,8 +71,19 @@ Strict: TypeAlias = Annotated[
     bool,
     _named(
         None,
-        "Refuse a capture that lists a photograph which is not there. Without it such photographs "
-        "are left out and named, as long as half of them are there.",
+        "Refuse a splat file with Gaussians that cannot be rendered (NaN, infinite), and a capture "
+        "with photographs that are not there, cannot be opened, are of another shape than their "
+        "intrinsics or mask or have an impossible pose, or with start points that are not finite. "
+        "Without it they are left out and counted or named, as long as a Gaussian and half of the "
+        "photographs are left.",
+    ),
+]
+
+Linear: TypeAlias = Annotated[
+    tuple[Values, ...],
+    _named(
+        "VALUES",
+        "Which of scales and opacities a PLY file has as they are, where 3DGS has logs and logits.",
     ),
 ]
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from splatseg.cli._types import Json, Overwrite, Quiet
+from splatseg.cli._types import Json, Linear, Overwrite, Quiet, Strict
 from splatseg.cli._work import ConsoleObserver, print_result
 from splatseg.lift import AttachOptions
 from splatseg.tasks import AttachedLayers, AttachLayersOptions, attach_layers
@@ -62,6 +62,8 @@ class Command:
     """Least share of FILE's Gaussians that must be found, in [0, 1]; with fewer nothing is
     written."""
 
+    strict: Strict = False
+    linear: Linear = ()
     overwrite: Overwrite = False
     json: Json = False
     quiet: Quiet = False

@@ -122,6 +122,10 @@ class Command:
     """Laser scans of the drive: the fit starts at their points and learns their depth, as with
     --depth metric. For streets, whose far and thin things photographs alone place badly."""
 
+    points: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A PLY file of points, or of a mesh, in the world of DATA: where the fit starts, instead of
+    the points of DATA."""
+
     moving: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """Boxes of moving things, which are left out of training views and of scans: a JSON file, a
     drive of KITTI-360 or a segment of Waymo."""
@@ -182,6 +186,7 @@ def run(command: Command) -> None:
             preset=command.preset,
             depth_evidence=command.depth_evidence,
             scans=command.scans,
+            points=command.points,
             moving=command.moving,
             moving_classes=command.moving_classes,
             moving_evidence=command.moving_evidence,

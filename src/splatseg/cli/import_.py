@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from splatseg.cli._types import Backend, Format, Json, MadeSceneFolder, Quiet, Strict
+from splatseg.cli._types import Backend, Format, Json, Linear, MadeSceneFolder, Quiet, Strict
 from splatseg.cli._work import ConsoleObserver, print_result
 from splatseg.tasks import ImportOptions, import_scene
 from splatseg.tasks.import_scene import UpAxis
@@ -45,6 +45,7 @@ class Command:
     """Take the file as it stands, without comparing it with the photographs."""
 
     strict: Strict = False
+    linear: Linear = ()
 
     up: UpAxis = "auto"
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else, which is

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseg.cli._types import Format, Json
+from splatseg.cli._types import Format, Json, Linear, Strict
 from splatseg.cli._work import print_result
 from splatseg.tasks import describe
 
@@ -28,6 +28,8 @@ class Command:
     """Folder of a capture, of a scene, of evidence or of bare photographs, or a splat file."""
 
     format: Format = "auto"
+    strict: Strict = False
+    linear: Linear = ()
     json: Json = False
 
     verbose: bool = False
@@ -36,7 +38,9 @@ class Command:
 
 def run(command: Command) -> None:
     """Tell what is there."""
-    facts = describe(command.path, format=command.format)
+    facts = describe(
+        command.path, format=command.format, strict=command.strict, linear=command.linear
+    )
     lines = [summary(facts)]
     if command.verbose:
         lines += [f"  {key}: {_shown(value)}" for key, value in facts.items()]

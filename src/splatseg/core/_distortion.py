@@ -14,7 +14,15 @@ opencv (k1 k2 p1 p2 k3 k4 k5 k6), :math:`r^2 = x^2 + y^2`:
 .. math:: (x', y') = \theta (1 + k_1 \theta^2 + k_2 \theta^4 + k_3 \theta^6 + k_4 \theta^8)
           \, (x, y) / r
 
-References: OpenCV documentation, calib3d and fisheye modules.
+thin_prism_fisheye (k1 k2 p1 p2 k3 k4 s1 s2), with :math:`(u, v) = \theta \, (x, y) / r`:
+
+.. math::
+    x' = u (1 + k_1 \theta^2 + k_2 \theta^4 + k_3 \theta^6 + k_4 \theta^8)
+         + 2 p_1 u v + p_2 (\theta^2 + 2 u^2) + s_1 \theta^2
+
+(y' alike with p1 and p2 exchanged and s2).
+
+References: OpenCV documentation, calib3d and fisheye modules; COLMAP's ThinPrismFisheyeCameraModel.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,6 +35,7 @@ from splatseg.errors import InputError
 
 OPENCV_PARAMETERS = 8
 FISHEYE_PARAMETERS = 4
+THIN_PRISM_FISHEYE_PARAMETERS = 8
 _NEWTON_STEPS = 50
 _TOLERANCE = 1e-10
 _MAX_RADIUS = 1e4
@@ -67,6 +76,40 @@ def _theta_polynomial(theta: Tensor, parameters: Sequence[float]) -> Tensor:
     return 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
 
 
+def distort_thin_prism_fisheye(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    """Distort points of the normalised plane with COLMAP's thin prism fisheye model."""
+    return _thin_prism(distort_fisheye(plane, (0.0,) * FISHEYE_PARAMETERS), parameters)
+
+
+def undistort_thin_prism_fisheye(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    """Invert `distort_thin_prism_fisheye`.
+
+    Raises:
+        InputError: If a point lies beyond 90 degrees from the axis, or has no inverse.
+    """
+    angles = _inverted(plane, lambda at: _thin_prism(at, parameters))
+    return undistort_fisheye(angles, (0.0,) * FISHEYE_PARAMETERS).to(plane)
+
+
+def _thin_prism(angles: Tensor, parameters: Sequence[float]) -> Tensor:
+    """The polynomial of `distort_thin_prism_fisheye` of equidistant coordinates (u, v)."""
+    k1, k2, p1, p2, k3, k4, s1, s2 = parameters
+    u, v = angles.unbind(-1)
+    t2 = u * u + v * v
+    radial = 1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+    return torch.stack(
+        (
+            u * radial + 2 * p1 * u * v + p2 * (t2 + 2 * u * u) + s1 * t2,
+            v * radial + p1 * (t2 + 2 * v * v) + 2 * p2 * u * v + s2 * t2,
+        ),
+        dim=-1,
+    )
+
+
 def undistort_opencv(
     plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
 ) -> Float[Tensor, "*batch 2"]:
@@ -75,18 +118,23 @@ def undistort_opencv(
     Raises:
         InputError: If a point has no inverse: the polynomial folds over inside the image.
     """
+    return _inverted(plane, lambda at: distort_opencv(at, parameters)).to(plane)
+
+
+def _inverted(plane: Tensor, distort: Callable[[Tensor], Tensor]) -> Tensor:
+    """Where `distort` leads to these points from, float64, by damped Newton steps from them."""
     target = plane.double()
     guess = target.clone()
     eye = torch.eye(2, dtype=torch.float64, device=plane.device)
 
     def residual(at: Tensor) -> Tensor:
-        return distort_opencv(at, parameters) - target
+        return distort(at) - target
 
     error = residual(guess)
     for _ in range(_NEWTON_STEPS):
         if not error.numel() or float(error.abs().max()) < _TOLERANCE:
             break
-        jacobian = _numerical_jacobian(lambda at: distort_opencv(at, parameters), guess)
+        jacobian = _numerical_jacobian(distort, guess)
         step = torch.linalg.solve(jacobian + 1e-15 * eye, error.unsqueeze(-1)).squeeze(-1)
         # A full step may jump over the fold of the polynomial; halve it until it helps.
         fraction = torch.ones_like(error[..., :1])
@@ -101,10 +149,10 @@ def undistort_opencv(
         error = residual(guess)
     # Beyond the fold of the polynomial lie solutions that no lens has: there the image is
     # mirrored, or lies on the other side of the axis.
-    jacobian = _numerical_jacobian(lambda at: distort_opencv(at, parameters), guess)
+    jacobian = _numerical_jacobian(distort, guess)
     folded = (torch.linalg.det(jacobian) <= 0) | ((guess * target).sum(-1) < 0)
     _require_converged(torch.where(folded.unsqueeze(-1), torch.inf, error))
-    return guess.to(plane)
+    return guess
 
 
 def _numerical_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:

@@ -12,22 +12,26 @@ from splatseg._check import check_choice, check_finite, check_shape
 from splatseg.core._distortion import (
     FISHEYE_PARAMETERS,
     OPENCV_PARAMETERS,
+    THIN_PRISM_FISHEYE_PARAMETERS,
     distort_fisheye,
     distort_opencv,
+    distort_thin_prism_fisheye,
     undistort_fisheye,
     undistort_opencv,
+    undistort_thin_prism_fisheye,
 )
 from splatseg.core._mei import MEI_PARAMETERS, distort_mei, undistort_mei
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.rigid import Similarity, check_rotation
 from splatseg.errors import InputError, RangeError
 
-CameraModel = Literal["pinhole", "opencv", "fisheye", "mei"]
+CameraModel = Literal["pinhole", "opencv", "fisheye", "mei", "thin_prism_fisheye"]
 _PARAMETERS = {
     "pinhole": 0,
     "opencv": OPENCV_PARAMETERS,
     "fisheye": FISHEYE_PARAMETERS,
     "mei": MEI_PARAMETERS,
+    "thin_prism_fisheye": THIN_PRISM_FISHEYE_PARAMETERS,
 }
 _MAX_UNDISTORTED_GROWTH = 8.0
 
@@ -64,8 +68,8 @@ class Camera:
     """Lens model, see `core._distortion` and `core._mei`."""
 
     distortion: tuple[float, ...] = ()
-    """opencv: k1 k2 p1 p2 k3 k4 k5 k6; fisheye: k1 k2 k3 k4; mei: xi k1 k2 p1 p2; pinhole:
-    nothing. Missing trailing values are 0."""
+    """opencv: k1 k2 p1 p2 k3 k4 k5 k6; fisheye: k1 k2 k3 k4; mei: xi k1 k2 p1 p2;
+    thin_prism_fisheye: k1 k2 p1 p2 k3 k4 s1 s2; pinhole: nothing. Missing trailing values are 0."""
 
     def __post_init__(self) -> None:
         convert_fields(self)
@@ -104,7 +108,7 @@ class Camera:
     @property
     def is_pinhole(self) -> bool:
         """True where straight lines stay straight: no distortion, or all of it zero."""
-        if self.model == "fisheye":
+        if self.model in ("fisheye", "thin_prism_fisheye"):
             return False
         return not any(self.distortion)
 
@@ -278,6 +282,8 @@ class Camera:
             return plane
         if self.model == "fisheye":
             return undistort_fisheye(plane, self.distortion)
+        if self.model == "thin_prism_fisheye":
+            return undistort_thin_prism_fisheye(plane, self.distortion)
         if self.model == "mei":
             return undistort_mei(plane, self.distortion)
         return undistort_opencv(plane, self.distortion)
@@ -287,6 +293,8 @@ class Camera:
         if not distorted and not self.is_pinhole:
             if self.model == "fisheye":
                 plane = distort_fisheye(plane, self.distortion)
+            elif self.model == "thin_prism_fisheye":
+                plane = distort_thin_prism_fisheye(plane, self.distortion)
             elif self.model == "mei":
                 plane = distort_mei(plane, self.distortion)
             else:

@@ -4,6 +4,7 @@ JSON has numbers of any size, and Python reads NaN, Infinity and 1e999 as well. 
 takes a number out of a file takes it from here.
 """
 
+import math
 from typing import TypeGuard, cast
 
 import numpy as np
@@ -67,8 +68,12 @@ def json_integer(value: object, *, where: str, low: int = 0, high: int = MAX_INT
     return value
 
 
+def _is_no_number(entry: object) -> bool:
+    return entry is None or (isinstance(entry, float) and not math.isfinite(entry))
+
+
 def json_matrix(
-    value: object, *, where: str, shapes: tuple[tuple[int, int], ...]
+    value: object, *, where: str, shapes: tuple[tuple[int, int], ...], finite: bool = True
 ) -> NDArray[np.float64]:
     """A matrix of a JSON document, a list of rows.
 
@@ -76,9 +81,11 @@ def json_matrix(
         value: What the document holds.
         where: The file and the place in it; starts the message.
         shapes: Numbers of rows and columns that it may have.
+        finite: Whether entries must be. Without, what is not, and null, as which some programs
+            write it, is NaN.
 
     Raises:
-        FileFormatError: If it is no matrix of such a shape, or an entry no finite number.
+        FileFormatError: If it is no matrix of such a shape, or an entry no (finite) number.
     """
     rows = cast("list[object]", value) if isinstance(value, list) else []
     expected = " or ".join(f"{height} x {width}" for height, width in shapes)
@@ -87,7 +94,12 @@ def json_matrix(
             isinstance(row, list) and len(cast("list[object]", row)) == width for row in rows
         ):
             entries = [
-                [json_number(entry, where=where) for entry in cast("list[object]", row)]
+                [
+                    math.nan
+                    if not finite and _is_no_number(entry)
+                    else json_number(entry, where=where)
+                    for entry in cast("list[object]", row)
+                ]
                 for row in rows
             ]
             return np.array(entries, np.float64)

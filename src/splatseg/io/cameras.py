@@ -17,7 +17,14 @@ from splatseg.core import Camera, View
 from splatseg.core.view_names import view_name_fault
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures.build import checked_pose, opencv_from_opengl
-from splatseg.io.captures.nerfstudio import MILLIMETRE, frame_matrix, lens_of, number, size_of
+from splatseg.io.captures.nerfstudio import (
+    LENS_KEYS,
+    MILLIMETRE,
+    frame_matrix,
+    lens_of,
+    number,
+    size_of,
+)
 from splatseg.io.foreign import made_from
 
 _MODEL_NAMES = {
@@ -25,14 +32,10 @@ _MODEL_NAMES = {
     "opencv": "OPENCV",
     "fisheye": "OPENCV_FISHEYE",
     "mei": "MEI",
+    "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
 }
-_DISTORTION = {
-    "pinhole": (),
-    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-    "mei": ("xi", "k1", "k2", "p1", "p2"),
-}
-_LENS = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "xi", *_DISTORTION["opencv"])
+_SIZES = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy")
+_LENS = (*_SIZES, "xi", *LENS_KEYS["opencv"], "sx1", "sy1")
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _FILES = {"image": "file_path", "mask": "mask_path", "depth": "depth_file_path"}
 
@@ -122,7 +125,7 @@ def _frame(view: View, *, folder: Path, source: Path | None) -> dict[str, Any]:
         "h": camera.height,
     }
     frame |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    frame |= dict(zip(_DISTORTION[camera.model], camera.distortion, strict=True))
+    frame |= dict(zip(LENS_KEYS.get(camera.model, ()), camera.distortion, strict=True))
     frame["transform_matrix"] = (world_from_cam @ _FLIP).tolist()
     return frame
 

@@ -81,6 +81,17 @@ def reduced_size(width: int, height: int, longest: int | None) -> tuple[int, int
 
 
 @boundary
+def same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
+    """Whether a uniform scale leads from one size to another, up to one pixel of the other.
+
+    Example:
+        >>> same_shape(4032, 3024, 1600, 1200), same_shape(640, 480, 480, 640)
+        (True, False)
+    """
+    return abs(other_width * height - other_height * width) <= max(width, height)
+
+
+@boundary
 def load_image(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width 3"]:
     """The photograph of a view, upright, 8 bit sRGB.
 
@@ -115,11 +126,12 @@ def load_image(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heig
 def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "height width"] | None:
     """The mask of a view as 0 (ignore) and 1 (use); None where the view has none.
 
-    It is reduced with the photograph: a pixel that mixes both is one to ignore.
+    It may be of the photograph's size or a uniform scale of it, and is reduced with the
+    photograph: a pixel that mixes both is one to ignore.
 
     Raises:
         MissingFileError: If the mask is not where it was.
-        FileFormatError: If it cannot be decoded, or its size is not the photograph's.
+        FileFormatError: If it cannot be decoded, or its shape is not the photograph's.
     """
     if view.mask is None:
         return None
@@ -130,10 +142,11 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
     if upright.mode in ("RGBA", "LA"):
         grey = grey[..., -1]
     grey = grey.max(axis=2) if grey.ndim == 3 else grey
-    if grey.shape != (camera.height, camera.width):
+    if not same_shape(camera.width, camera.height, grey.shape[1], grey.shape[0]):
         raise FileFormatError(
             f"{view.mask}: expected {camera.width}x{camera.height} pixels as the photograph of "
-            f"view {view.name!r} has, got {grey.shape[1]}x{grey.shape[0]}."
+            f"view {view.name!r} has, or a uniform scale of it, got "
+            f"{grey.shape[1]}x{grey.shape[0]}."
         )
     keep = Image.fromarray(np.where(grey > 0, 255, 0).astype(np.uint8))
     target = reduced_size(camera.width, camera.height, longest)
@@ -155,7 +168,7 @@ def left_out_pixels(view: View, height: int, width: int) -> Bool[Tensor, "height
 
     Raises:
         MissingFileError: If the mask is not where it was.
-        FileFormatError: If it cannot be decoded, or its size is not the photograph's.
+        FileFormatError: If it cannot be decoded, or its shape is not the photograph's.
     """
     used = load_mask(view)
     if used is None:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
 from splatseg.io.foreign import read_bytes, reading
+from splatseg.io.text_numbers import number_table
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -159,13 +160,28 @@ def read_ply_tables(path: Path, header: PlyHeader, names: Collection[str]) -> di
     return found
 
 
+def end_of_rows(path: Path, name: str) -> int:
+    """Byte at which the rows of an element of a binary file end, whose lists must be gone through.
+
+    Raises:
+        FileFormatError: If the file ends early, or there is no such element.
+    """
+    header = read_ply_header(path)
+    reader = _BinaryRows(path, header)
+    for element in header.elements:
+        reader.next(element)
+        if element.name == name:
+            return reader.at
+    raise FileFormatError(f"{path}: expected a PLY element {quoted(name)}, got none.")
+
+
 class _BinaryRows:
     """Goes through the elements of a binary file."""
 
     def __init__(self, path: Path, header: PlyHeader) -> None:
         self._path = path
         self._order = header.order
-        self._at = header.offset
+        self.at = header.offset
         with reading(path, _KIND):
             self._size = path.stat().st_size
 
@@ -174,13 +190,13 @@ class _BinaryRows:
         lengths = self._lengths_of_first(element)
         dtype = self._row(element, lengths)
         lists = [one for one in element.properties if one.count_code is not None]
-        if lists and dtype.itemsize * element.count > self._size - self._at:
+        if lists and dtype.itemsize * element.count > self._size - self.at:
             return self._walked(element)
         rows = self._read(element, dtype)
         for i, one in enumerate(lists):
             if bool((rows[f"n {one.name}"] != lengths[i]).any()):
                 return self._walked(element)
-        self._at += dtype.itemsize * element.count
+        self.at += dtype.itemsize * element.count
         return PlyTable(
             count=element.count,
             numbers={p.name: rows[p.name] for p in element.properties if p.count_code is None},
@@ -196,7 +212,7 @@ class _BinaryRows:
     def _lengths_of_first(self, element: PlyElement) -> list[int]:
         """Lengths of the lists of the first row; most files have them in all rows."""
         lengths: list[int] = []
-        at = self._at
+        at = self.at
         if not element.count:
             return [0 for one in element.properties if one.count_code is not None]
         for one in element.properties:
@@ -235,18 +251,18 @@ class _BinaryRows:
         return np.dtype(fields)
 
     def _read(self, element: PlyElement, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-        have = self._size - self._at
+        have = self._size - self.at
         if have < dtype.itemsize * element.count:
             raise FileFormatError(
                 f"{self._path}: expected {element.count} rows of {element.name} of "
                 f"{dtype.itemsize} bytes, got {have} bytes: the file ends early."
             )
         with reading(self._path, _KIND):
-            return np.fromfile(self._path, dtype, element.count, offset=self._at)
+            return np.fromfile(self._path, dtype, element.count, offset=self.at)
 
     def _walked(self, element: PlyElement) -> PlyTable:
         """The table where lists differ in length: row by row."""
-        rest = read_bytes(self._path, _KIND)[self._at :]
+        rest = read_bytes(self._path, _KIND)[self.at :]
         at = 0
         numbers: dict[str, list[float]] = {}
         lists: dict[str, tuple[list[int], list[NDArray[Any]]]] = {}
@@ -267,7 +283,7 @@ class _BinaryRows:
                     starts, parts = lists[one.name]
                     starts.append(starts[-1] + int(count))
                     parts.append(values)
-        self._at += at
+        self.at += at
         codes = {one.name: one.code for one in element.properties}
         return PlyTable(
             count=element.count,
@@ -293,7 +309,8 @@ class _TextRows:
 
     def __init__(self, path: Path, header: PlyHeader) -> None:
         self._path = path
-        self._lines = read_bytes(path, _KIND)[header.offset :].split(b"\n")
+        lines = read_bytes(path, _KIND)[header.offset :].split(b"\n")
+        self._lines = [line for line in lines if line and not line.isspace()]
         self._at = 0
 
     def next(self, element: PlyElement) -> PlyTable:
@@ -312,6 +329,16 @@ class _TextRows:
 
 
 def _parsed(element: PlyElement, lines: list[bytes]) -> PlyTable:
+    if all(one.count_code is None for one in element.properties):
+        table = number_table(lines, len(element.properties))
+        numbers: dict[str, NDArray[Any]] = {}
+        for one, values in zip(element.properties, table.T, strict=True):
+            numbers[one.name] = values.copy() if one.code[0] == "f" else _whole(values, one)
+        return PlyTable(count=element.count, numbers=numbers)
+    return _parsed_lists(element, lines)
+
+
+def _parsed_lists(element: PlyElement, lines: list[bytes]) -> PlyTable:
     columns: list[list[float]] = [[] for _ in element.properties]
     starts = [[0] for _ in element.properties]
     for line in lines:

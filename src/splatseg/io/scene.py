@@ -53,7 +53,7 @@ from splatseg.io.scene_folder import (
     is_unfinished,
     scene_path,
 )
-from splatseg.io.splats import read_splats, write_splats
+from splatseg.io.splats import read_scene_splats, write_splats
 from splatseg.io.write_errors import named_write_failures
 
 FORMAT = "splatseg-scene"
@@ -130,7 +130,7 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
     views = views_from_content(
         cameras, folder=root / "cameras", source=source, path=root / CAMERAS_FILE
     )
-    gaussians = read_splats(current_file(root, GAUSSIANS_FILE))
+    gaussians = read_scene_splats(current_file(root, GAUSSIANS_FILE))
     if len(gaussians) != content["gaussians"]:
         raise FileFormatError(
             f"{root / GAUSSIANS_FILE}: expected {content['gaussians']} Gaussians as {SCENE_FILE} "

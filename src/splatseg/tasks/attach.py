@@ -25,6 +25,7 @@ from splatseg.io.atomic import is_vacant
 from splatseg.io.export import check_parent, column_table_of, label_columns, write_labelled_splats
 from splatseg.io.scene import load_scene, save_scene, save_scene_layer, scene_layer_names
 from splatseg.io.scene_folder import is_scene, work_on_scene
+from splatseg.io.splats import Values, read_scene_splats
 from splatseg.lift import Attached, AttachOptions, attach
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.import_scene import read_with_notes
@@ -55,6 +56,12 @@ class AttachLayersOptions:
     min_found: float = 0.5
     """Least share of the edited file's Gaussians that must be found, in [0, 1]; with fewer
     nothing is written."""
+
+    strict: bool = False
+    """Refuse files with Gaussians that cannot be rendered; see `read_splats`."""
+
+    linear: tuple[Values, ...] = ()
+    """Which of scales and opacities PLY files have as they are, where 3DGS has logs and logits."""
 
     overwrite: bool = False
     """Replace layers of the same name in a scene folder that the edited file is."""
@@ -172,7 +179,7 @@ def _check_output(output: Path, read: set[Path]) -> None:
 
 
 def _columns_to_file(work: _Work, output: Path) -> AttachedLayers:
-    source = read_with_notes(work.source, work.observer)
+    source = _read(work, work.source)
     named = [name for name in _LABEL_COLUMNS if name in source.extra]
     if not named:
         raise InputError(
@@ -280,9 +287,14 @@ def _layers(work: _Work, scene: Scene) -> dict[str, Layer]:
     return {name: whole_layer(scene, name) for name in names}
 
 
+def _read(work: _Work, path: Path) -> Gaussians:
+    options = work.options
+    return read_with_notes(path, work.observer, strict=options.strict, linear=options.linear)
+
+
 def _edited(work: _Work) -> Gaussians:
     path = work.file / "gaussians.ply" if is_scene(work.file) else work.file
-    edited = read_with_notes(path, work.observer)
+    edited = read_scene_splats(path) if is_scene(work.file) else _read(work, path)
     if not len(edited):
         raise InputError(f"{path}: expected Gaussians, got a file of none.")
     return edited

@@ -30,7 +30,7 @@ from splatseg.io.lock import lock_owner
 from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
 from splatseg.io.scene_fields import DRIVE_FILE, scene_field_names, scene_field_path
 from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished, training_files
-from splatseg.io.splats import SplatWarning, read_splats, splat_format
+from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format, trained_splats
 from splatseg.tasks.stopped_fit import where_it_stopped
 from splatseg.tasks.stopped_training import where_training_stopped
 
@@ -48,12 +48,16 @@ _SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog", ".gltf", ".glb")
 
 
 @boundary
-def describe(path: Path, *, format: str = "auto") -> dict[str, Any]:
+def describe(
+    path: Path, *, format: str = "auto", strict: bool = False, linear: tuple[Values, ...] = ()
+) -> dict[str, Any]:
     """What is at a path, in values that JSON holds.
 
     Args:
         path: A folder of a capture, a scene, evidence or bare photographs, or a file.
         format: Which description of a capture to read, where it has several.
+        strict: Refuse what `read_splats` and `read_capture` would leave out.
+        linear: What a PLY file has as it is; see `read_splats`.
 
     Returns:
         The kind of thing and its figures; notes are sentences.
@@ -67,24 +71,24 @@ def describe(path: Path, *, format: str = "auto") -> dict[str, Any]:
     if not path.exists():
         raise MissingFileError(f"{path}: there is no such file or folder.")
     if path.is_dir():
-        return _describe_folder(path, format)
+        return _describe_folder(path, format, strict=strict)
     if path.name in _CAPTURE_FILES or path.suffix in _CAPTURE_SUFFIXES:
-        return _capture_facts(read_capture(path, format=format))
+        return _capture_facts(read_capture(path, format=format, strict=strict))
     if path.suffix == ".npz":
         layer = load_layer(path)
         return {"path": str(path), "kind": "layer", "holds": _layer_kind(layer), "rows": len(layer)}
-    return _splat_facts(path)
+    return _splat_facts(path, strict=strict, linear=linear)
 
 
-def _describe_folder(path: Path, format: str) -> dict[str, Any]:
+def _describe_folder(path: Path, format: str, *, strict: bool) -> dict[str, Any]:
     if format == "auto" and is_scene(path):
         return _scene_facts(load_scene(path))
     if format == "auto" and is_unfinished(path):
         return _unfinished_facts(path)
     if format != "auto" or find_formats(path):
-        return _capture_facts(read_capture(path, format=format))
-    if (path / "meta.json").is_file():
-        return _splat_facts(path)
+        return _capture_facts(read_capture(path, format=format, strict=strict))
+    if (path / "meta.json").is_file() or trained_splats(path) is not None:
+        return _splat_facts(path, strict=strict, linear=())
     if inside := _captures_inside(path):
         return {"path": str(path), "kind": "folder", "holds": inside}
     files = [p for p in sorted(path.iterdir()) if p.suffix.lower() in _SPLAT_SUFFIXES]
@@ -283,10 +287,10 @@ def _first_view(evidence: Evidence, name: str) -> str:
     return f"{len(masks)} {what} on {masks.width}x{masks.height} pixels"
 
 
-def _splat_facts(path: Path) -> dict[str, Any]:
+def _splat_facts(path: Path, *, strict: bool, linear: tuple[Values, ...]) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SplatWarning)
-        gaussians = read_splats(path)
+        gaussians = read_splats(path, strict=strict, linear=linear)
     facts: dict[str, Any] = {"path": str(path), "kind": "splats", "format": splat_format(path)}
     notes = [str(warning.message) for warning in caught]
     return facts | _gaussian_facts(gaussians) | {"notes": notes}

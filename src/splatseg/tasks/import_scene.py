@@ -13,7 +13,7 @@ from splatseg.importing import Alignment, VirtualViews, align, place_cameras
 from splatseg.io.captures import read_capture
 from splatseg.io.paths import check_utf8
 from splatseg.io.scene import save_scene
-from splatseg.io.splats import SplatWarning, read_splats, splat_format
+from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks.new_scene import check_replaceable_scene
@@ -36,7 +36,11 @@ class ImportOptions:
     """Take the file as it stands, without comparing it with the photographs."""
 
     strict: bool = False
-    """Refuse a capture that lists a photograph which is not there."""
+    """Refuse a file with Gaussians that cannot be rendered, and a capture that lists a photograph
+    which is not there; see `read_splats` and `read_capture`."""
+
+    linear: tuple[Values, ...] = ()
+    """Which of scales and opacities a PLY file has as they are, where 3DGS has logs and logits."""
 
     up: UpAxis = "auto"
     """Which way is up, where there is no capture. auto: +y for glTF, -y for all else."""
@@ -65,8 +69,6 @@ class ImportOptions:
             )
         if self.as_is and self.data is None:
             raise InputError("as_is: goes with `data`, which says what the file is compared with.")
-        if self.strict and self.data is None:
-            raise InputError("strict: goes with `data`, whose photographs it is about.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,7 +114,7 @@ def import_scene(
     options = options or ImportOptions()
     check_replaceable_scene(folder)
     check_utf8(file)
-    gaussians = read_with_notes(file, observer)
+    gaussians = read_with_notes(file, observer, strict=options.strict, linear=options.linear)
     if not len(gaussians):
         raise InputError(f"{file}: expected Gaussians, got a file of none.")
     provenance = _provenance(file, backend)
@@ -159,11 +161,13 @@ def _provenance(file: Path, backend: str) -> dict[str, Any]:
     }
 
 
-def read_with_notes(file: Path, observer: Observer) -> Gaussians:
-    """The Gaussians of a splat file; what is odd about it goes to the observer."""
+def read_with_notes(
+    file: Path, observer: Observer, *, strict: bool, linear: tuple[Values, ...]
+) -> Gaussians:
+    """The Gaussians of a splat file, see `read_splats`; what is odd goes to the observer."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SplatWarning)
-        gaussians = read_splats(file)
+        gaussians = read_splats(file, strict=strict, linear=linear)
     for warning in caught:
         observer.note(str(warning.message))
     return gaussians

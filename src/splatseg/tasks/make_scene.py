@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from splatseg.fit import (
     random_point_count,
     reduction_note,
 )
+from splatseg.io.captures import read_start_points
 from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import save_scene
@@ -49,7 +50,7 @@ class MakeSceneOptions(CheckpointOptions):
     """How the capture is read: auto, or one of `io.captures.FORMATS`."""
 
     strict: bool = False
-    """Refuse a capture that lists a photograph which is not there."""
+    """Refuse a capture that lists a photograph which would be left out; see `read_capture`."""
 
     poses: Poses = "auto"
     """Where cameras come from: given, the capture; sfm, from the photographs alone; pointmaps,
@@ -76,6 +77,10 @@ class MakeSceneOptions(CheckpointOptions):
     """Scans of lasers, in any layout that `splatseg.io.scans.read_scans` reads and in the world of
     the capture: their points are where the fit starts, and the depth that it learns with the
     metric depth option. None uses none."""
+
+    points: Path | None = None
+    """A PLY file of points, or of a mesh, in the world of the capture: where the fit starts,
+    instead of the capture's own points."""
 
     moving: Path | None = None
     """Boxes of moving things, which are left out of training views and of scans: a JSON file, a
@@ -252,6 +257,13 @@ def _capture(
             seed=fit_options.seed,
             observer=observer,
         )
+    if options.points is not None:
+        if poses is not None:
+            raise InputError("points: expected none where poses are found, whose world is new.")
+        if options.scans is not None:
+            raise InputError("points: expected none with scans, whose points the fit starts at.")
+        points, notes = read_start_points(options.points, strict=options.strict)
+        capture = replace(capture, points=points, notes=(*capture.notes, *notes))
     if options.depth_evidence is not None:
         if fit_options.depth == "off":
             raise InputError("depth: expected metric or relative with evidence of depth, got off.")
@@ -342,6 +354,7 @@ def _record(options: MakeSceneOptions, moving: LeftOut | None) -> dict[str, Any]
         "preset": options.preset,
         **({} if options.depth_evidence is None else {"depth_evidence": options.depth_evidence}),
         **({} if options.scans is None else {"scans": str(options.scans)}),
+        **({} if options.points is None else {"points": str(options.points)}),
         **({} if moving is None else {"moving": moving.record}),
     }
 

@@ -216,7 +216,7 @@ def test_files_that_cannot_be(file, content, error, message, root) -> None:
 def test_photographs_that_lack_or_are_of_another_size(root) -> None:
     picture(root / "data_2d_raw" / DRIVE / "image_00/data_rect/0000000003.png", 20, 20)
     with pytest.raises(InputError, match=r"0000000003.png: expected a photograph of 16x8 pixels"):
-        read_capture(root)
+        read_capture(root, strict=True)
     for camera in ("image_00", "image_01"):
         (root / "data_2d_raw" / DRIVE / camera).rename(root / camera)
     with pytest.raises(MissingFileError, match="expected image_00/data_rect or image_01/data_rect"):

@@ -111,8 +111,8 @@ def test_blender(tmp_path, write_image) -> None:
         write_image(tmp_path / f"train/r_{i}.png")
     capture = read_capture(tmp_path)
     assert [view.name for view in capture.views] == ["r_0", "r_2"]
-    assert capture.missing == ("train/r_1.png",)
-    with pytest.raises(MissingFileError, match=r"1 of 3 .*train/r_1.png"):
+    assert capture.missing == ("train/r_1",)
+    with pytest.raises(MissingFileError, match=r"1 of 3 .*train/r_1"):
         read_capture(tmp_path, strict=True)
 
 

@@ -163,7 +163,10 @@ def test_photographs_of_a_uniform_scale_are_taken_and_it_is_said(nerfstudio) -> 
         ({"fl_x": 0}, "positive focal length, got fx = 0"),
         ({"fl_y": -3}, "positive focal length, got fy = -3"),
         ({"cx": "left"}, "cx: expected a finite number, got 'left'"),
-        ({"w": None}, "expected the image size as w and h"),
+        (
+            {"fl_x": None, "fl_y": None},
+            "expected a focal length .fl_x, camera_angle_x or x_fov., got none",
+        ),
         ({"camera_model": "EQUIRECTANGULAR"}, "got 'EQUIRECTANGULAR'"),
         ({"ply_file_path": "gone.ply"}, r"transforms.json: the start points .* \('gone.ply'\)"),
         ({"k1": float("nan")}, "k1: expected a finite number, got nan"),
@@ -171,7 +174,7 @@ def test_photographs_of_a_uniform_scale_are_taken_and_it_is_said(nerfstudio) -> 
 )
 def test_impossible_intrinsics_are_refused(nerfstudio, top, message) -> None:
     with pytest.raises(InputError, match=message):
-        read_capture(nerfstudio(top=top))
+        read_capture(nerfstudio(top=top), strict=True)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +197,7 @@ def test_words_that_no_file_can_hold_are_refused_with_the_captures_name(
 def test_a_long_name_of_start_points_is_cut(nerfstudio) -> None:
     folder = nerfstudio(top={"ply_file_path": "x" * 5000})
     with pytest.raises(MissingFileError, match=r"transforms\.json: the start points") as caught:
-        read_capture(folder)
+        read_capture(folder, strict=True)
     assert len(str(caught.value)) < 300 + len(str(folder))
 
 
@@ -209,7 +212,7 @@ def _changed(change) -> dict:
     [
         (
             _changed(lambda m: m.__setitem__((0, 3), math.nan)),
-            "transform_matrix: .* finite number, got nan",
+            r"b.png'?: expected a finite pose, got 1 values of 16 that are not",
         ),
         (_changed(lambda m: m.__imul__(2)), r"b.png'?: expected a rotation in its pose"),
         (
@@ -223,7 +226,7 @@ def _changed(change) -> dict:
 )
 def test_impossible_poses_are_refused(nerfstudio, frame, message) -> None:
     with pytest.raises(InputError, match=message):
-        read_capture(nerfstudio(frames={1: frame}))
+        read_capture(nerfstudio(frames={1: frame}), strict=True)
 
 
 def test_a_rotation_written_with_few_digits_is_made_exact(nerfstudio) -> None:

@@ -178,7 +178,7 @@ LENS = "[CameraCalibrationComponent]"
 )
 def test_broken_components(tmp_path, changes, words) -> None:
     with pytest.raises(InputError) as caught:
-        read_capture(write_segment(tmp_path, **changes))
+        read_capture(write_segment(tmp_path, **changes), strict=True)
     assert words in str(caught.value)
     assert str(tmp_path) in str(caught.value)
     assert str(caught.value).count("\n") == 0

@@ -149,10 +149,23 @@ def test_the_alpha_of_a_mask_is_the_mask(tmp_path) -> None:
     assert load_mask(view_of(None, 2, 1, mask=tmp_path / "m.png")).tolist() == [[0, 1]]
 
 
-def test_a_mask_of_another_size_is_refused(tmp_path) -> None:
-    Image.fromarray(np.zeros((3, 3), np.uint8)).save(tmp_path / "m.png")
-    with pytest.raises(FileFormatError, match=r"m.png: expected 6x4 pixels .* got 3x3"):
+def test_a_mask_of_another_shape_is_refused(tmp_path) -> None:
+    Image.fromarray(np.zeros((6, 4), np.uint8)).save(tmp_path / "m.png")
+    with pytest.raises(FileFormatError, match=r"m.png: expected 6x4 pixels .* got 4x6"):
         load_mask(view_of(None, mask=tmp_path / "m.png"))
+
+
+@pytest.mark.parametrize("scale", [0.5, 2, 3])
+@pytest.mark.parametrize("longest", [None, 16])
+def test_a_mask_of_a_uniform_scale_covers_the_photograph(tmp_path, scale, longest) -> None:
+    """Its left half leaves out the photograph's, at whatever size it is worked on."""
+    mask = np.full((int(24 * scale), int(32 * scale)), 255, np.uint8)
+    mask[:, : int(16 * scale)] = 0
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    found = load_mask(view_of(None, 32, 24, mask=tmp_path / "m.png"), longest=longest)
+    width = longest or 32
+    assert found.shape == (width * 3 // 4, width)
+    assert (found == (torch.arange(width) >= width // 2)).all()
 
 
 @pytest.mark.parametrize("channels", [None, 1, 3, 4])

@@ -7,12 +7,14 @@ the first of `FORMATS` wins.
 from pathlib import Path
 
 from splatseg._check import check_choice
-from splatseg.core import Capture
+from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._metadata import Metadata as Metadata
 from splatseg.io.captures._metadata import read_metadata as read_metadata
+from splatseg.io.captures._points import read_ply_points
 from splatseg.io.captures.blender import find_blender, read_blender
+from splatseg.io.captures.build import finite_points
 from splatseg.io.captures.colmap import find_colmap, read_colmap
 from splatseg.io.captures.idr import FILES as _IDR_FILES
 from splatseg.io.captures.idr import find_idr, read_idr
@@ -42,9 +44,13 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     """Read a capture: cameras, split, start points and classes, not the photographs themselves.
 
     Views are sorted by name. The split is the capture's own, else every 8th view by sorted
-    name (0, 8, 16, ...) is a test view. Photographs are checked to be there and to have the
-    size their intrinsics say, or a uniform scale of it, which is noted. Those that are listed
-    and not there are left out, which is noted too, as long as half of them are there.
+    name (0, 8, 16, ...) is a test view. Photographs are checked to be there, under their name or
+    their stem, and to have the size their intrinsics say, or a uniform scale of it, which is
+    noted. Where fewer than half are there, the capture's own folders stand for those of another
+    machine, and folders of smaller copies (``images_2``, ``images_4``, ``images_8``) for theirs.
+    Those that are not there, cannot be opened, are of another shape than their intrinsics or mask,
+    or have an impossible pose or lens are left out, which is noted too, as long as half of them can
+    be used; so are start points that are not finite.
 
     Args:
         path: The capture's folder, or its transforms.json, poses_bounds.npy,
@@ -52,7 +58,8 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             segment of Waymo, or of KITTI-360 a drive, a camera or a window of frames of one
             (see `kitti360_drive`).
         format: One of `FORMATS`, or ``auto`` for the first of them that is found.
-        strict: Refuse a capture that lists a photograph which is not there.
+        strict: Refuse a capture of which a photograph or a start point would be left out, or
+            whose ``ply_file_path`` is not there.
 
     Returns:
         The capture, with `notes` on what a person should know of how it was read.
@@ -60,8 +67,9 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
     Raises:
         MissingFileError: If there is no such folder, or more than half of the photographs (with
             `strict` any) are missing.
-        InputError: If no layout is found, or what it says cannot be; one sentence with the
-            reason.
+        InputError: If no layout is found, what it says cannot be, or more than half of the
+            photographs (with `strict` any) cannot be used; one sentence with the reason.
+        MissingPackageError: If a lens needs pycolmap, and that is not installed.
     """
     check_choice("format", format, ("auto", *FORMATS))
     folder = Path(path)
@@ -97,6 +105,24 @@ def read_capture(path: Path | str, *, format: str = "auto", strict: bool = False
             return read_scannetpp(folder, strict=strict)
         case _:
             return read_kitti360(folder, strict=strict)
+
+
+@boundary
+def read_start_points(
+    path: Path | str, *, strict: bool = False
+) -> tuple[PointCloud, tuple[str, ...]]:
+    """Points of a PLY file of points or of a mesh, and notes on those that are left out.
+
+    Args:
+        path: The file.
+        strict: Refuse points that are NaN or infinite.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        InputError: If it is no PLY of points, or all of them, any with `strict`, are not finite.
+    """
+    file = Path(path)
+    return finite_points(read_ply_points(file), where=file, strict=strict)
 
 
 @boundary

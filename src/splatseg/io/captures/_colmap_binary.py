@@ -153,9 +153,6 @@ def read_points(path: Path) -> PointCloud:
         colours[row] = (red, green, blue)
         cursor.skip(8 * int(track))
     cursor.finish()
-    if not np.isfinite(points).all():
-        bad = int((~np.isfinite(points)).any(axis=1).sum())
-        raise FileFormatError(f"{path}: {bad} of {count} points are not finite.")
     return point_cloud(points, colours)
 
 

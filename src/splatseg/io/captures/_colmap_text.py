@@ -80,9 +80,6 @@ def read_points(path: Path) -> PointCloud:
 
     rows = _parsed(path, _rows(path), parse, "POINT3D_ID X Y Z R G B ERROR")
     values = np.array(rows, np.float64).reshape(-1, 6)
-    if not np.isfinite(values).all():
-        bad = int((~np.isfinite(values)).any(axis=1).sum())
-        raise FileFormatError(f"{path}: {bad} of {len(values)} points are not finite.")
     return point_cloud(values[:, :3], values[:, 3:].astype(np.uint8))
 
 

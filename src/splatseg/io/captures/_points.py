@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from splatseg.core import PointCloud
 from splatseg.core.sh import SH_C0
-from splatseg.io.ply_vertices import ply_columns, read_ply_vertices, vertex_positions
+from splatseg.io.ply_vertices import ply_columns, read_ply_vertices
 
 
 def point_cloud(points: NDArray[np.floating], colours: NDArray[np.uint8] | None) -> PointCloud:
-    """A point cloud of NumPy arrays."""
+    """A point cloud of NumPy arrays; what is not finite in them stays, see `build_capture`."""
+    with np.errstate(over="ignore"):
+        narrow = np.ascontiguousarray(points, np.float32)
     return PointCloud(
-        points=torch.from_numpy(np.ascontiguousarray(points, np.float32)),
+        points=torch.from_numpy(narrow),
         colours=None if colours is None else torch.from_numpy(np.ascontiguousarray(colours)),
     )
 
@@ -31,10 +33,11 @@ def read_ply_points(path: Path) -> PointCloud:
 
     Raises:
         MissingFileError: If there is no such file.
-        FileFormatError: If it is not a PLY of points, ends early, or holds NaN or infinity.
+        FileFormatError: If it is not a PLY of points, or ends early.
     """
     columns = read_ply_vertices(path)
-    return point_cloud(vertex_positions(path, columns), vertex_colours(columns))
+    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    return point_cloud(positions, vertex_colours(columns))
 
 
 def vertex_colours(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8] | None:

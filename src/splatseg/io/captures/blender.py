@@ -7,10 +7,8 @@ from typing import Any
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures._points_beside import points_beside
-from splatseg.io.captures.build import Intrinsics, RawView, build_capture
-from splatseg.io.captures.nerfstudio import cam_from_world_of, focal_of, number
-from splatseg.io.foreign import is_file
-from splatseg.io.images import IMAGE_SUFFIXES, image_size
+from splatseg.io.captures.build import RawView, build_capture
+from splatseg.io.captures.nerfstudio import cam_from_world_of, intrinsics_of_frame
 from splatseg.io.json_files import read_json
 
 SPLITS = ("train", "val", "test")
@@ -24,9 +22,10 @@ def find_blender(folder: Path) -> bool:
 def read_blender(folder: Path, *, strict: bool = False) -> Capture:
     """Read a NeRF-synthetic capture; see `read_capture`.
 
-    One file a split; ``camera_angle_x`` (radians) gives the focal length, the principal point
-    is the middle, and ``file_path`` has no suffix (png is tried first). Poses are as in
-    transforms.json. Transparent pixels are blended over white when a photograph is read.
+    One file a split. ``camera_angle_x`` (radians) gives the focal length, the principal point
+    is the middle and the size that of the photographs, unless the file has other intrinsics of
+    transforms.json; ``file_path`` has no suffix (png is tried first). Poses are as there.
+    Transparent pixels are blended over white when a photograph is read.
 
     Raises:
         InputError: If a file is broken, or what it says cannot be.
@@ -54,19 +53,10 @@ def _raw_view(content: Mapping[str, Any], frame: object, split: str, *, path: Pa
     image = path.parent / relative
     if not image.name:
         raise FileFormatError(f"{where}: expected a file_path that names a file, got none.")
-    if image.suffix.lower() not in IMAGE_SUFFIXES:
-        tried = [image.parent / f"{image.name}{suffix}" for suffix in (".png", ".jpg", ".jpeg")]
-        image = next((file for file in tried if is_file(file)), tried[0])
-        relative += image.suffix
-    # The layout does not tell the size; a photograph that is missing is reported later.
-    width, height = image_size(image) if is_file(image) else (1, 1)
-    focal = focal_of(number({**content, **entry}, "camera_angle_x", None, where=where), width)
     return RawView(
         image=image,
         relative=relative,
-        intrinsics=Intrinsics(
-            fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height
-        ),
+        intrinsics=intrinsics_of_frame({**content, **entry}, where=where),
         cam_from_world=cam_from_world_of(entry, where=where),
         split=split,
     )

@@ -7,9 +7,10 @@ the same mistakes in the same words.
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -20,8 +21,9 @@ from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.core.view_names import clean_view_names
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures._metadata import read_metadata
+from splatseg.io.captures._photographs import Photographs, moves
 from splatseg.io.foreign import is_file, made_from
-from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size
+from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size, same_shape
 from splatseg.io.paths import check_utf8
 
 TEST_EVERY = 8
@@ -61,6 +63,10 @@ class Intrinsics:
     height: int | None
 
 
+OfSize: TypeAlias = Callable[[int, int], Intrinsics]
+"""Intrinsics of a photograph by its width and height, where the layout does not tell its size."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RawView:
     """One photograph as a layout describes it, unchecked."""
@@ -71,9 +77,12 @@ class RawView:
     relative: str
     """The photograph's path as the layout writes it; names come from it."""
 
-    intrinsics: Intrinsics
+    intrinsics: Intrinsics | OfSize
     cam_from_world: NDArray[np.float64]
     """4 x 4, OpenCV axes."""
+
+    copy_of: int = 1
+    """Pixels of the photograph that the intrinsics are of for one of `image`, a smaller copy."""
 
     split: str | None = None
     mask: Path | None = None
@@ -93,13 +102,17 @@ def build_capture(
 ) -> Capture:
     """Check what a reader found and make the capture of it.
 
-    Photographs that are listed and not there are left out, and a note names them. They are
-    left out before views are split, and after they are named: a view keeps its name when the
-    others come back.
+    Photographs are sought by their stem too, and where fewer than half are where they are listed,
+    in the capture's own folders and in folders of smaller copies. Those that are not there, cannot
+    be opened, are of another shape than their intrinsics or their mask, or have an impossible pose
+    or lens are left out, and a note names them. They are left out before views are split, and after
+    they are named: a view keeps its name when the others come back. Start points that are not
+    finite are left out and counted.
 
     Raises:
-        InputError: If there is no photograph, one is listed twice, a pose or focal length is
-            impossible, or a photograph's size is not that of its intrinsics.
+        InputError: If there is no photograph, one is listed twice, more than half of the
+            photographs, any with `strict`, cannot be used, or all points, any with `strict`, are
+            not finite.
         MissingFileError: If more than half of the photographs are missing, or any with
             `strict`, or masks or depth maps of those that are there.
     """
@@ -107,6 +120,7 @@ def build_capture(
         raise InputError(
             f"{path}: expected photographs with poses, got a {format} capture of none."
         )
+    raw, found_notes = _located(path, raw)
     with made_from(path):
         names = view_names([view.relative for view in raw])
     order = sorted(range(len(raw)), key=lambda i: names[i])
@@ -114,13 +128,31 @@ def build_capture(
     _check_missing(path, missing, listed=len(raw), strict=strict)
     order = [i for i in order if is_file(raw[i].image)]
     left_out = [_left_out(missing, listed=len(raw))] if missing else []
-    raw, names = [raw[i] for i in order], [names[i] for i in order]
-    _check_paths(path, raw)
-    _check_files(path, raw)
-    splits, split_note = _splits(raw)
-    views, scaled = _made_views(path, raw, names, splits)
+    cameras, camera_notes = _cameras(path, raw, order, strict=strict)
+    order = [i for i in order if i in cameras]
+    used = [raw[i] for i in order]
+    _check_paths(path, used)
+    _check_files(path, used)
+    splits, split_note = _splits(used)
+    with made_from(path):
+        views = [
+            View(
+                name=names[i],
+                camera=cameras[i],
+                image=raw[i].image,
+                split=split,
+                mask=raw[i].mask,
+                depth=raw[i].depth,
+                depth_unit=raw[i].depth_unit,
+            )
+            for i, split in zip(order, splits, strict=True)
+        ]
     metadata = read_metadata(path)
-    found = (*left_out, *notes, *scaled, *([split_note] if split_note else []), *_size_notes(views))
+    point_notes: tuple[str, ...] = ()
+    if points is not None:
+        points, point_notes = finite_points(points, where=path, strict=strict)
+    found = (*left_out, *found_notes, *camera_notes, *point_notes, *notes)
+    found += (*([split_note] if split_note else []), *_size_notes(views))
     with made_from(path):
         return Capture(
             path=path,
@@ -136,32 +168,144 @@ def build_capture(
         )
 
 
-def _made_views(
-    path: Path, raw: Sequence[RawView], names: Sequence[str], splits: Sequence[str]
-) -> tuple[list[View], tuple[str, ...]]:
-    """Views of photographs that are there, and notes of intrinsics that were scaled to them."""
-    scaled: list[str] = []
-    views: list[View] = []
-    for view, name, split in zip(raw, names, splits, strict=True):
-        width, height = image_size(view.image)
-        intrinsics = scaled_to(view.intrinsics, (width, height), where=str(view.image))
-        if intrinsics is not view.intrinsics and view.intrinsics.width is not None:
-            before = f"{view.intrinsics.width}x{view.intrinsics.height}"
-            scaled.append(f"intrinsics of {before} were scaled to photographs of {width}x{height}")
-        where = f"{path}: {view.relative}"
-        camera = _camera(view, intrinsics, width, height, where=where)
-        with made_from(where):
-            made = View(
-                name=name,
-                camera=camera,
-                image=view.image,
-                split=split,
-                mask=view.mask,
-                depth=view.depth,
-                depth_unit=view.depth_unit,
+def finite_points(
+    points: PointCloud, *, where: Path, strict: bool
+) -> tuple[PointCloud, tuple[str, ...]]:
+    """Start points without those that are NaN or infinite, and a note that counts them.
+
+    Raises:
+        InputError: If all are, or any with `strict`; `where` starts the message.
+    """
+    kept = torch.isfinite(points.points).all(dim=1)
+    lost = int((~kept).sum())
+    if lost == 0:
+        return points, ()
+    if strict or lost == len(points):
+        raise InputError(f"{where}: {lost} of {len(points)} start points are not finite.")
+    colours = None if points.colours is None else points.colours[kept]
+    note = f"{lost} of {len(points)} start points are not finite and are left out"
+    return PointCloud(points=points.points[kept], colours=colours), (note,)
+
+
+def _located(path: Path, raw: Sequence[RawView]) -> tuple[list[RawView], list[str]]:
+    """Views with the photographs that are there instead of the paths that are listed, and notes."""
+    photographs = Photographs()
+    there = photographs.find_all([view.image for view in raw])
+    notes: list[str] = []
+    number, move = 1, None
+    if sum(file is not None for file in there) < MIN_THERE * len(raw):
+        for pixels, candidates in moves(path):
+            found = [_moved(photographs, candidates(view.image)) for view in raw]
+            files = [file for file in found if file is not None]
+            # Without its first folders a path may be that of another photograph too.
+            if len(files) >= MIN_THERE * len(raw) and len(set(files)) == len(files):
+                there, number, move = found, pixels, candidates
+                folder = files[0].parent
+                where = folder.relative_to(path) if folder.is_relative_to(path) else folder
+                notes.append(
+                    f"photographs were read from {_first([str(where)])}, as they are not where the "
+                    "capture lists them"
+                )
+                break
+    located: list[RawView] = []
+    others: list[str] = []
+    for view, file in zip(raw, there, strict=True):
+        if file is None:
+            located.append(view)
+            continue
+        suffix = file.suffix if file.stem == view.image.name else ""
+        if not suffix and file.name != view.image.name:
+            others.append(view.relative)
+        if move is not None:
+            mask, depth = (
+                next((c for c in move(f) if is_file(c)), f) if f else None
+                for f in (view.mask, view.depth)
             )
-        views.append(made)
-    return views, tuple(dict.fromkeys(scaled))
+            view = replace(view, mask=mask, depth=depth, copy_of=number)
+        located.append(replace(view, image=file, relative=view.relative + suffix))
+    if others:
+        notes.append(
+            f"{len(others)} photographs have another suffix or case than the capture lists "
+            f"({_first(others)})"
+        )
+    return located, notes
+
+
+def _moved(photographs: Photographs, candidates: Sequence[Path]) -> Path | None:
+    """The first of these that is there, None where none is."""
+    for candidate in candidates:
+        if (file := photographs.find(candidate)) is not None:
+            return file
+    return None
+
+
+def _cameras(
+    path: Path, raw: Sequence[RawView], order: Sequence[int], *, strict: bool
+) -> tuple[dict[int, Camera], list[str]]:
+    """Cameras of the photographs that can be used, by index, and notes of them and the others.
+
+    Raises:
+        InputError: The complaint about the first that cannot, if it is one of more than half
+            with those that are not there, or with `strict`.
+    """
+    cameras: dict[int, Camera] = {}
+    unfit: dict[str, list[str]] = {}
+    scaled: list[str] = []
+    first: InputError | None = None
+    for i in order:
+        view, fault = raw[i], "cannot be opened"
+        try:
+            size = image_size(view.image)
+            fault = "are of another shape than their intrinsics say"
+            written = _of_size(view, size)
+            intrinsics = scaled_to(written, size, where=str(view.image))
+            fault = "have a mask that cannot be opened or is of another shape"
+            mask = _mask_size(view, size)
+            fault = "have a pose or a lens that no camera has"
+            with made_from(where := f"{path}: {view.relative}"):
+                cameras[i] = _camera(view, intrinsics, size, where=where)
+        except InputError as error:
+            unfit.setdefault(fault, []).append(view.relative)
+            first = first or error
+            continue
+        for what, (width, height) in (
+            ("intrinsics", (written.width or size[0], written.height or size[1])),
+            ("masks", mask),
+        ):
+            if (width, height) != size:
+                to = f"photographs of {size[0]}x{size[1]}"
+                scaled.append(f"{what} of {width}x{height} were scaled to {to}")
+    if first is not None and (strict or len(cameras) < MIN_THERE * len(raw)):
+        raise first
+    notes = [
+        f"{len(names)} of {len(raw)} photographs {fault} and are left out ({_first(names, _NAMED)})"
+        for fault, names in unfit.items()
+    ]
+    return cameras, [*notes, *dict.fromkeys(scaled)]
+
+
+def _mask_size(view: RawView, size: tuple[int, int]) -> tuple[int, int]:
+    """The size of a view's mask, that of its photograph where it has none or it is missing.
+
+    Raises:
+        InputError: If it is no uniform scale of the photograph's, or it cannot be opened.
+    """
+    if view.mask is None or not is_file(view.mask):
+        return size
+    mask = image_size(view.mask)
+    if not same_shape(*size, *mask):
+        raise InputError(
+            f"{view.mask}: expected a mask of {size[0]}x{size[1]} pixels as its photograph has, or "
+            f"a uniform scale of it, got {mask[0]}x{mask[1]}."
+        )
+    return mask
+
+
+def _of_size(view: RawView, size: tuple[int, int]) -> Intrinsics:
+    """The intrinsics of a view whose photograph has this size."""
+    if isinstance(view.intrinsics, Intrinsics):
+        return view.intrinsics
+    return view.intrinsics(size[0] * view.copy_of, size[1] * view.copy_of)
 
 
 def view_names(relatives: Sequence[str]) -> list[str]:
@@ -218,21 +362,18 @@ def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> I
     if not (1 <= intrinsics.width <= MAX_SIDE and 1 <= intrinsics.height <= MAX_SIDE):
         raise InputError(
             f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got "
-            f"{intrinsics.width}x{intrinsics.height}."
+            f"{quoted(intrinsics.width)}x{quoted(intrinsics.height)}."
         )
     if (intrinsics.width, intrinsics.height) == size:
         return intrinsics
-    sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
-    uniform = (
-        abs(sx * intrinsics.height - size[1]) <= 1 or abs(sy * intrinsics.width - size[0]) <= 1
-    )
-    if not uniform:
-        turned = abs(size[1] / intrinsics.width * intrinsics.height - size[0]) <= 1
+    if not same_shape(intrinsics.width, intrinsics.height, *size):
+        turned = same_shape(intrinsics.height, intrinsics.width, *size)
         hint = "; turned by its EXIF orientation, perhaps" if turned else ""
         raise InputError(
-            f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or "
-            f"a uniform scale of it, as its intrinsics say, got {size[0]}x{size[1]}{hint}."
+            f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or a "
+            f"uniform scale of it, as its intrinsics say, got {size[0]}x{size[1]}{hint}."
         )
+    sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
     return replace(
         intrinsics,
         width=size[0],
@@ -278,18 +419,18 @@ def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64
 def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back).
 
-    A singular one comes back as it is: no rotation, which `checked_pose` refuses in its own words.
+    One that is singular or not finite comes back as it is: no pose, which `checked_pose` refuses in
+    its own words.
     """
-    world_from_opencv = world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
+    if not np.isfinite(world_from_cam).all():
+        return world_from_cam
     try:
-        return np.linalg.inv(world_from_opencv).astype(np.float64)
+        return np.linalg.inv(world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).astype(np.float64)
     except np.linalg.LinAlgError:
-        return world_from_opencv
+        return world_from_cam
 
 
-def _camera(
-    view: RawView, intrinsics: Intrinsics, width: int, height: int, *, where: str
-) -> Camera:
+def _camera(view: RawView, intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Camera:
     for name in ("fx", "fy"):
         value = float(getattr(intrinsics, name))
         if not (math.isfinite(value) and value > 0):
@@ -298,10 +439,11 @@ def _camera(
     if not all(math.isfinite(value) for value in rest):
         raise InputError(f"{where}: expected finite intrinsics, got {rest}.")
     pose = checked_pose(view.cam_from_world, where=where)
-    distorted = intrinsics.model == "fisheye" or any(intrinsics.distortion)
+    angular = intrinsics.model in ("fisheye", "thin_prism_fisheye")
+    distorted = angular or any(intrinsics.distortion)
     return Camera(
-        width=width,
-        height=height,
+        width=size[0],
+        height=size[1],
         fx=intrinsics.fx,
         fy=intrinsics.fy,
         cx=intrinsics.cx,

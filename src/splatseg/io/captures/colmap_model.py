@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, PointCloud
 from splatseg.errors import InputError, quoted
-from splatseg.io.captures.build import Intrinsics
+from splatseg.io.captures.build import MAX_SIDE, Intrinsics
 
 MODELS: dict[int, tuple[str, int]] = {
     0: ("SIMPLE_PINHOLE", 3),
@@ -51,6 +51,7 @@ _LENSES: dict[str, tuple[CameraModel, int]] = {
     "RADIAL_FISHEYE": ("fisheye", 1),
     "SIMPLE_FISHEYE": ("fisheye", 1),
     "FISHEYE": ("fisheye", 2),
+    "THIN_PRISM_FISHEYE": ("thin_prism_fisheye", 2),
 }
 # Our lens model and the number of focal lengths. The principal point follows them, then the
 # distortion in OpenCV's order, of which the simpler models give the first values.
@@ -108,15 +109,17 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
     """The lens of a COLMAP camera as ours.
 
     SIMPLE_RADIAL and RADIAL are OpenCV's k1 and k2; the fisheye models are OpenCV's polynomial
-    in the angle, theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
+    in the angle, theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8). Models
+    that are not ours go through pycolmap, see `lens_by_pycolmap`.
 
     Raises:
-        InputError: If the model is one that cannot be undistorted here, or parameters lack.
+        InputError: If the model is one that cannot be undistorted, or parameters lack.
+        MissingPackageError: If it needs pycolmap, and that is not installed.
     """
-    if camera.model not in _LENSES:
+    if camera.model not in PARAMETER_COUNTS:
         raise InputError(
-            f"{where}: expected a camera model that can be undistorted ({', '.join(_LENSES)}), "
-            f"got {quoted(camera.model)}; undistort the photographs with COLMAP first."
+            f"{where}: expected a camera model of COLMAP ({', '.join(PARAMETER_COUNTS)}), "
+            f"got {quoted(camera.model)}."
         )
     expected, values = PARAMETER_COUNTS[camera.model], camera.parameters
     if len(values) != expected:
@@ -124,6 +127,12 @@ def intrinsics_of(camera: ColmapCamera, *, where: str) -> Intrinsics:
             f"{where}: expected {expected} parameters of a {camera.model} camera, "
             f"got {len(values)}."
         )
+    if camera.model not in _LENSES:
+        if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
+            raise InputError(f"{where}: expected 1 to {MAX_SIDE} pixels a side, got others.")
+        from splatseg.io.captures._pycolmap_lens import lens_by_pycolmap
+
+        return lens_by_pycolmap(camera.model, camera.width, camera.height, values, where=where)
     model, focals = _LENSES[camera.model]
     cx, cy, *distortion = values[focals:]
     return Intrinsics(

@@ -17,6 +17,7 @@ from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import (
     MAX_SIDE,
     Intrinsics,
+    OfSize,
     RawView,
     build_capture,
     opencv_from_opengl,
@@ -38,28 +39,45 @@ _MODELS: dict[str, CameraModel] = {
     "FULL_OPENCV": "opencv",
     "OPENCV_FISHEYE": "fisheye",
     "MEI": "mei",
+    "THIN_PRISM_FISHEYE": "thin_prism_fisheye",
 }
-_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE = ("k1", "k2", "k3", "k4")
-_KEYS: dict[CameraModel, tuple[str, ...]] = {
-    "opencv": _OPENCV,
-    "fisheye": _FISHEYE,
+_FOCALS = (
+    (("fl_x", "fl_y"), None),
+    (("camera_angle_x", "camera_angle_y"), 1.0),
+    (("x_fov", "y_fov"), math.pi / 180),
+)
+"""Keys of focal lengths in pixels, and of fields of view with their unit in radians; the first that
+is there counts. Those in degrees are instant-ngp's."""
+
+LENS_KEYS: dict[CameraModel, tuple[str, ...]] = {
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
     "mei": ("xi", "k1", "k2", "p1", "p2"),
+    "thin_prism_fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
 }
+"""Keys of the distortion of a lens model, in the order of `Camera.distortion`."""
+
+
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
+"""Keys by which instant-ngp knows lenses that a plane does not hold."""
 
 
 def read_nerfstudio(folder: Path, *, file: str = FILE, strict: bool = False) -> Capture:
     """Read a capture with a transforms.json; see `read_capture`.
 
     Intrinsics stand at the top or in a frame, which wins: ``fl_x fl_y cx cy w h`` in pixels
-    (or ``camera_angle_x`` in radians), ``camera_model``, and distortion as OpenCV names it.
+    (or ``camera_angle_x`` in radians, or ``x_fov`` in degrees; without ``w h`` the photograph's
+    size is taken),
+    ``camera_model``, and distortion as OpenCV names it.
     ``transform_matrix`` is world_from_cam with OpenGL axes (x right, y up, z backwards).
     ``mask_path``, ``depth_file_path`` and ``split`` of a frame are taken over. Start points
     come from ``ply_file_path``, else from points3D.ply, sparse_pc.ply or points3D.bin beside
-    it. A ply_file_path that holds Gaussians is the capture's splat file as well.
+    it. A ply_file_path that holds Gaussians is the capture's splat file as well; one that is not
+    there is noted.
 
     Raises:
-        MissingFileError: If transforms.json, or a file that it names, is missing.
+        MissingFileError: If transforms.json, or a file that it names (ply_file_path with `strict`
+            only), is missing.
         InputError: If it is broken, or what it says cannot be.
     """
     path = folder / file
@@ -70,20 +88,23 @@ def read_nerfstudio(folder: Path, *, file: str = FILE, strict: bool = False) -> 
         _raw_view(content, frame, split, path=path, index=i)
         for i, (frame, split) in enumerate(zip(frames, splits, strict=True))
     ]
-    points, splats = _points(content, folder)
+    points, splats, notes = _points(content, folder, strict=strict)
     return build_capture(
-        folder, raw, format="nerfstudio", points=points, splats=splats, strict=strict
+        folder, raw, format="nerfstudio", points=points, splats=splats, notes=notes, strict=strict
     )
 
 
 def frame_matrix(frame: Mapping[str, Any], *, where: str) -> NDArray[np.float64]:
-    """The 4 x 4 ``transform_matrix`` of a frame: world_from_cam, OpenGL axes.
+    """The 4 x 4 ``transform_matrix`` of a frame: world_from_cam, OpenGL axes; NaN stays NaN.
 
     Raises:
         FileFormatError: If it is no matrix of numbers of 4 x 4 or 3 x 4.
     """
     matrix = json_matrix(
-        frame.get("transform_matrix"), where=f"{where}: transform_matrix", shapes=((4, 4), (3, 4))
+        frame.get("transform_matrix"),
+        where=f"{where}: transform_matrix",
+        shapes=((4, 4), (3, 4)),
+        finite=False,
     )
     return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
 
@@ -108,13 +129,18 @@ def lens_of(source: Mapping[str, Any], *, where: str) -> tuple[CameraModel, tupl
     Raises:
         FileFormatError: If the camera model is not one that can be undistorted.
     """
+    for key in _OTHER_LENSES:
+        if source.get(key) not in (None, False):
+            raise FileFormatError(
+                f"{where}: expected a lens that can be undistorted, got one with {key}."
+            )
     default = "OPENCV_FISHEYE" if source.get("is_fisheye") is True else "OPENCV"
     name = source.get("camera_model", default)
     if not isinstance(name, str) or name not in _MODELS:
         known = ", ".join(sorted(_MODELS))
         raise FileFormatError(f"{where}: expected a camera_model of {known}, got {quoted(name)}.")
     model = _MODELS[name]
-    return model, tuple(number(source, key, 0.0, where=where) for key in _KEYS[model])
+    return model, tuple(number(source, key, 0.0, where=where) for key in LENS_KEYS[model])
 
 
 def _frames(content: Mapping[str, Any], path: Path) -> list[Mapping[str, Any]]:
@@ -158,32 +184,28 @@ def _beside(path: Path, name: object) -> Path | None:
     return path.parent / name.replace("\\", "/") if isinstance(name, str) and name else None
 
 
-def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics:
-    """The lens of a frame, or of a file that has one lens.
+def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics | OfSize:
+    """The lens of a frame, or of a file that has one lens; by its size where that is not said.
 
     Args:
         source: The keys of the frame over those of the file.
         where: The file and the frame; starts the message.
 
     Raises:
-        FileFormatError: If the size or a focal length lacks, or the camera model is not one that
-            can be undistorted.
+        FileFormatError: If a focal length lacks, or the camera model is not one that can be
+            undistorted.
     """
     model, distortion = lens_of(source, where=where)
     if "w" not in source or "h" not in source:
-        raise FileFormatError(f"{where}: expected the image size as w and h, got none.")
+
+        def of_size(width: int, height: int) -> Intrinsics:
+            found = intrinsics_of_frame({**source, "w": width, "h": height}, where=where)
+            return found if isinstance(found, Intrinsics) else found(width, height)
+
+        _focals(source, (1, 1), where=where)
+        return of_size
     width, height = size_of(source, where=where)
-    if "fl_x" in source:
-        fx = number(source, "fl_x", None, where=where)
-    else:
-        angle = number(source, "camera_angle_x", None, where=where)
-        fx = focal_of(angle, width)
-    if "fl_y" in source:
-        fy = number(source, "fl_y", None, where=where)
-    elif "camera_angle_y" in source and "fl_x" not in source:
-        fy = focal_of(number(source, "camera_angle_y", None, where=where), height)
-    else:
-        fy = fx
+    fx, fy = _focals(source, (width, height), where=where)
     return Intrinsics(
         model=model,
         fx=fx,
@@ -193,6 +215,24 @@ def intrinsics_of_frame(source: Mapping[str, Any], *, where: str) -> Intrinsics:
         distortion=distortion,
         width=width,
         height=height,
+    )
+
+
+def _focals(source: Mapping[str, Any], size: tuple[int, int], *, where: str) -> tuple[float, float]:
+    """Focal lengths in pixels, from one of `_FOCALS`.
+
+    Either axis stands for both where only it is said.
+    """
+    for keys, radians in _FOCALS:
+        found: list[float] = []
+        for key, side in zip(keys, size, strict=True):
+            if key in source:
+                value = number(source, key, None, where=where)
+                found.append(value if radians is None else focal_of(value * radians, side))
+        if found:
+            return found[0], found[-1]
+    raise FileFormatError(
+        f"{where}: expected a focal length (fl_x, camera_angle_x or x_fov), got none."
     )
 
 
@@ -220,13 +260,17 @@ def focal_of(angle: float, size: float) -> float:
     return 0.5 * size / tangent if tangent > 0 else 0.0
 
 
-def _points(content: Mapping[str, Any], folder: Path) -> tuple[PointCloud | None, Path | None]:
+def _points(
+    content: Mapping[str, Any], folder: Path, *, strict: bool
+) -> tuple[PointCloud | None, Path | None, list[str]]:
+    """Start points, the same as splats where they are some, and notes."""
     name = content.get("ply_file_path")
-    if isinstance(name, str) and name:
-        path = folder / name.replace("\\", "/")
-        if not is_file(path):
-            raise MissingFileError(
-                f"{folder / FILE}: the start points that it names are not there ({quoted(name)})."
-            )
-        return read_ply_points(path), path if ply_holds_splats(path) else None
-    return points_beside(folder), None
+    if not isinstance(name, str) or not name:
+        return points_beside(folder), None, []
+    path = folder / name.replace("\\", "/")
+    if is_file(path):
+        return read_ply_points(path), path if ply_holds_splats(path) else None, []
+    missing = f"the start points that it names are not there ({quoted(name)})"
+    if strict:
+        raise MissingFileError(f"{folder / FILE}: {missing}.")
+    return None, None, [missing]

@@ -6,6 +6,7 @@ described in docs/formats/splats.md.
 """
 
 import zlib
+from collections.abc import Collection
 from pathlib import Path
 from typing import Literal
 
@@ -16,8 +17,11 @@ from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import is_folder
 from splatseg.io.json_files import read_json
-from splatseg.io.splats._common import Losses, StrPath, check_file
+from splatseg.io.splats._common import Losses, StrPath, check_file, warn
 from splatseg.io.splats._common import SplatWarning as SplatWarning
+
+Values = Literal["scales", "opacities"]
+"""What a file may have as it is, where 3DGS has logs and logits."""
 
 SplatFormat = Literal["ply", "compressed.ply", "splat", "ksplat", "spz", "sog", "gltf"]
 WritableFormat = Literal["ply", "compressed.ply", "splat", "spz", "spz3", "sog"]
@@ -34,33 +38,55 @@ _PEEK = 4096
 
 
 @boundary
-def read_splats(path: StrPath) -> Gaussians:
+def read_splats(
+    path: StrPath, *, strict: bool = False, linear: Collection[Values] = ()
+) -> Gaussians:
     """Read Gaussians from a splat file of any known format.
 
-    PLY (3DGS, any further columns kept), SuperSplat's compressed PLY, ``.splat``, ``.ksplat``,
-    SPZ versions 2 to 4, SOG versions 1 and 2 (bundled, or by ``meta.json`` or its folder), and
-    glTF with KHR_gaussian_splatting. In memory scales are linear, opacities in [0, 1], quaternions
-    wxyz of unit length.
+    PLY (3DGS and 2DGS, binary or ASCII, any further columns kept), SuperSplat's compressed PLY,
+    ``.splat``, ``.ksplat``, SPZ versions 2 to 4, SOG versions 1 and 2 (bundled, or by
+    ``meta.json`` or its folder), and glTF with KHR_gaussian_splatting. In memory scales are
+    linear, opacities in [0, 1], quaternions wxyz of unit length.
 
     Args:
-        path: The file; for unbundled SOG its ``meta.json`` or the folder of it.
+        path: The file; for unbundled SOG its ``meta.json`` or the folder of it; of a folder that
+            3DGS trained a model in its last iteration.
+        strict: Refuse a file with Gaussians that cannot be rendered (NaN, infinite, a log scale
+            of minus infinity, zero rotation). Without, they are left out, and
+            the extra column ``source_row`` says which row of the file each of the others is.
+        linear: Which of ``scales`` and ``opacities`` a PLY file has as they are, where 3DGS has
+            logs and logits.
 
     Returns:
         Float32 Gaussians on the CPU, rows in file order.
 
     Raises:
-        FileFormatError: If the file is none of these, is truncated or damaged, or holds a
-            Gaussian that cannot be rendered (NaN, infinite, zero rotation); the sentence
-            starts with the path and says how many rows and which is the first.
+        FileFormatError: If the file is none of these, is truncated or damaged, holds no Gaussian
+            that can be rendered or, with `strict`, one that cannot; the sentence starts with the
+            path and says how many rows and which is the first.
+        InputError: If `linear` is asked of a file that is no PLY of 3DGS.
         MissingFileError: If there is no such file.
 
     Warns:
-        SplatWarning: If the file says something that Gaussians in memory cannot hold.
+        SplatWarning: If rows are left out, columns have other names than those of 3DGS, something
+            was changed on reading (surfels, filters), values look as if they were never logs or
+            logits, or the file says something that Gaussians in memory cannot hold.
     """
     source = Path(path)
-    match splat_format(source):
-        case "ply":
-            from splatseg.io.splats.ply import read_ply as read
+    if (trained := trained_splats(source)) is not None:
+        where = trained.relative_to(source).as_posix()
+        warn(source, f"a model of 3DGS, of which {where} was read.")
+        source = trained
+    format = splat_format(source)
+    if format == "ply":
+        from splatseg.io.splats.ply import read_ply
+
+        return read_ply(source, strict=strict, linear=linear)
+    if linear:
+        raise InputError(
+            f"linear: expected a PLY file of 3DGS, whose values may be logs or not, got {source}."
+        )
+    match format:
         case "compressed.ply":
             from splatseg.io.splats.compressed_ply import read_compressed_ply as read
         case "splat":
@@ -73,7 +99,36 @@ def read_splats(path: StrPath) -> Gaussians:
             from splatseg.io.splats.sog import read_sog as read
         case "gltf":
             from splatseg.io.splats.gltf import read_gltf as read
-    return read(source)
+    return read(source, strict=strict)
+
+
+@boundary
+def trained_splats(folder: StrPath) -> Path | None:
+    """The PLY file of the last iteration of a folder that 3DGS trained a model in, or None."""
+    files = Path(folder).glob("point_cloud/iteration_*/point_cloud.ply")
+    last = max(((_iteration(file), file) for file in files), default=None)
+    return None if last is None else last[1]
+
+
+def _iteration(file: Path) -> int:
+    number = file.parent.name.removeprefix("iteration_")
+    return int(number) if number.isdecimal() and len(number) < 10 else -1
+
+
+@boundary
+def read_scene_splats(path: StrPath) -> Gaussians:
+    """Read the Gaussians of a scene folder: all rows, as layers go by rows, and nothing doubted.
+
+    Raises:
+        FileFormatError: If the file is damaged, or holds a Gaussian that cannot be rendered.
+        MissingFileError: If there is no such file.
+    """
+    source = Path(path)
+    if splat_format(source) != "ply":
+        return read_splats(source, strict=True)
+    from splatseg.io.splats.ply import read_ply
+
+    return read_ply(source, strict=True, own=True)
 
 
 @boundary
@@ -163,11 +218,13 @@ def splat_format(path: StrPath) -> SplatFormat:
         MissingFileError: If there is no such file.
     """
     source = Path(path)
+    source = trained_splats(source) or source
     if is_folder(source):
         if (source / "meta.json").is_file():
             return "sog"
         raise FileFormatError(
-            f"{source}: expected a splat file, got a folder without the meta.json of SOG."
+            f"{source}: expected a splat file, got a folder without the meta.json of SOG or the "
+            "point_cloud of a model of 3DGS."
         )
     check_file(source)
     with source.open("rb") as file:

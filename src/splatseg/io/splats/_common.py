@@ -23,6 +23,7 @@ from torch import Tensor
 from splatseg.core import Gaussians
 from splatseg.core.activations import exponential, sigmoid
 from splatseg.core.gaussians import LOW_PASS
+from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.foreign import is_file, is_folder, read_bytes
 from splatseg.io.limits import check_unpacked
@@ -75,6 +76,21 @@ def check_size(path: Path, count: int, degree: int, *, packed: int) -> None:
         FileFormatError: If these are too many, see `io.limits`.
     """
     check_unpacked(path, count * bytes_in_memory(degree), packed=packed, what=f"{count} Gaussians")
+
+
+def rendered_degree(path: Path, degree: int, *, strict: bool) -> int:
+    """The degree of harmonics up to which they are read.
+
+    Raises:
+        FileFormatError: If there are more in the file, with `strict`.
+    """
+    if degree <= MAX_DEGREE:
+        return degree
+    said = f"harmonics of degree {degree}, of which those up to {MAX_DEGREE} are rendered"
+    if strict:
+        raise FileFormatError(f"{path}: {said}.")
+    warn(path, f"{said}; the others were left out.")
+    return MAX_DEGREE
 
 
 def bytes_in_memory(degree: int) -> int:
@@ -135,18 +151,42 @@ class Rows:
             sh=np.empty((count, coefficients, 3), np.float32),
         )
 
-    def exponentiate(self) -> None:
-        """Turn logs of scales and logits of opacities into values, in place.
+    def exponentiate(self, *, scales: bool = True, opacities: bool = True) -> None:
+        """Turn logs of scales and logits of opacities into values, in place; or one of them.
 
-        Minus infinity becomes scale or opacity 0 and plus infinity opacity 1, as some tools
-        mean it; NaN and a scale beyond float32 stay for `finish` to refuse.
+        A logit of minus infinity becomes opacity 0 and plus infinity opacity 1, as some tools
+        mean it. NaN, a scale beyond float32 and a log scale of minus infinity, which is no
+        Gaussian but a point, stay for `finish` to find.
         """
-        self.scales[:] = exponential(self.scales)
-        self.opacities[:] = sigmoid(self.opacities)
+        if scales:
+            nothing = np.isneginf(self.scales)
+            self.scales[:] = exponential(self.scales)
+            self.scales[nothing] = -np.inf
+        if opacities:
+            self.opacities[:] = sigmoid(self.opacities)
+
+    def __getitem__(self, kept: NDArray[np.bool_]) -> "Rows":
+        """Some of the rows."""
+        return Rows(
+            means=self.means[kept],
+            rotations=self.rotations[kept],
+            scales=self.scales[kept],
+            opacities=self.opacities[kept],
+            sh=self.sh[kept],
+        )
 
 
 ANTIALIASED = "splatseg antialiased"
 """Comment line of a PLY file whose Gaussians are meant for antialiased rendering."""
+
+_ANTIALIASED = {
+    ANTIALIASED: True,
+    "splatrendermode: mip": True,
+    "splatrendermode: default": False,
+    "antialiased 1": True,
+    "antialiased 0": False,
+}
+"""The same as Brush and Postshot say it, in lower case; the last line counts."""
 
 _VARIANCE_LINE = "splatseg low_pass "
 
@@ -166,11 +206,12 @@ class Filter:
     @classmethod
     def from_comments(cls, path: Path, comments: Sequence[str]) -> "Filter":
         """Read the lines that `comments` writes; without one, what 3DGS draws with."""
-        low_pass = LOW_PASS
+        low_pass, antialiased = LOW_PASS, False
         for line in comments:
             if line.startswith(_VARIANCE_LINE):
                 low_pass = _variance(path, line.removeprefix(_VARIANCE_LINE))
-        return cls(antialiased=ANTIALIASED in comments, low_pass=low_pass)
+            antialiased = _ANTIALIASED.get(" ".join(line.lower().split()), antialiased)
+        return cls(antialiased=antialiased, low_pass=low_pass)
 
     def comments(self) -> list[str]:
         """Lines for the header; none for what 3DGS draws with."""
@@ -190,18 +231,31 @@ def _variance(path: Path, text: str) -> float:
     return value
 
 
+_VALUES = "hold values that are NaN or infinite"
+_ROTATION = "have a rotation of length zero"
+
+SOURCE_ROW = "source_row"
+"""Extra column of Gaussians of a file some of whose rows were left out: the row of that file that
+each of them was, from 0, so that what belongs to the file by row can still be found."""
+
+
 def finish(
     path: Path,
     rows: Rows,
     extra: Mapping[str, Tensor] | None = None,
     *,
+    strict: bool,
     drawn: Filter = Filter(),
 ) -> Gaussians:
     """Check every row, give quaternions unit length and make `Gaussians` without a copy.
 
+    Rows that cannot be rendered are left out with a warning that counts them, and `SOURCE_ROW`
+    says which rows are left; with `strict` they are refused.
+
     Raises:
-        FileFormatError: If a row is not finite, has a rotation of length zero, a negative
-            scale or an opacity outside [0, 1]; says how many rows and which is the first.
+        FileFormatError: If a row has a negative scale or an opacity outside [0, 1]; with `strict`
+            also if one is not finite or has a rotation of length zero, without if all are. It
+            says how many rows and which is the first.
     """
     columns = {
         "position": rows.means,
@@ -210,22 +264,34 @@ def finish(
         "opacity": rows.opacities,
         "colour": rows.sh,
     }
-    _refuse(
-        path,
-        {name: _not_finite(column) for name, column in columns.items()},
-        "hold values that are NaN or infinite",
-    )
-    _refuse(path, {"rotation": _normalise(rows.rotations)}, "have a rotation of length zero")
-    _refuse(path, {"scale": np.any(rows.scales < 0, axis=1)}, "have a negative scale")
-    outside = np.logical_or(rows.opacities < 0, rows.opacities > 1)
+    faults = [(_VALUES, {name: _not_finite(column) for name, column in columns.items()})]
+    faults.append((_ROTATION, {"rotation": _normalise(rows.rotations)}))
+    bad = np.any(np.stack([fault for _, found in faults for fault in found.values()]), axis=0)
+    if strict or (len(bad) and bad.all()):
+        for what, found in faults:
+            _refuse(path, found, what)
+    _refuse(path, {"scale": np.any(rows.scales < 0, axis=1) & ~bad}, "have a negative scale")
+    outside = np.logical_or(rows.opacities < 0, rows.opacities > 1) & ~bad
     _refuse(path, {"opacity": outside}, "have an opacity outside [0, 1]")
+    kept = dict(extra or {})
+    if bad.any():
+        said = "; ".join(_faults(found, what) for what, found in faults if _any(found))
+        warn(
+            path,
+            f"{said}; they were left out, and the column {SOURCE_ROW} says which row of the file "
+            "each of the others is.",
+        )
+        rows = rows[~bad]
+        left = torch.from_numpy(~bad)
+        kept = {name: column[left] for name, column in kept.items()}
+        kept.setdefault(SOURCE_ROW, torch.nonzero(left).squeeze(1).to(torch.int32))
     return Gaussians(
         means=torch.from_numpy(rows.means),
         rotations=torch.from_numpy(rows.rotations),
         scales=torch.from_numpy(rows.scales),
         opacities=torch.from_numpy(rows.opacities),
         sh=torch.from_numpy(rows.sh),
-        extra=dict(extra or {}),
+        extra=kept,
         antialiased=drawn.antialiased,
         low_pass=drawn.low_pass,
     )
@@ -233,15 +299,20 @@ def finish(
 
 def _refuse(path: Path, faults: Mapping[str, NDArray[np.bool_]], what: str) -> None:
     """Raise if any row is at fault, naming the first such row and its attributes."""
+    if _any(faults):
+        raise FileFormatError(f"{path}: {_faults(faults, what)}.")
+
+
+def _any(faults: Mapping[str, NDArray[np.bool_]]) -> bool:
+    return any(bool(fault.any()) for fault in faults.values())
+
+
+def _faults(faults: Mapping[str, NDArray[np.bool_]], what: str) -> str:
+    """How many rows are at fault, and the first of them with its attributes."""
     bad = np.any(np.stack(list(faults.values())), axis=0)
-    if not bad.any():
-        return
     row = int(bad.argmax())
     names = ", ".join(name for name, fault in faults.items() if fault[row])
-    raise FileFormatError(
-        f"{path}: {int(bad.sum())} of {len(bad)} Gaussians {what}; "
-        f"the first is row {row} ({names})."
-    )
+    return f"{int(bad.sum())} of {len(bad)} Gaussians {what}; the first is row {row} ({names})"
 
 
 def _not_finite(column: Array) -> NDArray[np.bool_]:
@@ -263,7 +334,8 @@ def _normalise(rotations: Array) -> NDArray[np.bool_]:
         length = np.linalg.norm(rotations[rows].astype(np.float64), axis=1)
         zero[rows] = length == 0
         length[(np.abs(length - 1) < 1e-6) | (length == 0)] = 1
-        rotations[rows] /= length[:, None]
+        with np.errstate(invalid="ignore"):  # rows that are not finite are dealt with elsewhere
+            rotations[rows] /= length[:, None]
     return zero
 
 

@@ -54,7 +54,7 @@ def is_compressed(header: PlyHeader) -> bool:
     return vertex is not None and "packed_position" in (vertex.row.names or ())
 
 
-def read_compressed_ply(path: Path) -> Gaussians:
+def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
     """Read a compressed PLY file.
 
     Raises:
@@ -87,7 +87,7 @@ def read_compressed_ply(path: Path) -> Gaussians:
             rows.sh[part, 1:] = _HARMONIC[table].transpose(0, 2, 1)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
-    return finish(path, rows, drawn=Filter.from_comments(path, header.comments))
+    return finish(path, rows, strict=strict, drawn=Filter.from_comments(path, header.comments))
 
 
 def _harmonic_of_byte() -> Array:
@@ -103,6 +103,10 @@ _HARMONIC = _harmonic_of_byte()
 def _elements(path: Path, header: PlyHeader) -> tuple[PlyElement, PlyElement, PlyElement | None]:
     """The vertex, chunk and sh elements, checked."""
     vertex, chunk, sh = (header.elements.get(name) for name in ("vertex", "chunk", "sh"))
+    if header.ascii or any(one.lists for one in header.elements.values()):
+        raise FileFormatError(
+            f"{path}: expected a compressed PLY file in binary and without lists, got another."
+        )
     if vertex is None or chunk is None:
         raise FileFormatError(
             f"{path}: expected the elements chunk and vertex of a compressed PLY file, "

@@ -7,6 +7,7 @@ in 2026 and logs in its drafts, which are told apart by what linear scales canno
 come one after the other. Coordinates stay glTF's own (y up). See docs/formats/splats.md.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians, Similarity
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError
-from splatseg.io.splats._common import Array, Rows, check_size, finish, warn
+from splatseg.io.splats._common import SOURCE_ROW, Array, Rows, check_size, finish, warn
 from splatseg.io.splats._gltf_container import Gltf
 from splatseg.io.splats._json import Json
 
@@ -31,7 +32,7 @@ LINEAR_COLOUR = "linear_colour"
 _Attributes = Mapping[str, Array]
 
 
-def read_gltf(path: Path) -> Gaussians:
+def read_gltf(path: Path, *, strict: bool = False) -> Gaussians:
     """Read all Gaussians of the default scene, in world coordinates.
 
     Harmonics are padded with zeros to the highest degree in the file. Colours stay as they
@@ -70,11 +71,22 @@ def read_gltf(path: Path) -> Gaussians:
     if kernels:
         warn(path, f"the kernel {', '.join(kernels)} is not known; read as ellipses.")
     spaces = [extension["colorSpace"].text() for _, extension, _ in found]
+    counts = [len(attributes.get("POSITION", ())) for attributes, _, _ in found]
+    starts = list(itertools.accumulate(counts, initial=0))
     parts = [
-        _gaussians(path, attributes, degree=degree, logs=logs, space=space, transform=transform)
-        for (attributes, _, transform), space in zip(found, spaces, strict=True)
+        _gaussians(
+            path,
+            attributes,
+            degree=degree,
+            logs=logs,
+            space=space,
+            transform=transform,
+            first=first,
+            strict=strict,
+        )
+        for (attributes, _, transform), space, first in zip(found, spaces, starts, strict=False)
     ]
-    return _marked(path, parts, spaces)
+    return _marked(path, parts, spaces, count=starts[-1])
 
 
 def _check_amount(gltf: Gltf, primitives: Sequence[Json]) -> None:
@@ -154,8 +166,13 @@ def _gaussians(
     logs: bool,
     space: str,
     transform: NDArray[np.float64],
+    first: int,
+    strict: bool,
 ) -> Gaussians:
-    """The Gaussians of one primitive in the world, harmonics padded to `degree`."""
+    """The Gaussians of one primitive in the world, harmonics padded to `degree`.
+
+    They have the column `SOURCE_ROW`, counted from `first`.
+    """
     means = _column(path, attributes, "POSITION", 3, None)
     count = len(means)
     rotations = _column(path, attributes, "ROTATION", 4, count)
@@ -169,7 +186,7 @@ def _gaussians(
     )
     if logs:
         with np.errstate(over="ignore"):
-            rows.scales = np.exp(scales)
+            rows.scales = np.where(np.isneginf(scales), scales, np.exp(scales))
     if "SH_DEGREE_0_COEF_0" in attributes:
         index = 0
         for level in range(_degree(path, attributes) + 1):
@@ -183,7 +200,8 @@ def _gaussians(
         raise FileFormatError(
             f"{path}: expected SH_DEGREE_0_COEF_0 or COLOR_0 for Gaussians, got neither."
         )
-    gaussians = finish(path, rows)
+    of_file = torch.arange(first, first + count, dtype=torch.int32)
+    gaussians = finish(path, rows, {SOURCE_ROW: of_file}, strict=strict)
     if np.array_equal(transform, np.eye(4)):
         return gaussians
     return gaussians.transformed(_similarity(path, transform))
@@ -238,9 +256,11 @@ def _similarity(path: Path, transform: NDArray[np.float64]) -> Similarity:
     )
 
 
-def _marked(path: Path, parts: list[Gaussians], spaces: list[str]) -> Gaussians:
-    """All parts as one, with the Gaussians of linear colour marked."""
+def _marked(path: Path, parts: list[Gaussians], spaces: list[str], *, count: int) -> Gaussians:
+    """All parts as one, with the Gaussians of linear colour marked, of `count` in the file."""
     joined = Gaussians.concatenate(parts)
+    if len(joined) == count:
+        joined = joined.replace(extra={})
     unknown = sorted(set(spaces) - {_SRGB, _LINEAR})
     if unknown:
         warn(
@@ -260,4 +280,4 @@ def _marked(path: Path, parts: list[Gaussians], spaces: list[str]) -> Gaussians:
         f"{int(linear.sum())} of {len(joined)} Gaussians have linear colours; they are kept as "
         f"stored, marked in the extra column {LINEAR_COLOUR!r}, and look dark.",
     )
-    return joined.replace(extra={LINEAR_COLOUR: linear})
+    return joined.replace(extra={**joined.extra, LINEAR_COLOUR: linear})

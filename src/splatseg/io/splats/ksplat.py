@@ -57,7 +57,7 @@ class _Section:
         return (self.degree + 1) ** 2 - 1
 
 
-def read_ksplat(path: Path) -> Gaussians:
+def read_ksplat(path: Path, *, strict: bool = False) -> Gaussians:
     """Read a ``.ksplat`` file of version 0.1, of any compression level.
 
     Raises:
@@ -96,7 +96,7 @@ def read_ksplat(path: Path) -> Gaussians:
             part[:] = (packed["mean"].astype(np.float64) - section.steps) * half + centres
         at += table + row.itemsize * section.room
         start += section.count
-    return finish(path, rows)
+    return finish(path, rows, strict=strict)
 
 
 def _sections(path: Path, data: bytes, level: int) -> list[_Section]:

@@ -7,15 +7,16 @@ nothing and are zero; other columns are kept as `Gaussians.extra`. See docs/form
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core import Gaussians
-from splatseg.core.sh import MAX_DEGREE
+from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.splats._common import (
     BLOCK,
@@ -25,17 +26,31 @@ from splatseg.io.splats._common import (
     finish,
     logits,
     logs,
+    rendered_degree,
     to_rows,
+    warn,
 )
-from splatseg.io.splats._ply_header import PlyHeader, read_ply_header
+from splatseg.io.splats._ply_columns import (
+    DC,
+    MEANS,
+    REST,
+    ROTATIONS,
+    SCALES,
+    Columns,
+    find_columns,
+)
+from splatseg.io.splats._ply_header import PlyHeader, read_ply_header, read_rows
 
-_MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
-_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALES = ("scale_0", "scale_1", "scale_2")
-_ROTATIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
-_REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES, *_ROTATIONS)
-_REST = re.compile(r"f_rest_(0|[1-9]\d*)")
+
+_FLAT = 1e-3
+"""Thickness of a surfel over its smaller scale. Seen from its edge it stays below a pixel until it
+is a thousand pixels wide, as thin as 2DGS means it; its variance is 1e-6 of the smaller, above
+float32's rounding (6e-8), so that the covariance keeps its rank and its normal."""
+
+_JUDGED = 32
+"""Gaussians from which on a file's values tell whether they are logs: of fewer all may be so by
+chance."""
 
 _STORED = {
     torch.float32: "<f4",
@@ -72,79 +87,137 @@ _NOTE = "splatseg column"
 those of several components (0 stands for a plain column) and those of a type it lacks."""
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Read Gaussians and their extra columns from a binary PLY file.
+def read_ply(
+    path: Path,
+    *,
+    strict: bool = False,
+    linear: Collection[str] = (),
+    own: bool = False,
+) -> Gaussians:
+    """Read Gaussians and their extra columns from a PLY file, binary or ASCII.
 
-    Columns beyond the standard ones come back under their own name and type in
+    Columns beyond those of Gaussians come back under their own name and type in
     `Gaussians.extra`; normals only if any of them is not zero.
 
+    Args:
+        path: The file.
+        strict: Refuse rows that cannot be rendered instead of leaving them out.
+        linear: Which of scales and opacities the file has as they are, not as logs and logits.
+        own: Whether splatseg wrote it: nothing in it is doubted, and no column is a filter.
+
     Raises:
-        FileFormatError: If the file is no binary PLY, is longer or shorter than its header
-            says, lacks a column of Gaussians, or holds a row that cannot be rendered.
+        FileFormatError: If the file is no PLY file, is longer or shorter than its header says,
+            lacks a column of Gaussians, or holds a row that cannot be rendered.
         MissingFileError: If there is no such file.
     """
     header = read_ply_header(path)
-    vertex = header.elements.get("vertex")
-    names = list(vertex.row.names or ()) if vertex else []
-    missing = [name for name in _REQUIRED if name not in names]
-    if vertex is None or missing:
-        raise FileFormatError(
-            f"{path}: expected Gaussians, got a PLY file without {', '.join(missing)}"
-            f"{': a point cloud' if set(_MEANS) <= set(names) else ''}."
-        )
-    rest = _rest_columns(path, names)
-    _check_types(path, vertex.row, rest)
-    others = [name for name in names if name not in _REQUIRED and name not in rest]
-    rows = Rows.empty(vertex.count, 1 + len(rest) // 3)
+    columns = find_columns(path, header, own=own)
+    vertex = header.elements["vertex"]
+    rendered_degree(path, MAX_DEGREE + 1 if columns.beyond else 0, strict=strict)
+    others = [name for name in vertex.row.names or () if name not in columns.used]
+    rows = Rows.empty(vertex.count, 1 + len(columns.rest) // 3)
+    filters = np.zeros(vertex.count, np.float32)
     extra = {name: np.empty(vertex.count, vertex.row[name].newbyteorder("=")) for name in others}
-    with path.open("rb") as file:
-        file.seek(vertex.offset)
-        for part in blocks(vertex.count, BLOCK // 4):
-            block = np.fromfile(file, vertex.row, part.stop - part.start)
-            _unpack(block, rows, part, rest)
-            for name, column in extra.items():
-                column[part] = block[name]
-    rows.exponentiate()
-    drawn = Filter.from_comments(path, header.comments)
-    return finish(path, rows, _restore(header, extra), drawn=drawn)
-
-
-def _rest_columns(path: Path, names: Sequence[str]) -> list[str]:
-    """The names of the harmonics from degree 1 on, in order."""
-    count = sum(_REST.fullmatch(name) is not None for name in names)
-    rest = [f"f_rest_{i}" for i in range(count)]
-    known = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)]
-    if count not in known or not set(rest) <= set(names):
+    for part, block in read_rows(path, header, vertex, BLOCK // 4):
+        _unpack(block, rows, part, columns)
+        if columns.filter_3d is not None:
+            filters[part] = block[columns.filter_3d]
+        for name, column in extra.items():
+            column[part] = block[name]
+    if columns.coloured and bool((rows.sh[:, 0] > 0.5 / SH_C0 + 1e-3).any()):
         raise FileFormatError(
-            f"{path}: expected {', '.join(map(str, known[:-1]))} or {known[-1]} columns f_rest_0, "
-            f"f_rest_1 and so on, got {count}."
+            f"{path}: expected real colours {' '.join(columns.dc)} in [0, 1], got larger ones."
         )
-    return rest
+    bytes_of_alpha = vertex.row[columns.opacity[0]].kind == "u"
+    asked = {*linear, *(["opacities"] if bytes_of_alpha else [])}
+    if not own:
+        _tell(path, rows, columns, asked)
+    rows.exponentiate(scales="scales" not in asked, opacities="opacities" not in asked)
+    if columns.filter_3d is not None:
+        _smooth(rows, filters, axes=len(columns.scales))
+    if len(columns.scales) == 2:
+        rows.scales[:, 2] = _FLAT * rows.scales[:, :2].min(axis=1)
+    drawn = Filter.from_comments(path, header.comments)
+    return finish(path, rows, _restore(header, extra), strict=strict, drawn=drawn)
 
 
-def _check_types(path: Path, row: np.dtype[np.void], rest: Sequence[str]) -> None:
-    """Refuse integers where Gaussians have real numbers: they would need a scale to read."""
-    for name in (*_REQUIRED, *rest):
-        if row[name].kind != "f":
-            raise FileFormatError(
-                f"{path}: expected the PLY column {name} to be float or double, got {row[name]}."
-            )
+def _smooth(rows: Rows, filters: Float[np.ndarray, "rows"], *, axes: int) -> None:
+    """Apply the 3D smoothing filter of Mip-Splatting (Yu et al. 2024, eq. 9) to values, in place.
+
+    With scales s and the filter's width f, sqrt(s^2 + f^2) and the opacity times
+    sqrt(prod s^2 / prod (s^2 + f^2)), the square root of the quotient of the determinants of the
+    covariances before and after.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        before = rows.scales[:, :axes].astype(np.float64)
+        after = np.hypot(before, filters.astype(np.float64)[:, None])
+        share = np.divide(before, after, out=np.zeros_like(before), where=after != 0)
+        rows.opacities[:] = rows.opacities * share.prod(axis=1)
+        rows.scales[:, :axes] = after
+        # A scale of minus infinity is no number: its row is found as any other.
+        rows.scales[:, :axes][np.isneginf(before)] = -np.inf
 
 
-def _unpack(block: np.ndarray, rows: Rows, part: slice, rest: Sequence[str]) -> None:
-    """Copy the standard columns of some rows to where they belong."""
+def _tell(path: Path, rows: Rows, columns: Columns, linear: Collection[str]) -> None:
+    """Warn of what was read otherwise than 3DGS would, and of what may be no log or logit."""
+    said: list[str] = []
+    if columns.renamed:
+        said.append(f"read {', '.join(columns.renamed)}")
+    if len(columns.scales) == 2:
+        said.append(
+            "surfels of 2DGS, which have two scales: made Gaussians that are flat along the third "
+            f"axis, {_FLAT:g} times as thick as their smaller scale"
+        )
+    if columns.unordered:
+        said.append(
+            f"{columns.unordered[0]} and others look like harmonics and are kept as columns, as "
+            "their names do not tell whether they go by coefficient or by channel"
+        )
+    if columns.filter_3d is not None:
+        said.append(
+            f"applied the 3D filter of Mip-Splatting ({columns.filter_3d}) to scales and opacities"
+        )
+    scales, opacities = rows.scales[:, : len(columns.scales)], rows.opacities
+    sound = np.isfinite(opacities) & np.isfinite(scales).all(axis=1)
+    if int(sound.sum()) >= _JUDGED:
+        doubted: list[str] = []
+        if "scales" not in linear and (scales[sound] > 0).all():
+            doubted.append("scales")
+            said.append("all scales are positive, as if they were never logs")
+        low, high = opacities[sound].min(), opacities[sound].max()
+        # One opacity for all may be any logit.
+        if "opacities" not in linear and 0 <= low < high <= 1:
+            doubted.append("opacities")
+            said.append("all opacities lie in [0, 1], as if they were never logits")
+        if doubted:
+            said[-1] += f": `--linear {' '.join(doubted)}` reads them so"
+    if said:
+        warn(path, "; ".join(said) + ".")
+
+
+def _unpack(block: np.ndarray, rows: Rows, part: slice, columns: Columns) -> None:
+    """Copy the columns of Gaussians of some rows to where they belong."""
     for target, names in (
-        (rows.means, _MEANS),
-        (rows.rotations, _ROTATIONS),
-        (rows.scales, _SCALES),
-        (rows.sh[:, 0], _DC),
+        (rows.means, columns.means),
+        (rows.rotations, columns.rotations),
+        (rows.scales, columns.scales),
+        (rows.sh[:, 0], columns.dc),
     ):
         for i, name in enumerate(names):
-            target[part, i] = block[name]
-    rows.opacities[part] = block["opacity"]
-    per_channel = len(rest) // 3
-    for i, name in enumerate(rest):
+            target[part, i] = _share(block[name])
+    if columns.coloured:
+        rows.sh[part, 0] = (rows.sh[part, 0] - 0.5) / SH_C0
+    if len(columns.scales) == 2:
+        rows.scales[part, 2] = 0
+    rows.opacities[part] = _share(block[columns.opacity[0]])
+    per_channel = len(columns.rest) // 3
+    for i, name in enumerate(columns.rest):
         rows.sh[part, 1 + i % per_channel, i // per_channel] = block[name]
+
+
+def _share(values: np.ndarray) -> np.ndarray:
+    """Bytes and other integers of colours in [0, 1]; real numbers as they are."""
+    return values if values.dtype.kind == "f" else values / np.iinfo(values.dtype).max
 
 
 def _restore(header: PlyHeader, columns: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
@@ -181,7 +254,7 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     notes = [*Filter.of(gaussians).comments(), *notes]
     coefficients = rows.sh.shape[1] - 1
     rest = [f"f_rest_{i}" for i in range(3 * coefficients)]
-    standard = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS)
+    standard = (*MEANS, *_NORMALS, *DC, *rest, "opacity", *SCALES, *ROTATIONS)
     _check_names(extra, standard)
     normals = all(name in extra for name in _NORMALS)
     fields = [(name, "<f4") for name in standard]
@@ -210,10 +283,10 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
 def _pack(block: np.ndarray, rows: Rows, part: slice, coefficients: int) -> None:
     """Copy some rows into a block of the file's layout."""
     for source, names in (
-        (rows.means[part], _MEANS),
-        (rows.rotations[part], _ROTATIONS),
-        (logs(rows.scales[part]), _SCALES),
-        (rows.sh[part, 0], _DC),
+        (rows.means[part], MEANS),
+        (rows.rotations[part], ROTATIONS),
+        (logs(rows.scales[part]), SCALES),
+        (rows.sh[part, 0], DC),
     ):
         for i, name in enumerate(names):
             block[name] = source[:, i]
@@ -265,5 +338,5 @@ def _check_names(extra: Mapping[str, np.ndarray], standard: Sequence[str]) -> No
             raise InputError(
                 f"extra[{name!r}]: expected a name of printable ASCII without spaces, as PLY needs."
             )
-        if (name in standard and name not in allowed) or _REST.fullmatch(name):
+        if (name in standard and name not in allowed) or REST.fullmatch(name):
             raise InputError(f"extra[{name!r}]: PLY uses the name {name!r} for something else.")

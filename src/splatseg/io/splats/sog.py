@@ -39,7 +39,7 @@ Pixels = NDArray[np.uint8]
 Load = Callable[[str, int], bytes]
 
 
-def read_sog(path: Path) -> Gaussians:
+def read_sog(path: Path, *, strict: bool = False) -> Gaussians:
     """Read a bundled ``.sog`` file, or an unbundled one by its ``meta.json`` or its folder.
 
     Raises:
@@ -59,6 +59,7 @@ def read_sog(path: Path) -> Gaussians:
             lambda name, limit: _load_beside(path, name, limit),
             path.name,
             packed=sum(file.stat().st_size for file in (path, *beside)),
+            strict=strict,
         )
     with open_archive(path, where=path, expected="a zip file of SOG") as archive:
         metas = [n for n in archive.namelist() if n.rsplit("/", 1)[-1] == "meta.json"]
@@ -72,6 +73,7 @@ def read_sog(path: Path) -> Gaussians:
             lambda name, limit: _load_member(path, archive, folder + name, limit),
             "meta.json",
             packed=path.stat().st_size,
+            strict=strict,
         )
 
 
@@ -100,7 +102,7 @@ def _load_member(path: Path, archive: zipfile.ZipFile, name: str, limit: int) ->
     return data
 
 
-def _read(path: Path, load: Load, meta_name: str, *, packed: int) -> Gaussians:
+def _read(path: Path, load: Load, meta_name: str, *, packed: int, strict: bool) -> Gaussians:
     """Read by a function that loads a file of the bundle by name."""
     meta = Json.parse(path, load(meta_name, _MAX_META))
     version = meta["version"].integer() if "version" in meta else 1
@@ -129,7 +131,8 @@ def _read(path: Path, load: Load, meta_name: str, *, packed: int) -> Gaussians:
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
     antialiased = "antialias" in meta and meta["antialias"].value is True
-    return finish(path, rows, drawn=Filter(antialiased=antialiased))
+    antialiased |= "model" in meta and meta["model"].value == "antialiased"
+    return finish(path, rows, strict=strict, drawn=Filter(antialiased=antialiased))
 
 
 def _image(path: Path, load: Load, name: str, min_pixels: int) -> Pixels:

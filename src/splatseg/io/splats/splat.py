@@ -32,7 +32,7 @@ _ROW = np.dtype(
 )
 
 
-def read_splat(path: Path) -> Gaussians:
+def read_splat(path: Path, *, strict: bool = False) -> Gaussians:
     """Read a ``.splat`` file.
 
     Raises:
@@ -55,7 +55,7 @@ def read_splat(path: Path) -> Gaussians:
             rows.sh[part, 0] = (block["colour"][:, :3] / 255 - 0.5) / SH_C0
             rows.opacities[part] = block["colour"][:, 3] / 255
             rows.rotations[part] = (block["rotation"].astype(np.float32) - 128) / 128
-    return finish(path, rows)
+    return finish(path, rows, strict=strict)
 
 
 def write_splat(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:

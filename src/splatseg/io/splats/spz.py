@@ -30,6 +30,7 @@ from splatseg.io.splats._common import (
     finish,
     logs,
     read_file,
+    rendered_degree,
     to_rows,
     unsigned,
 )
@@ -69,7 +70,7 @@ class _Header:
         return (9, 1, 3, 3, rotation, rest) if rest else (9, 1, 3, 3, rotation)
 
 
-def read_spz(path: Path) -> Gaussians:
+def read_spz(path: Path, *, strict: bool = False) -> Gaussians:
     """Read an SPZ file of version 2, 3 or 4, turned to the axes of PLY files.
 
     Extensions (limits for a viewer's camera, for example) are not kept; the flag of a file made
@@ -89,10 +90,10 @@ def read_spz(path: Path) -> Gaussians:
         np.frombuffer(stream, np.uint8).reshape(header.count, size)
         for stream, size in zip(streams[:5], header.sizes[:5], strict=True)
     )
-    coefficients = (header.degree + 1) ** 2
+    coefficients = (rendered_degree(path, header.degree, strict=strict) + 1) ** 2
     rows = Rows.empty(header.count, coefficients)
     rest = (
-        np.frombuffer(streams[5], np.uint8).reshape(header.count, coefficients - 1, 3)
+        np.frombuffer(streams[5], np.uint8).reshape(header.count, (header.degree + 1) ** 2 - 1, 3)
         if header.degree
         else None
     )
@@ -104,8 +105,10 @@ def read_spz(path: Path) -> Gaussians:
         rows.rotations[part] = _rotations(rotations[part], header.version) * _FLIP_ROTATION
         if rest is not None:
             signs = _FLIP_SH[: coefficients - 1, None]
-            rows.sh[part, 1:] = (rest[part].astype(np.float32) - 128) / 128 * signs
-    return finish(path, rows, drawn=Filter(antialiased=bool(header.flags & _ANTIALIASED)))
+            kept = rest[part, : coefficients - 1].astype(np.float32)
+            rows.sh[part, 1:] = (kept - 128) / 128 * signs
+    drawn = Filter(antialiased=bool(header.flags & _ANTIALIASED))
+    return finish(path, rows, strict=strict, drawn=drawn)
 
 
 def _header(path: Path, data: bytes) -> _Header:
@@ -119,9 +122,9 @@ def _header(path: Path, data: bytes) -> _Header:
         raise FileFormatError(f"{path}: expected the SPZ magic {MAGIC!r}, got {magic!r}.")
     if version not in (2, 3, 4):
         raise FileFormatError(f"{path}: expected SPZ version 2, 3 or 4, got {version}.")
-    if degree > MAX_DEGREE:
+    if degree > MAX_DEGREE + 1:
         raise FileFormatError(
-            f"{path}: expected harmonics of degree 0 to {MAX_DEGREE}, got {degree}."
+            f"{path}: expected harmonics of degree 0 to {MAX_DEGREE + 1}, got {degree}."
         )
     if bits > 24:
         raise FileFormatError(f"{path}: expected at most 24 fractional bits, got {bits}.")

@@ -48,6 +48,31 @@ def nerfstudio(folder: Path) -> Target:
     return _capture(folder, "transforms.json", json.dumps(content).encode())
 
 
+@target("transforms-without-sizes.json")
+def without_sizes(folder: Path) -> Target:
+    """What Blender and instant-ngp leave out, with photographs elsewhere than listed."""
+    frames = _frames()
+    for frame in frames:
+        frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+    frames[0] |= {"x_fov": 50, "y_fov": 40, "mask_path": "images/001.png"}
+    frames[1]["transform_matrix"] = [[None] * 4, *frames[1]["transform_matrix"][1:]]
+    content = {"camera_angle_x": 0.8, "k1": 0.01, "ply_file_path": "p.ply", "frames": frames}
+    (folder / "p.ply").write_bytes(_ascii_ply().replace(b"1 2 3", b"nan 2 3"))
+    made = _capture(folder, "transforms.json", json.dumps(content).encode())
+    (folder / "images").rename(folder / "images_4")
+    return made
+
+
+@target("transforms-elsewhere.json")
+def elsewhere(folder: Path) -> Target:
+    """Paths of another machine."""
+    frames = _frames()
+    for frame in frames:
+        frame["file_path"] = "C:\\scene\\" + frame["file_path"].replace("/", "\\")
+    content = {"w": WIDTH, "h": HEIGHT, "x_fov": 50, "frames": frames}
+    return _capture(folder, "transforms.json", json.dumps(content).encode())
+
+
 @target("doctor-transforms.json")
 def doctor(folder: Path) -> Target:
     """A capture whose sizes contradict its photographs, as `splatseg doctor` reads it."""
@@ -120,6 +145,28 @@ def colmap_capture(folder: Path) -> Target:
         images += struct.pack("<Q", 0)
     (model / "images.bin").write_bytes(images)
     return _capture(folder, "sparse/0/cameras.bin", (model / "cameras.bin").read_bytes())
+
+
+@target("colmap-beside-each-other")
+def colmap_beside(folder: Path) -> Target:
+    """Two models and a lens of thin prisms, of what convert.py of 3DGS starts from."""
+    photographs(folder)
+    (folder / "images").rename(folder / "input")
+    for number in (0, 1):
+        model = folder / "distorted" / "sparse" / str(number)
+        model.mkdir(parents=True)
+        lens = f"1 THIN_PRISM_FISHEYE {WIDTH} {HEIGHT} 9 9 4 3 .01 0 0 0 0 0 .001 0\n"
+        (model / "cameras.txt").write_text(lens)
+        rows = [f"{i + 1} 1 0 0 0 {i} 0 0 1 {i:03d}.jpg\n\n" for i in range(2 + number)]
+        (model / "images.txt").write_text("".join(rows))
+    return Target(file=folder / "distorted/sparse/1/images.txt", read=lambda: read_capture(folder))
+
+
+@target("colmap-thin-prism")
+def colmap_thin_prism(folder: Path) -> Target:
+    """The lens of the same."""
+    made = colmap_beside(folder)
+    return Target(file=folder / "distorted/sparse/1/cameras.txt", read=made.read)
 
 
 def _ascii_ply() -> bytes:
