@@ -14,6 +14,7 @@ from typing import Any, cast
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Model
 from splatseg.errors import InputError, MissingPackageError
+from splatseg.io.foreign import is_file, is_folder
 from splatseg.models._family import LoadOptions, ModelFamily
 from splatseg.models._loading import loading_of
 
@@ -101,10 +102,11 @@ def find_model(
     known = _known()
     text = str(name)
     if text not in known:
-        if not Path(name).is_dir():
+        if not is_file(Path(name)) and not is_folder(Path(name)):
             names = ", ".join(known)
             raise InputError(
-                f"model: expected one of {names}, or a folder of recorded evidence, got {text!r}."
+                f"model: expected one of {names}, or a file or folder of recorded evidence, got "
+                f"{text!r:.200}."
             )
         _refuse(text, options, loading)
         from splatseg.models.recorded import recorded_model

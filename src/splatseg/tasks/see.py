@@ -1,10 +1,11 @@
 """A 2D model looks at a scene's photographs, and what it sees is written down."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from splatseg.core import Model, Scene
+from splatseg.core import Model, Scene, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -23,9 +24,10 @@ from splatseg.models import (
     TrackingOptions,
     What,
     find_model,
+    model_names,
     record_evidence,
 )
-from splatseg.models.recorded import AnyRecorded, recorded_model
+from splatseg.models.recorded import recorded_model
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._view_images import ViewImages
@@ -133,7 +135,7 @@ def see(
     if scene.root is None:
         raise InputError("scene: expected one that was read from its folder, got one without.")
     views = views_asked(scene, options.views)
-    found = _model(model, options, model_options, loading, observer)
+    found = _model(model, options, model_options, loading, observer, views=scene.views)
     seeds = _seeds(scene, options.seeds)
     tracking = None if seeds is None and options.tracking == TrackingOptions() else options.tracking
     cache = None
@@ -185,19 +187,17 @@ def _model(
     model_options: object,
     loading: LoadOptions | None,
     observer: Observer,
+    *,
+    views: Sequence[View],
 ) -> Model:
     """The model with its settings; settings that it does not have are refused."""
-    if isinstance(asked, str):
-        model = find_model(asked, model_options, loading=loading, report=observer.note)
-    elif model_options is not None or loading is not None:
-        raise InputError("model: expected a name with options and weights, got a model made.")
-    else:
-        model = asked
-    name = asked if isinstance(asked, str) else model.name
-    if isinstance(model, AnyRecorded) and isinstance(asked, str):
+    if isinstance(asked, str) and asked not in model_names() and Path(asked).exists():
+        if model_options is not None or loading is not None:
+            raise InputError(f"options: model {asked} takes neither options nor weights.")
         told: dict[tuple[What, ...], EvidenceKind] = {("masks",): "masks", ("depth",): "depth"}
         return recorded_model(
-            name,
+            asked,
+            views=views,
             kind=told.get(options.what),
             zero_is_class=options.zero_is_class,
             void=options.void,
@@ -205,6 +205,13 @@ def _model(
             classes=options.classes,
             depth_unit=options.depth_unit,
         )
+    if isinstance(asked, str):
+        model = find_model(asked, model_options, loading=loading, report=observer.note)
+    elif model_options is not None or loading is not None:
+        raise InputError("model: expected a name with options and weights, got a model made.")
+    else:
+        model = asked
+    name = asked if isinstance(asked, str) else model.name
     given = (options.void, options.depth_unit)
     if options.zero_is_class or given != (None, None) or options.suffix or options.classes:
         raise InputError(

@@ -133,7 +133,10 @@ def read_id_map(path: Path) -> Ids:
 def _from_picture(path: Path, palette: Palette | None) -> Ids:
     with open_image(path) as image:
         coloured = palette is not None and image.mode in ("RGB", "RGBA")
-        if not coloured and (len(image.getbands()) != 1 or image.mode == "F"):
+        pages = getattr(image, "n_frames", 1)
+        if pages != 1:
+            raise FileFormatError(f"{path}: expected one picture of ids, got {pages} pages.")
+        if not coloured and len(image.getbands()) != 1:
             raise FileFormatError(
                 f"{path}: expected one channel of ids, got {image.mode}; a coloured picture "
                 "of labels needs a class table with its colours."
@@ -149,6 +152,8 @@ def _from_picture(path: Path, palette: Palette | None) -> Ids:
             array = np.asarray(image.convert("RGB") if coloured else image)
     if coloured and palette is not None:
         return palette.ids(path, array)
+    if image.format == "TIFF":  # of 32 bits, whole numbers or floats, as arrays are
+        return _from_array(path, array, None)[0]
     return _checked(path, array, least=0)
 
 

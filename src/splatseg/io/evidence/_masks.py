@@ -19,7 +19,7 @@ from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._label_files import read_id_map
-from splatseg.io.json_files import read_json
+from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
 from splatseg.io.npz import read_npz
 
@@ -177,13 +177,11 @@ def read_masks(path: Path) -> MaskSet:
         MissingFileError: If there is no such file.
         FileFormatError: If it holds anything else.
     """
-    content = read_json(path)
-    rows = content.get("masks")
-    height, width = content.get("height"), content.get("width")
+    rows, height, width = _mask_rows(read_json_value(path))
     if not isinstance(rows, list) or not _is_side(height) or not _is_side(width):
         raise FileFormatError(
-            f"{path}: expected masks with their height and width, got {quoted(height)} and "
-            f"{quoted(width)}."
+            f"{path}: expected masks in run lengths with their height and width (SAM's generator "
+            f"with output_mode='coco_rle'), got {quoted(height)} and {quoted(width)}."
         )
     check_unpacked(
         path,
@@ -212,6 +210,34 @@ def read_masks(path: Path) -> MaskSet:
         scores=torch.tensor(scores, dtype=torch.float32),
         levels=torch.tensor(levels, dtype=torch.int32),
     )
+
+
+def holds_mask_rows(content: object) -> bool:
+    """Whether a JSON value is the masks of one picture."""
+    return isinstance(_mask_rows(content)[0], list)
+
+
+def _mask_rows(content: object) -> tuple[object, object, object]:
+    """The rows of masks, and the height and width of their picture, None where it has none.
+
+    Ours are an object with ``masks``, ``height`` and ``width``; a file of SA-1B has ``annotations``
+    and ``image``; what SAM's generator gives is a list of rows, and their first tells the size.
+    """
+    if isinstance(content, list):
+        rows = cast(list[object], content)
+        first = cast(dict[str, Any], rows[0]) if rows and isinstance(rows[0], dict) else {}
+        segmentation = first.get("segmentation")
+        size = cast(dict[str, Any], segmentation if isinstance(segmentation, dict) else {}).get(
+            "size"
+        )
+        sides = cast(list[object], size) if isinstance(size, list) else []
+        height, width = sides if len(sides) == 2 else (None, None)
+        return (rows if "segmentation" in first else None), height, width
+    fields = cast(dict[str, Any], content) if isinstance(content, dict) else {}
+    if "masks" not in fields and isinstance(fields.get("image"), dict):
+        image = cast(dict[str, Any], fields["image"])
+        return fields.get("annotations"), image.get("height"), image.get("width")
+    return fields.get("masks"), fields.get("height"), fields.get("width")
 
 
 def masks_content(masks: MaskSet) -> dict[str, Any]:
