@@ -6,9 +6,12 @@
 
 splatseg is not used. truth.npz has what went in: masks (pictures, objects, 48, 64) of a car (a
 polygon), a tree (a disc with a hole) and a wall, which lie over each other in this order, the
-car on top; decoded.npz what pycocotools makes of two of the files. versions.json has the tools. Label Studio's server, Detectron2 and CVAT are on no
-package registry: what they write is put together here out of what their own libraries give (the run
-lengths of label_studio_sdk and pycocotools, the XML of datumaro, which CVAT exports with).
+car on top; decoded.npz what pycocotools makes of two of the files. versions.json has the tools.
+
+CVAT, Detectron2 and Label Studio's server are on no package registry: what they write is put
+together here out of what their own libraries give (the XML of datumaro, which CVAT exports with,
+the run lengths of pycocotools and of label_studio_sdk). labelme needs Qt's libraries, and
+QT_QPA_PLATFORM=offscreen where there is no screen.
 """
 
 import importlib.util

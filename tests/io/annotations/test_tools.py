@@ -1,36 +1,17 @@
 """What other tools wrote of two pictures, against the masks that went in."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import torch
 
-from splatseg.core import Camera, View
 from splatseg.errors import InputError
 from splatseg.io.annotations import AnnotationEvidence, open_annotations
 from splatseg.io.evidence import Evidence, open_evidence
+from support.annotations import GOLDEN, HEIGHT, TRUTH, WIDTH, views_of
 
-GOLDEN = Path(__file__).parents[2] / "golden" / "annotations"
-HEIGHT, WIDTH = 48, 64
 CLASSES = ("car", "tree", "wall")
-TRUTH = np.load(GOLDEN / "truth.npz")["masks"]
 DECODED = np.load(GOLDEN / "decoded.npz")
 SCORES = [0.9, 0.75, 0.5]
-
-
-def views(*names: str, suffix: str = ".png") -> tuple[View, ...]:
-    """Views of 64 x 48 pixels whose photographs, of these names, need not be there."""
-    camera = Camera(
-        width=WIDTH, height=HEIGHT, fx=50, fy=50, cx=32, cy=24, cam_from_world=torch.eye(4).double()
-    )
-    return tuple(
-        View(name=name, camera=camera, split="train", image=Path("capture") / f"{name}{suffix}")
-        for name in names
-    )
-
-
-VIEWS = views("000", "001", "002")
+VIEWS = views_of("000", "001", "002")
 
 
 def opened(name: str, **more: object) -> Evidence:

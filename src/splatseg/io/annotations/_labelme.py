@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatseg.core.json_numbers import json_integer
-from splatseg.errors import FileFormatError, quoted
+from splatseg.errors import FileFormatError, quoted, reason
 from splatseg.io.annotations._base import AnnotatedPicture, Annotations, classes_of_names
 from splatseg.io.annotations._names import parts_of
 from splatseg.io.annotations._regions import Canvas, Region, corners_of
@@ -101,8 +101,13 @@ def _mask(shape: Row, canvas: Canvas, where: str) -> tuple[NDArray[np.bool_], in
         for row in corners for number in row
     )  # fmt: skip
     size = right - left + 1, bottom - top + 1
-    with reading(where, "a PNG in base64"):
-        image = Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=["PNG"])
+    try:
+        with reading(where, "a PNG in base64"):
+            image = Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=["PNG"])
+    except Image.DecompressionBombError as error:
+        raise FileFormatError(
+            f"{where}: expected a mask of {size[0]}x{size[1]} pixels, got {reason(error)}."
+        ) from error
     with image:
         if image.size != size or size[0] > canvas.width or size[1] > canvas.height:
             raise FileFormatError(

@@ -170,9 +170,9 @@ def _results(path: Path, contents: dict[Path, Any]) -> Annotations:
     datasets = [p for p, content in contents.items() if is_dataset(content)]
     dataset = contents[_only(sorted(datasets))] if datasets else None
     rows = contents[path]
-    wrong = next((row for row in rows if not isinstance(row, dict)), None)
-    if wrong is not None:
-        raise FileFormatError(f"{path}: expected a list of results, got {quoted(wrong)} in it.")
+    wrong = [row for row in rows if not isinstance(row, dict)]
+    if wrong:
+        raise FileFormatError(f"{path}: expected a list of results, got {quoted(wrong[0])} in it.")
     return coco_results(path, rows, dataset)
 
 

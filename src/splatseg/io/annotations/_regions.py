@@ -183,12 +183,12 @@ def corners_of(values: object, *, where: str, pairs: bool) -> NDArray[np.float64
     """
     listed = cast(list[object], values) if isinstance(values, list) else []
     if pairs:
-        rows = [cast(list[object], row) if isinstance(row, list) else [None] for row in listed]
-        wrong = next((row for row in rows if len(row) != 2), None)
-        listed = [number for row in rows for number in row] if wrong is None else [wrong]
-    bad = next((number for number in listed if not is_json_number(number)), None)
-    if bad is not None or len(listed) < 6 or len(listed) % 2:
-        got = quoted(bad) if bad is not None else f"{len(listed)} numbers"
+        rows = [cast(list[object], row) if isinstance(row, list) else [row] for row in listed]
+        # What is no pair is shown as it is, which is no number.
+        listed = [number for row in rows for number in (row if len(row) == 2 else [row])]
+    wrong = [number for number in listed if not is_json_number(number)]
+    if wrong or len(listed) < 6 or len(listed) % 2:
+        got = quoted(wrong[0]) if wrong else f"{len(listed)} numbers"
         raise FileFormatError(
             f"{where}: expected an outline of at least three corners, two finite numbers each, got "
             f"{got}."
@@ -202,9 +202,9 @@ def whole_runs(runs: Sequence[object]) -> NDArray[np.int64]:
     Raises:
         InputError: If one is no whole number that 32 bits hold.
     """
-    wrong = next((run for run in runs if not _is_run(run)), None)
-    if wrong is not None:
-        raise InputError(f"counts: expected whole numbers up to {MAX_RUN}, got {quoted(wrong)}.")
+    wrong = [run for run in runs if not _is_run(run)]
+    if wrong:
+        raise InputError(f"counts: expected whole numbers up to {MAX_RUN}, got {quoted(wrong[0])}.")
     return np.array(runs, np.int64)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import ClassTable
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, brief
 from splatseg.io.evidence._base import MAX_FILE_ID
 from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
@@ -67,7 +67,7 @@ class Palette:
             colour = (code >> 16, code >> 8 & 255, code & 255)
             names = self._names.get(colour, [])
             if len(names) != 1:
-                what = " and ".join(names) if names else "no class of the table"
+                what = brief(" and ".join(names[:3])) if names else "no class of the table"
                 raise FileFormatError(
                     f"{path}: expected the colours of the class table, got {colour} in {count} "
                     f"pixels, which is that of {what}."
@@ -133,7 +133,8 @@ def read_id_map(path: Path) -> Ids:
 def _from_picture(path: Path, palette: Palette | None) -> Ids:
     with open_image(path) as image:
         coloured = palette is not None and image.mode in ("RGB", "RGBA")
-        pages = getattr(image, "n_frames", 1)
+        with reading(path, "a label map"):
+            pages = int(getattr(image, "n_frames", 1))
         if pages != 1:
             raise FileFormatError(f"{path}: expected one picture of ids, got {pages} pages.")
         if not coloured and len(image.getbands()) != 1:

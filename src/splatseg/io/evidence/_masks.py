@@ -180,8 +180,9 @@ def read_masks(path: Path) -> MaskSet:
     rows, height, width = _mask_rows(read_json_value(path))
     if not isinstance(rows, list) or not _is_side(height) or not _is_side(width):
         raise FileFormatError(
-            f"{path}: expected masks in run lengths with their height and width (SAM's generator "
-            f"with output_mode='coco_rle'), got {quoted(height)} and {quoted(width)}."
+            f"{path}: expected masks with their height and width, in run lengths as SAM's "
+            f"generator gives them with output_mode='coco_rle', got {quoted(height)} and "
+            f"{quoted(width)}."
         )
     check_unpacked(
         path,
