@@ -84,6 +84,8 @@ def copied(
 
 def _ending_hint(names: Sequence[str], others: Sequence[str]) -> str:
     """The option that reads files which are named as views are, with an ending of their own."""
+    if all("/" in other for other in others) and names[0] in {o.split("/")[0] for o in others}:
+        return "; --what masks reads a folder of pictures a view"
     endings = (other.removeprefix(names[0]) for other in others if other.startswith(names[0]))
     ending = min(endings, key=len, default="")
     if ending and all(other.endswith(ending) for other in others):

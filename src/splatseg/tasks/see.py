@@ -61,10 +61,10 @@ class SeeOptions:
     for 000_pred.png; files without it are left aside."""
 
     classes: str | None = None
-    """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360 or
-    semantic-kitti, for the ids of their annotations, with -train behind it for the ids that
+    """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360,
+    semantic-kitti or voc, for the ids of their annotations, with -train behind it for the ids that
     networks learn; or a JSON file with "classes" (id, name, isthing, colour), where 0 is a class
-    if it is called so. Pictures in a table's colours are read by it."""
+    if it is called so; or CVAT's labelmap.txt. Pictures in a table's colours are read by it."""
 
     depth_unit: float | None = None
     """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
@@ -113,7 +113,7 @@ def see(
 
     Args:
         scene: The scene, read from its folder.
-        model: The model; or the name of one, or a folder of evidence recorded elsewhere.
+        model: The model; or the name of one, or a file or folder of evidence recorded elsewhere.
         evidence: Name of the evidence to write.
         options: What is asked.
         model_options: Options of the model's family, such as `RegionOptions` of ``classical``; None

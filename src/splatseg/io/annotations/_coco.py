@@ -46,6 +46,11 @@ class _Categories:
     classes: ClassTable | None
     source_ids: Mapping[int, int] | None
 
+    @property
+    def things(self) -> Mapping[int, bool]:
+        """Whether a class has instances, where the file tells."""
+        return {} if self.classes is None else {row.id: row.isthing for row in self.classes.rows}
+
     def id_of(self, row: Row, *, where: str) -> int:
         own = row.get("category_id")
         number = json_integer(own, where=f"{where}: category_id")
@@ -172,14 +177,16 @@ def _instance_regions(
             mask = canvas.outlined(outlines)
         score = min(1.0, max(0.0, json_number(row.get("score", 1), where=f"{where}: score")))
         category = categories.id_of(row, where=where)
-        yield Region(mask=mask, category=category, score=score, order=score)
+        yield Region(
+            mask=mask, category=category, score=score, order=score,
+            isthing=categories.things.get(category, True),
+        )  # fmt: skip
 
 
 def _panoptic_regions(
     rows: Sequence[Row], categories: _Categories, folder: Path, canvas: Canvas
 ) -> Iterator[Region]:
     """A region each segment of a picture's PNG that `segments_info` tells of."""
-    things = {row.id: row.isthing for row in categories.classes.rows} if categories.classes else {}
     for row in rows:
         name, where = row.get("file_name"), canvas.where
         if not isinstance(name, str) or not 0 < len(name) <= _MAX_NAME:
@@ -203,7 +210,7 @@ def _panoptic_regions(
             yield Region(
                 mask=canvas.boxed(inside, left, top), category=category,
                 score=min(1.0, max(0.0, score)),
-                isthing=bool(segment.get("isthing", things.get(category, True))),
+                isthing=bool(segment.get("isthing", categories.things.get(category, True))),
             )  # fmt: skip
 
 

@@ -145,7 +145,7 @@ class _Found:
         self.labels: list[str] = []
         self.images: list[tuple[str, tuple[int, int], list[_Shape]]] = []
         self.left_out: Counter[str] = Counter()
-        self.parser = expat.ParserCreate()
+        self.parser = expat.ParserCreate("utf-8")  # whatever encoding it names
         self.parser.buffer_text = True
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end

@@ -31,6 +31,7 @@ _BYTES_OF_PIXEL = 5
 _BYTES_OF_COLOUR = 32
 """Three bytes as they are decoded, and four integers that find the colour's id."""
 
+_TIFF = (".tif", ".tiff")
 _NONE = -1
 _BLACK = (0, 0, 0)
 _SUM_TOLERANCE = 0.02
@@ -137,7 +138,8 @@ def _from_picture(path: Path, palette: Palette | None) -> Ids:
             pages = int(getattr(image, "n_frames", 1))
         if pages != 1:
             raise FileFormatError(f"{path}: expected one picture of ids, got {pages} pages.")
-        if not coloured and len(image.getbands()) != 1:
+        single = len(image.getbands()) == 1 and (image.mode != "F" or path.suffix in _TIFF)
+        if not coloured and not single:
             raise FileFormatError(
                 f"{path}: expected one channel of ids, got {image.mode}; a coloured picture "
                 "of labels needs a class table with its colours."
@@ -153,7 +155,7 @@ def _from_picture(path: Path, palette: Palette | None) -> Ids:
             array = np.asarray(image.convert("RGB") if coloured else image)
     if coloured and palette is not None:
         return palette.ids(path, array)
-    if image.format == "TIFF":  # of 32 bits, whole numbers or floats, as arrays are
+    if path.suffix in _TIFF:  # of 32 bits, whole numbers or floats, as arrays are
         return _from_array(path, array, None)[0]
     return _checked(path, array, least=0)
 

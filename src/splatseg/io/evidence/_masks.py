@@ -21,10 +21,14 @@ from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._label_files import read_id_map
 from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
-from splatseg.io.npz import read_npz
+from splatseg.io.npy import read_npy
+from splatseg.io.npz import npz_names, read_npz
 
 MASK_TABLE = "metadata.csv"
 """What SAM's tool writes beside the pictures of masks of one photograph."""
+
+_STACKS = ("masks", "segmentation", "segmentations")
+"""Arrays of an npz that are stacks of masks."""
 
 _SCORES = ("score", "predicted_iou")
 _INT32 = np.iinfo(np.int32)
@@ -54,17 +58,34 @@ def read_any_masks(path: Path) -> MaskSet:
     """The masks of one view: a JSON, an npz or a folder of pictures."""
     if path.is_dir():
         return read_mask_images(path)
-    return read_mask_arrays(path) if path.suffix == ".npz" else read_masks(path)
+    return read_mask_arrays(path) if path.suffix in (".npz", ".npy") else read_masks(path)
+
+
+def holds_masks(path: Path) -> bool:
+    """Whether an npz, or an ``.npy`` of booleans, is a stack of masks."""
+    if path.suffix == ".npy":
+        array = read_npy(path, mapped=True)
+        return array.ndim == 3 and array.dtype.kind == "b"
+    return path.suffix == ".npz" and _stack_name(path) is not None
 
 
 def read_mask_arrays(path: Path) -> MaskSet:
-    """The masks of an npz: ``masks`` (m, height, width), ``scores`` and ``levels`` may lack.
+    """The masks (m, height, width) of an ``.npy``, or of an npz: ``masks`` or another usual name.
+
+    Of an npz ``scores``, or SAM's ``predicted_iou``, and ``levels`` may lack.
 
     Raises:
         MissingFileError: If there is no such file.
         FileFormatError: If it holds anything else.
     """
-    arrays = read_npz(path, ["masks"], optional=["scores", "levels"])
+    if path.suffix == ".npy":
+        arrays = {"masks": read_npy(path)}
+    else:
+        name = _stack_name(path) or "masks"
+        arrays = read_npz(path, [name], optional=["scores", "predicted_iou", "levels"])
+        arrays["masks"] = arrays[name]
+        if "predicted_iou" in arrays:
+            arrays.setdefault("scores", arrays["predicted_iou"])
     masks = arrays["masks"]
     if (
         masks.ndim != 3
@@ -95,6 +116,14 @@ def read_mask_arrays(path: Path) -> MaskSet:
         scores=torch.from_numpy(scores.astype(np.float32)).clamp(0, 1),
         levels=torch.from_numpy(levels.astype(np.int32)),
     )
+
+
+def _stack_name(path: Path) -> str | None:
+    """The array of an npz that is a stack of masks; one without a name is where it is alone."""
+    names = npz_names(path)
+    if tuple(names) == ("arr_0",):
+        return "arr_0"
+    return next((name for name in _STACKS if name in names), None)
 
 
 def _is_finite(values: NDArray[Any]) -> bool:

@@ -24,12 +24,16 @@ from splatseg.io.evidence._features import (
     BASIS_FILE,
     QUANTISATION_FILE,
     holds_features,
-    holds_masks,
     open_features,
 )
 from splatseg.io.evidence._label_files import LABEL_NAMES, Palette, is_soft
 from splatseg.io.evidence._labels import IdRule, LabelEvidence, check_rule
-from splatseg.io.evidence._masks import MaskEvidence, holds_mask_rows, mask_folders
+from splatseg.io.evidence._masks import (
+    MaskEvidence,
+    holds_mask_rows,
+    holds_masks,
+    mask_folders,
+)
 from splatseg.io.evidence._segments import (
     SEGMENTS_FILE,
     TRACKS_FILE,
@@ -137,7 +141,8 @@ def open_evidence(
     if classes is not None:
         raise InputError(f"classes: goes with label maps, {folder} has none.")
     if found == "masks":
-        files = objects or arrays or mask_folders(folder, marked_by="*.png")
+        stacks = objects or arrays or view_files(folder, suffix + ".npy")
+        files = stacks or mask_folders(folder, marked_by="*.png")
         return MaskEvidence(root=folder, files=files)
     if found == "features":
         return open_features(folder, arrays)
@@ -277,6 +282,8 @@ def _kind(
 ) -> str | None:
     """The kind that files without a header show; the first one must hold what its kind has."""
     if maps and mask_folders(folder, marked_by="metadata.csv"):
+        return "masks"
+    if maps and holds_masks(next(iter(maps.values()))):
         return "masks"
     if maps:
         if (folder / SEGMENTS_FILE).is_file():
