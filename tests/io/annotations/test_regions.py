@@ -60,6 +60,17 @@ def test_several_outlines_are_one_mask() -> None:
     assert CANVAS.outlined([one * 1e29 - 5e28]).area == HEIGHT * WIDTH
 
 
+def test_centres_on_an_edge_belong_to_what_lies_below_and_to_its_right() -> None:
+    """So that areas side by side share no pixel and leave none."""
+    upper, lower = (
+        np.array([[1.5, top], [5.5, top], [5.5, top + 2], [1.5, top + 2]]) for top in (0.5, 2.5)
+    )
+    found = [CANVAS.outlined([corners]).decode().numpy() for corners in (upper, lower)]
+    wanted = np.zeros((2, HEIGHT, WIDTH), bool)
+    wanted[0, 0:2, 1:5] = wanted[1, 2:4, 1:5] = True
+    assert np.array_equal(found, wanted)
+
+
 def test_a_box_must_lie_in_the_picture() -> None:
     for left, top in ((-1, 0), (0, -1), (WIDTH - 1, 0), (0, HEIGHT - 1)):
         with pytest.raises(FileFormatError, match="file: expected masks within 9x7 pixels"):

@@ -28,6 +28,9 @@ LABEL_NAMES = ("ids", *SOFT_NAMES)
 _BYTES_OF_PIXEL = 5
 """A byte as it is decoded and an int32."""
 
+_BYTES_OF_TIFF = 24
+"""Four bytes as they are decoded, a copy that is checked, an int64 and an int32."""
+
 _BYTES_OF_COLOUR = 32
 """Three bytes as they are decoded, and four integers that find the colour's id."""
 
@@ -145,9 +148,11 @@ def _from_picture(path: Path, palette: Palette | None) -> Ids:
                 "of labels needs a class table with its colours."
             )
         width, height = image.size
+        bytes_of_pixel = _BYTES_OF_TIFF if path.suffix in _TIFF else _BYTES_OF_PIXEL
+        bytes_of_pixel = _BYTES_OF_COLOUR if coloured else bytes_of_pixel
         check_unpacked(
             path,
-            width * height * (_BYTES_OF_COLOUR if coloured else _BYTES_OF_PIXEL),
+            width * height * bytes_of_pixel,
             packed=path.stat().st_size,
             what=f"a label map of {width}x{height} pixels",
         )
