@@ -257,7 +257,7 @@ def change_runs(counts: object) -> Spoil:
         (lambda p: edited(p, lambda c: c.update(masks=[3])), "masks[0]: expected a run-length"),
         (halved, "expected JSON, but it cannot be parsed"),
         (lambda p: p.write_text(""), "expected JSON, but it cannot be parsed"),
-        (lambda p: p.write_text("[]"), "expected a JSON object, got list"),
+        (lambda p: p.write_text("[]"), "masks with their height and width"),
         (lambda p: p.write_text("[" * 100_000), "expected JSON, but it cannot be parsed"),
     ],
 )

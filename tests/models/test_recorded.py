@@ -337,7 +337,7 @@ def test_features_that_are_not_finite_are_refused(tmp_path) -> None:
 
 
 def test_what_cannot_be_a_recorded_model(tmp_path) -> None:
-    with pytest.raises(MissingFileError, match="no such folder"):
+    with pytest.raises(MissingFileError, match="no such file or folder"):
         recorded_model(tmp_path / "gone")
     empty = create_evidence(tmp_path / "e", kind="masks")
     with pytest.raises(InputError, match="at least one view, got none"):

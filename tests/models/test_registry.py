@@ -93,7 +93,7 @@ def test_names_that_nobody_knows_are_answered_with_those_that_are(installed) -> 
         find_model("sammy")
     sentence = str(caught.value)
     assert sentence.startswith("model: expected one of classical, ")
-    assert sentence.endswith(", halves, or a folder of recorded evidence, got 'sammy'.")
+    assert sentence.endswith(", halves, or a file or folder of recorded evidence, got 'sammy'.")
     with pytest.raises(InputError, match="did you mean halves"):
         find_family("halfes")
     assert find_family("halves") is None, "it is made whole"

@@ -44,13 +44,17 @@ class Command:
     splatseg see room --model label-maps --evidence labels --zero-is-class --void 255
 
     splatseg see room --model predictions --evidence ade --suffix _pred --classes ade20k-train
+
+    splatseg see room --model instances_default.json --evidence drawn --what labels
     """
 
     scene: SceneFolder
 
-    model: Annotated[str, tyro.conf.arg(metavar="NAME_OR_FOLDER")]
-    """The model: one of those above, or a folder of evidence that was recorded elsewhere
-    (docs/models.md). `splatseg see --model NAME --help` shows the options of one."""
+    model: Annotated[str, tyro.conf.arg(metavar="NAME_OR_PATH")]
+    """The model: one of those above, or a file or folder that was recorded elsewhere: masks, label
+    maps, features or depth, a file a view, or annotations as COCO, CVAT, labelme, Label Studio and
+    Detectron2 write them (docs/models.md). `splatseg see --model NAME --help` shows the options of
+    one."""
 
     evidence: Annotated[str, tyro.conf.arg(metavar="NAME")]
     """Name of the evidence to write."""
@@ -78,10 +82,10 @@ class Command:
     for 000_pred.png; files without it are left aside."""
 
     classes: Annotated[str | None, tyro.conf.arg(metavar="NAME_OR_FILE")] = None
-    """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360 or
-    semantic-kitti, for the ids of their annotations, with -train behind it for the ids that
+    """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360,
+    semantic-kitti or voc, for the ids of their annotations, with -train behind it for the ids that
     networks learn; or a JSON file with "classes" (id, name, isthing, colour), where 0 is a class
-    if it is called so. Pictures in a table's colours are read by it."""
+    if it is called so; or CVAT's labelmap.txt. Pictures in a table's colours are read by it."""
 
     depth_unit: float | None = None
     """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.

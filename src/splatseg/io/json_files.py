@@ -25,6 +25,13 @@ def parse_object(text: str | bytes, *, where: str) -> dict[str, Any]:
         FileFormatError: If it is not JSON, holds something other than an object, or text in it is
             no Unicode (half of a pair of surrogates).
     """
+    value = _parsed(text, where=where)
+    if not isinstance(value, dict):
+        raise FileFormatError(f"{where}: expected a JSON object, got {type(value).__name__}.")
+    return cast(dict[str, Any], value)
+
+
+def _parsed(text: str | bytes, *, where: str) -> object:
     try:
         decoded = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
         value = json.loads(decoded)
@@ -32,11 +39,9 @@ def parse_object(text: str | bytes, *, where: str) -> dict[str, Any]:
         raise FileFormatError(
             f"{where}: expected JSON, but it cannot be parsed ({reason(error)})."
         ) from error
-    if not isinstance(value, dict):
-        raise FileFormatError(f"{where}: expected a JSON object, got {type(value).__name__}.")
     if _SURROGATE.search(decoded) is not None:
-        _refuse_surrogates(cast(dict[str, Any], value), where)
-    return cast(dict[str, Any], value)
+        _refuse_surrogates(value, where)
+    return value
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -49,7 +54,17 @@ def read_json(path: Path) -> dict[str, Any]:
     return parse_object(read_bytes(path, "a JSON file"), where=str(path))
 
 
-def _refuse_surrogates(content: dict[str, Any], where: str) -> None:
+def read_json_value(path: Path) -> Any:
+    """Whatever JSON a file holds: others write lists, where we write objects.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is not JSON.
+    """
+    return _parsed(read_bytes(path, "a JSON file"), where=str(path))
+
+
+def _refuse_surrogates(content: object, where: str) -> None:
     """Refuse text that no file name, terminal or other file could hold."""
     pending: list[object] = [content]
     while pending:

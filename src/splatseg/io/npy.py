@@ -146,7 +146,8 @@ def filled(file: IO[bytes], header: ArrayHeader) -> NDArray[Any]:
 def _check(header: ArrayHeader, size: int, where: object) -> None:
     dtype, shape = header.dtype, header.shape
     if dtype.kind not in KINDS or (dtype.kind != "U" and dtype.itemsize > _MAX_ITEM):
-        raise FileFormatError(f"{where}: expected an array of numbers or text, got {dtype.kind!r}.")
+        what = "objects, and nothing is unpickled" if dtype.kind == "O" else repr(dtype.kind)
+        raise FileFormatError(f"{where}: expected an array of numbers or text, got {what}.")
     if any(not 0 <= side < _MAX_SIDE for side in shape) or (
         math.prod(shape) and not dtype.itemsize
     ):

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from splatseg.core import UNLABELLED, ClassTable, LabelMap, View, camera_of_map
 from splatseg.errors import InputError, ShapeError
+from splatseg.io.annotations import AREA_KINDS, AnnotationEvidence
 from splatseg.io.atomic import atomic_file
 from splatseg.io.evidence import (
     TEXT_FILE,
@@ -37,6 +38,7 @@ from splatseg.models._sources import Source, some, without_empty
 from splatseg.models.recorded import AnyRecorded
 
 _SHARED = ("quant.npz", "basis.npz")
+_WITH_SEGMENTS = (PanopticEvidence, AnnotationEvidence)
 _ASKED: Mapping[str, tuple[EvidenceKind, ...]] = {
     "masks": ("masks",),
     "labels": ("labels", "tracked"),
@@ -60,6 +62,8 @@ def copied(
         InputError: If it is of another kind, or lacks views.
     """
     evidence = model.evidence
+    if isinstance(evidence, AnnotationEvidence):
+        evidence = evidence.given(AREA_KINDS.get(what or "", evidence.given_as))
     if what is not None and evidence.kind not in _ASKED.get(what, ()):
         raise InputError(f"{evidence.folder}: expected evidence of {what}, got {evidence.kind}.")
     there = frozenset(evidence.view_names)
@@ -80,6 +84,8 @@ def copied(
 
 def _ending_hint(names: Sequence[str], others: Sequence[str]) -> str:
     """The option that reads files which are named as views are, with an ending of their own."""
+    if all("/" in other for other in others) and names[0] in {o.split("/")[0] for o in others}:
+        return "; --what masks reads a folder of pictures a view"
     endings = (other.removeprefix(names[0]) for other in others if other.startswith(names[0]))
     ending = min(endings, key=len, default="")
     if ending and all(other.endswith(ending) for other in others):
@@ -168,7 +174,7 @@ class _Copied(Source):
         if evidence.source_ids is not None:
             there = view_files(folder, ".png").values()
             self.highest.extend(int(read_id_map(path).max(initial=0)) for path in there)
-        if isinstance(evidence, PanopticEvidence):
+        if evidence.kind == "panoptic" and isinstance(evidence, _WITH_SEGMENTS):
             save_segments({view.name: evidence.segments(view.name) for view in views}, folder)
         elif isinstance(evidence, TrackedEvidence):
             save_tracks(evidence.tracks, folder, order=evidence.order)
@@ -217,7 +223,7 @@ class _Copied(Source):
 
     @override
     def notes(self) -> tuple[str, ...]:
-        notes: list[str] = []
+        notes = list(self.evidence.notes)
         if self.lacking:
             notes.append(f"{len(self.lacking)} views have no evidence ({some(self.lacking)}).")
         if self.empty:

@@ -13,7 +13,8 @@ from typing import Any, cast
 
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Model
-from splatseg.errors import InputError, MissingPackageError
+from splatseg.errors import InputError, MissingFileError, MissingPackageError
+from splatseg.io.foreign import is_file, is_folder
 from splatseg.models._family import LoadOptions, ModelFamily
 from splatseg.models._loading import loading_of
 
@@ -94,17 +95,20 @@ def find_model(
     Raises:
         InputError: If there is neither, options are not those of the model, or what another
             package brings is no model.
-        MissingFileError: If the weights are not on this machine.
+        MissingFileError: If the weights are not on this machine, or a path leads to nothing.
         FileFormatError: If the weights are broken, or of another model.
         MissingPackageError: If the package that brings it, or one it needs, cannot be imported.
     """
     known = _known()
     text = str(name)
     if text not in known:
-        if not Path(name).is_dir():
+        if not is_file(Path(name)) and not is_folder(Path(name)):
+            if Path(name).suffix or len(Path(name).parts) > 1:
+                raise MissingFileError(f"model: {text!r:.200}: there is no such file or folder.")
             names = ", ".join(known)
             raise InputError(
-                f"model: expected one of {names}, or a folder of recorded evidence, got {text!r}."
+                f"model: expected one of {names}, or a file or folder of recorded evidence, got "
+                f"{text!r:.200}."
             )
         _refuse(text, options, loading)
         from splatseg.models.recorded import recorded_model

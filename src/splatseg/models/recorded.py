@@ -14,6 +14,7 @@ from splatseg.core import ClassTable, DepthMap, LabelMap, View
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Image, Panoptic
 from splatseg.errors import InputError
+from splatseg.io.annotations import AnnotationEvidence, open_annotations
 from splatseg.io.evidence import (
     DepthEvidence,
     EvidenceKind,
@@ -62,7 +63,7 @@ class RecordedPanoptic(RecordedMaskModel):
     def panoptic(self, image: Image, *, view: str | None = None) -> Panoptic:
         """The recorded segments of the view."""
         evidence = self.evidence
-        if not isinstance(evidence, PanopticEvidence):
+        if not isinstance(evidence, PanopticEvidence | AnnotationEvidence):
             raise InputError(f"{evidence.folder}: expected panoptic evidence, got {evidence.kind}.")
         name = self.view_of(image, view)
         return Panoptic(ids=self.recorded_label_map(image, name), segments=evidence.segments(name))
@@ -115,14 +116,19 @@ def recorded_model(
     classes: str | None = None,
     depth_unit: float | None = None,
 ) -> AnyRecorded:
-    """The model that a folder of recorded evidence stands for.
+    """The model that recorded evidence stands for: a folder with a file a view, or annotations.
+
+    Annotations of another tool (`io.annotations.open_annotations`) are one file, or the folder that
+    it exported; their pictures are matched with `views` by name, then by stem.
 
     Features become `RecordedTextFeatures` where text_embeddings.npz lies in the folder or
     beside it and its vectors are as wide as the features; else `RecordedFeatures`.
 
     Args:
-        folder: The folder: label maps, panoptic, tracked, masks, features or depth maps.
-        views: Views whose photographs an image is compared with where no view is named.
+        folder: The folder: label maps, panoptic, tracked, masks, features or depth maps; or the
+            file or folder of annotations.
+        views: Views whose photographs an image is compared with where no view is named, and that
+            pictures of annotations are matched with.
         kind: As for `open_evidence`.
         zero_is_class: As for `open_evidence`.
         void: As for `open_evidence`.
@@ -135,10 +141,17 @@ def recorded_model(
         InputError: If it holds no evidence, or none of any view.
         FileFormatError: If a table in it is broken.
     """
-    evidence = open_evidence(
-        folder, zero_is_class=zero_is_class, void=void, kind=kind, suffix=suffix, classes=classes,
-        depth_unit=depth_unit,
-    )  # fmt: skip
+    evidence = open_annotations(folder, views=views, classes=classes)
+    if evidence is None:
+        evidence = open_evidence(
+            folder, zero_is_class=zero_is_class, void=void, kind=kind, suffix=suffix,
+            classes=classes, depth_unit=depth_unit,
+        )  # fmt: skip
+    elif zero_is_class or void is not None or suffix or depth_unit is not None:
+        raise InputError(
+            "zero_is_class, void, suffix, depth_unit: expected with a file a view, got annotations "
+            f"of all views, {folder}."
+        )
     if not evidence.view_names:
         raise InputError(f"{evidence.folder}: expected evidence of at least one view, got none.")
     by_content = ViewsByContent(tuple(views))
@@ -155,7 +168,7 @@ def recorded_model(
                 evidence=evidence, views=by_content, reading=reading, words=words
             )
         return RecordedFeatures(evidence=evidence, views=by_content, reading=reading)
-    if isinstance(evidence, PanopticEvidence):
+    if evidence.kind == "panoptic":
         return RecordedPanoptic(evidence=evidence, views=by_content, reading=reading)
     if isinstance(evidence, TrackedEvidence):
         return RecordedTracks(evidence=evidence, views=by_content, reading=reading)

@@ -1,10 +1,11 @@
 """A 2D model looks at a scene's photographs, and what it sees is written down."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from splatseg.core import Model, Scene
+from splatseg.core import Model, Scene, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.io.evidence import (
@@ -23,9 +24,10 @@ from splatseg.models import (
     TrackingOptions,
     What,
     find_model,
+    model_names,
     record_evidence,
 )
-from splatseg.models.recorded import AnyRecorded, recorded_model
+from splatseg.models.recorded import recorded_model
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer
 from splatseg.tasks._view_images import ViewImages
@@ -59,10 +61,10 @@ class SeeOptions:
     for 000_pred.png; files without it are left aside."""
 
     classes: str | None = None
-    """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360 or
-    semantic-kitti, for the ids of their annotations, with -train behind it for the ids that
+    """Names of the ids of recorded label maps: ade20k, coco, cityscapes, scannet, kitti360,
+    semantic-kitti or voc, for the ids of their annotations, with -train behind it for the ids that
     networks learn; or a JSON file with "classes" (id, name, isthing, colour), where 0 is a class
-    if it is called so. Pictures in a table's colours are read by it."""
+    if it is called so; or CVAT's labelmap.txt. Pictures in a table's colours are read by it."""
 
     depth_unit: float | None = None
     """Metres of one step of recorded depth maps that are pictures or .npy files, such as 0.001.
@@ -111,7 +113,7 @@ def see(
 
     Args:
         scene: The scene, read from its folder.
-        model: The model; or the name of one, or a folder of evidence recorded elsewhere.
+        model: The model; or the name of one, or a file or folder of evidence recorded elsewhere.
         evidence: Name of the evidence to write.
         options: What is asked.
         model_options: Options of the model's family, such as `RegionOptions` of ``classical``; None
@@ -133,7 +135,7 @@ def see(
     if scene.root is None:
         raise InputError("scene: expected one that was read from its folder, got one without.")
     views = views_asked(scene, options.views)
-    found = _model(model, options, model_options, loading, observer)
+    found = _model(model, options, model_options, loading, observer, views=scene.views)
     seeds = _seeds(scene, options.seeds)
     tracking = None if seeds is None and options.tracking == TrackingOptions() else options.tracking
     cache = None
@@ -185,19 +187,17 @@ def _model(
     model_options: object,
     loading: LoadOptions | None,
     observer: Observer,
+    *,
+    views: Sequence[View],
 ) -> Model:
     """The model with its settings; settings that it does not have are refused."""
-    if isinstance(asked, str):
-        model = find_model(asked, model_options, loading=loading, report=observer.note)
-    elif model_options is not None or loading is not None:
-        raise InputError("model: expected a name with options and weights, got a model made.")
-    else:
-        model = asked
-    name = asked if isinstance(asked, str) else model.name
-    if isinstance(model, AnyRecorded) and isinstance(asked, str):
+    if isinstance(asked, str) and asked not in model_names() and Path(asked).exists():
+        if model_options is not None or loading is not None:
+            raise InputError(f"options: model {asked} takes neither options nor weights.")
         told: dict[tuple[What, ...], EvidenceKind] = {("masks",): "masks", ("depth",): "depth"}
         return recorded_model(
-            name,
+            asked,
+            views=views,
             kind=told.get(options.what),
             zero_is_class=options.zero_is_class,
             void=options.void,
@@ -205,6 +205,13 @@ def _model(
             classes=options.classes,
             depth_unit=options.depth_unit,
         )
+    if isinstance(asked, str):
+        model = find_model(asked, model_options, loading=loading, report=observer.note)
+    elif model_options is not None or loading is not None:
+        raise InputError("model: expected a name with options and weights, got a model made.")
+    else:
+        model = asked
+    name = asked if isinstance(asked, str) else model.name
     given = (options.void, options.depth_unit)
     if options.zero_is_class or given != (None, None) or options.suffix or options.classes:
         raise InputError(

@@ -9,7 +9,9 @@ import torch
 from PIL import Image
 
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.evidence import open_evidence
+from splatseg.io.evidence import check_map_sizes, open_evidence
+from splatseg.io.label_tables import label_table
+from support.annotations import views_of
 
 IDS = np.array([[0, 1, 2], [7, 7, 0]])
 
@@ -222,3 +224,133 @@ def test_tables_go_with_label_maps(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", features=np.zeros((2, 2, 3), np.float32), stride=np.int64(4))
     with pytest.raises((InputError, FileFormatError)):
         open_evidence(tmp_path, classes="coco")
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "i4", "f4"])
+@pytest.mark.parametrize("suffix", [".tif", ".tiff"])
+def test_tiffs_of_ids(tmp_path: Path, dtype: str, suffix: str) -> None:
+    """Whole numbers or floats; -1 is none where the type has it."""
+    ids = IDS - 1 if dtype in ("i4", "f4") else IDS
+    Image.fromarray(ids.astype(dtype)).save(tmp_path / f"a{suffix}")
+    evidence = open_evidence(tmp_path)
+    assert (evidence.kind, evidence.view_names) == ("labels", ("a",))
+    assert opened(tmp_path) == np.where(ids > 0, ids, -1).tolist()
+
+
+@pytest.mark.parametrize(
+    ("ids", "message"),
+    [
+        (np.full((2, 3), 70000, np.int32), r"ids in \[-1, 65535\], got \[70000, 70000\]"),
+        (np.full((2, 3), 1.5, np.float32), "whole numbers as ids, got fractions"),
+        (np.full((2, 3), np.nan, np.float32), r"ids in \[-1, 65535\]"),
+    ],
+)
+def test_tiffs_that_are_no_ids(tmp_path: Path, ids: np.ndarray, message: str) -> None:
+    Image.fromarray(ids).save(tmp_path / "a.tif")
+    with pytest.raises(FileFormatError, match=rf"a\.tif: expected .*{message}"):
+        opened(tmp_path)
+
+
+def test_a_tiff_of_several_pages_is_refused(tmp_path: Path) -> None:
+    page = Image.fromarray(IDS.astype(np.uint8))
+    page.save(tmp_path / "a.tif", save_all=True, append_images=[page])
+    with pytest.raises(FileFormatError, match="one picture of ids, got 2 pages"):
+        opened(tmp_path)
+
+
+def test_large_tiffs_are_held_against_the_photograph(tmp_path: Path) -> None:
+    Image.fromarray(np.ones((40, 40), np.int32)).save(tmp_path / "a.tif")
+    evidence = open_evidence(tmp_path)
+    view = views_of("a")[0]
+    check_map_sizes(evidence, [view])
+    Image.fromarray(np.ones((200, 200), np.int32)).save(tmp_path / "a.tif")
+    with pytest.raises(FileFormatError, match="a label map of 64x48 pixels .* got 200x200"):
+        check_map_sizes(evidence, [view])
+
+
+MASKS = np.array([[[1, 0, 1], [0, 0, 1]], [[0, 0, 0], [1, 1, 0]]])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "scores"),
+    [
+        ({"masks": MASKS, "scores": np.array([0.5, 0.25])}, [0.5, 0.25]),
+        ({"segmentation": MASKS > 0, "predicted_iou": np.array([0.5, 0.25])}, [0.5, 0.25]),
+        ({"segmentations": MASKS}, [1, 1]),
+        ({"arr_0": MASKS}, [1, 1]),
+        (None, [1, 1]),
+    ],
+)
+def test_stacks_of_masks(
+    tmp_path: Path, arrays: dict[str, np.ndarray] | None, scores: list[float]
+) -> None:
+    if arrays is None:
+        np.save(tmp_path / "a.npy", MASKS > 0)
+    else:
+        np.savez(tmp_path / "a.npz", **arrays)
+    evidence = open_evidence(tmp_path)
+    assert (evidence.kind, evidence.view_names) == ("masks", ("a",))
+    masks = evidence.masks("a")
+    assert [masks.dense(k).tolist() for k in (0, 1)] == (MASKS > 0).tolist()
+    assert masks.scores.tolist() == scores
+
+
+def test_an_array_without_a_name_counts_where_it_is_alone(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", MASKS, MASKS)
+    with pytest.raises(InputError, match="expected evidence"):
+        open_evidence(tmp_path)
+
+
+def test_numbers_are_masks_where_one_says_so(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", MASKS)
+    assert len(open_evidence(tmp_path, kind="masks").masks("a")) == 2
+    np.save(tmp_path / "a.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(FileFormatError, match="got objects, and nothing is unpickled"):
+        open_evidence(tmp_path, kind="masks").masks("a")
+
+
+def text_table(folder: Path, text: str) -> str:
+    (folder / "labelmap.txt").write_text(text)
+    return str(folder / "labelmap.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "known"),
+    [
+        ("# label:color_rgb:parts:actions\nbackground:0,0,0::\ncar:1,2,3::\n", {1: "car"}),
+        ("car:1,2,3::\nwall: 4, 5, 6:x,y:z\n".replace(": 4, 5", ":4, 5"), {1: "car", 2: "wall"}),
+        ("0 0 0 void\n1\t2\t3\ta car\n", {1: "a car"}),
+        ("1 2 3 car\n4 5 6 wall\n", {1: "car", 2: "wall"}),
+    ],
+)
+def test_tables_of_colours_as_text(tmp_path: Path, text: str, known: dict[int, str]) -> None:
+    (tmp_path / "maps").mkdir()
+    pixels = np.array([[(1, 2, 3), (0, 0, 0)]], np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "maps" / "a.png")
+    evidence = open_evidence(tmp_path / "maps", classes=text_table(tmp_path, text))
+    assert evidence.classes is not None
+    assert {row.id: row.name for row in evidence.classes.rows} == known
+    if "0 0 0" in text or "0,0,0" in text:
+        assert evidence.label_map("a").ids.tolist() == [[1, -1]]
+
+
+@pytest.mark.parametrize("line", ["car", "car:1,2", "1 2 car", "car:256,0,0::", "car:1,2,-3::"])
+def test_tables_of_colours_that_are_broken(tmp_path: Path, line: str) -> None:
+    with pytest.raises(FileFormatError, match=r"labelmap\.txt: .*(a line|three bytes)"):
+        label_table(text_table(tmp_path, line))
+
+
+def test_pascal_voc(tmp_path: Path) -> None:
+    """Indices of a palette, or its colours; 255, the border, is none."""
+    palette = [0] * 768
+    palette[3:6], palette[21:24], palette[765:] = (128, 0, 0), (128, 128, 128), (224, 224, 192)
+    picture = Image.fromarray(np.array([[0, 1, 7, 255]], np.uint8), mode="P")
+    picture.putpalette(palette)
+    for one in (picture, picture.convert("RGB")):
+        one.save(tmp_path / "a.png")
+        assert opened(tmp_path, classes="voc") == [[-1, 1, 7, -1]]
+        evidence = open_evidence(tmp_path, classes="voc")
+        assert evidence.classes is not None
+        assert evidence.classes.name_of(7) == "car"
+    assert label_table("voc-train").classes.name_of(20) == "tvmonitor"
+    assert not label_table("voc-train").zero_is_class

@@ -57,6 +57,11 @@ class Evidence(ABC):
     def source_ids(self) -> Mapping[int, int] | None:
         """Id in the files by id in memory, where they differ (a source whose 0 is a class)."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of how it was read, a sentence each."""
+        return ()
+
     @abstractmethod
     def label_map(self, name: str) -> LabelMap:
         """The ids of a view, -1 where there is none.
@@ -167,6 +172,19 @@ def view_files(folder: Path, suffix: str) -> dict[str, Path]:
         if path.is_file() and not shared and not hidden and below.parts[0] not in _BESIDE:
             found[below.as_posix().removesuffix(suffix)] = path
     return dict(sorted(found.items()))
+
+
+PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
+"""Of pictures of ids; a folder has one of them."""
+
+
+def picture_files(folder: Path, suffix: str = "") -> dict[str, Path]:
+    """Pictures of ids by view name: PNGs, else TIFFs."""
+    for ending in PICTURE_SUFFIXES:
+        found = view_files(folder, suffix + ending)
+        if found:
+            return found
+    return {}
 
 
 def is_id(value: object) -> TypeGuard[int]:

@@ -260,11 +260,6 @@ def _check_tables(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         )
 
 
-def holds_masks(path: Path) -> bool:
-    """Whether a file is an npz with masks."""
-    return "masks" in npz_names(path)
-
-
 def holds_features(path: Path) -> bool:
     """Whether a file is an npz with features in our own layout."""
     return "features" in npz_names(path)

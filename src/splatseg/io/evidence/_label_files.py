@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import ClassTable
-from splatseg.errors import FileFormatError
+from splatseg.errors import FileFormatError, brief
 from splatseg.io.evidence._base import MAX_FILE_ID
 from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
@@ -28,9 +28,13 @@ LABEL_NAMES = ("ids", *SOFT_NAMES)
 _BYTES_OF_PIXEL = 5
 """A byte as it is decoded and an int32."""
 
+_BYTES_OF_TIFF = 24
+"""Four bytes as they are decoded, a copy that is checked, an int64 and an int32."""
+
 _BYTES_OF_COLOUR = 32
 """Three bytes as they are decoded, and four integers that find the colour's id."""
 
+_TIFF = (".tif", ".tiff")
 _NONE = -1
 _BLACK = (0, 0, 0)
 _SUM_TOLERANCE = 0.02
@@ -67,7 +71,7 @@ class Palette:
             colour = (code >> 16, code >> 8 & 255, code & 255)
             names = self._names.get(colour, [])
             if len(names) != 1:
-                what = " and ".join(names) if names else "no class of the table"
+                what = brief(" and ".join(names[:3])) if names else "no class of the table"
                 raise FileFormatError(
                     f"{path}: expected the colours of the class table, got {colour} in {count} "
                     f"pixels, which is that of {what}."
@@ -133,15 +137,22 @@ def read_id_map(path: Path) -> Ids:
 def _from_picture(path: Path, palette: Palette | None) -> Ids:
     with open_image(path) as image:
         coloured = palette is not None and image.mode in ("RGB", "RGBA")
-        if not coloured and (len(image.getbands()) != 1 or image.mode == "F"):
+        with reading(path, "a label map"):
+            pages = int(getattr(image, "n_frames", 1))
+        if pages != 1:
+            raise FileFormatError(f"{path}: expected one picture of ids, got {pages} pages.")
+        single = len(image.getbands()) == 1 and (image.mode != "F" or path.suffix in _TIFF)
+        if not coloured and not single:
             raise FileFormatError(
                 f"{path}: expected one channel of ids, got {image.mode}; a coloured picture "
                 "of labels needs a class table with its colours."
             )
         width, height = image.size
+        bytes_of_pixel = _BYTES_OF_TIFF if path.suffix in _TIFF else _BYTES_OF_PIXEL
+        bytes_of_pixel = _BYTES_OF_COLOUR if coloured else bytes_of_pixel
         check_unpacked(
             path,
-            width * height * (_BYTES_OF_COLOUR if coloured else _BYTES_OF_PIXEL),
+            width * height * bytes_of_pixel,
             packed=path.stat().st_size,
             what=f"a label map of {width}x{height} pixels",
         )
@@ -149,6 +160,8 @@ def _from_picture(path: Path, palette: Palette | None) -> Ids:
             array = np.asarray(image.convert("RGB") if coloured else image)
     if coloured and palette is not None:
         return palette.ids(path, array)
+    if path.suffix in _TIFF:  # of 32 bits, whole numbers or floats, as arrays are
+        return _from_array(path, array, None)[0]
     return _checked(path, array, least=0)
 
 

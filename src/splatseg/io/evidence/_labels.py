@@ -81,6 +81,9 @@ class LabelEvidence(FileEvidence):
     recorded: Mapping[int, int] | None = None
     """The model's own id by id in the files, as evidence.json has it."""
 
+    remarks: tuple[str, ...] = ()
+    """What was found when it was opened, a sentence each."""
+
     masked: Mapping[str, View] = field(default_factory=dict[str, View])
     """Views by their names, whose masks leave pixels out: these have no id."""
 
@@ -98,6 +101,11 @@ class LabelEvidence(FileEvidence):
     @override
     def source_ids(self) -> Mapping[int, int] | None:
         return self.rule.source_ids if self.recorded is None else self.recorded
+
+    @property
+    @override
+    def notes(self) -> tuple[str, ...]:
+        return self.remarks
 
     @override
     def label_map(self, name: str) -> LabelMap:

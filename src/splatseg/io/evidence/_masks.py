@@ -19,12 +19,16 @@ from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._label_files import read_id_map
-from splatseg.io.json_files import read_json
+from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
-from splatseg.io.npz import read_npz
+from splatseg.io.npy import read_npy
+from splatseg.io.npz import npz_names, read_npz
 
 MASK_TABLE = "metadata.csv"
 """What SAM's tool writes beside the pictures of masks of one photograph."""
+
+_STACKS = ("masks", "segmentation", "segmentations")
+"""Arrays of an npz that are stacks of masks."""
 
 _SCORES = ("score", "predicted_iou")
 _INT32 = np.iinfo(np.int32)
@@ -54,17 +58,34 @@ def read_any_masks(path: Path) -> MaskSet:
     """The masks of one view: a JSON, an npz or a folder of pictures."""
     if path.is_dir():
         return read_mask_images(path)
-    return read_mask_arrays(path) if path.suffix == ".npz" else read_masks(path)
+    return read_mask_arrays(path) if path.suffix in (".npz", ".npy") else read_masks(path)
+
+
+def holds_masks(path: Path) -> bool:
+    """Whether an npz, or an ``.npy`` of booleans, is a stack of masks."""
+    if path.suffix == ".npy":
+        array = read_npy(path, mapped=True)
+        return array.ndim == 3 and array.dtype.kind == "b"
+    return path.suffix == ".npz" and _stack_name(path) is not None
 
 
 def read_mask_arrays(path: Path) -> MaskSet:
-    """The masks of an npz: ``masks`` (m, height, width), ``scores`` and ``levels`` may lack.
+    """The masks (m, height, width) of an ``.npy``, or of an npz: ``masks`` or another usual name.
+
+    Of an npz ``scores``, or SAM's ``predicted_iou``, and ``levels`` may lack.
 
     Raises:
         MissingFileError: If there is no such file.
         FileFormatError: If it holds anything else.
     """
-    arrays = read_npz(path, ["masks"], optional=["scores", "levels"])
+    if path.suffix == ".npy":
+        arrays = {"masks": read_npy(path)}
+    else:
+        name = _stack_name(path) or "masks"
+        arrays = read_npz(path, [name], optional=["scores", "predicted_iou", "levels"])
+        arrays["masks"] = arrays[name]
+        if "predicted_iou" in arrays:
+            arrays.setdefault("scores", arrays["predicted_iou"])
     masks = arrays["masks"]
     if (
         masks.ndim != 3
@@ -95,6 +116,14 @@ def read_mask_arrays(path: Path) -> MaskSet:
         scores=torch.from_numpy(scores.astype(np.float32)).clamp(0, 1),
         levels=torch.from_numpy(levels.astype(np.int32)),
     )
+
+
+def _stack_name(path: Path) -> str | None:
+    """The array of an npz that is a stack of masks; one without a name is where it is alone."""
+    names = npz_names(path)
+    if tuple(names) == ("arr_0",):
+        return "arr_0"
+    return next((name for name in _STACKS if name in names), None)
 
 
 def _is_finite(values: NDArray[Any]) -> bool:
@@ -177,12 +206,11 @@ def read_masks(path: Path) -> MaskSet:
         MissingFileError: If there is no such file.
         FileFormatError: If it holds anything else.
     """
-    content = read_json(path)
-    rows = content.get("masks")
-    height, width = content.get("height"), content.get("width")
+    rows, height, width = _mask_rows(read_json_value(path))
     if not isinstance(rows, list) or not _is_side(height) or not _is_side(width):
         raise FileFormatError(
-            f"{path}: expected masks with their height and width, got {quoted(height)} and "
+            f"{path}: expected masks with their height and width, in run lengths as SAM's "
+            f"generator gives them with output_mode='coco_rle', got {quoted(height)} and "
             f"{quoted(width)}."
         )
     check_unpacked(
@@ -212,6 +240,34 @@ def read_masks(path: Path) -> MaskSet:
         scores=torch.tensor(scores, dtype=torch.float32),
         levels=torch.tensor(levels, dtype=torch.int32),
     )
+
+
+def holds_mask_rows(content: object) -> bool:
+    """Whether a JSON value is the masks of one picture."""
+    return isinstance(_mask_rows(content)[0], list)
+
+
+def _mask_rows(content: object) -> tuple[object, object, object]:
+    """The rows of masks, and the height and width of their picture, None where it has none.
+
+    Ours are an object with ``masks``, ``height`` and ``width``; a file of SA-1B has ``annotations``
+    and ``image``; what SAM's generator gives is a list of rows, and their first tells the size.
+    """
+    if isinstance(content, list):
+        rows = cast(list[object], content)
+        first = cast(dict[str, Any], rows[0]) if rows and isinstance(rows[0], dict) else {}
+        segmentation = first.get("segmentation")
+        size = cast(dict[str, Any], segmentation if isinstance(segmentation, dict) else {}).get(
+            "size"
+        )
+        sides = cast(list[object], size) if isinstance(size, list) else []
+        height, width = sides if len(sides) == 2 else (None, None)
+        return (rows if "segmentation" in first else None), height, width
+    fields = cast(dict[str, Any], content) if isinstance(content, dict) else {}
+    if "masks" not in fields and isinstance(fields.get("image"), dict):
+        image = cast(dict[str, Any], fields["image"])
+        return fields.get("annotations"), image.get("height"), image.get("width")
+    return fields.get("masks"), fields.get("height"), fields.get("width")
 
 
 def masks_content(masks: MaskSet) -> dict[str, Any]:

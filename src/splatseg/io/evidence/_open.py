@@ -12,25 +12,35 @@ from splatseg.core.json_values import id_of_key
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, quoted
 from splatseg.io.captures import read_metadata
 from splatseg.io.class_tables import class_table
-from splatseg.io.evidence._base import HEADER_FILE, Evidence, EvidenceKind, view_files
+from splatseg.io.evidence._base import (
+    HEADER_FILE,
+    Evidence,
+    EvidenceKind,
+    picture_files,
+    view_files,
+)
 from splatseg.io.evidence._depth import holds_depth, open_depth
 from splatseg.io.evidence._features import (
     BASIS_FILE,
     QUANTISATION_FILE,
     holds_features,
-    holds_masks,
     open_features,
 )
 from splatseg.io.evidence._label_files import LABEL_NAMES, Palette, is_soft
 from splatseg.io.evidence._labels import IdRule, LabelEvidence, check_rule
-from splatseg.io.evidence._masks import MaskEvidence, mask_folders
+from splatseg.io.evidence._masks import (
+    MaskEvidence,
+    holds_mask_rows,
+    holds_masks,
+    mask_folders,
+)
 from splatseg.io.evidence._segments import (
     SEGMENTS_FILE,
     TRACKS_FILE,
     open_panoptic,
     open_tracked,
 )
-from splatseg.io.json_files import read_json
+from splatseg.io.json_files import read_json, read_json_value
 from splatseg.io.label_tables import LabelTable, label_table, training_table
 from splatseg.io.npz import npz_names
 
@@ -99,7 +109,7 @@ def open_evidence(
         raise MissingFileError(f"{folder}: there is no such folder of evidence.")
     header = _header(folder)
     rule = check_rule(zero_is_class, void)
-    maps, arrays = view_files(folder, suffix + ".png"), view_files(folder, suffix + ".npz")
+    maps, arrays = picture_files(folder, suffix), view_files(folder, suffix + ".npz")
     objects = view_files(folder, suffix + ".json")
     if not maps and (kind is None or kind == "labels"):
         maps = _label_arrays(folder, suffix, arrays)
@@ -131,7 +141,8 @@ def open_evidence(
     if classes is not None:
         raise InputError(f"classes: goes with label maps, {folder} has none.")
     if found == "masks":
-        files = objects or arrays or mask_folders(folder, marked_by="*.png")
+        stacks = objects or arrays or view_files(folder, suffix + ".npy")
+        files = stacks or mask_folders(folder, marked_by="*.png")
         return MaskEvidence(root=folder, files=files)
     if found == "features":
         return open_features(folder, arrays)
@@ -272,11 +283,13 @@ def _kind(
     """The kind that files without a header show; the first one must hold what its kind has."""
     if maps and mask_folders(folder, marked_by="metadata.csv"):
         return "masks"
+    if maps and holds_masks(next(iter(maps.values()))):
+        return "masks"
     if maps:
         if (folder / SEGMENTS_FILE).is_file():
             return "panoptic"
         return "tracked" if (folder / TRACKS_FILE).is_file() else "labels"
-    if objects and "masks" in read_json(next(iter(objects.values()))):
+    if objects and holds_mask_rows(read_json_value(next(iter(objects.values())))):
         return "masks"
     if (folder / QUANTISATION_FILE).is_file() or (folder / BASIS_FILE).is_file():
         return "features" if arrays else None

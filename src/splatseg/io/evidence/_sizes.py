@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from splatseg.core import View
 from splatseg.errors import FileFormatError
-from splatseg.io.evidence._base import Evidence
+from splatseg.io.evidence._base import PICTURE_SUFFIXES, Evidence
 from splatseg.io.evidence._labels import LabelEvidence
 from splatseg.io.evidence._segments import TableEvidence
 from splatseg.io.images import open_image
@@ -30,7 +30,7 @@ def check_map_sizes(evidence: Evidence, views: Iterable[View]) -> None:
         return
     for view in views:
         path = maps.files.get(view.name)
-        if path is None or path.suffix != ".png":
+        if path is None or path.suffix not in PICTURE_SUFFIXES:
             continue  # an .npy takes as much on the disk as in memory, `io.limits` holds an .npz
         with open_image(path) as image:
             width, height = image.size

@@ -2,28 +2,35 @@
 
 Names, ids and colours are facts that the data sets publish; each table's file says where they
 are from. ``NAME`` has the ids of the annotations, where 0 is void, ``NAME-train`` the ids from 0
-in which networks learn them, where 255 is void (of SemanticKITTI: from 1, and 0 is void). Where
-several classes have one id in training, it is called as the first of them.
+in which networks learn them, where 255 is void (of SemanticKITTI and VOC: from 1, and 0 is void).
+Where several classes have one id in training, it is called as the first of them.
 """
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.errors import InputError
+from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.class_tables import class_table
+from splatseg.io.foreign import read_lines
 from splatseg.io.json_files import read_json
 
-TABLES = ("ade20k", "coco", "cityscapes", "scannet", "kitti360", "semantic-kitti")
+TABLES = ("ade20k", "coco", "cityscapes", "scannet", "kitti360", "semantic-kitti", "voc")
 """Data sets whose tables are known by name."""
 
 _VOID_NAMES = ("background", "ignore", "none", "unannotated", "unknown", "unlabel", "void")
 """How names of what is no class begin in the usual tables."""
 
+_LABELMAP_LINE = re.compile(r"(?P<name>[^:]+):(?P<colour>\d{1,3}, ?\d{1,3}, ?\d{1,3})(?::.*)?")
+_CAMVID_LINE = re.compile(r"(?P<colour>\d{1,3}\s+\d{1,3}\s+\d{1,3})\s+(?P<name>.+)")
+
 _TRAIN = "-train"
 _TRAIN_VOID = 255
-_LEARNED_FROM_ONE = frozenset({"semantic-kitti"})
+_LEARNED_FROM_ONE = frozenset({"semantic-kitti", "voc"})
+_ANNOTATED_VOID = {"voc": _TRAIN_VOID}
+"""Further ids of annotations that mean none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +52,11 @@ class LabelTable:
 
 
 def label_table(name: str) -> LabelTable:
-    """A table by name, or from a JSON file: an object with ``classes``, a list of rows.
+    """A table by name, or from a file: a JSON object with ``classes``, a list of rows, or text.
+
+    Text has a class a line: ``car:128,0,0::`` (labelmap.txt of CVAT and datumaro) or
+    ``128 0 0 car`` (label_colors.txt of CamVid). They are numbered from 0 where the first is of no
+    class, else from 1.
 
     A file that gives 0 the name of a class says that 0 is one; names such as void, background or
     unlabelled are of none.
@@ -66,12 +77,33 @@ def label_table(name: str) -> LabelTable:
     if not path.is_file():
         known = ", ".join(f"{table}, {table}{_TRAIN}" for table in TABLES)
         raise InputError(f"classes: expected one of {known} or a JSON file, got {name!r:.80}.")
+    if path.suffix == ".txt":
+        return _colour_lines(path)
     content: Any = read_json(path)
     table = class_table(content.get("classes"), where=str(path), keep_zero=True)
     zero = next((row.name for row in table.rows if row.id == 0), None)
     return LabelTable(
         name=name, classes=table, zero_is_class=zero is not None and not is_void_name(zero)
     )
+
+
+def _colour_lines(path: Path) -> LabelTable:
+    """A table of colours as text."""
+    rows: list[dict[str, object]] = []
+    for line in read_lines(path, "a table of colours"):
+        if line.startswith("#"):
+            continue
+        found = _LABELMAP_LINE.fullmatch(line) or _CAMVID_LINE.fullmatch(line)
+        if found is None:
+            raise FileFormatError(
+                f"{path}: expected a class and its colour a line (car:128,0,0:: or 128 0 0 car), "
+                f"got {quoted(line)}."
+            )
+        colour = [int(word) for word in re.split(r"[\s,]+", found["colour"])]
+        rows.append({"id": len(rows), "name": found["name"].strip(), "colour": colour})
+    if rows and not is_void_name(str(rows[0]["name"])):
+        rows = [row | {"id": i} for i, row in enumerate(rows, start=1)]
+    return LabelTable(name=str(path), classes=class_table(rows, where=str(path), keep_zero=True))
 
 
 def training_table(name: str) -> LabelTable | None:
@@ -109,7 +141,8 @@ def is_void_name(name: str) -> bool:
 
 
 def _annotated(base: str) -> LabelTable:
-    return LabelTable(name=base, classes=ClassTable(rows=tuple(info for _, info in _rows(base))))
+    rows = tuple(info for _, info in _rows(base))
+    return LabelTable(name=base, classes=ClassTable(rows=rows), void=_ANNOTATED_VOID.get(base))
 
 
 def _training(base: str) -> LabelTable:

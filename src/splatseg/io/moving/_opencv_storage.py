@@ -134,7 +134,7 @@ class _Found:
         self._texts: dict[str, list[str]] = {}
         self._kept = 0
         self._objects: list[StoredObject] = []
-        self.parser = expat.ParserCreate()
+        self.parser = expat.ParserCreate("utf-8")  # whatever encoding it names
         self.parser.buffer_text = True
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end

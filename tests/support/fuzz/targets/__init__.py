@@ -1,6 +1,7 @@
 """One function a format: it writes a small sound file and says which file is damaged and read."""
 
 from support.fuzz.targets import (
+    annotations,
     benchmarks,
     captures,
     evidence,
@@ -20,6 +21,7 @@ from support.fuzz.targets.base import TARGETS, Target
 __all__ = [
     "TARGETS",
     "Target",
+    "annotations",
     "benchmarks",
     "captures",
     "evidence",

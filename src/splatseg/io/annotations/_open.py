@@ -1,0 +1,219 @@
+"""Tells which tool wrote a file or folder of annotations, and opens it; or says what to export."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from splatseg.core import View
+from splatseg.core.boundary import boundary
+from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.io.annotations._base import Annotations, evidence_of
+from splatseg.io.annotations._coco import (
+    coco_dataset,
+    coco_results,
+    is_dataset,
+    is_results,
+    named_by,
+)
+from splatseg.io.annotations._colours import class_pictures, picture_tables
+from splatseg.io.annotations._cvat import cvat_annotations
+from splatseg.io.annotations._label_studio import (
+    is_label_studio,
+    is_label_studio_min,
+    label_studio_annotations,
+)
+from splatseg.io.annotations._labelme import is_labelme, labelme_annotations
+from splatseg.io.evidence import Evidence
+from splatseg.io.evidence._base import HEADER_FILE
+from splatseg.io.json_files import read_json_value
+from splatseg.io.label_tables import label_table
+
+_OPENED = frozenset({".json", ".npy", ".npz", ".png", ".tif", ".tiff", ".xml"})
+"""Suffixes of files that hold evidence of some kind."""
+
+_ADVICE = {
+    ".zip": "unpack it and give the folder",
+    ".pkl": "save masks as COCO run lengths in JSON (nothing is unpickled)",
+    ".pickle": "save masks as COCO run lengths in JSON (nothing is unpickled)",
+    ".pth": "give coco_instances_results.json instead, which Detectron2 writes beside it",
+    ".pt": "save masks as COCO run lengths in JSON (nothing is unpickled)",
+    ".csv": "export JSON, COCO or CVAT for images, which hold the masks",
+    ".tsv": "export JSON, COCO or CVAT for images, which hold the masks",
+    ".txt": "YOLO's text names no pixels of a picture; export COCO with segmentation",
+    ".h5": "save an npz with masks, or PNG label maps, one file a view",
+    ".mat": "save an npz with masks, or PNG label maps, one file a view",
+}
+"""What to give instead, by the suffix of what is not read."""
+
+_OF_ONE_VIEW = frozenset({".npy", ".npz", ".png", ".tif", ".tiff"})
+_TABLES = frozenset({HEADER_FILE, "segments.json", "tracks.json", "legend.json", "metadata.json"})
+_WHOLE = "annotations"
+"""Folder of the files of a whole data set."""
+
+
+@boundary
+def open_annotations(
+    path: Path | str, *, views: Sequence[View] = (), classes: str | None = None
+) -> Evidence | None:
+    """Annotations of another tool as evidence; None where a folder holds none.
+
+    COCO (instances, panoptic, results of Detectron2), CVAT for images, labelme, Label Studio, and
+    pictures of classes in the colours of a table beside them (CVAT's segmentation masks, CamVid).
+    Pictures are matched with views by name, then by stem.
+
+    Args:
+        path: The file, or the folder that was exported.
+        views: The views of the scene; without them every picture is a view by its own name.
+        classes: Names of the ids where the file has none, see `label_table`.
+
+    Raises:
+        MissingFileError: If there is neither.
+        InputError: If it cannot be told which file is meant, or no picture is of a view.
+        FileFormatError: If it is broken, or holds no masks; the message says what to export.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise MissingFileError(f"{path}: there is no such file or folder.")
+    if path.is_dir():
+        if (path / HEADER_FILE).is_file():
+            return None
+        if picture_tables(path):
+            return class_pictures(path, views, classes=classes)
+    annotations = _of_folder(path) if path.is_dir() else _of_file(path)
+    if annotations is None:
+        return None
+    if classes is not None:
+        if annotations.classes is not None:
+            raise InputError(f"classes: {path} names its classes itself.")
+        annotations = named_by(annotations, label_table(classes).classes)
+    return evidence_of(annotations, views)
+
+
+def _of_file(path: Path) -> Annotations:
+    suffix = path.suffix.lower()
+    if suffix == ".xml":
+        return cvat_annotations(path)
+    if suffix == ".json":
+        found = _of_json(path, read_json_value(path))
+        if found is None:
+            raise FileFormatError(
+                f"{path}: expected annotations (COCO, Label Studio, labelme), got another JSON; "
+                "masks of one view are read with the folder of all views, VIEW.json each."
+            )
+        return found
+    if suffix in _OF_ONE_VIEW:
+        raise InputError(
+            f"{path}: expected a folder with a file a view, or annotations of all views in one "
+            f"JSON or XML, got one {suffix} file; give the folder."
+        )
+    advice = _ADVICE.get(suffix, "docs/models.md has a table of what is read")
+    raise InputError(f"{path}: annotations in {suffix or 'such'} files are not read: {advice}.")
+
+
+def _of_folder(folder: Path) -> Annotations | None:
+    documents = sorted(folder.glob("*.xml"))
+    whole = sorted((folder / _WHOLE).glob("*.json"))
+    objects = whole or sorted(p for p in folder.glob("*.json") if p.name not in _TABLES)
+    if documents and not objects:
+        return cvat_annotations(_only(documents))
+    if not objects:
+        deeper = sorted(p for p in folder.rglob("*.json") if p.name not in _TABLES)
+        if deeper and is_labelme(read_json_value(deeper[0])):
+            return labelme_annotations(folder, deeper)
+        if not deeper:
+            _advise(folder)
+        return None
+    # Label maps lie beside tables of their own; only a file of segments means them.
+    if not whole and any(folder.glob("*.png")):
+        objects = [p for p in objects if p.stem in ("panoptic", "predictions")]
+        if not objects:
+            return None
+    first = read_json_value(objects[0])
+    if is_labelme(first):
+        return labelme_annotations(folder, sorted(folder.rglob("*.json")))
+    if _is_of_one_view(first):
+        return None
+    contents = {path: read_json_value(path) for path in objects[1:]} | {objects[0]: first}
+    results = [path for path, content in contents.items() if is_results(content)]
+    if results:
+        return _results(_only(results), contents)
+    known = {path: read for path, content in contents.items() if (read := _reader(content))}
+    if not known:
+        return None
+    path = _only(sorted(known))
+    return known[path](path)
+
+
+def _of_json(path: Path, content: Any) -> Annotations | None:
+    if is_results(content):
+        beside = {p: read_json_value(p) for p in sorted(path.parent.glob("*.json")) if p != path}
+        return _results(path, beside | {path: content})
+    reader = _reader(content)
+    return None if reader is None else reader(path)
+
+
+def _reader(content: Any) -> Callable[[Path], Annotations] | None:
+    if is_label_studio_min(content):
+        return _refuse_min
+    if is_label_studio(content):
+        return lambda path: label_studio_annotations(path, cast(list[object], content))
+    if is_dataset(content):
+        return lambda path: coco_dataset(path, content)
+    if is_labelme(content):
+        return lambda path: labelme_annotations(path, [path])
+    if isinstance(content, dict) and "items" in content and "categories" in content:
+        return _refuse_datumaro
+    return None
+
+
+def _results(path: Path, contents: dict[Path, Any]) -> Annotations:
+    datasets = [p for p, content in contents.items() if is_dataset(content)]
+    dataset = contents[_only(sorted(datasets))] if datasets else None
+    rows = contents[path]
+    wrong = [row for row in rows if not isinstance(row, dict)]
+    if wrong:
+        raise FileFormatError(f"{path}: expected a list of results, got {quoted(wrong[0])} in it.")
+    return coco_results(path, rows, dataset)
+
+
+def _is_of_one_view(content: Any) -> bool:
+    """Whether a JSON value is the masks of one picture, as SAM and we write them."""
+    if isinstance(content, list):
+        first = cast(list[Any], content)[0] if content else {}
+        return isinstance(first, dict) and not is_results(content) and "segmentation" in first
+    return isinstance(content, dict) and ("masks" in content or "image" in content)
+
+
+def _only(files: Sequence[Path]) -> Path:
+    if len(files) != 1:
+        names = ", ".join(quoted(path.name) for path in files[:3])
+        more = ", ..." if len(files) > 3 else ""
+        raise InputError(
+            f"{files[0].parent}: expected one file of annotations, got {len(files)} "
+            f"({names}{more}): give the one that is meant."
+        )
+    return files[0]
+
+
+def _advise(folder: Path) -> None:
+    """Refuse a folder of nothing but files that are known and not read."""
+    suffixes = {path.suffix.lower() for path in folder.rglob("*") if path.is_file()}
+    if suffixes.isdisjoint(_OPENED):
+        for suffix in sorted(suffixes & _ADVICE.keys()):
+            raise InputError(
+                f"{folder}: annotations in {suffix} files are not read: {_ADVICE[suffix]}."
+            )
+
+
+def _refuse_min(path: Path) -> Annotations:
+    raise FileFormatError(
+        f"{path}: expected Label Studio's JSON, got JSON-MIN, which lacks the tasks; export JSON "
+        "or COCO."
+    )
+
+
+def _refuse_datumaro(path: Path) -> Annotations:
+    raise FileFormatError(
+        f"{path}: expected annotations, got datumaro's own format; export COCO, CVAT or Pascal VOC "
+        "segmentation (datum convert -f coco_instances)."
+    )
