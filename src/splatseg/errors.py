@@ -22,6 +22,7 @@ import reprlib
 _QUOTED = 60
 _REASON = 120
 
+_WORD = 40
 _LONG_WORD = re.compile(r"[^\s/]{300,}")
 """No file has such a name; 255 bytes are the most."""
 
@@ -73,7 +74,7 @@ class BackendError(SplatsegError, RuntimeError):
 
 def _fitting(message: str) -> str:
     """A message without what nobody reads: the middle of long words, and of itself."""
-    text = _LONG_WORD.sub(lambda found: _ends(found.group(), _QUOTED), message)
+    text = _LONG_WORD.sub(lambda found: _ends(found.group(), _WORD), message)
     return _ends(text, _MESSAGE)
 
 

@@ -167,15 +167,18 @@ def _spread(
     """Shares after smoothing and label propagation over the neighbour graph, sparse (n, ids)."""
     kept = 1 if labels.candidates is None else labels.candidates.shape[1]
     max_shares = max(_MAX_SHARES, kept)
+    smoothed = options.smoothing > 0 and labels.evidence is not None
+    unknown = np.flatnonzero(~known)
     transition = transition_matrix(
         neighbour_graph(
             _attributes(gaussians, features),
             neighbours=options.neighbours,
             colour_width=options.colour_width,
             feature_width=options.feature_width,
+            rows=None if smoothed else unknown,
         )
     )
-    if options.smoothing > 0 and labels.evidence is not None:
+    if smoothed and labels.evidence is not None:
         own_weight = np.where(known, labels.evidence.cpu().float().numpy(), 0.0).astype(np.float32)
         shares = diffuse(
             transition,
@@ -185,6 +188,7 @@ def _spread(
             steps=options.smoothing_steps,
             max_shares=max_shares,
         )
+        transition = transition[unknown]
     own_weight = np.where(known, np.inf, 0.0).astype(np.float32)
     return diffuse(
         transition,
