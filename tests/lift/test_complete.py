@@ -102,6 +102,19 @@ def test_many_in_one_place_and_few_at_all(count: int) -> None:
     np.testing.assert_array_equal(graph, np.ones((count, count)) - np.eye(count))
 
 
+def test_some_rows_of_the_graph_are_those_of_the_whole(rng, monkeypatch) -> None:
+    monkeypatch.setattr("splatseg.lift.completion.graph._ROWS", 7)
+    nodes = NodeAttributes(
+        positions=rng.normal(size=(40, 3)), colours=rng.random((40, 3), dtype=np.float32)
+    )
+    how = {"neighbours": 4, "colour_width": 0.3, "feature_width": 1.0}
+    whole, rows = neighbour_graph(nodes, **how), np.array([0, 3, 8, 21, 39])
+    some = neighbour_graph(nodes, **how, rows=rows)
+    assert np.array_equal(some.toarray(), whole[rows].toarray())
+    assert some.has_sorted_indices
+    assert neighbour_graph(nodes, **how, rows=rows[:0]).shape == (0, 40)
+
+
 def test_diffusion_is_the_formula(rng) -> None:
     """Against dense matrices: some nodes held, some that know nothing, some that listen."""
     count, ids, neighbour_weight = 30, 4, 0.7
