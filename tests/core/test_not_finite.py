@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splatseg.core import FeatureMap, Features, Labels, MaskSet, PointCloud
+from splatseg.core import Features, Labels, MaskSet, PointCloud
 from splatseg.core.benchmark import TruePoints
 from splatseg.core.models import Boxes
 from splatseg.core.renderable import PointLabels
@@ -24,7 +24,6 @@ VALUES = {
     "values": lambda x: Features(values=x.unsqueeze(1)),
     "weights": lambda x: Features(values=SURE.unsqueeze(1), weights=x),
     "scores": lambda x: MaskSet.from_dense(torch.ones(2, 3, 4).bool(), scores=x),
-    "features": lambda x: FeatureMap(features=x.reshape(1, 2, 1), stride=1, height=1, width=2),
     "boxes": lambda x: Boxes(words=(0,), boxes=x.repeat(2)[None], scores=torch.ones(1)),
     "scores of boxes": lambda x: Boxes(words=(0, 1), boxes=torch.ones(2, 4), scores=x),
     "confidence of points": lambda x: PointLabels(ids=IDS, confidence=x),

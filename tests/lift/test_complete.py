@@ -352,12 +352,6 @@ def test_bad_input_is_refused() -> None:
         complete(gaussians, hard([1]))
     with pytest.raises(ShapeError, match="features: expected 2 rows, one a Gaussian, got 3"):
         complete(gaussians, labels, features=Features(values=torch.ones(3, 1)))
-    with pytest.raises(RangeError, match=r"features\.values: 1 of 2 values are not finite"):
-        complete(gaussians, labels, features=Features(values=torch.tensor([[1.0], [math.nan]])))
-    with pytest.raises(RangeError, match=r"labels\.evidence: 1 of 2"):
-        complete(gaussians, hard([1, -1], evidence=[math.inf, 0.0]))
-    with pytest.raises(RangeError, match=r"labels\.confidence: 1 of 2"):
-        complete(gaussians, hard([1, -1], confidence=[math.nan, 0.0]))
     with pytest.raises(RangeError, match="means"):
         complete(on_a_line([0.0, math.nan]), labels)
     with pytest.raises(InputError, match="smoothing: expected a layer with the evidence"):

@@ -130,7 +130,10 @@ class LabelMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FeatureMap:
-    """Dense features on a grid of square cells; cell (i, j) starts at pixel (i, j) * stride."""
+    """Dense features on a grid of square cells; cell (i, j) starts at pixel (i, j) * stride.
+
+    Values are checked where maps are read and lifted, with the name of the view.
+    """
 
     features: Float[Tensor, "rows columns channels"]
 
@@ -146,7 +149,6 @@ class FeatureMap:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("features", self.features, (None, None, None))
-        check_finite("features", self.features)
         if self.stride < 1:
             raise RangeError(f"stride: expected at least 1, got {self.stride}.")
 

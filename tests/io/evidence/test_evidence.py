@@ -408,8 +408,9 @@ def test_features_round_trip_as_float16(tmp_path, rng) -> None:
     assert torch.equal(read.features, values.half().float())
 
 
-def test_features_beyond_float16_are_refused(tmp_path) -> None:
-    features = FeatureMap(features=torch.full((1, 1, 1), 1e5), stride=1, height=1, width=1)
+@pytest.mark.parametrize("value", [float("nan"), 1e5])
+def test_features_beyond_float16_are_refused(tmp_path, value) -> None:
+    features = FeatureMap(features=torch.full((1, 1, 1), value), stride=1, height=1, width=1)
     with pytest.raises(RangeError, match="a: features"):
         save_features(features, tmp_path, "a")
 
