@@ -13,7 +13,7 @@
 Each class is also the builtin that fits, so ``except ValueError`` works. A message is one
 sentence that names the argument or the file, what was expected and what came. What came is foreign
 text, of any length and with any characters: `quoted` and `reason` make it fit for a message, and
-`visible` for people.
+`visible` for people, and none is longer than a message may be.
 """
 
 import re
@@ -22,9 +22,22 @@ import reprlib
 _QUOTED = 60
 _REASON = 120
 
+_WORD = 40
+_LONG_WORD = re.compile(r"[^\s/]{300,}")
+"""No file has such a name; 255 bytes are the most."""
+
+_MESSAGE = 1000
+
 
 class SplatsegError(Exception):
-    """Base of every error that splatseg raises on purpose."""
+    """Base of every error that splatseg raises on purpose.
+
+    What stands in a message and is longer than any file's name is cut, and so is a message of more
+    than 1000 characters.
+    """
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(_fitting(arg) if isinstance(arg, str) else arg for arg in args))
 
 
 class InputError(SplatsegError, ValueError):
@@ -57,6 +70,20 @@ class MissingPackageError(SplatsegError, ImportError):
 
 class BackendError(SplatsegError, RuntimeError):
     """A rendering backend cannot run here or refuses what was asked of it."""
+
+
+def _fitting(message: str) -> str:
+    """A message without what nobody reads: the middle of long words, and of itself."""
+    text = _LONG_WORD.sub(lambda found: _ends(found.group(), _WORD), message)
+    return _ends(text, _MESSAGE)
+
+
+def _ends(text: str, limit: int) -> str:
+    """The first two thirds of what fits, and the last."""
+    if len(text) <= limit:
+        return text
+    last = limit // 3
+    return f"{text[: limit - last - 3]}...{text[-last:]}"
 
 
 def quoted(value: object, limit: int = _QUOTED) -> str:

@@ -5,7 +5,7 @@ import torch
 
 from splatseg.core import LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.lift.mass import segment_masses
+from splatseg.lift.mass import pieces, segment_masses
 from splatseg.lift.mass.segment_masses import view_masses
 from splatseg.render.warp import warp_into_photograph
 
@@ -48,6 +48,19 @@ def test_overlapping_masks(rng, lens, band, monkeypatch) -> None:
     order = found.segment * len(gaussians) + found.gaussian
     assert bool((order[1:] > order[:-1]).all())
     assert found.segment.dtype == found.gaussian.dtype == torch.int64
+
+
+@pytest.mark.parametrize("lens", [{}, BARREL])
+def test_runs_of_masks_give_the_same_bits(rng, lens, monkeypatch) -> None:
+    """Weights are half precision and sums exact, whatever masks are taken together."""
+    camera, gaussians = camera_at(0.1, **lens), random_gaussians(rng)
+    masks = MaskSet.from_dense(torch.from_numpy(rng.random((9, 12, 16)) < 0.4))
+    together = view_masses(gaussians, camera, masks, backend=BACKEND)
+    monkeypatch.setattr(pieces, "_LAYERS", 1)
+    assert len(pieces.pieces_of(masks)) > 2
+    apart = view_masses(gaussians, camera, masks, backend=BACKEND)
+    for name in ("segment", "gaussian", "weight", "visible", "covered"):
+        assert torch.equal(getattr(together, name), getattr(apart, name)), name
 
 
 def test_label_maps_keep_their_ids_and_confidence(rng) -> None:

@@ -264,3 +264,17 @@ def test_strided_and_shared_tensors(backend, rng):
     expected = backend.back_project(scene, camera, image).sums
     strided_image = image.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     assert backend.same(backend.back_project(scene, camera, strided_image).sums, expected)
+
+
+def test_more_contributors_than_there_is_use_for_are_refused(backend, rng):
+    """A table of 2^31 columns would take 16 GB for one pixel."""
+    scene, camera = random_gaussians(rng, 300), random_camera(rng)
+    pixels = torch.tensor([[0, 0]])
+    assert backend.contributors(scene, camera, pixels, 300).ids.shape == (1, 300)
+    assert backend.contributors(scene[:3], camera, pixels, 256).ids.shape == (1, 256)
+    for some, most in ((scene, 300), (scene[:3], 256)):
+        with pytest.raises(RangeError, match=f"k: expected at most {most}, .*, got {2**31}"):
+            backend.contributors(some, camera, pixels, 2**31)
+    many = pixels.expand(2**28 // 256 + 1, 2)
+    with pytest.raises(RangeError, match=r"k: expected at most 268435456 pixels x k, .*fewer"):
+        backend.contributors(scene, camera, many, 256)

@@ -1,5 +1,7 @@
 """Connected pieces, and what a removal would leave behind."""
 
+import importlib
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,8 @@ import torch
 from splatseg.core import Gaussians, Labels, Selection
 from splatseg.errors import RangeError, ShapeError
 from splatseg.selection import Where, components, leftovers, select_where
+
+module = importlib.import_module("splatseg.selection.components")
 
 
 def balls(*groups: tuple[tuple[float, float, float], int]) -> Gaussians:
@@ -66,6 +70,24 @@ def test_pieces_agree_with_a_search_by_hand(rng: np.random.Generator) -> None:
                 stack += np.flatnonzero(touch[row]).tolist()
     assert 3 < max(expected) < n - 1
     assert components(g, everything(g)).tolist() == expected
+
+
+def test_pieces_of_pairs_that_come_some_at_a_time(monkeypatch) -> None:
+    """Joined after every few pairs, numbered by their first row all the same."""
+    g = balls(((0, 0, 0), 9), ((0, 9, 0), 7), ((1.35, 0, 0), 4), ((3, 3, 3), 1))
+    order = torch.randperm(len(g), generator=torch.Generator().manual_seed(0))
+    expected = components(g[order], everything(g))
+    removed = Selection(mask=torch.isin(order, torch.tensor([9, 10])))
+    specks = leftovers(g[order], removed, most=5)
+    assert specks.count == 5
+    monkeypatch.setattr("splatseg.selection.components._PAIRS", 3 * 16)
+    monkeypatch.setattr("splatseg.selection.components._KEPT", 0)
+    joins: list[int] = []
+    whole = module.pieces
+    monkeypatch.setattr(module, "pieces", lambda *args: joins.append(1) or whole(*args))
+    assert torch.equal(components(g[order], everything(g)), expected)
+    assert len(joins) > 1
+    assert torch.equal(leftovers(g[order], removed, most=5).mask, specks.mask)
 
 
 def test_one_piece_is_selected() -> None:

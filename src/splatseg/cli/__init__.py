@@ -8,6 +8,7 @@ Exit status: 0 done, 2 bad input or usage, 1 everything else, Ctrl-C included.
 """
 
 import difflib
+import errno
 import importlib
 import re
 import sys
@@ -284,7 +285,9 @@ def _report_system(error: OSError, *, debug: bool) -> int:
     from splatseg.io.write_errors import failure_to_write, is_write_failure
 
     sentence = f"{type(error).__name__}: {error} (add --debug for the traceback)"
-    if is_write_failure(error):
+    if error.errno == errno.ENAMETOOLONG:
+        sentence = str(InputError(f"{error.filename}: the name is too long for a file."))
+    elif is_write_failure(error):
         sentence = failure_to_write(error.filename or "the standard output", error)
     if error.filename is None:
         silence(sys.stdout)

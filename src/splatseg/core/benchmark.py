@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import convert_fields
 from splatseg.core.evidence import LabelMap
 from splatseg.core.layers import Labels
@@ -102,6 +102,7 @@ class TruePoints:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("points", self.points, (len(self.labels), 3))
+        check_finite("points", self.points)
         if self.visible is not None:
             check_shape("visible", self.visible, (len(self.labels),))
         if self.faces is not None:

@@ -15,6 +15,7 @@ code without either.
 """
 
 import collections.abc
+import errno
 import functools
 import inspect
 import os
@@ -65,7 +66,8 @@ def boundary(function: Callable[P, R]) -> Callable[P, R]:
 
     Raises:
         InputError: When the function is called with an argument that cannot be what it should
-            be; the sentence names the argument, what was expected and what came.
+            be; the sentence names the argument, what was expected and what came. Also where a
+            name is too long for any file.
     """
     names = tuple(inspect.signature(function).parameters)
     found: dict[str, Converter] = {}
@@ -84,7 +86,14 @@ def boundary(function: Callable[P, R]) -> Callable[P, R]:
         for name in kwargs:
             if name in found:
                 kwargs[name] = found[name](name, kwargs[name])
-        return function(*given, **kwargs)  # pyright: ignore[reportCallIssue]
+        try:
+            return function(*given, **kwargs)  # pyright: ignore[reportCallIssue]
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            raise InputError(
+                f"{error.filename}: expected the name of a file, got one that is too long."
+            ) from error
 
     return converted
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_choice, check_shape, check_values
+from splatseg._check import check_choice, check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.late import preview
 from splatseg.core.rle import Rle
@@ -40,6 +40,7 @@ class MaskSet:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("scores", self.scores, (len(self.masks),))
+        check_finite("scores", self.scores)
         check_shape("levels", self.levels, (len(self.masks),))
         for i, mask in enumerate(self.masks):
             if (mask.height, mask.width) != (self.height, self.width):
@@ -129,7 +130,10 @@ class LabelMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FeatureMap:
-    """Dense features on a grid of square cells; cell (i, j) starts at pixel (i, j) * stride."""
+    """Dense features on a grid of square cells; cell (i, j) starts at pixel (i, j) * stride.
+
+    Values are checked where maps are read and lifted, with the name of the view.
+    """
 
     features: Float[Tensor, "rows columns channels"]
 

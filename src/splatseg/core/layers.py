@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatseg._check import check_shape, check_values
+from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
@@ -17,7 +17,12 @@ from splatseg.errors import InputError, RangeError, ShapeError
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Labels:
-    """One id a Gaussian, with its confidence."""
+    """One id a Gaussian, with its confidence.
+
+    Raises:
+        ShapeError: If rows differ in number.
+        RangeError: If an id is below -1, or a value is NaN or infinite.
+    """
 
     ids: Int[Tensor, "n"]
     """int32 ids, -1 where there is none."""
@@ -72,6 +77,10 @@ class Labels:
             check_shape("inferred", self.inferred, (n,))
             if self.inferred.dtype != torch.bool:
                 raise InputError(f"inferred: expected booleans, got {self.inferred.dtype}.")
+        for name in ("confidence", "shares", "evidence", "effective_views"):
+            values = getattr(self, name)
+            if values is not None:
+                check_finite(name, values)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -110,7 +119,12 @@ class Labels:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Features:
-    """One feature vector a Gaussian."""
+    """One feature vector a Gaussian.
+
+    Raises:
+        ShapeError: If rows differ in number.
+        RangeError: If a value is NaN or infinite.
+    """
 
     values: Float[Tensor, "n channels"]
 
@@ -126,6 +140,8 @@ class Features:
         check_layer_info("info", self.info)
         if self.weights is not None:
             check_shape("weights", self.weights, (len(self.values),))
+            check_finite("weights", self.weights)
+        check_finite("values", self.values)
 
     def __len__(self) -> int:
         return len(self.values)

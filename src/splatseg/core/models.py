@@ -249,6 +249,8 @@ class Boxes:
         convert_fields(self)
         check_shape("boxes", self.boxes, (len(self.words), 4))
         check_shape("scores", self.scores, (len(self.words),))
+        check_finite("boxes", self.boxes)
+        check_finite("scores", self.scores)
 
 
 @runtime_checkable

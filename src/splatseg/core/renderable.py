@@ -13,7 +13,7 @@ from typing import Literal, Protocol, Self, runtime_checkable
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseg._check import check_choice, check_shape
+from splatseg._check import check_choice, check_finite, check_shape
 from splatseg.core.boundary import convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.evidence import UNLABELLED, LabelMap
@@ -26,7 +26,7 @@ _KINDS = ("labels", "selection", "features")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewSignals:
-    """What a view shows besides its layers, on the CPU."""
+    """What a view shows besides its layers, on the CPU, as the renderer gave it: NaN stays NaN."""
 
     alpha: Float[Tensor, "height width"]
     """How much of a pixel's light is stopped, in [0, 1]."""
@@ -66,6 +66,7 @@ class PointLabels:
         convert_fields(self)
         check_shape("ids", self.ids, (None,))
         check_shape("confidence", self.confidence, (len(self.ids),))
+        check_finite("confidence", self.confidence)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Any
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
@@ -83,6 +83,7 @@ class PointCloud:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("points", self.points, (None, 3))
+        check_finite("points", self.points)
         if self.colours is not None:
             check_shape("colours", self.colours, (len(self.points), 3))
 

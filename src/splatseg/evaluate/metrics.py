@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Num, UInt8
 from torch import Tensor
 
-from splatseg._check import check_shape, check_values
+from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core import UNLABELLED
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
@@ -271,6 +271,7 @@ def psnr(
 
     Raises:
         ShapeError: If sizes differ.
+        RangeError: If a value is NaN or infinite.
         InputError: If `keep` keeps nothing.
 
     Example:
@@ -378,5 +379,7 @@ def _image_pair(image: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
         raise ShapeError(
             f"image: expected the photograph's size {tuple(truth.shape)}, got {tuple(image.shape)}."
         )
+    check_finite("image", image)
+    check_finite("truth", truth)
     a, b = (x.double() / 255 if x.dtype == torch.uint8 else x.double() for x in (image, truth))
     return a.cpu(), b.cpu()

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg._check import check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 
@@ -117,6 +117,7 @@ def relevancy(
 
     Raises:
         InputError: If there is no negative.
+        RangeError: If a cosine is NaN or infinite.
 
     Example:
         >>> relevancy(torch.tensor([[0.3, 0.1]]), torch.tensor([[0.1, 0.0]])).round(decimals=3)
@@ -124,4 +125,6 @@ def relevancy(
     """
     if not negatives.dim() or not negatives.shape[-1]:
         raise InputError("negatives: expected at least one, got none.")
+    check_finite("cosines", cosines)
+    check_finite("negatives", negatives)
     return torch.sigmoid(temperature * (cosines - negatives.amax(dim=-1, keepdim=True)))

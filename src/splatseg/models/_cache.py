@@ -18,7 +18,7 @@ import numpy as np
 
 from splatseg._check import check_choice
 from splatseg.core import DepthMap, FeatureMap, LabelMap, MaskSet
-from splatseg.core.boundary import convert_fields
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.models import (
     AutomaticMasks,
     DeepFeatures,
@@ -81,6 +81,7 @@ class ModelCache:
     report: Callable[[str], None] = _silent
     """Told in a sentence when an entry is damaged and is computed again."""
 
+    @boundary
     def __post_init__(self) -> None:
         convert_fields(self)
         check_choice("precision", self.precision, ("float16", "int8"))

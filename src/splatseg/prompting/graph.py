@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from splatseg._check import check_finite
 from splatseg.core import Features, Gaussians
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import RangeError, ShapeError
@@ -147,12 +146,10 @@ def build_graph(
     """
     options = options or GraphOptions()
     gaussians.check_values()
-    if features is not None:
-        if len(features) != len(gaussians):
-            raise ShapeError(
-                f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
-            )
-        check_finite("features.values", features.values)
+    if features is not None and len(features) != len(gaussians):
+        raise ShapeError(
+            f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
+        )
     gaussians = gaussians.to(device="cpu")
     matrix = neighbour_graph(
         NodeAttributes(

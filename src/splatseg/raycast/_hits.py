@@ -45,7 +45,7 @@ def through_triangles(
 
     Returns:
         t, and the weights :math:`(1 - \beta - \gamma, \beta, \gamma)`; NaN where a ray is parallel
-        to the plane.
+        to the plane, and where a number of it or of its triangle is.
 
     Raises:
         ShapeError: If the last axes are not 3, 3 and (3, 3), or the others do not go together.

@@ -13,6 +13,13 @@ MAX_CHANNELS = 1024
 _checked: "WeakKeyDictionary[Gaussians, tuple[int, ...]]" = WeakKeyDictionary()
 
 
+_NARROW = 256
+"""Contributors that may always be asked for, however few Gaussians there are."""
+
+_ENTRIES = 1 << 28
+"""Pixels x contributors at most, of 24 bytes each while they are sorted."""
+
+
 def check_scene(gaussians: Gaussians) -> None:
     """Scan the values once; again only after somebody wrote into the tensors."""
     columns = (
@@ -57,3 +64,25 @@ def check_k(k: int) -> None:
     """At least one contributor a pixel."""
     if k < 1:
         raise RangeError(f"k: expected at least 1, got {k}.")
+
+
+def check_table(k: int, *, pixels: int, gaussians: int) -> None:
+    """Contributors are a table of k columns: no wider than there is use for, and of bounded size.
+
+    Args:
+        k: Contributors of a pixel, those that are missing included.
+        pixels: How many pixels.
+        gaussians: How many Gaussians the scene has.
+    """
+    check_k(k)
+    most = max(gaussians, _NARROW)
+    if k > most:
+        raise RangeError(
+            f"k: expected at most {most}, the larger of the scene's {gaussians} Gaussians and "
+            f"{_NARROW}, got {k}."
+        )
+    if pixels * k > _ENTRIES:
+        raise RangeError(
+            f"k: expected at most {_ENTRIES} pixels x k, which take about 6 GB, got "
+            f"{pixels} x {k}; ask for fewer pixels at a time."
+        )

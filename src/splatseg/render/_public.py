@@ -120,13 +120,14 @@ def contributors(
         gaussians: The Gaussians of the scene.
         camera: Whose pixels are meant; with distortion, the nearest pinhole pixel is read.
         pixels: Column and row of each pixel.
-        k: How many, at least 1.
+        k: How many, at least 1; no more than there are Gaussians, or than 256 where these are
+            fewer, and pixels x k at most 2^28.
         options: Switches of the blending model; None is what the Gaussians were
             fitted with, with the constants of the backend (`options_for`).
         backend: ``auto``, ``cpu``, ``cuda`` or ``reference``.
 
     Raises:
-        RangeError: If a pixel lies outside the image or k is less than 1.
+        RangeError: If a pixel lies outside the image, or k is less than 1 or too large.
     """
     with prepare(gaussians, camera, options=options, backend=backend) as view:
         return view.contributors(pixels, k)

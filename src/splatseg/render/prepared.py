@@ -16,7 +16,7 @@ from splatseg.core import Camera, Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.render._backend import Backend, Layout
-from splatseg.render._checks import check_columns, check_k, check_pixels, check_scene
+from splatseg.render._checks import check_columns, check_k, check_pixels, check_scene, check_table
 from splatseg.render._options import RenderOptions
 from splatseg.render._registry import get_backend, options_for
 from splatseg.render._rows import SparseWeights
@@ -228,7 +228,7 @@ class PreparedView:
         With distortion they are those of the pinhole pixel that each pixel's centre falls into.
         """
         check_pixels(pixels, self._camera)
-        check_k(k)
+        check_table(k, pixels=len(pixels), gaussians=self._count)
         return self._view.contributors(self._in_pinhole(pixels), k)
 
     @overload

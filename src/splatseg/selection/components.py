@@ -5,8 +5,10 @@ their centres: :math:`|x_j - x_i| \le 2 (\sigma_i(u) + \sigma_j(u))` with u the 
 line and :math:`\sigma(u)^2 = u^\top \Sigma u`. Only the nearest 16 others of each are asked.
 """
 
+from collections.abc import Iterator
+
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from splatseg.core import Gaussians, Labels, Selection
@@ -17,8 +19,11 @@ from splatseg.neighbours import NeighbourIndex
 NEIGHBOURS = 16
 REACH = 2.0
 
-_PAIRS = 1 << 20
+_PAIRS = 1 << 18
 """Pairs looked at together."""
+
+_KEPT = 1 << 21
+"""Pairs that are kept before pieces are made of them, and at least two a Gaussian."""
 
 
 def components(gaussians: Gaussians, among: Selection) -> Int64[Tensor, "n"]:
@@ -31,9 +36,11 @@ def components(gaussians: Gaussians, among: Selection) -> Int64[Tensor, "n"]:
     """
     _check_length("among", among, gaussians)
     rows = among.ids
-    first, second = _touching_pairs(gaussians[rows])
+    joined = _Pieces(len(rows))
+    for first, second in _touching_pairs(gaussians[rows]):
+        joined.add(first, second)
     result = torch.full((len(gaussians),), -1, dtype=torch.int64)
-    result[rows] = pieces(len(rows), first, second)
+    result[rows] = joined.numbers()
     return result
 
 
@@ -68,14 +75,18 @@ def leftovers(
     none = torch.zeros(len(gaussians), dtype=torch.bool)
     if not most or not removed.count or removed.count == len(gaussians):
         return Selection(mask=none)
-    first, second = _touching_pairs(gaussians)
     gone = removed.mask
-    both = ~gone[first] & ~gone[second]
-    piece_of = pieces(len(gaussians), first[both], second[both])
+    beside, at_removed = none.clone(), none.clone()
+    staying = _Pieces(len(gaussians))
+    for first, second in _touching_pairs(gaussians):
+        one, other = gone[first], gone[second]
+        beside[first[~one & other]] = True
+        beside[second[one & ~other]] = True
+        both = ~one & ~other
+        staying.add(first[both], second[both])
+    piece_of = staying.numbers()
     sizes = torch.bincount(piece_of, minlength=len(gaussians))
-    at_removed = torch.zeros(len(gaussians), dtype=torch.bool)
-    for one, other in ((first, second), (second, first)):
-        at_removed[piece_of[one[~gone[one] & gone[other]]]] = True
+    at_removed[piece_of[beside]] = True
     small = at_removed & (sizes <= most)
     mask = small[piece_of] & ~gone
     if labels is not None:
@@ -100,35 +111,82 @@ def _own_things(
     return own[piece_of]
 
 
-def _touching_pairs(gaussians: Gaussians) -> tuple[Int64[Tensor, "pairs"], Int64[Tensor, "pairs"]]:
-    """Pairs of rows that touch; each pair may come in both orders."""
-    found = NeighbourIndex(gaussians).nearest_others(NEIGHBOURS)
-    first = torch.arange(len(gaussians)).repeat_interleave(found.indices.shape[1])
-    second = found.indices.reshape(-1)
-    there = second >= 0
-    first, second = first[there], second[there]
-    close = touching(gaussians, first, second)
-    return first[close], second[close]
+class _Pieces:
+    """Connected pieces of pairs that come some at a time, of which few are kept."""
+
+    def __init__(self, count: int) -> None:
+        self._piece_of = torch.arange(count)
+        self._pairs: list[Int64[Tensor, "2 pairs"]] = []
+        self._kept = 0
+
+    def add(self, first: Int64[Tensor, "pairs"], second: Int64[Tensor, "pairs"]) -> None:
+        """More pairs of rows."""
+        pairs = self._piece_of[torch.stack((first, second))]
+        pairs = pairs[:, pairs[0] != pairs[1]].int()
+        self._pairs.append(pairs)
+        self._kept += pairs.shape[1]
+        if self._kept > max(_KEPT, 2 * len(self._piece_of)):
+            self._join()
+
+    def numbers(self) -> Int64[Tensor, "n"]:
+        """The piece of each row, numbered by their first row."""
+        self._join()
+        return self._piece_of
+
+    def _join(self) -> None:
+        count = len(self._piece_of)
+        none = torch.zeros(2, 0, dtype=torch.int32)
+        first, second = torch.cat([none, *self._pairs], dim=1)
+        self._pairs, self._kept = [], 0
+        # Pieces are numbered by their first row, and so are pieces of pieces.
+        self._piece_of = pieces(count, first, second)[self._piece_of]
+
+
+def _touching_pairs(
+    gaussians: Gaussians,
+) -> Iterator[tuple[Int64[Tensor, "pairs"], Int64[Tensor, "pairs"]]]:
+    """Pairs of rows that touch, some rows at a time; each pair may come in both orders."""
+    index, axes = NeighbourIndex(gaussians), _axes(gaussians)
+    for rows in torch.arange(len(gaussians)).split(_PAIRS // NEIGHBOURS):
+        second = index.nearest_others(NEIGHBOURS, rows=rows).indices.long()
+        first = rows.unsqueeze(1).expand_as(second)
+        there = second >= 0
+        first, second = first[there], second[there]
+        close = _close(gaussians.means, axes, first, second)
+        yield first[close], second[close]
+
+
+def _axes(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
+    """Principal axes, each as long as its standard deviation, in columns."""
+    return rotation_from_quaternion(gaussians.rotations) * gaussians.scales.unsqueeze(1)
 
 
 def touching(
     gaussians: Gaussians, first: Int64[Tensor, "pairs"], second: Int64[Tensor, "pairs"]
 ) -> Bool[Tensor, "pairs"]:
     """Which pairs of rows touch along the line between their centres."""
-    axes = rotation_from_quaternion(gaussians.rotations) * gaussians.scales.unsqueeze(1)
-    means = gaussians.means
-    parts: list[Tensor] = []
-    for start in range(0, len(first), _PAIRS):
-        pair = (first[start : start + _PAIRS], second[start : start + _PAIRS])
-        lines = means[pair[1]].double() - means[pair[0]].double()
-        apart = torch.linalg.vector_norm(lines, dim=1)
-        lines = (lines / apart.unsqueeze(1).clamp_min(1e-30)).to(axes)
-        reach = sum(
-            torch.linalg.vector_norm((axes[rows] * lines.unsqueeze(2)).sum(dim=1), dim=1)
-            for rows in pair
-        )
-        parts.append(apart <= REACH * reach)
+    axes = _axes(gaussians)
+    parts = [
+        _close(gaussians.means, axes, one, other)
+        for one, other in zip(first.split(_PAIRS), second.split(_PAIRS), strict=True)
+    ]
     return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.bool)
+
+
+def _close(
+    means: Float[Tensor, "n 3"],
+    axes: Float[Tensor, "n 3 3"],
+    first: Int64[Tensor, "pairs"],
+    second: Int64[Tensor, "pairs"],
+) -> Bool[Tensor, "pairs"]:
+    lines = means[second].double() - means[first].double()
+    apart = torch.linalg.vector_norm(lines, dim=1)
+    lines = (lines / apart.unsqueeze(1).clamp_min(1e-30)).to(axes)
+    reach = sum(
+        torch.linalg.vector_norm((axes[rows] * lines.unsqueeze(2)).sum(dim=1), dim=1)
+        for rows in (first, second)
+    )
+    return apart <= REACH * reach
 
 
 def pieces(

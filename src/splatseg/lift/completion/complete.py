@@ -32,7 +32,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_range
+from splatseg._check import check_choice, check_range
 from splatseg.core import UNLABELLED, Features, Gaussians, Labels
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError, ShapeError
@@ -167,15 +167,18 @@ def _spread(
     """Shares after smoothing and label propagation over the neighbour graph, sparse (n, ids)."""
     kept = 1 if labels.candidates is None else labels.candidates.shape[1]
     max_shares = max(_MAX_SHARES, kept)
+    smoothed = options.smoothing > 0 and labels.evidence is not None
+    unknown = np.flatnonzero(~known)
     transition = transition_matrix(
         neighbour_graph(
             _attributes(gaussians, features),
             neighbours=options.neighbours,
             colour_width=options.colour_width,
             feature_width=options.feature_width,
+            rows=None if smoothed else unknown,
         )
     )
-    if options.smoothing > 0 and labels.evidence is not None:
+    if smoothed and labels.evidence is not None:
         own_weight = np.where(known, labels.evidence.cpu().float().numpy(), 0.0).astype(np.float32)
         shares = diffuse(
             transition,
@@ -185,6 +188,7 @@ def _spread(
             steps=options.smoothing_steps,
             max_shares=max_shares,
         )
+        transition = transition[unknown]
     own_weight = np.where(known, np.inf, 0.0).astype(np.float32)
     return diffuse(
         transition,
@@ -204,22 +208,15 @@ def _check(
             f"labels: expected {len(gaussians)} rows, one a Gaussian, got {len(labels)}."
         )
     gaussians.check_values()
-    check_finite("labels.confidence", labels.confidence)
-    if labels.shares is not None:
-        check_finite("labels.shares", labels.shares)
-    if labels.evidence is not None:
-        check_finite("labels.evidence", labels.evidence)
-    elif options.smoothing > 0:
+    if labels.evidence is None and options.smoothing > 0:
         raise InputError(
             "smoothing: expected a layer with the evidence of each Gaussian, got one without; "
             "make the layer again, or set smoothing to 0."
         )
-    if features is not None:
-        if len(features) != len(gaussians):
-            raise ShapeError(
-                f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
-            )
-        check_finite("features.values", features.values)
+    if features is not None and len(features) != len(gaussians):
+        raise ShapeError(
+            f"features: expected {len(gaussians)} rows, one a Gaussian, got {len(features)}."
+        )
 
 
 def _known(labels: Labels, options: CompletionOptions) -> NDArray[np.bool_]:

@@ -33,7 +33,7 @@ from splatseg.core import Gaussians
 from splatseg.core.rigid import rotation_from_quaternion
 from splatseg.neighbours import NeighbourIndex
 
-_ROWS = 65536
+_ROWS = 1 << 14
 """Nodes handled at a time."""
 
 _MIN_SHARE = 1e-6
@@ -75,6 +75,7 @@ def neighbour_graph(
     colour_width: float,
     feature_width: float,
     normal_width: float = 1.0,
+    rows: NDArray[np.int64] | None = None,
 ) -> Any:
     """Symmetric edge strengths, scipy sparse rows (n, n), nothing on the diagonal.
 
@@ -87,37 +88,67 @@ def neighbour_graph(
         colour_width: Standard deviation of colours that count as alike.
         feature_width: The factor b of the squared median distance of features.
         normal_width: Standard deviation of the sine between normals that count as alike.
+        rows: Nodes whose rows are wanted, ascending; None is all of them.
     """
     import scipy.sparse
 
     count = len(nodes.positions)
+    wanted = count if rows is None else len(rows)
     neighbours = min(neighbours, count - 1)
-    if neighbours < 1:
-        return scipy.sparse.csr_matrix((count, count), dtype=np.float32)
-    nearest, distance = _nearest(nodes.positions, neighbours)
+    if neighbours < 1 or not wanted:
+        return scipy.sparse.csr_matrix((wanted, count), dtype=np.float32)
+    nearest, values = _nearest(nodes.positions, neighbours)
     # Where neighbours share a position all of them are as near as can be.
-    local_width = np.maximum(distance[:, -1].astype(np.float64), 1e-30)
-    exponent = np.empty((count, neighbours), dtype=np.float32)
-    for rows in _blocks(count):
-        scale = local_width[rows, None] * local_width[nearest[rows]]
-        exponent[rows] = distance[rows] ** 2 / (2 * scale)
+    local_width = np.maximum(values[:, -1].astype(np.float64), 1e-30)
+    # A million nodes have 12 million edges: distances become strengths where they are.
+    for block in _blocks(count):
+        scale = local_width[block, None] * local_width[nearest[block]]
+        values[block] = values[block] ** 2 / (2 * scale)
         if nodes.colours is not None:
-            squared = _squared(nodes.colours, rows, nearest[rows])
-            exponent[rows] += squared / (2 * colour_width**2)
+            squared = _squared(nodes.colours, block, nearest[block])
+            values[block] += squared / (2 * colour_width**2)
         if nodes.normals is not None:
-            squared = _squared_sines(nodes.normals, rows, nearest[rows])
-            exponent[rows] += squared / (2 * normal_width**2)
+            squared = _squared_sines(nodes.normals, block, nearest[block])
+            values[block] += squared / (2 * normal_width**2)
     if nodes.features is not None:
-        exponent += _feature_distances(nodes.features, nearest) / feature_width
+        values += _feature_distances(nodes.features, nearest) / feature_width
     # Beyond this float32 would leave a node with unlike neighbours without any.
-    edge_weights = np.exp(-np.minimum(exponent, 60.0))
-    starts = np.arange(count + 1, dtype=np.int64) * neighbours
-    graph = scipy.sparse.csr_matrix(
-        (edge_weights.reshape(-1), nearest.reshape(-1), starts), shape=(count, count)
-    )
-    graph = graph.maximum(graph.T).tocsr()
+    np.minimum(values, 60.0, out=values)
+    np.exp(np.negative(values, out=values), out=values)
+    graph = _to_and_from(nearest, values, rows)
     graph.sort_indices()
     return graph
+
+
+def _to_and_from(
+    nearest: NDArray[np.int32], values: NDArray[np.float32], rows: NDArray[np.int64] | None
+) -> Any:
+    """Edges that either end has, of all nodes or of some: sparse (rows, n)."""
+    import scipy.sparse
+
+    count, neighbours = nearest.shape
+    if rows is None:
+        starts = np.arange(count + 1, dtype=np.int64) * neighbours
+        graph = scipy.sparse.csr_matrix(
+            (values.reshape(-1), nearest.reshape(-1), starts), shape=(count, count)
+        )
+        return graph.maximum(graph.T).tocsr()
+    starts = np.arange(len(rows) + 1, dtype=np.int64) * neighbours
+    shape = (len(rows), count)
+    to: Any = scipy.sparse.csr_matrix(
+        (values[rows].reshape(-1), nearest[rows].reshape(-1), starts), shape=shape
+    )
+    place = np.full(count, -1, np.int32)
+    place[rows] = np.arange(len(rows), dtype=np.int32)
+    entries: list[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]] = []
+    for block in _blocks(count):
+        row = place[nearest[block]]
+        one, other = np.nonzero(row >= 0)
+        found = (block.start + one).astype(np.int32)
+        entries.append((row[one, other], found, values[block][one, other]))
+    ends, begins, strengths = (np.concatenate(part) for part in zip(*entries, strict=True))
+    came: Any = scipy.sparse.csr_matrix((strengths, (ends, begins)), shape=shape)
+    return to.maximum(came).tocsr()
 
 
 def _nearest(
@@ -207,7 +238,8 @@ def diffuse(
     a node's own evidence against the shares of its neighbours.
 
     Args:
-        transition: P, sparse (n, n), rows that add up to at most 1.
+        transition: The rows of P of nodes with finite o, sparse (free, n); they add up to at most
+            1.
         shares: y, sparse (n, ids), rows that add up to at most 1.
         own_weight: o, (n,): how much a node's own shares count; 0 for a node without evidence.
         neighbour_weight: s, how much neighbours count, positive.
@@ -224,9 +256,15 @@ def diffuse(
     if not len(free_rows):
         return shares
     free_weight = own_weight[free_rows].astype(np.float64)
-    free_transition = (
-        scipy.sparse.diags((neighbour_weight / (free_weight + neighbour_weight)).astype(np.float32))
-        @ transition[free_rows]
+    factor = (neighbour_weight / (free_weight + neighbour_weight)).astype(np.float32)
+    transition.sort_indices()
+    free_transition: Any = scipy.sparse.csr_matrix(
+        (
+            transition.data * np.repeat(factor, np.diff(transition.indptr)),
+            transition.indices,
+            transition.indptr,
+        ),
+        shape=transition.shape,
     )
     # The part of free nodes' own shares and of clamped neighbours never changes.
     source = (

@@ -41,7 +41,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_finite, check_range
+from splatseg._check import check_range
 from splatseg.core import UNLABELLED, Labels
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError, RangeError
@@ -119,8 +119,7 @@ def correct_confusion(
 
     Raises:
         InputError: If the layer is hard or has a single candidate.
-        RangeError: If a share, an evidence, a number of views or the correlation is NaN or
-            infinite.
+        RangeError: If the correlation is NaN or infinite.
 
     Example:
         Of 21 Gaussians 19 are surely desk (1) and one is surely mouse (2), though half of
@@ -157,11 +156,6 @@ def _checked_max_views(
             "labels: expected a soft layer with at least 2 candidates, whose shares show which "
             "ids are confused, got a hard one; lift it with more candidates."
         )
-    check_finite("labels.shares", labels.shares)
-    if labels.evidence is not None:
-        check_finite("labels.evidence", labels.evidence)
-    if labels.effective_views is not None:
-        check_finite("labels.effective_views", labels.effective_views)
     if view_correlation is None:
         return options.effective_views
     check_range("view_correlation", view_correlation, -math.inf, 1.0)

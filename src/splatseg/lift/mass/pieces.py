@@ -3,16 +3,25 @@
 Masks that are nested or overlap share most of their pixels. What is summed over pixels is summed
 over every piece once, and a segment is the sum of its pieces: the pixels are read once, however
 many segments they lie in.
+
+Where many large masks lie over each other, pieces go with the square of the masks until each pixel
+is one, and each lies in many masks: what is saved is lost again. Masks are taken in runs that cover
+the image some times over, each with pieces of its own, so that the work goes with the masks.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core import UNLABELLED, LabelMap, MaskSet
+
+_LAYERS = 12
+"""Masks that lie over a pixel of the image, on average, from which on a run of masks ends. Of 64 to
+128 discs of a fifth of an image each the pieces cost least a mask."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,38 +40,75 @@ class Pieces:
     segments: Any
     """Sparse (segments, pieces): 1 where a piece lies in a segment."""
 
+    @property
+    def covered(self) -> NDArray[np.bool_]:
+        """(pieces,): whether a piece lies in some segment."""
+        return np.bincount(self.segments.indices, minlength=self.segments.shape[1]) > 0
 
-def pieces_of(segments: LabelMap | MaskSet) -> Pieces:
-    """The pieces of a label map, which are its segments, or of masks that may overlap."""
+
+def pieces_of(segments: LabelMap | MaskSet) -> tuple[Pieces, ...]:
+    """The pieces of a label map, which are its segments, or of each run of masks."""
     import scipy.sparse
 
     if isinstance(segments, MaskSet):
-        pixels = [_pixels_of(segments, i) for i in range(len(segments))]
-        piece = refined(pixels, segments.height * segments.width)
-        count = int(piece.max(initial=-1)) + 1
-        # Any one pixel of a piece shows which segments all of it lies in.
-        first = np.zeros(count, np.int64)
-        first[piece[::-1]] = np.arange(len(piece))[::-1]
-        is_first = np.zeros(len(piece), bool)
-        is_first[first] = True
-        within = [piece[part[is_first[part]]] for part in pixels]
-        indptr = np.cumsum([0, *map(len, within)])
-        columns = np.concatenate([np.zeros(0, np.int32), *within])
-        membership: Any = scipy.sparse.csr_matrix(
-            (np.ones(len(columns), np.float32), columns, indptr), shape=(len(pixels), count)
-        )
-        mask_index = np.arange(len(segments), dtype=np.int64)
-        return Pieces(segment_ids=mask_index, piece=piece, weight=None, segments=membership)
+        return tuple(_mask_pieces(segments, run) for run in _runs(segments))
     ids = segments.ids.cpu().reshape(-1).numpy()
     ids_found, piece = np.unique(ids, return_inverse=True)
     confidence = segments.confidence
     identity: Any = scipy.sparse.identity(len(ids_found), "f4", format="csr")
     known = np.flatnonzero(ids_found != UNLABELLED)
-    return Pieces(
+    pieces = Pieces(
         segment_ids=ids_found[known].astype(np.int64),
         piece=piece.reshape(-1).astype(np.int32),
         weight=None if confidence is None else confidence.cpu().float().reshape(-1).numpy(),
         segments=identity[known],
+    )
+    return (pieces,)
+
+
+def covered_pieces(runs: Sequence[Pieces]) -> Pieces:
+    """What lies in no segment of some runs, piece 0, and what lies in any, piece 1."""
+    import scipy.sparse
+
+    inside = np.zeros(len(runs[0].piece), bool)
+    for pieces in runs:
+        inside |= pieces.covered[pieces.piece]
+    union: Any = scipy.sparse.csr_matrix(np.array([[0, 1]], np.float32))
+    return Pieces(
+        segment_ids=np.zeros(1, np.int64),
+        piece=inside.astype(np.int32),
+        weight=runs[0].weight,
+        segments=union,
+    )
+
+
+def _runs(masks: MaskSet) -> list[range]:
+    """Indices of masks that cover the image `_LAYERS` times together; one run at least."""
+    areas = np.cumsum([0, *(mask.area for mask in masks.masks)])
+    layer = areas[:-1] // (_LAYERS * max(1, masks.height * masks.width))
+    starts = np.flatnonzero(np.diff(layer, prepend=-1)).tolist() or [0]
+    return [range(a, b) for a, b in pairwise([*starts, len(masks)])]
+
+
+def _mask_pieces(masks: MaskSet, run: range) -> Pieces:
+    import scipy.sparse
+
+    pixels = [_pixels_of(masks, i) for i in run]
+    piece = refined(pixels, masks.height * masks.width)
+    count = int(piece.max(initial=-1)) + 1
+    # Any one pixel of a piece shows which masks all of it lies in.
+    first = np.zeros(count, np.int64)
+    first[piece[::-1]] = np.arange(len(piece))[::-1]
+    is_first = np.zeros(len(piece), bool)
+    is_first[first] = True
+    within = [piece[part[is_first[part]]] for part in pixels]
+    indptr = np.cumsum([0, *map(len, within)])
+    columns = np.concatenate([np.zeros(0, np.int32), *within])
+    membership: Any = scipy.sparse.csr_matrix(
+        (np.ones(len(columns), np.float32), columns, indptr), shape=(len(run), count)
+    )
+    return Pieces(
+        segment_ids=np.array(run, np.int64), piece=piece, weight=None, segments=membership
     )
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from splatseg.core import Camera, Gaussians, LabelMap, MaskSet
 from splatseg.errors import ShapeError
-from splatseg.lift.mass.pieces import Pieces, pieces_of
+from splatseg.lift.mass.pieces import Pieces, covered_pieces, pieces_of
 from splatseg.lift.mass.products import entries_of, sparse_product
 from splatseg.render import ImageWeights, RenderOptions, SparseWeights, options_for, weights
 from splatseg.render.warp import undistorted_camera, warp_into_photograph
@@ -86,81 +86,100 @@ def view_masses(
             f"segments: expected {camera.width}x{camera.height} pixels, the camera's, "
             f"got {segments.width}x{segments.height}."
         )
+    runs = pieces_of(segments)
+    # The pieces of a single run say themselves what is covered; of several, those of all together.
+    cover = runs[0] if len(runs) == 1 else covered_pieces(runs)
+    options = options or options_for(gaussians, backend)
+    found, visible = _sums(
+        runs if len(runs) == 1 else (*runs, cover),
+        gaussians,
+        camera,
+        options=options,
+        backend=backend,
+    )
+    if visible is None:
+        total = np.zeros(len(gaussians))
+        for sums in found[-1]:
+            total += np.bincount(sums.indices, sums.data, minlength=len(gaussians))
+        visible = torch.from_numpy(total.astype(np.float32))
+    covered = _covered(cover, found[-1], len(gaussians))
+    masses = [_masses(run, sums) for run, sums in zip(runs, found, strict=False)]
+    segment, gaussian, weight = (torch.cat(column) for column in zip(*masses, strict=True))
+    return ViewMasses(
+        segment=segment, gaussian=gaussian, weight=weight, visible=visible, covered=covered
+    )
+
+
+def _masses(pieces: Pieces, sums: list[Any]) -> tuple[Tensor, Tensor, Tensor]:
+    """Segments, Gaussians and masses, the sums of pieces being those of each band."""
     import scipy.sparse
 
-    pieces = pieces_of(segments)
-    options = options or options_for(gaussians, backend)
-    sums, visible = _sums(pieces, gaussians, camera, options=options, backend=backend)
-    band_segments = scipy.sparse.hstack(
-        [pieces.segments] * len(sums), format="csr", dtype=np.float32
-    )
+    segments = scipy.sparse.hstack([pieces.segments] * len(sums), format="csr", dtype=np.float32)
     piece_masses: Any = scipy.sparse.vstack(sums, format="csr")
-    found = sparse_product(band_segments, entries_of(piece_masses), len(gaussians))
-    if visible is None:
-        total = np.bincount(piece_masses.indices, piece_masses.data, minlength=len(gaussians))
-        visible = torch.from_numpy(total.astype(np.float32))
-    return ViewMasses(
-        segment=torch.from_numpy(np.repeat(pieces.segment_ids, np.diff(found.indptr))),
-        gaussian=torch.from_numpy(found.indices.astype(np.int64)),
-        weight=torch.from_numpy(found.data.astype(np.float32)),
-        visible=visible,
-        covered=_covered(pieces, sums, len(gaussians)),
+    found = sparse_product(segments, entries_of(piece_masses), piece_masses.shape[1])
+    return (
+        torch.from_numpy(np.repeat(pieces.segment_ids, np.diff(found.indptr))),
+        torch.from_numpy(found.indices.astype(np.int64)),
+        torch.from_numpy(found.data.astype(np.float32)),
     )
 
 
 def _covered(pieces: Pieces, sums: Sequence[Any], count: int) -> Float[Tensor, "n"]:
     """What pieces in some segment hold of each Gaussian, each piece once."""
-    inside = np.bincount(pieces.segments.indices, minlength=pieces.segments.shape[1]) > 0
+    inside = pieces.covered.astype(np.float64)
     total = np.zeros(count)
     for part in sums:
-        total += inside.astype(np.float64) @ part
+        total += inside @ part
     return torch.from_numpy(total.astype(np.float32))
 
 
 def _sums(
-    pieces: Pieces,
+    runs: Sequence[Pieces],
     gaussians: Gaussians,
     camera: Camera,
     *,
     options: RenderOptions,
     backend: str,
-) -> tuple[list[Any], Tensor | None]:
-    """Sparse (pieces, Gaussians) of each band, and the visibility where pieces lack it."""
+) -> tuple[list[list[Any]], Tensor | None]:
+    """Of each run sparse (pieces, Gaussians) of each band; the visibility where pieces lack it."""
+    weight = runs[0].weight
     pinhole = undistorted_camera(camera)
     bands = list(_bands(pinhole.height * pinhole.width))
-    if len(bands) == 1 and camera.is_pinhole and pieces.weight is None:
-        return [_image_sums(pieces, gaussians, camera, options=options, backend=backend)], None
+    if len(bands) == 1 and camera.is_pinhole and weight is None:
+        return _image_sums(runs, gaussians, camera, options=options, backend=backend), None
     pinhole_pixel = None if camera.is_pinhole else _pinhole_pixels(camera)
-    sums: list[Any] = []
+    found: list[list[Any]] = [[] for _ in runs]
     visible = torch.zeros(len(gaussians))
     for band in bands:
         rows = _rows(gaussians, pinhole, band, options=options, backend=backend)
-        sums.append(_piece_sums(_band_pieces(pieces, band, pinhole_pixel), rows))
-        if pieces.weight is not None:
+        for pieces, sums in zip(runs, found, strict=True):
+            sums.append(_piece_sums(_band_pieces(pieces, band, pinhole_pixel), rows))
+        if weight is not None:
             visible += _visible(rows, band, pinhole_pixel)
-    return sums, None if pieces.weight is None else visible
+    return found, None if weight is None else visible
 
 
 def _image_sums(
-    pieces: Pieces,
+    runs: Sequence[Pieces],
     gaussians: Gaussians,
     camera: Camera,
     *,
     options: RenderOptions,
     backend: str,
-) -> Any:
-    """Sparse (pieces, Gaussians) of a whole image: the faster way, without rows of pixels."""
+) -> list[list[Any]]:
+    """The sums of a whole image, one band: the faster way, without rows of pixels."""
     import scipy.sparse
 
     image = weights(gaussians, camera, layout="blocks", options=options, backend=backend)
     if not isinstance(image, ImageWeights):
         raise TypeError(f"weights: expected those of an image, got {type(image).__name__}.")
-    part = torch.from_numpy(pieces.piece).to(gaussians.device)
-    found = image.part_sums(part)
-    return scipy.sparse.csr_matrix(
-        (found.sums.cpu().numpy(), found.ids.cpu().numpy(), found.indptr.cpu().numpy()),
-        shape=(pieces.segments.shape[1], len(gaussians)),
-    )
+    found: list[list[Any]] = []
+    for pieces in runs:
+        sums = image.part_sums(torch.from_numpy(pieces.piece).to(gaussians.device))
+        columns = (sums.sums.cpu().numpy(), sums.ids.cpu().numpy(), sums.indptr.cpu().numpy())
+        shape = (pieces.segments.shape[1], len(gaussians))
+        found.append([scipy.sparse.csr_matrix(columns, shape=shape)])
+    return found
 
 
 def _band_pieces(pieces: Pieces, band: slice, pinhole_pixel: NDArray[np.int64] | None) -> Any:

@@ -134,8 +134,8 @@ class VoteTable:
         size = 4 * self._count * (len(self._columns) + len(new))
         # A single column is always allowed: the slots of one id need more.
         if size <= self._memory or len(self._columns) + len(new) <= 1:
-            for id in new:
-                self._columns[id] = torch.zeros(self._count)
+            # One large block goes back to the system when it is freed; small ones would stay.
+            self._columns.update(zip(new, torch.zeros(len(new), self._count), strict=True))
             return
         summary = SlotTable(self._count, self._slots)
         for rows, column_ids, block in self._blocks():

@@ -30,6 +30,9 @@ from splatseg.lift.segments.pairs import join_pairs, seen_by
 
 _ROUNDS = 1000
 
+_PAIRS = 1 << 20
+"""Pairs that are compared at a time."""
+
 _MAX_CONFLICT = 0.2
 """Two groups stay apart if they contradict each other in more of the views of the smaller: that
 leaves room for a mask that is wrong now and then, and none for two levels."""
@@ -116,14 +119,27 @@ class _Candidates:
         )
         if self.conflicts is not None:
             self.conflicts = join_pairs(*self.conflicts, target)
-        ratio = self._ratios(row, column, shared)
         kept = ~touched
         self.row = np.concatenate((self.row[kept], row))
         self.column = np.concatenate((self.column[kept], column))
         self.shared = np.concatenate((self.shared[kept], shared))
-        self.ratio = np.concatenate((self.ratio[kept], ratio))
+        ratio = self.ratio[kept]
+        del row, column, shared, touched, kept
+        new = slice(len(ratio), None)
+        found = self._ratios(self.row[new], self.column[new], self.shared[new])
+        self.ratio = np.concatenate((ratio, found))
 
     def _ratios(
+        self, row: NDArray[Any], column: NDArray[Any], shared: NDArray[Any]
+    ) -> NDArray[np.float64]:
+        """Ratios of pairs, each by itself, some at a time: 0 for those that do not join."""
+        ratio = np.empty(len(row))
+        for start in range(0, len(row), _PAIRS):
+            some = slice(start, start + _PAIRS)
+            ratio[some] = self._some_ratios(row[some], column[some], shared[some])
+        return ratio
+
+    def _some_ratios(
         self, row: NDArray[Any], column: NDArray[Any], shared: NDArray[Any]
     ) -> NDArray[np.float64]:
         union = seen_by(self.seen, self.members, row, column)
@@ -157,11 +173,14 @@ class _Candidates:
         one = np.concatenate((row, column))
         other = np.concatenate((column, row))
         value = np.concatenate((ratio, ratio))
-        order = np.lexsort((other, -value, one))
-        first = np.unique(one[order], return_index=True)
-        best = np.full(self.seen.shape[0], -1)
-        best[first[0]] = other[order][first[1]]
-        target = np.arange(self.seen.shape[0])
+        count = self.seen.shape[0]
+        highest = np.zeros(count)
+        np.maximum.at(highest, one, value)
+        ties = np.flatnonzero(value == highest[one])
+        best = np.full(count, count)
+        np.minimum.at(best, one[ties], other[ties])
+        best[best == count] = -1
+        target = np.arange(count)
         has = np.flatnonzero(best >= 0)
         mutual = has[best[best[has]] == has]
         target[mutual] = np.minimum(mutual, best[mutual])

@@ -33,6 +33,10 @@ _SAME = 0.8
 """Intersection over union from which on two segments of one view are the same thing twice."""
 
 
+_ROWS = 256
+"""Segments whose pairs are looked at at a time."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Nesting:
     """Segments of one view inside each other."""
@@ -80,28 +84,36 @@ def nesting(agreement: Agreement, level: NDArray[np.int64] | None = None) -> Nes
 
     if level is None:
         level = np.zeros(len(agreement.view), np.int64)
-    pairs = agreement.shared.tocoo()
-    own = np.asarray(agreement.shared.diagonal(), dtype=np.float64)
-    same_view = (agreement.view[pairs.row] == agreement.view[pairs.col]) & (pairs.row != pairs.col)
-    row, column, both = pairs.row[same_view], pairs.col[same_view], pairs.data[same_view]
-    union = own[row] + own[column] - both
-    step = level[column] - level[row]
-    twice = (both >= _SAME * union) & (step == 0)
-    finer = (step > 0) | ((step == 0) & (own[row] < own[column]))
-    inside = ~twice & (both >= MIN_CONTAINMENT * own[row]) & finer
-    kept = np.ones(len(pairs.data), bool)
-    kept[np.flatnonzero(same_view)[~twice]] = False
-    shape = pairs.shape
+    shared = agreement.shared.tocsr()
+    own = np.asarray(shared.diagonal(), dtype=np.float64)
+    kept = np.ones(len(shared.data), bool)
+    inner, outer = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    # Pairs go with the square of the segments: some rows of them are looked at at a time.
+    for start in range(0, len(own), _ROWS):
+        ends = shared.indptr[start : start + _ROWS + 1]
+        row = np.repeat(np.arange(start, start + len(ends) - 1), np.diff(ends))
+        column = shared.indices[ends[0] : ends[-1]]
+        same_view = (agreement.view[row] == agreement.view[column]) & (row != column)
+        place = ends[0] + np.flatnonzero(same_view)
+        row, column, both = row[same_view], column[same_view], shared.data[place]
+        union = own[row] + own[column] - both
+        step = level[column] - level[row]
+        twice = (both >= _SAME * union) & (step == 0)
+        finer = (step > 0) | ((step == 0) & (own[row] < own[column]))
+        inside = ~twice & (both >= MIN_CONTAINMENT * own[row]) & finer
+        kept[place[~twice]] = False
+        inner.append(row[inside])
+        outer.append(column[inside])
+    ends = np.append(0, np.cumsum(kept))[shared.indptr]
+    pairs = np.concatenate(inner), np.concatenate(outer)
     return Nesting(
         agreement=replace(
             agreement,
             shared=scipy.sparse.csr_matrix(
-                (pairs.data[kept], (pairs.row[kept], pairs.col[kept])), shape=shape
+                (shared.data[kept], shared.indices[kept], ends), shape=shared.shape
             ),
         ),
-        inside=scipy.sparse.csr_matrix(
-            (np.ones(int(inside.sum())), (row[inside], column[inside])), shape=shape
-        ),
+        inside=scipy.sparse.csr_matrix((np.ones(len(pairs[0])), pairs), shape=shared.shape),
         forbidden=_different_levels(agreement.view, level),
     )
 

@@ -32,14 +32,18 @@ def join_pairs(
     """
     import scipy.sparse
 
-    one, other = target[row], target[column]
+    # Pairs are many: what is not wanted again is not kept.
+    short = target.astype(np.int32)
+    one, other = short[row], short[column]
     apart = one != other
     one, other = one[apart], other[apart]
-    index = np.minimum(one, other).astype(np.int32), np.maximum(one, other).astype(np.int32)
+    index = np.minimum(one, other), np.maximum(one, other)
+    del one, other
     count = len(target)
     sums: Any = scipy.sparse.csr_matrix(
         (value[apart].astype(np.float64, copy=False), index), shape=(count, count)
     )
+    del index
     sums.sort_indices()
     rows = np.repeat(np.arange(count, dtype=np.int32), np.diff(sums.indptr))
     return rows, sums.indices, sums.data

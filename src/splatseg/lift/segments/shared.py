@@ -28,16 +28,24 @@ def shared_masses(masses: Any) -> Any:
     length = np.sqrt(np.bincount(row, squares, minlength=count))
     entries = entries_of(columns)
     begin = entries[0][:-1].copy()
-    blocks: list[Any] = []
+    columns_of: list[Any] = [np.zeros(0, np.int32)]
+    values_of: list[Any] = [np.zeros(0, np.float32)]
+    kept_of = np.zeros(count + 1, np.int64)
     for start in range(0, count, _BLOCK):
         rows = masses[start : start + _BLOCK]
         block = sparse_product(rows, entries, count, begin=begin).tocoo()
         row, column = block.row + start, block.col
         kept = block.data > MIN_COSINE * length[row] * length[column]
         kept &= column >= row
-        blocks.append((row[kept], column[kept], block.data[kept].astype(np.float32)))
+        kept_of[1:] += np.bincount(row[kept], minlength=count)
+        columns_of.append(column[kept])
+        values_of.append(block.data[kept].astype(np.float32))
         # What is before a block was multiplied with it before.
         begin += np.bincount(rows.indices, minlength=width)
-    row, column, value = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    upper: Any = scipy.sparse.csr_matrix((value, (row, column)), shape=(count, count))
-    return (upper + scipy.sparse.triu(upper, 1).T).tocsr()
+    ends = np.cumsum(kept_of)
+    upper: Any = scipy.sparse.csr_matrix(
+        (np.concatenate(values_of), np.concatenate(columns_of), ends), shape=(count, count)
+    )
+    del columns_of, values_of
+    lower = scipy.sparse.triu(upper, 1).T.tocsr()
+    return (upper + lower).tocsr()

@@ -62,6 +62,7 @@ class SamplingOptions:
     folder: Path | None = None
     """Where those files go; None is the system's folder for temporary files."""
 
+    @boundary
     def __post_init__(self) -> None:
         convert_fields(self)
         if self.pixels < 1:
