@@ -43,7 +43,7 @@ def masks_of(room: Path) -> str:
     from splatseg.io.evidence import evidence_names, find_evidence, open_evidence
 
     scene = load_scene(room)
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+    folders = scene.evidence_folders
     names = [
         name
         for name in evidence_names(folders)

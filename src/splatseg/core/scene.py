@@ -245,6 +245,11 @@ class Scene(_WithViews):
         return preview(self)
 
     @property
+    def evidence_folders(self) -> list[Path]:
+        """Where evidence is sought by name: the scene's own folder, then its capture's."""
+        return [folder for folder in (self.root, self.source) if folder is not None]
+
+    @property
     def layers(self) -> SceneLayers:
         """The layers of its folder by name, read when asked for."""
         return SceneLayers(self.root)

@@ -215,8 +215,7 @@ def _boundary(
         raise InputError(
             "cut: the masks show the scene before it was edited; cut by the layer instead."
         )
-    folders = [path for path in (scene.root, scene.source) if path is not None]
-    folder = find_evidence(folders, cut.evidence)
+    folder = find_evidence(scene.evidence_folders, cut.evidence)
     return open_evidence(folder, zero_is_class=cut.zero_is_class), ids
 
 

@@ -72,10 +72,11 @@ def _masks(document: Document, where: Where, cut: Cut) -> CutBy | None:
         return None
     if not asked and (document.history or not keeps_boundaries(info.method)):
         return None
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
     zero_is_class = info.source_ids is not None
     try:
-        evidence = open_evidence(find_evidence(folders, name), zero_is_class=zero_is_class)
+        evidence = open_evidence(
+            find_evidence(scene.evidence_folders, name), zero_is_class=zero_is_class
+        )
     except InputError:
         if asked:
             raise

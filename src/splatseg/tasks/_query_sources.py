@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from splatseg.core import Features, Layer, Scene, VoxelFeatures
 from splatseg.core.models import TextFeatures
@@ -93,10 +92,6 @@ def word_source(
     )
 
 
-def _folders(scene: Scene) -> list[Path]:
-    return [folder for folder in (scene.root, scene.source) if folder is not None]
-
-
 def _layer_at_hand(
     scene: Scene,
     options: QueryOptions,
@@ -125,7 +120,7 @@ def _layer_at_hand(
 
 def mask_name(scene: Scene, asked: str | None, *, option: str = "masks") -> str | None:
     """Masks to find objects by: those asked for, or the only ones; `option` is who asks."""
-    folders = _folders(scene)
+    folders = scene.evidence_folders
     if asked is not None:
         if asked not in (known := evidence_names(folders)):
             raise InputError(
@@ -165,7 +160,7 @@ def feature_evidence(
     scene: Scene, name: str | None, encoder: TextFeatures | None
 ) -> FeatureEvidence:
     """The evidence of features in the space of words: of this name, or the only one."""
-    folders = _folders(scene)
+    folders = scene.evidence_folders
     if name is not None:
         evidence = open_evidence(find_evidence(folders, name))
         if not isinstance(evidence, FeatureEvidence):

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from splatseg.core import Features, Layer, Scene
@@ -60,7 +59,7 @@ def with_companions(scene: Scene, method: Method, options: Any, observer: Observ
     Raises:
         InputError: If an option takes any and there is none.
     """
-    folders = _folders(scene)
+    folders = scene.evidence_folders
     for option, kinds in method.companions.items():
         if getattr(options, option) != ANY_COMPANION:
             continue
@@ -84,7 +83,7 @@ def with_companions(scene: Scene, method: Method, options: Any, observer: Observ
 
 def named_companions(scene: Scene, method: Method, options: Any) -> dict[str, Evidence]:
     """The evidence that the method's options name besides, by option."""
-    folders = _folders(scene)
+    folders = scene.evidence_folders
     found: dict[str, Evidence] = {}
     for option, kinds in method.companions.items():
         asked = getattr(options, option)
@@ -102,7 +101,3 @@ def named_companions(scene: Scene, method: Method, options: Any) -> dict[str, Ev
             )
         found[option] = evidence
     return found
-
-
-def _folders(scene: Scene) -> list[Path]:
-    return [folder for folder in (scene.root, scene.source) if folder is not None]

@@ -216,9 +216,8 @@ def _guidance(offer: Offer, layer: Features) -> Callable[[View], FeatureMap | No
     name = layer.info.options.get("guidance")
     if not isinstance(name, str):
         return None
-    folders = [folder for folder in (offer.scene.root, offer.scene.source) if folder is not None]
     try:
-        evidence = open_evidence(find_evidence(folders, name))
+        evidence = open_evidence(find_evidence(offer.scene.evidence_folders, name))
     except InputError:
         return None
     known = set(evidence.view_names)
@@ -266,7 +265,7 @@ def _open_masks(offer: Offer) -> OpenedSource | None:
 def _masks(offer: Offer) -> str | None:
     """Name of the masks of the scene or its capture: those asked for, or the only ones."""
     scene, wanted = offer.scene, offer.options.evidence
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+    folders = scene.evidence_folders
     if wanted is not None:
         found = open_evidence(find_evidence(folders, wanted))
         if found.kind != "masks":

@@ -74,7 +74,7 @@ def prompter_of(
     Raises:
         InputError: If there is no such model, or it answers no points.
     """
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
+    folders = scene.evidence_folders
     folder = find_evidence(folders, named) if named in evidence_names(folders) else Path(named)
     if name_of(named) not in model_names() and folder.is_dir():
         model: Model = recorded_model(folder, views=scene.views)

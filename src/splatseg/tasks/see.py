@@ -170,8 +170,7 @@ def see(
 
 
 def _seeds(scene: Scene, name: str | None) -> Evidence | None:
-    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
-    return None if name is None else open_evidence(find_evidence(folders, name))
+    return None if name is None else open_evidence(find_evidence(scene.evidence_folders, name))
 
 
 def _rendered(drawn: int, folder: Path) -> str:

@@ -344,9 +344,8 @@ def _evidence(
     scene: Scene, method: Method, options: SegmentOptions, trained: Features | None
 ) -> tuple[str, Evidence]:
     """The evidence asked for, or else that of what was trained before, or else the only one."""
-    folders: list[Path] = [folder for folder in (scene.root, scene.source) if folder is not None]
     asked = options.evidence or (None if trained is None else trained.info.evidence)
-    folder = find_evidence(folders, asked)
+    folder = find_evidence(scene.evidence_folders, asked)
     evidence = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
     method.check_evidence(evidence)
     return folder.name, evidence

@@ -159,8 +159,7 @@ def _evidence(
     name = mask_name(scene, options.evidence, option="evidence")
     if name is None:
         return features, None
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    masks = open_evidence(find_evidence(folders, name))
+    masks = open_evidence(find_evidence(scene.evidence_folders, name))
     if masks.kind not in _KINDS:
         raise InputError(f"evidence: expected masks or segments, {name!r} has {masks.kind}.")
     return features, masks

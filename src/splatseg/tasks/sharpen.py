@@ -257,10 +257,9 @@ def _source(
             f"evidence: expected a name, as layer {options.layer} does not say what it was "
             "made from; got none."
         )
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
     own = name == layer.info.evidence
     zero = own and layer.info.source_ids is not None
-    evidence = open_evidence(find_evidence(folders, name), zero_is_class=zero)
+    evidence = open_evidence(find_evidence(scene.evidence_folders, name), zero_is_class=zero)
     views = views_to_learn_from(scene, layer, evidence)
     check_map_sizes(evidence, views)
     same = own and keeps_boundaries(layer.info.method)

@@ -135,8 +135,7 @@ def _label_maps(inputs: DriveInputs) -> str:
 def _depth_evidence(scene: Scene, depth: str) -> str:
     if depth in DEPTHS:
         return "none"
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    found = open_evidence(find_evidence(folders, depth, option="depth"))
+    found = open_evidence(find_evidence(scene.evidence_folders, depth, option="depth"))
     files = found.files if isinstance(found, DepthEvidence) else {}
     return digest((name, file_mark(path)) for name, path in sorted(files.items()))
 

@@ -110,8 +110,7 @@ def check_labelled(views: Sequence[View], evidence: Evidence, where: str) -> int
 
 
 def _evidence(scene: Scene, options: StreetOptions) -> tuple[str, Evidence]:
-    folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-    folder = find_label_maps(folders, options.evidence)
+    folder = find_label_maps(scene.evidence_folders, options.evidence)
     found = open_evidence(folder, zero_is_class=options.zero_is_class, void=options.void)
     if found.kind != "labels":
         raise InputError(f"{folder}: expected evidence of labels, got {found.kind}.")

@@ -174,8 +174,7 @@ def _depths(
         case "points":
             return _of_points(points, views, metres)
         case name:
-            folders = [folder for folder in (scene.root, scene.source) if folder is not None]
-            found = open_evidence(find_evidence(folders, name, option="depth"))
+            found = open_evidence(find_evidence(scene.evidence_folders, name, option="depth"))
             if not isinstance(found, DepthEvidence):
                 raise InputError(
                     f"depth: expected {', '.join(DEPTHS)} or evidence of depth, got {name!r:.80} "

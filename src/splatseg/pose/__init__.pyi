@@ -1,0 +1,13 @@
+from ._options import CameraSharing as CameraSharing
+from ._options import Mapper as Mapper
+from ._options import Matching as Matching
+from ._options import PoseOptions as PoseOptions
+from ._photographs import holds_photographs as holds_photographs
+from ._recover import PoseProgress as PoseProgress
+from ._recover import PoseResult as PoseResult
+from ._recover import recover_poses as recover_poses
+from ._report import LeftOut as LeftOut
+from ._report import MapperTry as MapperTry
+from ._report import PoseReport as PoseReport
+from ._saved import load_pose_report as load_pose_report
+from ._video import is_video as is_video
