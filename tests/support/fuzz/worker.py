@@ -5,6 +5,7 @@ that it is at into another, so that the process above knows which one never ende
 """
 
 import json
+import os
 import resource
 import signal
 import tempfile
@@ -68,6 +69,7 @@ def work(job: dict[str, Any]) -> None:
     """
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
+    os.dup2(2, 1)  # decoders print to the standard output, where the counts are JSON
     with tempfile.TemporaryDirectory(prefix="fuzz-") as holder, Path(job["said"]).open("w") as said:
         folder = Path(holder) / "files"
         folder.mkdir()
