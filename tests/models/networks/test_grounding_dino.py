@@ -132,7 +132,9 @@ def test_the_input_has_the_sides_that_the_weights_want(checkpoints, tmp_path) ->
     assert sides(bare, 100, 100) == (800, 800)
     assert sides(bare, 100, 200) == (666, 1333)
     path.write_text(json.dumps(content | {"size": {"shortest_edge": "wide"}}))
-    with pytest.raises(FileFormatError, match=r"shortest_edge: expected a number of pixels up to 16384, got"):
+    with pytest.raises(
+        FileFormatError, match=r"shortest_edge: expected a number of pixels up to 16384, got"
+    ):
         find_model("grounding-dino", loading=LoadOptions(weights=str(folder)))
 
 
