@@ -20,6 +20,7 @@ from splatseg.core import (
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.lift import ConfusionOptions
 from splatseg.lift.segments.ballots import majority
+from splatseg.lift.segments.clustering import _Candidates
 from splatseg.lift.segments.pairs import join_pairs
 from splatseg.lift.segments.shared import shared_masses
 from splatseg.lift.segments.table import SegmentTable, segment_table
@@ -295,6 +296,18 @@ def test_pairs_of_joined_groups_add_up() -> None:
     value = np.array([1.0, 2, 4, 8, 16, 32])
     found = join_pairs(row, column, value, np.array([0, 1, 1, 0, 4]))
     assert [part.tolist() for part in found] == [[0, 0], [1, 4], [27, 32]]
+
+
+def test_groups_join_their_best_and_of_equals_the_first() -> None:
+    """0 is as near to 1 as to 2; 3 is nearer to 5 than to 4; 4 and 5 are below the threshold."""
+    import scipy.sparse
+
+    one = scipy.sparse.identity(6, format="csr")
+    row, column = np.array([0, 0, 3, 3, 4]), np.array([1, 2, 4, 5, 5])
+    candidates = _Candidates((row, column, np.ones(5)), one, one, 0.5)
+    assert candidates.mutual_best() is None
+    candidates.ratio = np.array([0.9, 0.9, 0.6, 0.7, 0.2])
+    assert candidates.mutual_best().tolist() == [0, 0, 2, 3, 4, 3]
 
 
 def test_votes_become_a_soft_layer() -> None:
