@@ -3,6 +3,7 @@
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatseg.errors import FileFormatError
@@ -112,3 +113,33 @@ def test_chunks_and_their_layers(file) -> None:
         change(path, at, layout, value)
         with pytest.raises(FileFormatError, match=words):
             read_scans(path)
+
+
+def test_chunks_end_before_their_table(file) -> None:
+    path = file("laz")
+    content, data = path.read_bytes(), number(path, DATA, "I")
+    table = number(path, data, "q")
+    path.write_bytes(content[: table - 5] + content[table:])
+    change(path, data, "q", table - 5)
+    with pytest.raises(FileFormatError, match=f"that end before byte {table - 5}"):
+        check_las_sizes(path)
+
+
+def test_layers_of_every_chunk_are_looked_at(tmp_path) -> None:
+    """A chunk holds 50000 points: of one more there are two chunks."""
+    import laspy
+    import lazrs
+
+    path, count = tmp_path / "two.laz", 50_001
+    cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    cloud.x = np.arange(count) * 0.01
+    cloud.y = cloud.z = np.zeros(count)
+    cloud.write(path)
+    check_las_sizes(path)
+    data, record = number(path, DATA, "I"), path.read_bytes()[laszip(path) :][:46]
+    with path.open("rb") as stream:
+        stream.seek(data)
+        (_, first), _ = lazrs.read_chunk_table(stream, lazrs.LazVlr(record))
+    change(path, data + 8 + first + 30 + 4, "I", 2**31)
+    with pytest.raises(FileFormatError, match="layers of points within their chunks"):
+        check_las_sizes(path)
