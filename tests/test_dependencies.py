@@ -19,12 +19,15 @@ TOOLS = {  # of dev: programs, and what a test runs in a process of its own
     "import-linter", "pytest-xdist", "ruff", "pyright",
     "scikit-build-core", "nanobind", "cmake", "ninja",
 }  # fmt: skip
+ELSEWHERE = {ROOT / "tests/golden/make_annotations.py"}
+"""Run in an environment of its own, beside the tools whose files it makes."""
+
 BY_NAME = re.compile(r"(?:import_module|find_spec|importorskip)\(\"([\w.]+)\"")
 
 
 def imported(folder: Path) -> set[str]:
     """Top-level modules of others that the Python files of a folder import, at once or later."""
-    files = [path for path in folder.rglob("*.py") if path.is_file()]
+    files = [path for path in folder.rglob("*.py") if path.is_file() and path not in ELSEWHERE]
     own = {path.stem for path in files} | {path.parent.name for path in files}
     names: set[str] = set()
     for path in files:

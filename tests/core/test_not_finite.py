@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splatseg.core import Features, Labels, MaskSet, PointCloud
+from splatseg.core import Features, Labels, MaskSet
 from splatseg.core.benchmark import TruePoints
 from splatseg.core.models import Boxes
 from splatseg.core.renderable import PointLabels
@@ -27,7 +27,6 @@ VALUES = {
     "boxes": lambda x: Boxes(words=(0,), boxes=x.repeat(2)[None], scores=torch.ones(1)),
     "scores of boxes": lambda x: Boxes(words=(0, 1), boxes=torch.ones(2, 4), scores=x),
     "confidence of points": lambda x: PointLabels(ids=IDS, confidence=x),
-    "points": lambda x: PointCloud(points=x[:, None].expand(2, 3).clone()),
     "cosines": lambda x: relevancy(x, SURE),
     "negatives": lambda x: relevancy(SURE, x),
     "image": lambda x: psnr(x.reshape(1, 2, 1), SURE.reshape(1, 2, 1)),

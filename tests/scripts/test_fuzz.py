@@ -46,7 +46,7 @@ def _raising(error: Exception, folder: Path) -> Target:
         (KeyError("x"), "KeyError at"),
         (MemoryError(), "MemoryError at"),
         (FileFormatError("something is wrong."), "names no file"),
-        (FileFormatError("FOLDER/a: " + "x" * 500), "characters long"),
+        (FileFormatError("FOLDER/a: " + "x " * 300), "characters long"),
         (FileFormatError("FOLDER/a: \x1b[31m"), "cannot be printed"),
         (FileFormatError("FOLDER/a: expected something, got nothing."), None),
     ],

@@ -80,8 +80,8 @@ def test_pieces_of_pairs_that_come_some_at_a_time(monkeypatch) -> None:
     removed = Selection(mask=torch.isin(order, torch.tensor([9, 10])))
     specks = leftovers(g[order], removed, most=5)
     assert specks.count == 5
-    monkeypatch.setattr("splatseg.selection.components._PAIRS", 3 * 16)
-    monkeypatch.setattr("splatseg.selection.components._KEPT", 0)
+    monkeypatch.setattr(module, "_PAIRS", 3 * 16)
+    monkeypatch.setattr(module, "_KEPT", 0)
     joins: list[int] = []
     whole = module.pieces
     monkeypatch.setattr(module, "pieces", lambda *args: joins.append(1) or whole(*args))

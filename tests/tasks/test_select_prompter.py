@@ -152,7 +152,7 @@ def test_recorded_masks_answer_by_name_and_by_folder(room) -> None:
     assert bool(found[0][y, x])
     with pytest.raises(InputError, match="expected a model that answers points, got features_dino"):
         prompter_of("features_dino", scene, report=print)
-    with pytest.raises(InputError, match="or a folder of recorded evidence, got 'masks_sma'"):
+    with pytest.raises(InputError, match="a file or folder of recorded evidence, got 'masks_sma'"):
         prompter_of("masks_sma", scene, report=print)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from splatseg._check import check_finite, check_shape
+from splatseg._check import check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
@@ -73,7 +73,10 @@ class View:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointCloud:
-    """Start points of a capture, in the world."""
+    """Start points of a capture, in the world.
+
+    What is not finite stays: readers of captures leave it out, and a fit refuses it.
+    """
 
     points: Float[Tensor, "n 3"]
 
@@ -83,7 +86,6 @@ class PointCloud:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("points", self.points, (None, 3))
-        check_finite("points", self.points)
         if self.colours is not None:
             check_shape("colours", self.colours, (len(self.points), 3))
 

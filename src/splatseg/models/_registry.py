@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Model
-from splatseg.errors import InputError, MissingFileError, MissingPackageError
+from splatseg.errors import InputError, MissingFileError, MissingPackageError, quoted
 from splatseg.io.foreign import is_file, is_folder
 from splatseg.models._family import LoadOptions, ModelFamily
 from splatseg.models._loading import loading_of
@@ -104,11 +104,11 @@ def find_model(
     if text not in known:
         if not is_file(Path(name)) and not is_folder(Path(name)):
             if Path(name).suffix or len(Path(name).parts) > 1:
-                raise MissingFileError(f"model: {text!r:.200}: there is no such file or folder.")
+                raise MissingFileError(f"model: {quoted(text)}: there is no such file or folder.")
             names = ", ".join(known)
             raise InputError(
                 f"model: expected one of {names}, or a file or folder of recorded evidence, got "
-                f"{text!r:.200}."
+                f"{quoted(text)}."
             )
         _refuse(text, options, loading)
         from splatseg.models.recorded import recorded_model
