@@ -60,6 +60,8 @@ def load(folder: Path, family: str = "dinov2") -> object:
         ({"hidden_act": "os.system"}, "hidden_act: expected a word"),
         ({"out_features": ["../../a"]}, "out_features: expected a word"),
         ({"id2label": {"x": "a"}}, "id2label: expected a name by the number"),
+        ({"id2label": {"0": "a\0"}}, "config.json: id2label: 0: expected text that UTF-8 can hold"),
+        ({"eos_token_id": [1, 2]}, "eos_token_id: expected the number of one token"),
         ({"id2label": {str(i): "a" for i in range(70_000)}}, "names of 1 to 65535 classes"),
         ({"num_labels": 10**9}, "num_labels: expected a whole number from 1 to 65535"),
         ({"hidden_size": 1 << 16, "mlp_ratio": 8}, "expected a network of the size of its weights"),

@@ -17,8 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
+from splatseg.core.coerce import as_text
 from splatseg.errors import FileFormatError, quoted
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json
 from splatseg.models.networks._config_keys import FLAGS, NUMBERS, PARTS, WORDS, Numbers
 
@@ -177,6 +178,8 @@ class _Checked:
         return {key: self._value(key, one, f"{name}.{key}") for key, one in known.items()}
 
     def _value(self, key: str, value: object, name: str) -> object:
+        if key.endswith("_token_id") and isinstance(value, list):
+            self._fail(name, "the number of one token", value)
         if key in NUMBERS:
             return self._numbers(value, NUMBERS[key], name)
         if key in FLAGS:
@@ -224,6 +227,8 @@ class _Checked:
         for key, one in cast("dict[str, object]", value).items():
             if not _DIGITS.fullmatch(key) or not isinstance(one, str | int | float):
                 self._fail(name, "a name by the number of its class", {key: one})
+            with made_from(self._path):
+                as_text(f"{name:.60}: {key}", str(one))
         return {str(int(key)): str(one) for key, one in cast("dict[str, object]", value).items()}
 
     def _refuse(self, content: Mapping[str, Any], kind: str, where: str) -> None:
