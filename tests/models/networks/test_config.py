@@ -1,5 +1,6 @@
 """config.json is foreign: what it may say, and that nothing is fetched, run or built beyond it."""
 
+import importlib
 import json
 import os
 import shutil
@@ -12,6 +13,7 @@ import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.models import LoadOptions, find_model
+from splatseg.models.networks._config import offline
 from splatseg.models.networks._config_keys import FLAGS, NUMBERS, WORDS
 from splatseg.models.networks._library import side_of
 from support.networks import IMAGE, KINDS, asked, checkpoint, in_parts
@@ -323,3 +325,12 @@ def test_what_is_said_of_pictures(checkpoints, tmp_path, content, words) -> None
     (folder / "preprocessor_config.json").write_text(json.dumps(content))
     with pytest.raises(FileFormatError, match=f"preprocessor_config.json: {words}"):
         asked("clipseg", folder)
+
+
+def test_nothing_reaches_the_hub_while_a_library_loads() -> None:
+    constants = importlib.import_module("huggingface_hub").constants
+    before = constants.HF_HUB_OFFLINE
+    with pytest.raises(KeyError), offline():
+        assert constants.HF_HUB_OFFLINE is True
+        raise KeyError
+    assert constants.HF_HUB_OFFLINE is before
