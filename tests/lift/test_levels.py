@@ -95,7 +95,10 @@ SHARE = np.array([HALF, WHOLE] * 3, dtype=np.float64)
 VIEW = [0, 0, 1, 1, 2, 2]
 
 
-def test_what_lies_inside_another_of_its_view_is_of_another_level() -> None:
+@pytest.mark.parametrize("rows", [1, 4, 256])
+def test_what_lies_inside_another_of_its_view_is_of_another_level(monkeypatch, rows) -> None:
+    """However many segments are looked at at a time."""
+    monkeypatch.setattr("splatseg.lift.segments.nesting._ROWS", rows)
     found = nesting(agreement(SHARE, VIEW))
     assert sorted(zip(*found.inside.nonzero(), strict=True)) == [(0, 1), (2, 3), (4, 5)]
     assert found.share == 1
