@@ -8,8 +8,7 @@
       </image>
     </annotations>
 
-Runs of a mask go row by row through its box, the first one outside. A document type is refused:
-entities are declared there, and with them a few bytes may stand for gigabytes, or for other files.
+Runs of a mask go row by row through its box, the first one outside.
 """
 
 from collections import Counter
@@ -17,7 +16,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from xml.parsers import expat
 
 import numpy as np
 
@@ -25,10 +23,9 @@ from splatseg.core import Rle
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.annotations._base import AnnotatedPicture, Annotations, classes_of_names
 from splatseg.io.annotations._regions import Canvas, Region, corners_of, whole_runs
-from splatseg.io.foreign import reading
+from splatseg.io.xml_files import read_xml
 
 _KIND = "CVAT for images 1.1"
-_CHUNK = 1 << 16
 _MAX_SIDE = 1 << 24
 _MAX_DIGITS = 12
 
@@ -52,21 +49,9 @@ def cvat_annotations(path: Path) -> Annotations:
         MissingFileError: If there is no such file.
         FileFormatError: If it is another XML, ends early or has a document type.
     """
-    with reading(path, _KIND):
-        stream = path.open("rb")
     found = _Found(path)
-    with stream:
-        while True:
-            with reading(path, _KIND):
-                piece = stream.read(_CHUNK)
-            try:
-                found.parser.Parse(piece, not piece)
-            except expat.ExpatError as error:
-                raise FileFormatError(
-                    f"{path}: expected {_KIND}, but it cannot be read ({reason(error)})."
-                ) from error
-            if not piece:
-                break
+    for _ in read_xml(path, _KIND, found):
+        pass  # all shapes are needed before the first picture: labels are numbered by them
     used = sorted({s.fields.get("label", "") for _, _, shapes in found.images for s in shapes})
     ids, classes = classes_of_names([n for n in (*found.labels, *used) if n], where=str(path))
     pictures = [
@@ -145,14 +130,8 @@ class _Found:
         self.labels: list[str] = []
         self.images: list[tuple[str, tuple[int, int], list[_Shape]]] = []
         self.left_out: Counter[str] = Counter()
-        self.parser = expat.ParserCreate("utf-8")  # whatever encoding it names
-        self.parser.buffer_text = True
-        self.parser.StartElementHandler = self._start
-        self.parser.EndElementHandler = self._end
-        self.parser.CharacterDataHandler = self._text
-        self.parser.StartDoctypeDeclHandler = self._refuse
 
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
+    def start(self, name: str, attributes: dict[str, str]) -> None:
         self._names.append(name)
         if self._names[0] != "annotations":
             raise FileFormatError(
@@ -176,21 +155,18 @@ class _Found:
             elif name in _OTHERS:
                 self.left_out[_OTHERS[name]] += 1
 
-    def _end(self, name: str) -> None:
+    def end(self, name: str) -> None:
         if self._is_label_name():
             self.labels.append("".join(self._label).strip())
             self._label = []
         self._names.pop()
 
-    def _text(self, text: str) -> None:
+    def text(self, text: str) -> None:
         if self._is_label_name():
             self._label.append(text)
 
     def _is_label_name(self) -> bool:
         return self._names[-3:] == ["labels", "label", "name"]
-
-    def _refuse(self, *_: object) -> None:
-        raise FileFormatError(f"{self._path}: expected XML without a document type, got one.")
 
 
 def _side(attributes: Mapping[str, str], key: str, where: str) -> int:

@@ -10,25 +10,22 @@
     </object1>
     ...
 
-Expat reads it piece by piece, and what is not asked for is not kept. A document type is refused:
-entities are declared there, and with them a few bytes may stand for gigabytes, or for other files.
+What is not asked for is not kept.
 """
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.core.json_numbers import MAX_NUMBER
 from splatseg.errors import FileFormatError, quoted, reason
-from splatseg.io.foreign import reading
+from splatseg.io.xml_files import read_xml
 
 _KIND = "XML of OpenCV"
 _ROOT = "opencv_storage"
-_CHUNK = 1 << 16
 _DEEPEST = 8
 """Elements within each other; four are used."""
 
@@ -106,22 +103,9 @@ def stored_objects(path: Path, wanted: Collection[str]) -> Iterator[StoredObject
         FileFormatError: If it is no such XML, ends early, has a document type, or an object is
             too large.
     """
-    with reading(path, _KIND):
-        stream = path.open("rb")
     found = _Found(path, wanted)
-    with stream:
-        while True:
-            with reading(path, _KIND):
-                piece = stream.read(_CHUNK)
-            try:
-                found.parser.Parse(piece, not piece)
-            except expat.ExpatError as error:
-                raise FileFormatError(
-                    f"{path}: expected {_KIND}, but it cannot be read ({reason(error)})."
-                ) from error
-            yield from found.taken()
-            if not piece:
-                return
+    for _ in read_xml(path, _KIND, found):
+        yield from found.taken()
 
 
 class _Found:
@@ -134,12 +118,6 @@ class _Found:
         self._texts: dict[str, list[str]] = {}
         self._kept = 0
         self._objects: list[StoredObject] = []
-        self.parser = expat.ParserCreate("utf-8")  # whatever encoding it names
-        self.parser.buffer_text = True
-        self.parser.StartElementHandler = self._start
-        self.parser.EndElementHandler = self._end
-        self.parser.CharacterDataHandler = self._text
-        self.parser.StartDoctypeDeclHandler = self._refuse
 
     def taken(self) -> list[StoredObject]:
         """The objects that ended since this was last asked."""
@@ -150,7 +128,7 @@ class _Found:
     def _where(self) -> str:
         return f"{self._path}: {quoted(self._names[1])}" if self._names[1:] else str(self._path)
 
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
+    def start(self, name: str, attributes: dict[str, str]) -> None:
         self._names.append(name)
         if self._names[0] != _ROOT or len(self._names) > _DEEPEST:
             raise FileFormatError(f"{self._where}: expected {_KIND}, got other elements.")
@@ -163,7 +141,7 @@ class _Found:
         if self._key is not None:
             self._texts[key] = []
 
-    def _text(self, text: str) -> None:
+    def text(self, text: str) -> None:
         if self._key is None:
             return
         self._kept += len(text)
@@ -173,12 +151,9 @@ class _Found:
             )
         self._texts[self._key].append(text)
 
-    def _end(self, name: str) -> None:
+    def end(self, name: str) -> None:
         if len(self._names) == 2:
             texts = {key: "".join(parts) for key, parts in self._texts.items()}
             self._objects.append(StoredObject(where=self._where, texts=texts))
         self._key = None
         self._names.pop()
-
-    def _refuse(self, name: str, system: str | None, public: str | None, subset: bool) -> None:
-        raise FileFormatError(f"{self._path}: expected XML without a document type, got one.")
