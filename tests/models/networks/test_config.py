@@ -111,6 +111,15 @@ def test_sizes_that_leave_nothing_of_an_image(changed) -> None:
         asked("segformer", folder)
 
 
+def test_maps_that_do_not_fit_each_other(changed) -> None:
+    """Fewer sizes of maps than SAM 2's decoder takes; no block at all."""
+    folder = changed("sam2", vision_config__backbone_feature_sizes=[[16, 16]])
+    with pytest.raises(FileFormatError, match=r"weights: expected a network that takes an image"):
+        asked("sam2", folder)
+    with pytest.raises(InputError, match=r"depths: expected at most .*\(.*weights\)"):
+        load(changed("dino", num_hidden_layers=0), "dino")
+
+
 def test_what_is_said_reaches_the_library(changed) -> None:
     """None is a value, which is not the default of each key."""
     content = {"layerscale_value": 0.25, "out_features": None, "hidden_dropout_prob": 0.5}

@@ -122,11 +122,11 @@ def network(
             f"{len(lacking)} of its tensors ({', '.join(sorted(lacking)[:_SOME])}{more})."
         )
     for part in (made, *made.children()):
-        part.forward = _answering(place.folder, part.forward)
+        part.forward = answering(place.folder, part.forward)
     return made.to(place.device).eval()
 
 
-def _answering(folder: Path, forward: Callable[..., Any]) -> Callable[..., Any]:
+def answering(folder: Path, forward: Callable[..., Any]) -> Callable[..., Any]:
     """A pass through a network, or a part of it, that says why it fails.
 
     Sizes that fit the weights may not fit each other, such as steps that leave nothing of an image.

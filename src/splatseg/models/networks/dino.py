@@ -75,7 +75,7 @@ class Dino:
         if options.depths > count:
             raise RangeError(
                 f"depths: expected at most the {count} blocks of {place.name}, got "
-                f"{options.depths}."
+                f"{options.depths} ({place.folder})."
             )
         # After every count / depths blocks: 3, 6, 9, 12 of 12.
         self._blocks = [round(count * (i + 1) / options.depths) for i in range(options.depths)]

@@ -22,6 +22,7 @@ from splatseg.models._family import Checkpoint, Loading
 from splatseg.models._images import HALVES, Frame, Normalisation, frame_of, network_input
 from splatseg.models._mask_generator import Decode, MaskGeneratorOptions, automatic_masks
 from splatseg.models.networks._library import (
+    answering,
     configuration,
     network,
     network_family,
@@ -224,7 +225,7 @@ class Sam:
         batch = network_input(
             images, frame, self._normalisation, device=self._place.device, dtype=self._place.dtype
         )
-        maps = self._maps(batch)
+        maps = answering(self._place.folder, self._maps)(batch)
         return [
             _Seen(frame=frame, maps=tuple(one[i : i + 1] for one in maps))
             for i in range(len(images))
