@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import errno
 import importlib
 import inspect
 import os
@@ -238,3 +239,14 @@ def test_a_reader_that_goes_away_is_no_traceback(length: int) -> None:
         os.close(write_end)
     assert done.stderr == b""
     assert done.returncode == 1
+
+
+def test_a_name_too_long_for_a_file_is_one_sentence(monkeypatch, capsys) -> None:
+    """Where no boundary stands before the system."""
+
+    def run(command: object) -> None:
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), "x" * 5000)
+
+    monkeypatch.setattr("splatseg.cli.info.run", run)
+    assert main(["info", "a"]) == 1
+    assert capsys.readouterr().err.endswith("...xxxxxxxxxxxx: the name is too long for a file.\n")
