@@ -248,5 +248,5 @@ def test_a_name_too_long_for_a_file_is_one_sentence(monkeypatch, capsys) -> None
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), "x" * 5000)
 
     monkeypatch.setattr("splatseg.cli.info.run", run)
-    assert main(["info", "a"]) == 1
+    assert cli.main(["info", "a"]) == 1
     assert capsys.readouterr().err.endswith("...xxxxxxxxxxxx: the name is too long for a file.\n")
