@@ -16,7 +16,6 @@ import torch
 from splatseg.core import Camera, View
 from splatseg.core.view_names import view_name_fault
 from splatseg.errors import FileFormatError, quoted
-from splatseg.io.captures.build import checked_pose, opencv_from_opengl
 from splatseg.io.captures.nerfstudio import (
     LENS_KEYS,
     MILLIMETRE,
@@ -25,6 +24,7 @@ from splatseg.io.captures.nerfstudio import (
     number,
     size_of,
 )
+from splatseg.io.captures.raw_views import checked_pose, opencv_from_opengl
 from splatseg.io.foreign import made_from
 
 _MODEL_NAMES = {

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import InputError, MissingPackageError, quoted, reason
-from splatseg.io.captures.build import Intrinsics
+from splatseg.io.captures.raw_views import Intrinsics
 from splatseg.io.json_files import parse_object
 
 WORST = 0.5

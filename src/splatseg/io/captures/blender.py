@@ -7,8 +7,9 @@ from typing import Any
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures._points_beside import points_beside
-from splatseg.io.captures.build import RawView, build_capture
+from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.nerfstudio import cam_from_world_of, intrinsics_of_frame
+from splatseg.io.captures.raw_views import RawView
 from splatseg.io.json_files import read_json
 
 SPLITS = ("train", "val", "test")

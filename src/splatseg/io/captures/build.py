@@ -5,23 +5,24 @@ missing photographs, sizes and poses are dealt with here, once, so that every la
 the same mistakes in the same words.
 """
 
-import math
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import TypeAlias
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from splatseg.core import Camera, CameraModel, Capture, PointCloud, View
-from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.core import Camera, Capture, PointCloud, View
 from splatseg.core.view_names import clean_view_names
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures._metadata import read_metadata
 from splatseg.io.captures._photographs import Photographs, moves
+from splatseg.io.captures.raw_views import (
+    RawView,
+    camera_of,
+    intrinsics_of_size,
+    scaled_to,
+)
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size, same_shape
 from splatseg.io.paths import check_utf8
@@ -29,8 +30,6 @@ from splatseg.io.paths import check_utf8
 TEST_EVERY = 8
 """Without a split of its own, views 0, 8, 16 ... of a capture by sorted name are test views."""
 
-MAX_SIDE = 1 << 24
-"""Pixels a side of a picture that a layout may speak of."""
 
 _LONGEST = 100
 """Characters of a path in a message; its end is kept."""
@@ -40,54 +39,6 @@ MIN_THERE = 0.5
 
 # So many photographs that are not there are named in a note.
 _NAMED = 20
-
-_ROTATION_TOLERANCE = 1e-3
-# A matrix this close to a rotation is kept to the last bit; others are made exact.
-_ROTATION_EXACT = 1e-9
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Intrinsics:
-    """What a layout says of a lens, in pixels of an image of `width` x `height`."""
-
-    model: CameraModel = "pinhole"
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-
-    width: int | None
-    """None where the layout does not say: the photograph's own size is meant."""
-
-    height: int | None
-
-
-OfSize: TypeAlias = Callable[[int, int], Intrinsics]
-"""Intrinsics of a photograph by its width and height, where the layout does not tell its size."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RawView:
-    """One photograph as a layout describes it, unchecked."""
-
-    image: Path
-    """Where the photograph should be."""
-
-    relative: str
-    """The photograph's path as the layout writes it; names come from it."""
-
-    intrinsics: Intrinsics | OfSize
-    cam_from_world: NDArray[np.float64]
-    """4 x 4, OpenCV axes."""
-
-    copy_of: int = 1
-    """Pixels of the photograph that the intrinsics are of for one of `image`, a smaller copy."""
-
-    split: str | None = None
-    mask: Path | None = None
-    depth: Path | None = None
-    depth_unit: float | None = None
 
 
 def build_capture(
@@ -257,13 +208,13 @@ def _cameras(
         try:
             size = image_size(view.image)
             fault = "are of another shape than their intrinsics say"
-            written = _of_size(view, size)
+            written = intrinsics_of_size(view, size)
             intrinsics = scaled_to(written, size, where=str(view.image))
             fault = "have a mask that cannot be opened or is of another shape"
             mask = _mask_size(view, size)
             fault = "have a pose or a lens that no camera has"
             with made_from(where := f"{path}: {view.relative}"):
-                cameras[i] = _camera(view, intrinsics, size, where=where)
+                cameras[i] = camera_of(view, intrinsics, size, where=where)
         except InputError as error:
             unfit.setdefault(fault, []).append(view.relative)
             first = first or error
@@ -299,13 +250,6 @@ def _mask_size(view: RawView, size: tuple[int, int]) -> tuple[int, int]:
             f"a uniform scale of it, got {mask[0]}x{mask[1]}."
         )
     return mask
-
-
-def _of_size(view: RawView, size: tuple[int, int]) -> Intrinsics:
-    """The intrinsics of a view whose photograph has this size."""
-    if isinstance(view.intrinsics, Intrinsics):
-        return view.intrinsics
-    return view.intrinsics(size[0] * view.copy_of, size[1] * view.copy_of)
 
 
 def view_names(relatives: Sequence[str]) -> list[str]:
@@ -345,112 +289,6 @@ def view_names(relatives: Sequence[str]) -> list[str]:
             else str(path if bare[path.with_suffix("")] > 1 else path.with_suffix(""))
             for path in below
         ]
-    )
-
-
-def scaled_to(intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Intrinsics:
-    """Intrinsics in pixels of a photograph of another size but the same shape.
-
-    A photograph made smaller has whole pixels, so its sides may differ by up to one pixel from
-    a uniform scale; each axis is scaled by its own ratio.
-
-    Raises:
-        InputError: If no uniform scale leads from one size to the other.
-    """
-    if intrinsics.width is None or intrinsics.height is None:
-        return replace(intrinsics, width=size[0], height=size[1])
-    if not (1 <= intrinsics.width <= MAX_SIDE and 1 <= intrinsics.height <= MAX_SIDE):
-        raise InputError(
-            f"{where}: expected intrinsics of 1 to {MAX_SIDE} pixels a side, got "
-            f"{quoted(intrinsics.width)}x{quoted(intrinsics.height)}."
-        )
-    if (intrinsics.width, intrinsics.height) == size:
-        return intrinsics
-    if not same_shape(intrinsics.width, intrinsics.height, *size):
-        turned = same_shape(intrinsics.height, intrinsics.width, *size)
-        hint = "; turned by its EXIF orientation, perhaps" if turned else ""
-        raise InputError(
-            f"{where}: expected a photograph of {intrinsics.width}x{intrinsics.height} pixels or a "
-            f"uniform scale of it, as its intrinsics say, got {size[0]}x{size[1]}{hint}."
-        )
-    sx, sy = size[0] / intrinsics.width, size[1] / intrinsics.height
-    return replace(
-        intrinsics,
-        width=size[0],
-        height=size[1],
-        fx=intrinsics.fx * sx,
-        fy=intrinsics.fy * sy,
-        cx=intrinsics.cx * sx,
-        cy=intrinsics.cy * sy,
-    )
-
-
-def checked_pose(pose: NDArray[np.float64], *, where: str) -> NDArray[np.float64]:
-    """A rigid 4 x 4 transform, with its rotation made exact where digits were lost.
-
-    Raises:
-        InputError: If it is not 4 x 4, holds NaN or infinity, or does not rotate.
-    """
-    if pose.shape != (4, 4):
-        raise InputError(f"{where}: expected a 4 x 4 pose, got shape {pose.shape}.")
-    bad = int((~np.isfinite(pose)).sum())
-    if bad:
-        raise InputError(f"{where}: expected a finite pose, got {bad} values of 16 that are not.")
-    if np.abs(pose).max() > MAX_NUMBER:
-        raise InputError(f"{where}: expected a pose of numbers up to {MAX_NUMBER:g}, got more.")
-    rotation = pose[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(rotation))
-    if error > _ROTATION_TOLERANCE or determinant < 0:
-        raise InputError(
-            f"{where}: expected a rotation in its pose, got a matrix with |R R^T - I| = "
-            f"{error:.3g} and determinant {determinant:.3g}."
-        )
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > _ROTATION_EXACT:
-        raise InputError(f"{where}: expected a pose whose last row is 0 0 0 1, got {pose[3]}.")
-    exact = pose.copy()
-    exact[3] = (0, 0, 0, 1)
-    if error > _ROTATION_EXACT:
-        left, _, right = np.linalg.svd(rotation)
-        exact[:3, :3] = left @ right
-    return exact
-
-
-def opencv_from_opengl(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cam_from_world with OpenCV axes from world_from_cam with OpenGL axes (y up, z back).
-
-    One that is singular or not finite comes back as it is: no pose, which `checked_pose` refuses in
-    its own words.
-    """
-    if not np.isfinite(world_from_cam).all():
-        return world_from_cam
-    try:
-        return np.linalg.inv(world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0])).astype(np.float64)
-    except np.linalg.LinAlgError:
-        return world_from_cam
-
-
-def _camera(view: RawView, intrinsics: Intrinsics, size: tuple[int, int], *, where: str) -> Camera:
-    for name in ("fx", "fy"):
-        value = float(getattr(intrinsics, name))
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{where}: expected a positive focal length, got {name} = {value:g}.")
-    rest = (intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
-    if not all(math.isfinite(value) for value in rest):
-        raise InputError(f"{where}: expected finite intrinsics, got {rest}.")
-    pose = checked_pose(view.cam_from_world, where=where)
-    angular = intrinsics.model in ("fisheye", "thin_prism_fisheye")
-    distorted = angular or any(intrinsics.distortion)
-    return Camera(
-        width=size[0],
-        height=size[1],
-        fx=intrinsics.fx,
-        fy=intrinsics.fy,
-        cx=intrinsics.cx,
-        cy=intrinsics.cy,
-        cam_from_world=torch.from_numpy(pose),
-        model=intrinsics.model if distorted else "pinhole",
-        distortion=intrinsics.distortion if distorted else (),
     )
 
 

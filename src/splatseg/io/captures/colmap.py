@@ -8,8 +8,9 @@ from splatseg.errors import InputError, MissingFileError, brief, quoted
 from splatseg.io.captures import _colmap_binary, _colmap_text
 from splatseg.io.captures._nerfstudio_split import splits_beside
 from splatseg.io.captures._photographs import Photographs
-from splatseg.io.captures.build import MIN_THERE, RawView, build_capture
+from splatseg.io.captures.build import MIN_THERE, build_capture
 from splatseg.io.captures.colmap_model import ColmapModel, intrinsics_of, poses_of
+from splatseg.io.captures.raw_views import RawView
 from splatseg.io.foreign import is_folder
 
 _MODEL_PARENTS = ("sparse", "colmap/sparse", "distorted/sparse")

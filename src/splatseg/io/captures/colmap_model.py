@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatseg.core import CameraModel, PointCloud
 from splatseg.errors import InputError, quoted
-from splatseg.io.captures.build import MAX_SIDE, Intrinsics
+from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics
 
 MODELS: dict[int, tuple[str, int]] = {
     0: ("SIMPLE_PINHOLE", 3),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from splatseg.core import Capture, PointCloud
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
 from splatseg.io.captures._points import point_cloud, vertex_colours
-from splatseg.io.captures.build import Intrinsics, RawView, build_capture
+from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.kitti360_drive import (
     ACCUMULATED,
     PHOTOGRAPHS,
@@ -28,6 +28,7 @@ from splatseg.io.captures.kitti360_drive import (
     window_name,
     window_of,
 )
+from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.captures.replica import inverse_pose
 from splatseg.io.foreign import is_folder, read_lines
 from splatseg.io.images import find_images

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.captures.build import checked_pose
+from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.foreign import is_folder, read_lines
 from splatseg.io.keyed_numbers import keyed_matrix, read_keyed_numbers, rigid, shaped
 from splatseg.io.text_numbers import read_numbers

@@ -14,14 +14,8 @@ from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures._nerfstudio_split import frame_splits
 from splatseg.io.captures._points import ply_holds_splats, read_ply_points
 from splatseg.io.captures._points_beside import points_beside
-from splatseg.io.captures.build import (
-    MAX_SIDE,
-    Intrinsics,
-    OfSize,
-    RawView,
-    build_capture,
-    opencv_from_opengl,
-)
+from splatseg.io.captures.build import build_capture
+from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics, OfSize, RawView, opencv_from_opengl
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json
 

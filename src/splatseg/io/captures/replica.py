@@ -10,7 +10,8 @@ from splatseg.core import Capture
 from splatseg.core.json_numbers import json_number
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures._points_beside import points_beside
-from splatseg.io.captures.build import MAX_SIDE, Intrinsics, RawView, build_capture
+from splatseg.io.captures.build import build_capture
+from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics, RawView
 from splatseg.io.json_files import read_json
 from splatseg.io.text_numbers import read_numbers
 

@@ -10,7 +10,8 @@ from splatseg.core import Capture, PointCloud
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures._points import point_cloud, read_ply_points
 from splatseg.io.captures._points_beside import points_beside
-from splatseg.io.captures.build import Intrinsics, RawView, build_capture
+from splatseg.io.captures.build import build_capture
+from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.captures.replica import inverse_pose
 from splatseg.io.foreign import is_file
 from splatseg.io.images import image_size

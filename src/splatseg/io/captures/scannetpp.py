@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures import _colmap_text
-from splatseg.io.captures.build import RawView, build_capture, opencv_from_opengl
+from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.nerfstudio import frame_matrix, intrinsics_of_frame
+from splatseg.io.captures.raw_views import RawView, opencv_from_opengl
 from splatseg.io.json_files import read_json
 
 FILE = Path("dslr/nerfstudio/transforms.json")

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
 from splatseg.io.atomic import atomic_folder, sweep
-from splatseg.io.captures.build import MAX_SIDE, Intrinsics, RawView, build_capture
+from splatseg.io.captures.build import build_capture
+from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics, RawView
 from splatseg.io.captures.replica import inverse_pose
 from splatseg.io.captures.waymo_segment import (
     CAMERAS,

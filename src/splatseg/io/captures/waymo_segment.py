@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.captures.build import checked_pose
+from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.captures.waymo_tfrecord import (
     ENDING,
     components_folder,

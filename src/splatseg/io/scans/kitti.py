@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.captures.build import checked_pose
+from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.foreign import read_lines
 from splatseg.io.keyed_numbers import keyed_matrix, read_keyed_numbers, rigid
 from splatseg.io.scans._source import RawScan, Scans, only_one

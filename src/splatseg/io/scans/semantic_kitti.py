@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.captures.build import checked_pose
+from splatseg.io.captures.raw_views import checked_pose
 from splatseg.io.keyed_numbers import keyed_matrix, read_keyed_numbers, rigid
 from splatseg.io.label_tables import label_table
 from splatseg.io.scans._records import read_ids

@@ -20,7 +20,8 @@ from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, quoted
 from splatseg.io.atomic import atomic_file
-from splatseg.io.captures.build import Intrinsics, RawView, build_capture
+from splatseg.io.captures.build import build_capture
+from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import parse_object
 from splatseg.io.npz import read_npz
