@@ -12,23 +12,26 @@ code without either.
     values      any class: an instance of it
     many        tuple, Sequence, Mapping: each of them, lists and arrays included
     words       Literal: one of them
+    ranges      Annotated[float, Meta(ge=0)]: a number in it, finite unless it says otherwise
 """
 
 import collections.abc
 import errno
 import functools
 import inspect
+import math
 import os
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, Union, cast
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, cast
 
 import numpy as np
 import torch
 from jaxtyping import AbstractArray
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core.coerce import (
@@ -43,7 +46,7 @@ from splatseg.core.coerce import (
     as_text,
     describe,
 )
-from splatseg.errors import InputError, ShapeError
+from splatseg.errors import InputError, RangeError, ShapeError
 
 Converter = Callable[[str, Any], Any]
 P = ParamSpec("P")
@@ -124,7 +127,7 @@ def converters(owner: Any, names: tuple[str, ...]) -> dict[str, Converter]:
     """
     # JSON's alias is text that names what the module of the annotation may not import.
     known = {"JSON": object, "Sequence": Sequence, "Mapping": Mapping}
-    hints = typing.get_type_hints(owner, localns=known)
+    hints = typing.get_type_hints(owner, localns=known, include_extras=True)
     found = {name: _converter(hints[name]) for name in names if name in hints}
     return {name: convert for name, convert in found.items() if convert is not None}
 
@@ -135,6 +138,8 @@ def _converter(annotation: Any) -> Converter | None:
     if annotation in _SCALARS:
         return _SCALARS[annotation]
     origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return _within(_converter(args[0]), [m for m in args[1:] if isinstance(m, Meta)])
     if origin in (Union, types.UnionType):
         return _one_of(args)
     if origin is Literal:
@@ -238,6 +243,49 @@ def _one_of(members: tuple[Any, ...]) -> Converter | None:
         raise InputError(f"{name}: expected {words}, got {describe(value)}.") from errors[0]
 
     return convert
+
+
+def _within(convert: Converter | None, ranges: list[Meta]) -> Converter | None:
+    if convert is None or not ranges:
+        return convert
+
+    def within(name: str, value: Any) -> Any:
+        made = convert(name, value)
+        for bounds in ranges:
+            check_bounds(name, made, bounds)
+        return made
+
+    return within
+
+
+def check_bounds(name: str, value: float, bounds: Meta) -> None:
+    """Raise `RangeError` unless a number is in a declared range.
+
+    A number is finite unless the range has the extra ``infinite``; NaN is in none.
+    """
+    low = -math.inf if (lowest := _first(bounds.ge, bounds.gt)) is None else lowest
+    high = math.inf if (highest := _first(bounds.le, bounds.lt)) is None else highest
+    above = value > low if bounds.gt is not None else value >= low
+    below = value < high if bounds.lt is not None else value <= high
+    if above and below and (math.isfinite(value) or (bounds.extra or {}).get("infinite")):
+        return
+    raise RangeError(f"{name}: expected {range_in_words(bounds)}, got {value:g}.")
+
+
+def range_in_words(bounds: Meta) -> str:
+    """A declared range as messages and help have it: ``a value in [0, 1]``, ``at least 1``."""
+    lowest, highest = _first(bounds.ge, bounds.gt), _first(bounds.le, bounds.lt)
+    if lowest is not None and highest is not None:
+        opening = "(" if bounds.gt is not None else "["
+        closing = ")" if bounds.lt is not None else "]"
+        return f"a value in {opening}{lowest:g}, {highest:g}{closing}"
+    if lowest is not None:
+        return f"{'at least' if bounds.ge is not None else 'more than'} {lowest:g}"
+    return f"{'at most' if bounds.le is not None else 'less than'} {highest:g}"
+
+
+def _first(closed: float | None, opened: float | None) -> float | None:
+    return closed if closed is not None else opened
 
 
 def _word(words: tuple[Any, ...], name: str, value: Any) -> Any:
