@@ -46,6 +46,7 @@ from splatseg.core.coerce import (
     as_text,
     describe,
 )
+from splatseg.core.threads import is_limited, one_torch_thread
 from splatseg.errors import InputError, RangeError, ShapeError
 
 Converter = Callable[[str, Any], Any]
@@ -65,7 +66,7 @@ _MANY = (collections.abc.Sequence, collections.abc.Collection, collections.abc.I
 
 
 def boundary(function: Callable[P, R]) -> Callable[P, R]:
-    """Convert the arguments of a public function as its annotations say.
+    """Convert the arguments of a public function by its annotations; torch has one thread in it.
 
     Raises:
         InputError: When the function is called with an argument that cannot be what it should
@@ -90,7 +91,10 @@ def boundary(function: Callable[P, R]) -> Callable[P, R]:
             if name in found:
                 kwargs[name] = found[name](name, kwargs[name])
         try:
-            return function(*given, **kwargs)  # pyright: ignore[reportCallIssue]
+            if is_limited():
+                return function(*given, **kwargs)  # pyright: ignore[reportCallIssue]
+            with one_torch_thread():
+                return function(*given, **kwargs)  # pyright: ignore[reportCallIssue]
         except OSError as error:
             if error.errno != errno.ENAMETOOLONG:
                 raise

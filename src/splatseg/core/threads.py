@@ -1,22 +1,63 @@
-"""Sums that do not depend on how many threads there are."""
+"""How many threads torch has: the one place that decides.
 
+The kernels of this library share the cores, and sum in a fixed order. Torch splits sums and
+products of matrices among its threads, so that they round differently with their number; and its
+idle threads spin on the cores that the kernels need. So torch has one thread while a public
+function of this library runs (`core.boundary`), and its caller's again afterwards. Networks of
+others, which are torch alone, run in `all_torch_threads`.
+"""
+
+import threading
 from collections.abc import Generator
 from contextlib import contextmanager
 
 import torch
 
 
+class _Limit(threading.local):
+    outside: int | None = None
+    """Torch's threads before the limit; None where there is none."""
+
+
+_limit = _Limit()
+
+
+def is_limited() -> bool:
+    """Whether torch has one thread here, since a public function runs."""
+    return _limit.outside is not None
+
+
+def caller_threads() -> int:
+    """The threads that torch has outside of the library: what a pool of threads may have here."""
+    return torch.get_num_threads() if _limit.outside is None else _limit.outside
+
+
 @contextmanager
 def one_torch_thread() -> Generator[None]:
-    """Limit torch to one thread while the block runs.
-
-    Torch splits sums and products of matrices among its threads, so that they round differently
-    with their number; and its idle threads spin on the cores that the kernels of this library
-    need, which share their own work in a fixed order.
-    """
-    before = torch.get_num_threads()
+    """Limit torch to one thread while the block runs; within another such block, do nothing."""
+    if _limit.outside is not None:
+        yield
+        return
+    _limit.outside = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(_limit.outside)
+        _limit.outside = None
+
+
+@contextmanager
+def all_torch_threads() -> Generator[None]:
+    """Give torch its caller's threads while the block runs."""
+    before = _limit.outside
+    if before is None:
+        yield
+        return
+    _limit.outside = None
+    torch.set_num_threads(before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(1)
+        _limit.outside = before

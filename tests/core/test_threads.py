@@ -1,0 +1,53 @@
+"""Torch's threads inside the library and outside of it."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from splatseg.core.boundary import boundary
+from splatseg.core.threads import all_torch_threads, caller_threads, one_torch_thread
+
+
+@pytest.fixture(autouse=True)
+def three_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@boundary
+def _public(calls: int = 0) -> tuple[int, int]:
+    return _public(calls - 1) if calls else (torch.get_num_threads(), caller_threads())
+
+
+@boundary
+def _network() -> tuple[int, int, int]:
+    with all_torch_threads():
+        inside = torch.get_num_threads()
+        nested = _public()[0]
+        return inside, nested, torch.get_num_threads()
+
+
+def test_a_public_function_has_one_thread_and_gives_back_the_callers() -> None:
+    assert _public(2) == (1, 3)
+    assert torch.get_num_threads() == caller_threads() == 3
+
+
+def test_an_error_gives_back_the_threads() -> None:
+    @boundary
+    def fails() -> None:
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        fails()
+    assert torch.get_num_threads() == 3
+
+
+def test_networks_have_the_callers_threads() -> None:
+    assert _network() == (3, 1, 3)
+    assert torch.get_num_threads() == 3
+    with one_torch_thread():
+        assert _network() == (3, 1, 3)
+        assert torch.get_num_threads() == 1
