@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from splatseg.core.activations import exponential, sigmoid
+from splatseg.core.gaussians import exponential, sigmoid
 
 FUNCTIONS = {
     exponential: math.exp,

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from splatseg.core import Camera
-from splatseg.core.moving import MovingBox, boxes_at, inside_boxes, pixels_of_boxes
-from splatseg.core.scans import Scan
-from splatseg.core.view_names import frame_number
+from splatseg.core.scans import MovingBox, Scan, boxes_at, inside_boxes, pixels_of_boxes
+from splatseg.core.scene import frame_number
 from splatseg.errors import RangeError, ShapeError
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.io.arrays import map_values, npz_names, open_npz, read_npy, read_npz
 from splatseg.io.limits import FREE
-from splatseg.io.npy import map_values, read_npy
-from splatseg.io.npz import npz_names, open_npz, read_npz
 
 HUGE = "(1099511627775, 4)"
 

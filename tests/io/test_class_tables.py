@@ -3,7 +3,7 @@
 import pytest
 
 from splatseg.errors import FileFormatError
-from splatseg.io.class_tables import class_rows, class_table
+from splatseg.io.tables import class_rows, class_table
 
 
 def test_rows_come_back_and_void_is_no_class() -> None:

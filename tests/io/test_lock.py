@@ -13,13 +13,12 @@ import pytest
 
 from splatseg.errors import InputError
 from splatseg.io.atomic import TEMPORARY, check_writable, sweep
-from splatseg.io.lock import LOCK_FILE, lock_owner, scene_lock
-from splatseg.io.scene_folder import work_on_scene
+from splatseg.io.scene_folder import LOCK_FILE, lock_owner, scene_lock, work_on_scene
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from splatseg.io.lock import scene_lock
+from splatseg.io.scene_folder import scene_lock
 with scene_lock(Path(sys.argv[1]), "fit"):
     print("held", flush=True)
     time.sleep(60)

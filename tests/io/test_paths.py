@@ -10,13 +10,13 @@ import torch
 from PIL import Image
 
 from splatseg.core import Camera, LabelMap, MaskSet, View
-from splatseg.core.view_names import MAX_NAME, MAX_PART, clean_view_names, view_name_fault
+from splatseg.core.scene import MAX_NAME, MAX_PART, clean_view_names, view_name_fault
 from splatseg.errors import FileFormatError, InputError
+from splatseg.io.atomic import check_utf8, path_inside
 from splatseg.io.captures import read_capture
 from splatseg.io.captures.build import view_names
 from splatseg.io.evidence import save_label_map, save_masks
 from splatseg.io.json_files import json_text
-from splatseg.io.paths import check_utf8, path_inside
 
 CAMERA = Camera(
     width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0, cam_from_world=torch.eye(4).double()

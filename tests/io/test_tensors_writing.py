@@ -8,8 +8,7 @@ import torch
 from safetensors import safe_open
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.tensors import read_safetensors, read_tensors
-from splatseg.io.tensors_writing import write_tensors
+from splatseg.io.tensors import read_safetensors, read_tensors, write_tensors
 
 
 def tensors() -> dict[str, torch.Tensor]:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.torch_files import InertNumber, read_torch_file
+from splatseg.io.tensors import InertNumber, read_torch_file
 
 
 class Trap:

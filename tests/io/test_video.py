@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from splatseg.errors import BackendError, InputError, MissingPackageError, RangeError, ShapeError
-from splatseg.io.video import write_video
+from splatseg.io.images import write_video
 
 
 def frame(level: int, height: int = 48, width: int = 64) -> torch.Tensor:
@@ -77,7 +77,7 @@ def test_refusals(tmp_path, monkeypatch) -> None:
 
 
 def test_the_encoders_own_words(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("splatseg.io.video._CRF", "best")
+    monkeypatch.setattr("splatseg.io.images._CRF", "best")
     with pytest.raises(BackendError, match=r"a.mp4: the video encoder failed: .*"):
         write_video((frame(i % 200) for i in range(300)), tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())

@@ -13,10 +13,9 @@ import torch
 
 from splatseg.core import Labels
 from splatseg.errors import InputError, OutputError
-from splatseg.io.atomic import atomic_file, atomic_folder, sync
+from splatseg.io.arrays import unfinished, write_checkpoint_file
+from splatseg.io.atomic import atomic_file, atomic_folder, failure_to_write, sync
 from splatseg.io.layers import load_layer, save_layer
-from splatseg.io.npz_writing import unfinished, write_checkpoint_file
-from splatseg.io.write_errors import failure_to_write
 
 SMALL_FILES = """
 import resource
@@ -30,7 +29,7 @@ import torch
 from splatseg.core import Labels
 from splatseg.errors import OutputError
 from splatseg.io.layers import load_layer, save_layer
-from splatseg.io.npz_writing import write_checkpoint_file
+from splatseg.io.arrays import write_checkpoint_file
 
 path = Path(sys.argv[1])
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

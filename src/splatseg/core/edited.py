@@ -13,7 +13,7 @@ from splatseg.core.evidence import UNLABELLED
 from splatseg.core.gaussians import Gaussians
 from splatseg.core.instance_tree import InstanceTree, Layer
 from splatseg.core.layers import Features, Labels, Selection
-from splatseg.core.voxel_features import VoxelFeatures
+from splatseg.core.voxels import VoxelFeatures
 from splatseg.errors import InputError, RangeError, ShapeError
 
 NEW = -1

@@ -1,4 +1,10 @@
-"""The Gaussians of a scene: aligned arrays, one row a Gaussian."""
+"""The Gaussians of a scene: aligned arrays, one row a Gaussian; and scales and opacities of files.
+
+Files have logs and logits. Torch computes a sigmoid in vector registers where it can and one by
+one at the end of a thread's share; the two round differently, so that one file read by two threads
+and by three gave other opacities in the last bit. `exponential` and `sigmoid` compute in float64
+and round once: the result depends on the value alone.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -6,24 +12,66 @@ from dataclasses import replace as _replace
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
-from splatseg.core.late import preview
 from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
 from splatseg.core.sh import SH_C0, degree_of, rotate_sh
+from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, RangeError, ShapeError
+
+_BLOCK = 1 << 15
+"""Values converted at once: the float64 copies stay in the processor's cache."""
+
+
+def exponential(values: Float[np.ndarray, "*shape"]) -> NDArray[np.float32]:
+    """``exp(values)`` as float32: scales from their logs.
+
+    Minus infinity gives 0, NaN stays, and what float32 cannot hold becomes infinite.
+
+    Example:
+        >>> exponential(np.array([0.0, -np.inf], np.float32)).tolist()
+        [1.0, 0.0]
+    """
+    flat = np.ascontiguousarray(values).reshape(-1)
+    found = np.empty(flat.shape, np.float32)
+    with np.errstate(over="ignore", under="ignore"):
+        for start in range(0, len(flat), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            found[part] = np.exp(flat[part].astype(np.float64))
+    return found.reshape(values.shape)
+
+
+def sigmoid(values: Float[np.ndarray, "*shape"]) -> NDArray[np.float32]:
+    """``1 / (1 + exp(-values))`` as float32: opacities from their logits.
+
+    Minus infinity gives 0, plus infinity 1, and NaN stays.
+
+    Example:
+        >>> sigmoid(np.array([0.0, np.inf], np.float32)).tolist()
+        [0.5, 1.0]
+    """
+    flat = np.ascontiguousarray(values).reshape(-1)
+    found = np.empty(flat.shape, np.float32)
+    with np.errstate(over="ignore", under="ignore"):
+        for start in range(0, len(flat), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            found[part] = 1 / (1 + np.exp(-flat[part].astype(np.float64)))
+    return found.reshape(values.shape)
+
 
 LOW_PASS = 0.3
 """Variance of 3DGS's low-pass, square pixels."""
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
-class Gaussians:
+class Gaussians(Previewed):
     """3D Gaussians with colour, and any further columns, sliced and saved together.
 
     The covariance of Gaussian i is R diag(s)^2 R^T with R the rotation of its quaternion and s
@@ -91,9 +139,6 @@ class Gaussians:
         extra = f", extra={sorted(self.extra)}" if self.extra else ""
         where = "" if self.device.type == "cpu" else f", device={str(self.device)!r}"
         return f"Gaussians({len(self):,}, sh_degree={self.sh_degree}{extra}{where})"
-
-    def _repr_html_(self) -> str:
-        return preview(self)
 
     def __getitem__(self, index: slice | Tensor) -> "Gaussians":
         """Rows by slice, boolean mask (n,) or integer ids, extra columns included."""

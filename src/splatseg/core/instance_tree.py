@@ -10,14 +10,10 @@ from torch import Tensor
 
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import UNLABELLED
-from splatseg.core.late import preview
-from splatseg.core.layer_info import InstanceFacts, LayerInfo
-from splatseg.core.layers import Features, Labels, Selection
-from splatseg.core.soft_labels import merged_candidates
-from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
-from splatseg.core.tree_levels import TreeLevel as TreeLevel
-from splatseg.core.tree_levels import tree_level as tree_level
-from splatseg.core.voxel_features import VoxelFeatures
+from splatseg.core.layer_info import TREE_LEVELS, InstanceFacts, LayerInfo, TreeLevel, tree_level
+from splatseg.core.layers import Features, Labels, Selection, merged_candidates
+from splatseg.core.upward import Previewed
+from splatseg.core.voxels import VoxelFeatures
 from splatseg.errors import InputError, RangeError
 
 _FOLLOWS: dict[TreeLevel, tuple[TreeLevel | None, ...]] = {
@@ -64,7 +60,7 @@ class TreeNode:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class InstanceTree:
+class InstanceTree(Previewed):
     """Nodes inside each other, and of every Gaussian the deepest node that it belongs to.
 
     A Gaussian of a node is one of all the nodes above it, so that children always lie inside
@@ -109,9 +105,6 @@ class InstanceTree:
         counts = {level: sum(n.level == level for n in self.nodes) for level in TREE_LEVELS}
         words = ", ".join(f"{n} {level}{'s'[: n != 1]}" for level, n in counts.items())
         return f"InstanceTree({len(self):,} rows; {words})"
-
-    def _repr_html_(self) -> str:
-        return preview(self)
 
     def __getitem__(self, index: slice | Tensor) -> "InstanceTree":
         """Rows, in step with `Gaussians.__getitem__`; all nodes stay."""

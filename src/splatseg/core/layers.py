@@ -1,6 +1,6 @@
 """What is known of each Gaussian: labels, features, selections. One row a Gaussian."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,13 +10,22 @@ from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
-from splatseg.core.late import preview
-from splatseg.core.layer_info import LayerInfo, check_layer_info
+from splatseg.core.layer_info import LayerInfo
+from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, RangeError, ShapeError
+
+_OF_EVIDENCE = ("evidence", "effective_views", "inferred")
+"""Columns of labels that say what ids rest on."""
+
+
+def _taken(layer: object, names: tuple[str, ...], index: slice | Tensor) -> dict[str, Tensor]:
+    """Rows of those columns that a layer has."""
+    columns = {name: getattr(layer, name) for name in names}
+    return {name: column[index] for name, column in columns.items() if column is not None}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Labels:
+class Labels(Previewed):
     """One id a Gaussian, with its confidence.
 
     Raises:
@@ -58,7 +67,6 @@ class Labels:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("ids", self.ids, (None,))
-        check_layer_info("info", self.info)
         n = len(self.ids)
         check_shape("confidence", self.confidence, (n,))
         if n and int(self.ids.min()) < UNLABELLED:
@@ -69,18 +77,12 @@ class Labels:
         if self.candidates is not None and self.shares is not None:
             check_shape("candidates", self.candidates, (n, None))
             check_shape("shares", self.shares, tuple(self.candidates.shape))
-        if self.evidence is not None:
-            check_shape("evidence", self.evidence, (n,))
-        if self.effective_views is not None:
-            check_shape("effective_views", self.effective_views, (n,))
-        if self.inferred is not None:
-            check_shape("inferred", self.inferred, (n,))
-            if self.inferred.dtype != torch.bool:
-                raise InputError(f"inferred: expected booleans, got {self.inferred.dtype}.")
+        for name in _OF_EVIDENCE:
+            if getattr(self, name) is not None:
+                check_shape(name, getattr(self, name), (n,))
         for name in ("confidence", "shares", "evidence", "effective_views"):
-            values = getattr(self, name)
-            if values is not None:
-                check_finite(name, values)
+            if getattr(self, name) is not None:
+                check_finite(name, getattr(self, name))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -90,23 +92,11 @@ class Labels:
         made = "" if self.info.method is None else f", method={self.info.method!r}"
         return f"Labels({len(self):,} rows, {len(self.present)} ids, {none:,} unlabelled{made})"
 
-    def _repr_html_(self) -> str:
-        return preview(self)
-
     def __getitem__(self, index: slice | Tensor) -> "Labels":
         """Rows, in step with `Gaussians.__getitem__`."""
         index = as_rows("index", index, len(self))
-        return Labels(
-            ids=self.ids[index],
-            confidence=self.confidence[index],
-            background=self.background,
-            candidates=None if self.candidates is None else self.candidates[index],
-            shares=None if self.shares is None else self.shares[index],
-            evidence=None if self.evidence is None else self.evidence[index],
-            effective_views=None if self.effective_views is None else self.effective_views[index],
-            inferred=None if self.inferred is None else self.inferred[index],
-            info=self.info,
-        )
+        columns = ("ids", "confidence", "candidates", "shares", *_OF_EVIDENCE)
+        return replace(self, **_taken(self, columns, index))
 
     @property
     def present(self) -> Int[Tensor, "m"]:
@@ -137,7 +127,6 @@ class Features:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("values", self.values, (None, None))
-        check_layer_info("info", self.info)
         if self.weights is not None:
             check_shape("weights", self.weights, (len(self.values),))
             check_finite("weights", self.weights)
@@ -152,11 +141,7 @@ class Features:
     def __getitem__(self, index: slice | Tensor) -> "Features":
         """Rows, in step with `Gaussians.__getitem__`."""
         index = as_rows("index", index, len(self))
-        return Features(
-            values=self.values[index],
-            weights=None if self.weights is None else self.weights[index],
-            info=self.info,
-        )
+        return replace(self, **_taken(self, ("values", "weights"), index))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -196,9 +181,6 @@ class Selection:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("mask", self.mask, (None,))
-        check_layer_info("info", self.info)
-        if self.mask.dtype != torch.bool:
-            raise InputError(f"mask: expected booleans, got {self.mask.dtype}.")
         if self.confidence is not None:
             check_shape("confidence", self.confidence, (len(self.mask),))
             check_values("confidence", self.confidence, 0, 1)
@@ -233,8 +215,7 @@ class Selection:
     def __getitem__(self, index: slice | Tensor) -> "Selection":
         """Rows, in step with `Gaussians.__getitem__`."""
         index = as_rows("index", index, len(self))
-        confidence = None if self.confidence is None else self.confidence[index]
-        return Selection(mask=self.mask[index], confidence=confidence, info=self.info)
+        return replace(self, **_taken(self, ("mask", "confidence"), index))
 
     @property
     def count(self) -> int:
@@ -292,3 +273,16 @@ class Selection:
                 f"selection: expected one over {len(self)} Gaussians, got one over {len(other)}."
             )
         return other.mask
+
+
+def merged_candidates(candidates: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+    """Candidates of which several may be the same id, with their shares added up."""
+    columns = list(candidates.unbind(dim=1))
+    sums = [column.float().clone() for column in shares.unbind(dim=1)]
+    for later in range(1, len(columns)):
+        for first in range(later):
+            same = (columns[later] == columns[first]) & (columns[later] != UNLABELLED)
+            sums[first] += torch.where(same, sums[later], 0.0)
+            columns[later] = torch.where(same, UNLABELLED, columns[later])
+    found, added = torch.stack(columns, dim=1), torch.stack(sums, dim=1)
+    return found, torch.where(found == UNLABELLED, 0.0, added)

@@ -7,18 +7,88 @@ which protocols a model has by its methods, so an adapter inherits from nothing.
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Float, UInt8
+import torch
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape, check_values
-from splatseg.core.boundary import convert_fields
+from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import DepthMap, FeatureMap, LabelMap, MaskSet, Segment
-from splatseg.core.prompts import Prompt as Prompt
 from splatseg.core.scene import ClassTable
-from splatseg.errors import InputError
+from splatseg.errors import InputError, RangeError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prompt:
+    """What a person points at in an image: points, a box, a rough mask, or several of them."""
+
+    points: Float[Tensor, "p 2"] = field(default_factory=lambda: torch.zeros(0, 2))
+    """x to the right and y down, in pixels; the centre of the top-left pixel is (0.5, 0.5)."""
+
+    positive: Bool[Tensor, "p"] | None = None
+    """Whether each point is on the thing (True) or not; None means that all are."""
+
+    box: Float[Tensor, "4"] | None = None
+    """x0, y0, x1, y1 in pixels: the thing lies inside."""
+
+    mask: Bool[Tensor, "height width"] | None = None
+    """A rough mask of the thing, of the image's size."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_shape("points", self.points, (None, 2))
+        check_finite("points", self.points)
+        count = len(self.points)
+        if self.positive is None:
+            object.__setattr__(self, "positive", torch.ones(count, dtype=torch.bool))
+        else:
+            check_shape("positive", self.positive, (count,))
+            object.__setattr__(self, "positive", self.positive.to(torch.bool))
+        if self.box is not None:
+            check_shape("box", self.box, (4,))
+            check_finite("box", self.box)
+            x0, y0, x1, y1 = self.box.tolist()
+            if not (x0 < x1 and y0 < y1):
+                raise RangeError(
+                    f"box: expected x0 < x1 and y0 < y1, got ({x0:g}, {y0:g}, {x1:g}, {y1:g})."
+                )
+        if self.box is None and self.mask is None and not bool(self.signs.any()):
+            raise InputError("prompt: expected a positive point, a box or a mask, got none.")
+
+    @property
+    def signs(self) -> Bool[Tensor, "p"]:
+        """`positive`, never None."""
+        all_of_them = torch.ones(len(self.points), dtype=torch.bool)
+        return all_of_them if self.positive is None else self.positive
+
+    @boundary
+    def check_size(self, height: int, width: int) -> None:
+        """Raise `InputError` unless the prompt lies in an image of this size.
+
+        Raises:
+            RangeError: If a point lies outside, or the box does not meet the image.
+            ShapeError: If the mask has another size.
+        """
+        limits = torch.tensor([width, height])
+        outside = ((self.points < 0) | (self.points > limits)).any(1)
+        if bool(outside.any()):
+            x, y = self.points[outside][0].tolist()
+            raise RangeError(
+                f"points: expected pixels of an image of {width}x{height}, got ({x:g}, {y:g})."
+            )
+        if self.box is not None:
+            x0, y0, x1, y1 = self.box.tolist()
+            if x0 >= width or y0 >= height or x1 <= 0 or y1 <= 0:
+                raise RangeError(
+                    f"box: expected one that meets the image of {width}x{height}, "
+                    f"got ({x0:g}, {y0:g}, {x1:g}, {y1:g})."
+                )
+        if self.mask is not None:
+            check_shape("mask", self.mask, (height, width))
+
 
 Image = UInt8[Tensor, "height width 3"]
 
@@ -33,7 +103,6 @@ class Model(Protocol):
     @property
     def name(self) -> str:
         """How it is asked for, such as ``classical``; recorded with what it gives."""
-        ...
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -41,12 +110,10 @@ class Model(Protocol):
 
         Weights belong here too, by a revision or a digest. Cached answers are found by it.
         """
-        ...
 
     @property
     def note(self) -> str:
         """What people who use it should know, such as that it is a stand-in; may be empty."""
-        ...
 
 
 @runtime_checkable
@@ -56,7 +123,6 @@ class ModelWithDefaults(Model, Protocol):
     @property
     def default_settings(self) -> Mapping[str, Any]:
         """Like `settings`. Work that was begun before a setting existed counts as having these."""
-        ...
 
 
 @runtime_checkable
@@ -66,14 +132,12 @@ class BatchedModel(Model, Protocol):
     @property
     def batch_size(self) -> int:
         """How many images to announce together."""
-        ...
 
     def encode(self, images: Sequence[Image]) -> None:
         """Pass images of one size through the network together.
 
         Questions about them that come next are answered from that; others as ever.
         """
-        ...
 
 
 @runtime_checkable
@@ -82,7 +146,6 @@ class AutomaticMasks(Model, Protocol):
 
     def masks(self, image: Image) -> MaskSet:
         """Masks of the image; they may overlap."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -116,11 +179,9 @@ class PromptableMasks(Model, Protocol):
 
     def embed(self, image: Image) -> Embedding:
         """Encode an image."""
-        ...
 
     def prompted_masks(self, embedding: Embedding, prompt: Prompt) -> MaskSet:
         """Masks of what the prompt means, the best first; none where nothing fits."""
-        ...
 
 
 @runtime_checkable
@@ -130,11 +191,9 @@ class SemanticLabels(Model, Protocol):
     @property
     def classes(self) -> ClassTable | None:
         """Names of the ids."""
-        ...
 
     def label_map(self, image: Image) -> LabelMap:
         """The class of every pixel, -1 where there is none."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -153,11 +212,9 @@ class PanopticSegments(Model, Protocol):
     @property
     def categories(self) -> ClassTable | None:
         """Names of the segments' classes."""
-        ...
 
     def panoptic(self, image: Image) -> Panoptic:
         """The segments of an image."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,7 +245,6 @@ class DenseFeatures(Model, Protocol):
 
     def features(self, image: Image) -> DeepFeatures:
         """Features of an image."""
-        ...
 
 
 @runtime_checkable
@@ -197,7 +253,6 @@ class DenseDepth(Model, Protocol):
 
     def depth_map(self, image: Image) -> DepthMap:
         """The depth of every pixel: metric, or relative."""
-        ...
 
 
 @runtime_checkable
@@ -206,11 +261,9 @@ class TextFeatures(Model, Protocol):
 
     def text_features(self, image: Image) -> FeatureMap:
         """Unit vectors of the patches of an image."""
-        ...
 
     def encode_text(self, words: Sequence[str]) -> Float[Tensor, "n width"]:
         """Unit vectors of words or phrases."""
-        ...
 
 
 @runtime_checkable
@@ -220,7 +273,6 @@ class TextFeaturesWithWords(TextFeatures, Protocol):
     @property
     def words(self) -> tuple[str, ...]:
         """Words whose vectors are written beside the features; may be empty."""
-        ...
 
 
 @runtime_checkable
@@ -229,7 +281,6 @@ class LateTextFeatures(TextFeatures, DenseFeatures, Protocol):
 
     def in_word_space(self, decoded: Float[Tensor, "*n decoder"]) -> Float[Tensor, "*n width"]:
         """Unit vectors in the space of words of what `features` gives, or of means of it."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -259,7 +310,6 @@ class GroundedBoxes(Model, Protocol):
 
     def boxes(self, image: Image, words: Sequence[str]) -> Boxes:
         """Boxes of what the words mean, none where they mean nothing here."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -287,7 +337,6 @@ class GroundedMasks(Model, Protocol):
 
     def grounded_masks(self, image: Image, words: Sequence[str]) -> TextMasks:
         """Masks of what the words mean, none where they mean nothing here."""
-        ...
 
 
 @runtime_checkable
@@ -310,7 +359,6 @@ class MaskTracker(Model, Protocol):
                 of the result: a later seed may bring new ones, and say again where known ones
                 are. One is looked up when its frame is taken, so that the mapping may grow.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -343,4 +391,3 @@ class PointmapModel(Model, Protocol):
         A map may have any number of rows and columns: they divide its image evenly, so that the
         middle of row i lies at (i + 0.5) / rows of the image's height.
         """
-        ...

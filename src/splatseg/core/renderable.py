@@ -113,7 +113,6 @@ class RenderableView(Protocol):
 
     def __enter__(self) -> Self:
         """Begin to look."""
-        ...
 
     def __exit__(
         self,
@@ -122,11 +121,9 @@ class RenderableView(Protocol):
         trace: TracebackType | None,
     ) -> None:
         """Release what it holds."""
-        ...
 
     def signals(self, *, colour: bool = True) -> ViewSignals:
         """Alpha and depth, and the colour unless it is not needed."""
-        ...
 
     def features(self, layer: str) -> Float[Tensor, "height width channels"]:
         """A layer of features, blended as colours are.
@@ -134,7 +131,6 @@ class RenderableView(Protocol):
         Raises:
             InputError: If the field has no such layer.
         """
-        ...
 
     def label_map(self, layer: str) -> LabelMap:
         """Ids of a layer, with the confidence of each pixel's id.
@@ -142,7 +138,6 @@ class RenderableView(Protocol):
         Raises:
             InputError: If the field has no such layer, or it has no labels.
         """
-        ...
 
     def confidence(self, layer: str) -> Float[Tensor, "height width"]:
         """How sure the labels are of what a pixel shows, in [0, 1]; -1 where there is nothing.
@@ -150,7 +145,6 @@ class RenderableView(Protocol):
         Raises:
             InputError: If the field has no such layer, or it has no labels.
         """
-        ...
 
 
 @runtime_checkable
@@ -164,7 +158,6 @@ class Renderable(Protocol):
     @property
     def layer_names(self) -> Sequence[str]:
         """Names of all layers."""
-        ...
 
     def layer(self, layer: str) -> RenderableLayer:
         """What there is to know of a layer.
@@ -172,11 +165,9 @@ class Renderable(Protocol):
         Raises:
             InputError: If the field has no such layer.
         """
-        ...
 
     def view(self, camera: Camera) -> RenderableView:
         """What it shows through a camera."""
-        ...
 
     def labels_at(self, points: Float[Tensor, "p 3"], layer: str) -> PointLabels:
         """Labels of points of the world, scene units.
@@ -185,4 +176,3 @@ class Renderable(Protocol):
             InputError: If the field has no such layer, or it has no labels.
             ShapeError: If the points are not (p, 3).
         """
-        ...

@@ -29,18 +29,23 @@ from splatseg.core import Layer, Scene, View
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.atomic import atomic_folder, hidden_folder, is_vacant, sync, sync_tree
+from splatseg.io.atomic import (
+    atomic_folder,
+    hidden_folder,
+    is_vacant,
+    named_write_failures,
+    sync,
+    sync_tree,
+)
 from splatseg.io.cameras import (
     cameras_content,
     relative_path,
     source_paths,
     views_from_content,
 )
-from splatseg.io.class_tables import class_rows, class_table
 from splatseg.io.foreign import is_file, is_folder, made_from
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
-from splatseg.io.lock import scene_lock
 from splatseg.io.scene_folder import (
     CAMERAS_FILE,
     FOLDERS,
@@ -51,10 +56,11 @@ from splatseg.io.scene_folder import (
     finish_pending,
     is_scene,
     is_unfinished,
+    scene_lock,
     scene_path,
 )
 from splatseg.io.splats import read_scene_splats, write_splats
-from splatseg.io.write_errors import named_write_failures
+from splatseg.io.tables import class_rows, class_table
 
 FORMAT = "splatseg-scene"
 VERSION = 1

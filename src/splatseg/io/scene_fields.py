@@ -11,9 +11,9 @@ from pathlib import Path
 
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
+from splatseg.io.atomic import named_write_failures
 from splatseg.io.scene import check_name
 from splatseg.io.scene_folder import scene_path
-from splatseg.io.write_errors import named_write_failures
 
 FOLDER = "fields"
 SUFFIX = ".safetensors"

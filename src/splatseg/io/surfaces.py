@@ -19,10 +19,10 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED
 from splatseg.core.boundary import boundary
-from splatseg.core.surfaces import LabelledMesh, LabelledPoints
+from splatseg.core.scans import LabelledMesh, LabelledPoints
 from splatseg.errors import FileFormatError, InputError, quoted
+from splatseg.io.arrays import read_npz
 from splatseg.io.foreign import made_from
-from splatseg.io.npz import read_npz
 from splatseg.io.ply import PlyLists, PlyTable, read_ply_header, read_ply_tables
 
 _FACES = ("vertex_indices", "vertex_index")

@@ -3,7 +3,12 @@
 PyTorch's own ``.pth`` files are pickles and are not read here; see `read_tensors`.
 """
 
+import json
 import math
+import pickle
+import zipfile
+from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,9 +17,10 @@ from torch import Tensor
 
 from splatseg.core.json_numbers import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.io.arrays import open_npz
+from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import read_bytes, reading
 from splatseg.io.json_files import parse_object
-from splatseg.io.npz import open_npz
 
 _TYPES = {
     "F64": (torch.float64, 8),
@@ -127,3 +133,111 @@ def _tensor(path: Path, name: str, entry: Any, body: memoryview) -> Tensor:
         with reading(where, "a tensor"):
             return torch.zeros(shape, dtype=dtype)
     return torch.frombuffer(bytearray(body[begin:end]), dtype=dtype).reshape(shape)
+
+
+# Tensors by name, written as safetensors: a JSON header, then the bytes.
+
+
+_ALIGNED = 8
+"""Bytes that the header's length is a multiple of, so that numbers stand at even places."""
+
+
+def write_tensors(
+    tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping[str, str]
+) -> None:
+    """Write tensors to a ``.safetensors`` file; the same values give the same bytes.
+
+    `splatseg.io.tensors.read_safetensors` is the inverse.
+
+    Args:
+        tensors: By name, of types that `read_tensors` reads, in the order in which they are
+            written.
+        path: The file.
+        metadata: Text about them.
+
+    Raises:
+        InputError: If the name does not end in ``.safetensors``, or a tensor has another type.
+        MissingFileError: If the folder of `path` does not exist.
+        OutputError: If it cannot be written.
+    """
+    if path.suffix != ".safetensors":
+        raise InputError(f"{path}: expected .safetensors, got {path.suffix or 'no suffix'}.")
+    header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
+    end = 0
+    for name, tensor in tensors.items():
+        kind = SAFETENSORS_NAMES.get(tensor.dtype)
+        if kind is None:
+            raise InputError(f"{name}: expected a type of safetensors, got {tensor.dtype}.")
+        begin, end = end, end + tensor.numel() * tensor.element_size()
+        header[name] = {"dtype": kind, "shape": list(tensor.shape), "data_offsets": [begin, end]}
+    words = json.dumps(header, separators=(",", ":")).encode()
+    words += b" " * (-len(words) % _ALIGNED)
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        file.write(len(words).to_bytes(8, "little"))
+        file.write(words)
+        for tensor in tensors.values():
+            values = tensor.detach().cpu().contiguous().reshape(-1)
+            file.write(values.view(torch.uint8).numpy().tobytes())
+
+
+# Files of PyTorch (``torch.save``), read without running what is in them.
+
+
+_EXPECTED = "a checkpoint of PyTorch 1.6 or later, or safetensors"
+
+
+class Inert:
+    """Stands for every class and function that a checkpoint names besides those of tensors.
+
+    Checkpoints of Lightning hold callbacks and options, which are of no use here. Whatever would
+    be made of them becomes a dictionary that nobody reads.
+    """
+
+    def __new__(cls, *arguments: object) -> Any:
+        """Make a dictionary, of a kind that takes both items and a state."""
+        return OrderedDict[Any, Any]()
+
+
+class InertNumber:
+    """Stands for NumPy's numbers and arrays, whose states are not those of dictionaries.
+
+    Training programs leave their best scores in checkpoints.
+    """
+
+    def __init__(self, *arguments: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        """Forget it."""
+
+
+def read_torch_file(path: Path) -> object:
+    """What a file of PyTorch holds, by `torch.load` with ``weights_only``: nothing in it is run.
+
+    Classes that it names, other than those of tensors, become `Inert` or `InertNumber`. Tensors
+    are mapped from the file: they must be copied before it is changed.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it cannot be read so.
+    """
+    with reading(path, _EXPECTED):
+        if path.stat().st_size and not zipfile.is_zipfile(path):
+            raise FileFormatError(f"{path}: expected {_EXPECTED}, got another kind of file.")
+        try:
+            named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+            with torch.serialization.safe_globals([(_stand_in(name), name) for name in named]):
+                # Mapped and not read: optimizers' states, which are as large as the weights,
+                # are never touched.
+                return cast(
+                    object, torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+                )
+        except (pickle.UnpicklingError, AssertionError) as error:
+            raise FileFormatError(
+                f"{path}: expected a checkpoint of tensors and plain values, got one that only the "
+                "program it is of can read; its state_dict saved as safetensors is taken."
+            ) from error
+
+
+def _stand_in(name: str) -> type:
+    return InertNumber if name.startswith("numpy.") else Inert

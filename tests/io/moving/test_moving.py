@@ -10,8 +10,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import Camera, Capture, ScanSource, View
-from splatseg.core.moving import MovingBox, boxes_at, inside_boxes, pixels_of_boxes
-from splatseg.core.scans import Scan
+from splatseg.core.scans import MovingBox, Scan, boxes_at, inside_boxes, pixels_of_boxes
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splatseg.core.moving import inside_boxes
 from splatseg.core.rigid import rotation_from_quaternion
+from splatseg.core.scans import inside_boxes
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
 from splatseg.io.images import load_mask

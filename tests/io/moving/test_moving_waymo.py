@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from splatseg.core.moving import inside_boxes
 from splatseg.core.rigid import rotation_from_quaternion
+from splatseg.core.scans import inside_boxes
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import read_capture
 from splatseg.io.json_files import write_json

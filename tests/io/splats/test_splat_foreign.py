@@ -26,7 +26,7 @@ from splatseg.io.splats import (
     splat_format,
     write_splats,
 )
-from splatseg.io.splats._common import SOURCE_ROW
+from splatseg.io.splats._rows import SOURCE_ROW
 
 Columns = dict[str, list[float]]
 _KINDS = {"float": "f", "double": "d", "uchar": "B", "ushort": "H", "int": "i", "uint": "I"}

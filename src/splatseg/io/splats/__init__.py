@@ -17,8 +17,8 @@ from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
 from splatseg.io.foreign import is_folder
 from splatseg.io.json_files import read_json
-from splatseg.io.splats._common import Losses, StrPath, check_file, warn
-from splatseg.io.splats._common import SplatWarning as SplatWarning
+from splatseg.io.splats._rows import Losses, StrPath, check_file, warn
+from splatseg.io.splats._rows import SplatWarning as SplatWarning
 
 Values = Literal["scales", "opacities"]
 """What a file may have as it is, where 3DGS has logs and logits."""
@@ -92,7 +92,7 @@ def read_splats(
         case "splat":
             from splatseg.io.splats.splat import read_splat as read
         case "ksplat":
-            from splatseg.io.splats.ksplat import read_ksplat as read
+            from splatseg.io.splats.splat import read_ksplat as read
         case "spz":
             from splatseg.io.splats.spz import read_spz as read
         case "sog":

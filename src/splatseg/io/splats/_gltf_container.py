@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.foreign import is_file, read_bytes
-from splatseg.io.splats._common import read_file
 from splatseg.io.splats._json import Json
+from splatseg.io.splats._rows import read_file
 
 _GLB_MAGIC = b"glTF"
 _JSON_CHUNK = 0x4E4F534A

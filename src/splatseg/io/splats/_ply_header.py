@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
 from splatseg.io.ply import end_of_rows
-from splatseg.io.splats._common import blocks, check_file
+from splatseg.io.splats._rows import blocks, check_file
 from splatseg.io.text_numbers import number_table
 
 MAX_HEADER = 1 << 20

@@ -12,9 +12,8 @@ from PIL import Image
 
 from splatseg.core import Gaussians
 from splatseg.errors import InputError
-from splatseg.io.splats._codebooks import scalar_codebook, vector_palette
-from splatseg.io.splats._common import Array, Losses, Rows, logs, to_rows, unsigned
-from splatseg.io.splats._quaternions import split
+from splatseg.io.splats._quantisation import scalar_codebook, split, vector_palette
+from splatseg.io.splats._rows import Array, Losses, Rows, logs, to_rows, unsigned
 
 _PALETTE_WIDTH = 64
 """Entries of the palette of harmonics in a row of its picture."""

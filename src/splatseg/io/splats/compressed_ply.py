@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, quoted
-from splatseg.io.splats._common import (
+from splatseg.io.splats._ply_header import PlyElement, PlyHeader, read_ply_header
+from splatseg.io.splats._quantisation import pack_smallest_three, unpack_smallest_three
+from splatseg.io.splats._rows import (
     Array,
     Filter,
     Losses,
@@ -27,8 +29,6 @@ from splatseg.io.splats._common import (
     to_rows,
     unsigned,
 )
-from splatseg.io.splats._ply_header import PlyElement, PlyHeader, read_ply_header
-from splatseg.io.splats._quaternions import pack_smallest_three, unpack_smallest_three
 
 CHUNK = 256
 """Gaussians that share one set of bounds."""

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians, Similarity
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError
-from splatseg.io.splats._common import SOURCE_ROW, Array, Rows, check_size, finish, warn
 from splatseg.io.splats._gltf_container import Gltf
 from splatseg.io.splats._json import Json
+from splatseg.io.splats._rows import SOURCE_ROW, Array, Rows, check_size, finish, warn
 
 EXTENSION = "KHR_gaussian_splatting"
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit")

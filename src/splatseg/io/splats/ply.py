@@ -18,7 +18,17 @@ from torch import Tensor
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.splats._common import (
+from splatseg.io.splats._ply_columns import (
+    DC,
+    MEANS,
+    REST,
+    ROTATIONS,
+    SCALES,
+    Columns,
+    find_columns,
+)
+from splatseg.io.splats._ply_header import PlyHeader, read_ply_header, read_rows
+from splatseg.io.splats._rows import (
     BLOCK,
     Filter,
     Rows,
@@ -30,16 +40,6 @@ from splatseg.io.splats._common import (
     to_rows,
     warn,
 )
-from splatseg.io.splats._ply_columns import (
-    DC,
-    MEANS,
-    REST,
-    ROTATIONS,
-    SCALES,
-    Columns,
-    find_columns,
-)
-from splatseg.io.splats._ply_header import PlyHeader, read_ply_header, read_rows
 
 _NORMALS = ("nx", "ny", "nz")
 

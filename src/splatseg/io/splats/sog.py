@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatseg.core import Gaussians
-from splatseg.core.activations import sigmoid
+from splatseg.core.gaussians import sigmoid
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.archives import open_archive, open_member
+from splatseg.io.arrays import open_archive, open_member
 from splatseg.io.foreign import is_file, read_bytes, reading
-from splatseg.io.splats._common import Array, Filter, Rows, blocks, check_file, check_size, finish
 from splatseg.io.splats._json import Json
-from splatseg.io.splats._quaternions import assemble
+from splatseg.io.splats._quantisation import assemble
+from splatseg.io.splats._rows import Array, Filter, Rows, blocks, check_file, check_size, finish
 
 _PALETTE_WIDTH = 64
 """Entries of the palette of harmonics in a row of its picture."""

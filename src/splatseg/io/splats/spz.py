@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, RangeError, reason
-from splatseg.io.splats._common import (
+from splatseg.io.splats._quantisation import pack_signed_three, unpack_signed_three
+from splatseg.io.splats._rows import (
     Array,
     Filter,
     Losses,
@@ -34,7 +35,6 @@ from splatseg.io.splats._common import (
     to_rows,
     unsigned,
 )
-from splatseg.io.splats._quaternions import pack_signed_three, unpack_signed_three
 
 MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")

@@ -9,7 +9,7 @@ from splatseg.core import Scene
 from splatseg.core.boundary import boundary
 from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError, brief
-from splatseg.io.paths import path_inside
+from splatseg.io.atomic import path_inside
 from splatseg.io.scene_fields import (
     DRIVE_FILE,
     FOLDER,

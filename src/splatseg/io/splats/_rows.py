@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians
-from splatseg.core.activations import exponential, sigmoid
-from splatseg.core.gaussians import LOW_PASS
+from splatseg.core.gaussians import LOW_PASS, exponential, sigmoid
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.foreign import is_file, is_folder, read_bytes
