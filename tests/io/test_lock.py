@@ -142,7 +142,7 @@ def test_a_lock_whose_file_its_owner_has_just_removed_is_taken_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between opening and locking the file its owner may end: who locks it then locks nothing."""
-    from splatseg.io import lock
+    from splatseg.io import scene_folder as lock
 
     ends = [lambda: (tmp_path / LOCK_FILE).unlink()]
 
@@ -170,7 +170,7 @@ def test_what_a_longer_file_said_before_is_gone(tmp_path: Path) -> None:
 def test_where_there_are_no_locks_the_number_of_the_process_has_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from splatseg.io import lock
+    from splatseg.io import scene_folder as lock
 
     monkeypatch.setattr(lock, "try_lock", lambda handle, **more: "unknown")
     here, ended = socket.gethostname(), _ended()

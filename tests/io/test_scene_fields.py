@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from splatseg.errors import InputError
-from splatseg.io.scene_fields import (
+from splatseg.io.scene import (
     new_field_file,
     new_field_folder,
     remove_field_file,

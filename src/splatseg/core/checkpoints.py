@@ -1,7 +1,6 @@
 """Long work: when it may be interrupted, when it writes checkpoints, when it resumes from one."""
 
 import json
-import math
 import signal
 import threading
 import time
@@ -15,7 +14,7 @@ from types import FrameType
 from typing import Any, Final, cast
 
 from splatseg.core.boundary import convert_fields
-from splatseg.errors import RangeError
+from splatseg.core.options import Count, Positive
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 # This signal interrupts at once: the step in progress may never end.
@@ -107,10 +106,10 @@ class Checkpoints:
     path: Path
     """The file. Its folder is created with the first checkpoint."""
 
-    seconds: float = 60.0
+    seconds: Positive = 60.0
     """Time between two checkpoints, seconds; more where writing one takes over a sixtieth of it."""
 
-    steps: int | None = None
+    steps: Count | None = None
     """Steps between two checkpoints, instead of seconds."""
 
     resume: bool = False
@@ -129,12 +128,6 @@ class Checkpoints:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        if not (math.isfinite(self.seconds) and self.seconds > 0):
-            raise RangeError(
-                f"checkpoints.seconds: expected a positive number, got {self.seconds}."
-            )
-        if self.steps is not None and self.steps < 1:
-            raise RangeError(f"checkpoints.steps: expected at least 1, got {self.steps}.")
 
 
 def without_checkpoint(error: Exception) -> str:

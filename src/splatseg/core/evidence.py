@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape, check_values
+from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.options import Count
 from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, RangeError, ShapeError
 
@@ -249,7 +250,7 @@ class FeatureMap:
 
     features: Float[Tensor, "rows columns channels"]
 
-    stride: int
+    stride: Count
     """Pixels a cell, along both axes."""
 
     height: int
@@ -261,8 +262,6 @@ class FeatureMap:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("features", self.features, (None, None, None))
-        if self.stride < 1:
-            raise RangeError(f"stride: expected at least 1, got {self.stride}.")
 
     def __repr__(self) -> str:
         rows, columns, channels = self.features.shape
@@ -290,7 +289,6 @@ class DepthMap:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("kind", self.kind, ("metric", "relative"))
         check_shape("values", self.values, (None, None))
         check_values("values", self.values, 0.0, math.inf)
         if self.confidence is not None:
@@ -385,6 +383,7 @@ class ViewNames(Protocol):
     @property
     def view_names(self) -> Sequence[str]:
         """Views of which there is something."""
+        ...
 
 
 @runtime_checkable
@@ -394,9 +393,11 @@ class LabelSource(Protocol):
     @property
     def view_names(self) -> Sequence[str]:
         """Views that have a label map."""
+        ...
 
     def label_map(self, name: str) -> LabelMap:
         """The label map of one view."""
+        ...
 
 
 @runtime_checkable
@@ -406,20 +407,25 @@ class SegmentSource(Protocol):
     @property
     def view_names(self) -> Sequence[str]:
         """Views that have segments."""
+        ...
 
     @property
     def overlapping(self) -> bool:
         """Whether segments of one view may overlap."""
+        ...
 
     @property
     def persistent(self) -> bool:
         """Whether ids are meant to go through all views, as those of a tracker."""
+        ...
 
     def segments_of(self, name: str) -> LabelMap | MaskSet:
         """The segments of one view: a label map, or masks that may overlap."""
+        ...
 
     def categories_of(self, name: str) -> Mapping[int, int]:
         """Category by segment, where it is known."""
+        ...
 
 
 @runtime_checkable
@@ -429,6 +435,8 @@ class FeatureSource(Protocol):
     @property
     def view_names(self) -> Sequence[str]:
         """Views that have a feature map."""
+        ...
 
     def features(self, name: str) -> FeatureMap:
         """The feature map of one view."""
+        ...

@@ -7,7 +7,7 @@ and round once: the result depends on the value alone.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from dataclasses import replace as _replace
 from types import MappingProxyType
 from typing import Any
@@ -65,6 +65,8 @@ def sigmoid(values: Float[np.ndarray, "*shape"]) -> NDArray[np.float32]:
             found[part] = 1 / (1 + np.exp(-flat[part].astype(np.float64)))
     return found.reshape(values.shape)
 
+
+_ARRAYS = ("means", "rotations", "scales", "opacities", "sh")
 
 LOW_PASS = 0.3
 """Variance of 3DGS's low-pass, square pixels."""
@@ -143,16 +145,9 @@ class Gaussians(Previewed):
     def __getitem__(self, index: slice | Tensor) -> "Gaussians":
         """Rows by slice, boolean mask (n,) or integer ids, extra columns included."""
         index = as_rows("index", index, len(self))
-        return Gaussians(
-            means=self.means[index],
-            rotations=self.rotations[index],
-            scales=self.scales[index],
-            opacities=self.opacities[index],
-            sh=self.sh[index],
-            extra={name: column[index] for name, column in self.extra.items()},
-            antialiased=self.antialiased,
-            low_pass=self.low_pass,
-        )
+        arrays = {name: getattr(self, name)[index] for name in _ARRAYS}
+        extra = {name: column[index] for name, column in self.extra.items()}
+        return self.replace(**arrays, extra=extra)
 
     @property
     def sh_degree(self) -> int:
@@ -199,13 +194,9 @@ class Gaussians(Previewed):
         elif target is not None:
             device = target
         device = _device(device)
-        core = {
-            f.name: getattr(self, f.name).to(device=device, dtype=dtype)
-            for f in fields(self)
-            if f.name not in ("extra", "antialiased", "low_pass")
-        }
+        arrays = {n: getattr(self, n).to(device=device, dtype=dtype) for n in _ARRAYS}
         extra = {name: column.to(device=device) for name, column in self.extra.items()}
-        return Gaussians(**core, extra=extra, antialiased=self.antialiased, low_pass=self.low_pass)
+        return self.replace(**arrays, extra=extra)
 
     def check_values(self) -> None:
         """Raise `RangeError` unless every row can be rendered.
@@ -252,9 +243,9 @@ class Gaussians(Previewed):
         """
         if not parts:
             raise InputError("parts: expected at least one set of Gaussians, got none.")
-        names = set(parts[0].extra)
+        names = list(parts[0].extra)
         for i, part in enumerate(parts):
-            if set(part.extra) != names:
+            if set(part.extra) != set(names):
                 raise InputError(
                     f"parts[{i}]: expected the extra columns {sorted(names)}, "
                     f"got {sorted(part.extra)}."
@@ -270,16 +261,9 @@ class Gaussians(Previewed):
                     raise InputError(
                         f"parts[{i}]: expected {name} to be {expected} as in the first, got {got}."
                     )
-        return Gaussians(
-            means=torch.cat([p.means for p in parts]),
-            rotations=torch.cat([p.rotations for p in parts]),
-            scales=torch.cat([p.scales for p in parts]),
-            opacities=torch.cat([p.opacities for p in parts]),
-            sh=torch.cat([p.sh for p in parts]),
-            extra={name: torch.cat([p.extra[name] for p in parts]) for name in parts[0].extra},
-            antialiased=parts[0].antialiased,
-            low_pass=parts[0].low_pass,
-        )
+        arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        extra = {name: torch.cat([part.extra[name] for part in parts]) for name in names}
+        return parts[0].replace(**arrays, extra=extra)
 
 
 def _device(device: torch.device | str | None) -> torch.device | None:

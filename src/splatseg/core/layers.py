@@ -1,6 +1,8 @@
 """What is known of each Gaussian: labels, features, selections. One row a Gaussian."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,20 +20,43 @@ _OF_EVIDENCE = ("evidence", "effective_views", "inferred")
 """Columns of labels that say what ids rest on."""
 
 
-def _taken(layer: object, names: tuple[str, ...], index: slice | Tensor) -> dict[str, Tensor]:
-    """Rows of those columns that a layer has."""
-    columns = {name: getattr(layer, name) for name in names}
-    return {name: column[index] for name, column in columns.items() if column is not None}
+class RowColumns:
+    """A layer whose columns have one row a Gaussian; they are taken and filled together."""
+
+    __slots__ = ()
+    COLUMNS: ClassVar[Mapping[str, float]]
+    """Its columns, and what they have of a Gaussian of which nothing is known."""
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    def columns(self) -> dict[str, Tensor]:
+        """Those of its columns that it has."""
+        columns = {name: getattr(self, name) for name in self.COLUMNS}
+        return {name: column for name, column in columns.items() if column is not None}
+
+    def __getitem__(self, index: slice | Tensor) -> Self:
+        """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
+        taken = {name: column[index] for name, column in self.columns().items()}
+        return replace(cast("Any", self), **taken)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Labels(Previewed):
+class Labels(RowColumns, Previewed):
     """One id a Gaussian, with its confidence.
 
     Raises:
         ShapeError: If rows differ in number.
         RangeError: If an id is below -1, or a value is NaN or infinite.
     """
+
+    COLUMNS: ClassVar[Mapping[str, float]] = {
+        "ids": UNLABELLED,
+        "confidence": 0,
+        "candidates": UNLABELLED,
+        "shares": 0,
+    } | (dict.fromkeys(_OF_EVIDENCE, 0))
 
     ids: Int[Tensor, "n"]
     """int32 ids, -1 where there is none."""
@@ -92,12 +117,6 @@ class Labels(Previewed):
         made = "" if self.info.method is None else f", method={self.info.method!r}"
         return f"Labels({len(self):,} rows, {len(self.present)} ids, {none:,} unlabelled{made})"
 
-    def __getitem__(self, index: slice | Tensor) -> "Labels":
-        """Rows, in step with `Gaussians.__getitem__`."""
-        index = as_rows("index", index, len(self))
-        columns = ("ids", "confidence", "candidates", "shares", *_OF_EVIDENCE)
-        return replace(self, **_taken(self, columns, index))
-
     @property
     def present(self) -> Int[Tensor, "m"]:
         """The ids in use, ascending, without -1; the background's is among them."""
@@ -108,13 +127,15 @@ class Labels(Previewed):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Features:
+class Features(RowColumns):
     """One feature vector a Gaussian.
 
     Raises:
         ShapeError: If rows differ in number.
         RangeError: If a value is NaN or infinite.
     """
+
+    COLUMNS: ClassVar[Mapping[str, float]] = {"values": 0, "weights": 0}
 
     values: Float[Tensor, "n channels"]
 
@@ -138,14 +159,9 @@ class Features:
     def __repr__(self) -> str:
         return f"Features({len(self):,} rows, {self.values.shape[1]} channels)"
 
-    def __getitem__(self, index: slice | Tensor) -> "Features":
-        """Rows, in step with `Gaussians.__getitem__`."""
-        index = as_rows("index", index, len(self))
-        return replace(self, **_taken(self, ("values", "weights"), index))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Selection:
+class Selection(RowColumns):
     """A set of Gaussians. Immutable; ``& | ^ - ~`` give new ones.
 
     With confidences c and d these are, as in fuzzy sets,
@@ -167,6 +183,8 @@ class Selection:
         >>> (a & b).confidence
         tensor([0.2500, 0.7500, 0.0000])
     """
+
+    COLUMNS: ClassVar[Mapping[str, float]] = {"mask": 0, "confidence": 0}
 
     mask: Bool[Tensor, "n"]
     """True where a Gaussian is selected."""
@@ -211,11 +229,6 @@ class Selection:
         mean = self.mean_confidence
         sure = "" if mean is None else f", confidence {mean:.2f}"
         return f"Selection({self.count:,} of {len(self):,}{sure})"
-
-    def __getitem__(self, index: slice | Tensor) -> "Selection":
-        """Rows, in step with `Gaussians.__getitem__`."""
-        index = as_rows("index", index, len(self))
-        return replace(self, **_taken(self, ("mask", "confidence"), index))
 
     @property
     def count(self) -> int:

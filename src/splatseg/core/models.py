@@ -103,6 +103,7 @@ class Model(Protocol):
     @property
     def name(self) -> str:
         """How it is asked for, such as ``classical``; recorded with what it gives."""
+        ...
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -110,10 +111,12 @@ class Model(Protocol):
 
         Weights belong here too, by a revision or a digest. Cached answers are found by it.
         """
+        ...
 
     @property
     def note(self) -> str:
         """What people who use it should know, such as that it is a stand-in; may be empty."""
+        ...
 
 
 @runtime_checkable
@@ -123,6 +126,7 @@ class ModelWithDefaults(Model, Protocol):
     @property
     def default_settings(self) -> Mapping[str, Any]:
         """Like `settings`. Work that was begun before a setting existed counts as having these."""
+        ...
 
 
 @runtime_checkable
@@ -132,12 +136,14 @@ class BatchedModel(Model, Protocol):
     @property
     def batch_size(self) -> int:
         """How many images to announce together."""
+        ...
 
     def encode(self, images: Sequence[Image]) -> None:
         """Pass images of one size through the network together.
 
         Questions about them that come next are answered from that; others as ever.
         """
+        ...
 
 
 @runtime_checkable
@@ -146,6 +152,7 @@ class AutomaticMasks(Model, Protocol):
 
     def masks(self, image: Image) -> MaskSet:
         """Masks of the image; they may overlap."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,9 +186,11 @@ class PromptableMasks(Model, Protocol):
 
     def embed(self, image: Image) -> Embedding:
         """Encode an image."""
+        ...
 
     def prompted_masks(self, embedding: Embedding, prompt: Prompt) -> MaskSet:
         """Masks of what the prompt means, the best first; none where nothing fits."""
+        ...
 
 
 @runtime_checkable
@@ -191,9 +200,11 @@ class SemanticLabels(Model, Protocol):
     @property
     def classes(self) -> ClassTable | None:
         """Names of the ids."""
+        ...
 
     def label_map(self, image: Image) -> LabelMap:
         """The class of every pixel, -1 where there is none."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,9 +223,11 @@ class PanopticSegments(Model, Protocol):
     @property
     def categories(self) -> ClassTable | None:
         """Names of the segments' classes."""
+        ...
 
     def panoptic(self, image: Image) -> Panoptic:
         """The segments of an image."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -245,6 +258,7 @@ class DenseFeatures(Model, Protocol):
 
     def features(self, image: Image) -> DeepFeatures:
         """Features of an image."""
+        ...
 
 
 @runtime_checkable
@@ -253,6 +267,7 @@ class DenseDepth(Model, Protocol):
 
     def depth_map(self, image: Image) -> DepthMap:
         """The depth of every pixel: metric, or relative."""
+        ...
 
 
 @runtime_checkable
@@ -261,9 +276,11 @@ class TextFeatures(Model, Protocol):
 
     def text_features(self, image: Image) -> FeatureMap:
         """Unit vectors of the patches of an image."""
+        ...
 
     def encode_text(self, words: Sequence[str]) -> Float[Tensor, "n width"]:
         """Unit vectors of words or phrases."""
+        ...
 
 
 @runtime_checkable
@@ -273,6 +290,7 @@ class TextFeaturesWithWords(TextFeatures, Protocol):
     @property
     def words(self) -> tuple[str, ...]:
         """Words whose vectors are written beside the features; may be empty."""
+        ...
 
 
 @runtime_checkable
@@ -281,6 +299,7 @@ class LateTextFeatures(TextFeatures, DenseFeatures, Protocol):
 
     def in_word_space(self, decoded: Float[Tensor, "*n decoder"]) -> Float[Tensor, "*n width"]:
         """Unit vectors in the space of words of what `features` gives, or of means of it."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -310,6 +329,7 @@ class GroundedBoxes(Model, Protocol):
 
     def boxes(self, image: Image, words: Sequence[str]) -> Boxes:
         """Boxes of what the words mean, none where they mean nothing here."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -337,6 +357,7 @@ class GroundedMasks(Model, Protocol):
 
     def grounded_masks(self, image: Image, words: Sequence[str]) -> TextMasks:
         """Masks of what the words mean, none where they mean nothing here."""
+        ...
 
 
 @runtime_checkable
@@ -359,6 +380,7 @@ class MaskTracker(Model, Protocol):
                 of the result: a later seed may bring new ones, and say again where known ones
                 are. One is looked up when its frame is taken, so that the mapping may grow.
         """
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -391,3 +413,4 @@ class PointmapModel(Model, Protocol):
         A map may have any number of rows and columns: they divide its image evenly, so that the
         middle of row i lies at (i + 0.5) / rows of the image's height.
         """
+        ...

@@ -13,15 +13,13 @@ from typing import Literal, Protocol, Self, runtime_checkable
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.evidence import UNLABELLED, LabelMap
 from splatseg.core.layer_info import LayerInfo
 from splatseg.core.layers import Labels, Selection
 from splatseg.errors import InputError
-
-_KINDS = ("labels", "selection", "features")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +86,6 @@ class RenderableLayer:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("kind", self.kind, _KINDS)
         if list(self.ids) != sorted({id for id in self.ids if id != UNLABELLED}):
             raise InputError(f"ids: expected distinct ids, ascending, without -1, got {self.ids}.")
 
@@ -113,6 +110,7 @@ class RenderableView(Protocol):
 
     def __enter__(self) -> Self:
         """Begin to look."""
+        ...
 
     def __exit__(
         self,
@@ -121,9 +119,11 @@ class RenderableView(Protocol):
         trace: TracebackType | None,
     ) -> None:
         """Release what it holds."""
+        ...
 
     def signals(self, *, colour: bool = True) -> ViewSignals:
         """Alpha and depth, and the colour unless it is not needed."""
+        ...
 
     def features(self, layer: str) -> Float[Tensor, "height width channels"]:
         """A layer of features, blended as colours are.
@@ -131,6 +131,7 @@ class RenderableView(Protocol):
         Raises:
             InputError: If the field has no such layer.
         """
+        ...
 
     def label_map(self, layer: str) -> LabelMap:
         """Ids of a layer, with the confidence of each pixel's id.
@@ -138,6 +139,7 @@ class RenderableView(Protocol):
         Raises:
             InputError: If the field has no such layer, or it has no labels.
         """
+        ...
 
     def confidence(self, layer: str) -> Float[Tensor, "height width"]:
         """How sure the labels are of what a pixel shows, in [0, 1]; -1 where there is nothing.
@@ -145,6 +147,7 @@ class RenderableView(Protocol):
         Raises:
             InputError: If the field has no such layer, or it has no labels.
         """
+        ...
 
 
 @runtime_checkable
@@ -158,6 +161,7 @@ class Renderable(Protocol):
     @property
     def layer_names(self) -> Sequence[str]:
         """Names of all layers."""
+        ...
 
     def layer(self, layer: str) -> RenderableLayer:
         """What there is to know of a layer.
@@ -165,9 +169,11 @@ class Renderable(Protocol):
         Raises:
             InputError: If the field has no such layer.
         """
+        ...
 
     def view(self, camera: Camera) -> RenderableView:
         """What it shows through a camera."""
+        ...
 
     def labels_at(self, points: Float[Tensor, "p 3"], layer: str) -> PointLabels:
         """Labels of points of the world, scene units.
@@ -176,3 +182,4 @@ class Renderable(Protocol):
             InputError: If the field has no such layer, or it has no labels.
             ShapeError: If the points are not (p, 3).
         """
+        ...

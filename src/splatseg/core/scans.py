@@ -1,8 +1,8 @@
 """Points and surfaces with labels: laser scans, labelled meshes, and boxes of what moved."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -13,6 +13,7 @@ from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.evidence import UNLABELLED
+from splatseg.core.options import NonNegative, Positive
 from splatseg.core.rigid import normalised, rotation_from_quaternion
 from splatseg.errors import InputError, RangeError
 
@@ -119,10 +120,7 @@ def _positions(name: str, values: Tensor) -> Tensor:
 
 def checked_labels(name: str, given: Mapping[str, Tensor], rows: int) -> dict[str, Tensor]:
     """Ids of rows, by the name of what they tell: int32, one a row, none below -1."""
-    return dict(_checked(name, given, rows))
-
-
-def _checked(name: str, given: Mapping[str, Tensor], rows: int) -> Iterator[tuple[str, Tensor]]:
+    checked: dict[str, Tensor] = {}
     for key, ids in given.items():
         check_shape(f"{name}[{key!r}]", ids, (rows,))
         low, high = (int(ids.min()), int(ids.max())) if rows else (0, 0)
@@ -130,7 +128,8 @@ def _checked(name: str, given: Mapping[str, Tensor], rows: int) -> Iterator[tupl
             raise RangeError(
                 f"{name}[{key!r}]: expected ids from -1 to 2147483647, got [{low}, {high}]."
             )
-        yield str(key), ids.cpu().to(torch.int32)
+        checked[str(key)] = ids.cpu().to(torch.int32)
+    return checked
 
 
 def _names(labels: Mapping[str, Tensor]) -> str:
@@ -203,15 +202,13 @@ class Scan:
         Args:
             rows: Which points, ascending.
         """
-        return Scan(
-            name=self.name,
+        return replace(
+            self,
             points=self.points[rows],
             rows=rows if self.rows is None else self.rows[rows],
             recorded=len(self) if self.recorded is None else self.recorded,
-            origin=self.origin,
             intensity=None if self.intensity is None else self.intensity[rows],
             labels={name: ids[rows] for name, ids in self.labels.items()},
-            time=self.time,
         )
 
     def recorded_labels(self, ids: Int[Tensor, "n"], missing: int = -1) -> Int[Tensor, "recorded"]:
@@ -236,6 +233,7 @@ class ScanSource(Protocol):
     @property
     def scan_names(self) -> Sequence[str]:
         """Scans in the order in which they were measured."""
+        ...
 
     def scan(self, name: str) -> Scan:
         """One of them.
@@ -243,6 +241,7 @@ class ScanSource(Protocol):
         Raises:
             InputError: If there is none of that name, or its file is broken.
         """
+        ...
 
 
 _RAYS = 1 << 16
@@ -263,7 +262,7 @@ class MovingBox:
     centre: Float[Tensor, "3"]
     """World, scene units, float64."""
 
-    size: tuple[float, float, float]
+    size: tuple[Positive, Positive, Positive]
     """Whole length of its sides along its own x, y and z, scene units, positive."""
 
     rotation: Float[Tensor, "4"]
@@ -283,8 +282,6 @@ class MovingBox:
         check_shape("centre", self.centre, (3,))
         check_finite("centre", self.centre)
         check_shape("rotation", self.rotation, (4,))
-        if not all(math.isfinite(side) and side > 0 for side in self.size):
-            raise RangeError(f"size: expected three positive lengths, got {self.size}.")
         if not self.start <= self.end:
             raise RangeError(
                 f"start, end: expected a span of time, got {self.start:g} to {self.end:g}."
@@ -307,7 +304,7 @@ def boxes_at(boxes: Iterable[MovingBox], time: float) -> tuple[MovingBox, ...]:
 
 @boundary
 def inside_boxes(
-    points: Float[Tensor, "p 3"], boxes: Sequence[MovingBox], *, margin: float = 0.0
+    points: Float[Tensor, "p 3"], boxes: Sequence[MovingBox], *, margin: NonNegative = 0.0
 ) -> Bool[Tensor, "p"]:
     """Which points lie in any of some boxes, their faces included.
 
@@ -321,7 +318,6 @@ def inside_boxes(
         RangeError: If the margin is negative or not finite.
     """
     check_shape("points", points, (None, 3))
-    _check_margin(margin)
     at = points.detach().cpu().double()
     inside = torch.zeros(len(at), dtype=torch.bool)
     for box in boxes:
@@ -332,7 +328,7 @@ def inside_boxes(
 
 @boundary
 def pixels_of_boxes(
-    camera: Camera, boxes: Sequence[MovingBox], *, margin: float = 0.0
+    camera: Camera, boxes: Sequence[MovingBox], *, margin: NonNegative = 0.0
 ) -> Bool[Tensor, "height width"]:
     r"""Which pixels show any of some boxes: those whose central ray meets one.
 
@@ -353,7 +349,6 @@ def pixels_of_boxes(
     Raises:
         RangeError: If the margin is negative or not finite.
     """
-    _check_margin(margin)
     shown = torch.zeros(camera.height * camera.width, dtype=torch.bool)
     if not boxes:
         return shown.reshape(camera.height, camera.width)
@@ -385,8 +380,3 @@ def _meets(
 
 def _half(box: MovingBox, margin: float) -> Float[Tensor, "3"]:
     return torch.tensor(box.size, dtype=torch.float64) / 2 + margin
-
-
-def _check_margin(margin: float) -> None:
-    if not (math.isfinite(margin) and margin >= 0):
-        raise RangeError(f"margin: expected 0 or more, got {margin}.")

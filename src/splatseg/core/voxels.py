@@ -1,7 +1,8 @@
 """Occupied cells of a grid, and layers of their features: which cells each Gaussian reads."""
 
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -9,10 +10,10 @@ from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
 from splatseg.core.layer_info import LayerInfo
-from splatseg.core.layers import Features
+from splatseg.core.layers import Features, RowColumns
+from splatseg.core.options import Positive
 from splatseg.errors import InputError, RangeError, ShapeError
 
 BRICK = 8
@@ -61,7 +62,7 @@ class VoxelGrid:
     cells: Int[Tensor, "m 3"]
     """x, y and z of each, int32."""
 
-    size: float
+    size: Positive
     """Side of a cell, scene units."""
 
     origin: Float[Tensor, "3"]
@@ -72,8 +73,6 @@ class VoxelGrid:
         check_shape("cells", self.cells, (None, 3))
         check_shape("origin", self.origin, (3,))
         check_finite("origin", self.origin)
-        if not 0 < self.size < float("inf"):
-            raise RangeError(f"size: expected above 0, got {self.size}.")
         key = cell_order(self.cells)
         if bool((key[1:] <= key[:-1]).any()):
             raise InputError("cells: expected cells in their order, each once (see cell_order).")
@@ -99,7 +98,7 @@ class VoxelGrid:
         Args:
             rows: A mask, or ascending rows.
         """
-        return VoxelGrid(cells=self.cells[rows], size=self.size, origin=self.origin)
+        return replace(self, cells=self.cells[rows])
 
 
 StoredPrecision = Literal["float32", "float16", "int8", "product"]
@@ -195,8 +194,10 @@ def _precision(codes: Tensor) -> StoredPrecision:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class VoxelFeatures:
+class VoxelFeatures(RowColumns):
     """Features of voxels; a Gaussian has the mean of those that it reads."""
+
+    COLUMNS: ClassVar[Mapping[str, float]] = {"rows": UNLABELLED, "shares": 0}
 
     grid: VoxelGrid
     """The voxels; all of them were hit."""
@@ -249,19 +250,6 @@ class VoxelFeatures:
         return (
             f"VoxelFeatures({len(self):,} rows, {len(self.grid):,} voxels, "
             f"{self.table.channels} channels, {self.table.precision})"
-        )
-
-    @boundary
-    def __getitem__(self, index: slice | Tensor) -> "VoxelFeatures":
-        """Rows, in step with `Gaussians.__getitem__`; voxels stay."""
-        index = as_rows("index", index, len(self))
-        return VoxelFeatures(
-            grid=self.grid,
-            table=self.table,
-            weights=self.weights,
-            rows=self.rows[index],
-            shares=None if self.shares is None else self.shares[index],
-            info=self.info,
         )
 
     @boundary

@@ -1,4 +1,10 @@
-"""ZIP archives of others: members are read only as far as they may unpack."""
+"""Arrays of NumPy in files (``.npy``, ``.npz``): all that reads and writes them.
+
+Headers are held against the bytes that are there before anything is allocated, members of archives
+are read only as far as they may unpack, and no object of Python is ever made from a file (no
+pickles). Archives are written uncompressed and without time stamps: the same values give the same
+bytes.
+"""
 
 import io
 import math
@@ -16,7 +22,7 @@ from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.atomic import named_write_failures, sync
-from splatseg.io.foreign import reading
+from splatseg.io.foreign import expect, reading
 from splatseg.io.json_files import json_text
 from splatseg.io.limits import check_unpacked
 
@@ -61,12 +67,6 @@ def open_member(
             )
         with archive.open(info) as member:
             yield member, info.file_size
-
-
-# Arrays of NumPy in files: their headers, held against the bytes that are there.
-#
-# This and `npz` are all that reads arrays: nothing is allocated before the header is known to be
-# true, and no object of Python is ever made from a file (no pickles).
 
 
 KINDS = "biufU"
@@ -157,11 +157,11 @@ def map_values(path: Path, *, dtype: str, shape: tuple[int, ...]) -> NDArray[Any
     header = ArrayHeader(shape=shape, dtype=np.dtype(dtype), order="C", offset=0)
     with reading(path, "values of NumPy"):
         size = path.stat().st_size
-        if size != header.nbytes:
-            raise FileFormatError(
-                f"{path}: expected {header.nbytes} bytes, {shape} values of {header.dtype}, "
-                f"got {size}."
-            )
+        expect(
+            size == header.nbytes,
+            path,
+            f"{header.nbytes} bytes, {shape} values of {header.dtype}, got {size}",
+        )
         return _mapped(path, header, offset=0) if size else np.zeros(shape, header.dtype)
 
 
@@ -202,18 +202,17 @@ def _check(header: ArrayHeader, size: int, where: object) -> None:
     if dtype.kind not in KINDS or (dtype.kind != "U" and dtype.itemsize > _MAX_ITEM):
         what = "objects, and nothing is unpickled" if dtype.kind == "O" else repr(dtype.kind)
         raise FileFormatError(f"{where}: expected an array of numbers or text, got {what}.")
-    if any(not 0 <= side < _MAX_SIDE for side in shape) or (
-        math.prod(shape) and not dtype.itemsize
-    ):
-        raise FileFormatError(f"{where}: expected the shape of an array, got one that cannot be.")
-    if header.offset + header.nbytes != size:
-        raise FileFormatError(
-            f"{where}: expected {header.nbytes} bytes of values, as its header says, got "
-            f"{size - header.offset}."
-        )
-
-
-# Archives of NumPy arrays: read member by member, each header held against its bytes first.
+    expect(
+        not any(not 0 <= side < _MAX_SIDE for side in shape)
+        and (not math.prod(shape) or dtype.itemsize),
+        where,
+        "the shape of an array, got one that cannot be",
+    )
+    expect(
+        header.offset + header.nbytes == size,
+        where,
+        f"{header.nbytes} bytes of values, as its header says, got {size - header.offset}",
+    )
 
 
 _SUFFIX = ".npy"
@@ -242,11 +241,11 @@ class Npz:
             FileFormatError: If there is none of this name, it is damaged or holds objects, or the
                 archive would unpack to more than a file of its size may.
         """
-        if name not in self.names:
-            raise FileFormatError(
-                f"{self.where}: expected an array {quoted(name)}, got "
-                f"{_listed(self.names) or 'none'}."
-            )
+        expect(
+            name in self.names,
+            self.where,
+            f"an array {quoted(name)}, got {_listed(self.names) or 'none'}",
+        )
         place = f"{self.where}: array {quoted(name)}"
         with open_member(
             self._archive, name + _SUFFIX, where=self.where, expected=self._expected
@@ -308,12 +307,6 @@ def npz_names(path: Path) -> tuple[str, ...]:
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(quoted(name, 40).strip("'") for name in names[:8])
-
-
-# Archives of NumPy arrays with a header, written: layers, and checkpoints of long work.
-#
-# Entries are stored uncompressed and without time stamps, so that the same values give the same
-# bytes; nothing is pickled.
 
 
 HEADER = "header"

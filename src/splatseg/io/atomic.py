@@ -1,4 +1,11 @@
-"""What the system says when something cannot be written, as a sentence that says what to do."""
+"""Writing files and folders so that nothing half-written is ever seen under the target's name.
+
+Everything is written in a hidden folder beside the target (same file system, so that the rename
+is one step) and renamed only when the block ended well. The hidden folder's name has the number
+of the process, and the process holds a lock on it: what a killed process left is told from what
+another one is writing, and `sweep` removes it. What data names is written below its folder, see
+`path_inside`, and what the system says of a failure becomes a sentence that says what to do.
+"""
 
 import contextlib
 import errno
@@ -70,9 +77,6 @@ def _is_of(error: OSError, path: Path, within: Path | None) -> bool:
     return named in (path, within) or within in named.parents
 
 
-# Paths that come from files: where a name may lead, and what a name may be.
-
-
 def path_inside(folder: Path, *names: str, make: bool = True) -> Path:
     """A path below a folder, which it cannot leave: every file named by data is written so.
 
@@ -126,9 +130,6 @@ def check_utf8(path: Path) -> None:
         ) from error
 
 
-# Locks of the operating system on open files: they end with their process, however it ends.
-
-
 try:
     import fcntl
 except ImportError:  # Windows
@@ -154,14 +155,6 @@ def try_lock(handle: int, *, shared: bool = False) -> Lock:
     except OSError:
         return "unknown"
     return "taken"
-
-
-# Writing files and folders so that nothing half-written is ever seen under the target's name.
-#
-# Everything is written in a hidden folder beside the target (same file system, so that the rename
-# is one step) and renamed only when the block ended well. The hidden folder's name has the number
-# of the process, and the process holds a lock on it: what a killed process left is told from what
-# another one is writing, and `sweep` removes it.
 
 
 TEMPORARY = ".splatseg-"

@@ -1,4 +1,4 @@
-"""One process at a time changes a scene: a lock that ends with its process.
+"""The folder of a scene while it is worked on: who does, its files, what a kill left of it.
 
 ``SCENE/.splatseg-lock`` says who works on the scene, for people. What counts is the lock of the
 operating system on this file, which is gone when its process ends in whatever way; so the file
@@ -183,9 +183,6 @@ def _read(handle: int) -> LockOwner | None:
         )
     except (FileFormatError, OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
-
-
-# The folder of a scene while it is written: its files, who works on it, what a kill left of it.
 
 
 SCENE_FILE = "scene.json"

@@ -1,13 +1,16 @@
-"""CSV that spreadsheets read as it is meant: text is text, whatever it begins with."""
+"""Tables: CSV for spreadsheets, and classes as JSON rows (id, name, isthing, colour [r, g, b])."""
 
 import csv
 import io
 from collections.abc import Iterable, Sequence
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from
+from splatseg.io.schema import structured
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20", "'")
 """What programs take for the begin of a formula, the wide forms included, and the mark itself."""
@@ -30,11 +33,22 @@ def _cell(value: object) -> object:
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 
 
-# Class tables as JSON rows: id, name, isthing and, where there is one, colour [r, g, b].
+_Byte = Annotated[int, Meta(ge=0, le=255)]
 
 
-_MAX_ID = 2**31 - 1
-"""Ids are int32."""
+@dataclass(frozen=True, slots=True)
+class _Row:
+    id: Annotated[int, Meta(ge=0, le=2**31 - 1)]
+    name: str
+    isthing: Any = True
+    """COCO has 0 and 1."""
+
+    colour: tuple[_Byte, _Byte, _Byte] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    classes: list[_Row]
 
 
 def class_table(rows: object, *, where: str, keep_zero: bool = False) -> ClassTable:
@@ -45,16 +59,16 @@ def class_table(rows: object, *, where: str, keep_zero: bool = False) -> ClassTa
     Raises:
         FileFormatError: If a row has no integer id or no name; the message starts with `where`.
     """
-    if not isinstance(rows, list):
-        raise FileFormatError(f"{where}: expected a list of classes, got {type(rows).__name__}.")
-    table = [
-        _class_info(row, where=f"{where}: classes[{i}]")
-        for i, row in enumerate(cast(list[object], rows))
-    ]
-    ids = [row.id for row in table]
-    if len(set(ids)) != len(ids):
-        raise FileFormatError(f"{where}: expected classes of distinct ids, got one twice.")
-    return ClassTable(rows=tuple(row for row in table if keep_zero or row.id != 0))
+    classes: list[ClassInfo] = []
+    for i, row in enumerate(structured({"classes": rows}, _Table, where=where).classes):
+        if keep_zero or row.id != 0:
+            with made_from(f"{where}: classes[{i}]"):
+                thing = bool(row.isthing)
+                classes.append(
+                    ClassInfo(id=row.id, name=row.name, isthing=thing, colour=row.colour)
+                )
+    with made_from(where):
+        return ClassTable(rows=tuple(classes))
 
 
 def class_rows(table: ClassTable) -> list[dict[str, Any]]:
@@ -68,23 +82,3 @@ def class_rows(table: ClassTable) -> list[dict[str, Any]]:
         }
         for row in table.rows
     ]
-
-
-def _class_info(row: object, *, where: str) -> ClassInfo:
-    if not isinstance(row, dict):
-        raise FileFormatError(f"{where}: expected an object, got {type(row).__name__}.")
-    entry = cast(dict[str, Any], row)
-    id, name, colour = entry.get("id"), entry.get("name"), entry.get("colour")
-    if isinstance(id, bool) or not isinstance(id, int) or id < 0 or not isinstance(name, str):
-        raise FileFormatError(f"{where}: expected an integer id and a name, got {quoted(entry)}.")
-    if id > _MAX_ID:
-        raise FileFormatError(f"{where}: expected an id up to {_MAX_ID}, got {quoted(id)}.")
-    if colour is not None:
-        values = cast(list[object], colour) if isinstance(colour, list) else []
-        if len(values) != 3 or not all(type(v) is int and 0 <= v <= 255 for v in values):
-            raise FileFormatError(
-                f"{where}: expected a colour of three bytes, got {quoted(colour)}."
-            )
-        colour = cast(tuple[int, int, int], tuple(values))
-    with made_from(where):
-        return ClassInfo(id=id, name=name, isthing=bool(entry.get("isthing", True)), colour=colour)

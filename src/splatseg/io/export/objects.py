@@ -1,4 +1,8 @@
-"""Boxes around objects that a few stray Gaussians do not blow up."""
+"""Objects of a layer: their boxes, what is known of each, and tables of them and of tree nodes.
+
+Tables are CSV for spreadsheets and JSON for programs. Boxes are such that a few stray Gaussians do
+not blow them up.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -188,9 +192,6 @@ def _pointing_forward(axis: Array) -> Array:
     return axis * (1.0 if axis[int(np.abs(axis).argmax())] >= 0 else -1.0)
 
 
-# What is known of each object of a layer: one row an id.
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObjectRow:
     """One object."""
@@ -334,9 +335,6 @@ def _row(
     )
 
 
-# The table of objects as CSV, for spreadsheets, and as JSON, for programs.
-
-
 MADE_BY = "splatseg export"
 _DIGITS = 6
 
@@ -362,15 +360,27 @@ def write_object_table(
         MissingFileError: If the folder of `path` does not exist.
     """
     files = files or {}
+    content = [object_content(row) for row in rows]
+    named = [row | ({"file": files[row["id"]]} if row["id"] in files else {}) for row in content]
+    _write_table(
+        path,
+        {"made_by": MADE_BY} | dict(about or {}) | {"objects": named},
+        _HEADER,
+        [[*_cells(row), files.get(row["id"], "")] for row in content],
+    )
+
+
+def _write_table(
+    path: Path, content: Mapping[str, Any], columns: Sequence[str], rows: Sequence[Sequence[object]]
+) -> None:
+    """Write a table as the JSON `content`, or as CSV rows, by the ending of the name; atomic."""
     match path.suffix.lower():
         case ".json":
-            objects = [
-                object_content(row) | ({"file": files[row.id]} if row.id in files else {})
-                for row in rows
-            ]
-            write_json({"made_by": MADE_BY} | dict(about or {}) | {"objects": objects}, path)
+            write_json(content, path)
         case ".csv":
-            _write_csv(rows, path, files)
+            # The byte order mark is what makes spreadsheets read names as UTF-8.
+            with atomic_file(path) as temporary:
+                temporary.write_text(csv_text(columns, rows), encoding="utf-8-sig", newline="")
         case _:
             raise InputError(f"{path}: expected a table's name to end in .csv or .json.")
 
@@ -396,15 +406,6 @@ def object_content(row: ObjectRow) -> dict[str, Any]:
         "evidence": None if row.evidence is None else _figure(row.evidence),
         "inferred": None if row.inferred is None else _figure(row.inferred),
     }
-
-
-def _write_csv(rows: Sequence[ObjectRow], path: Path, files: Mapping[int, str]) -> None:
-    text = csv_text(
-        _HEADER, ([*_cells(object_content(row)), files.get(row.id, "")] for row in rows)
-    )
-    # The byte order mark is what makes spreadsheets read names as UTF-8.
-    with atomic_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8-sig", newline="")
 
 
 _HEADER = (
@@ -433,21 +434,10 @@ def _figure(value: float) -> float:
     return float(f"{value:.{_DIGITS}g}") + 0.0  # the sum turns -0.0 into 0.0
 
 
-# The nodes of a tree of instances as a table: CSV for spreadsheets, JSON for programs.
-
-
 _COLUMNS = (
-    "id",
-    "parent",
-    "level",
-    "granularity",
-    "name",
-    "class",
-    "gaussians",
-    "support",
-    "segments",
+    "id", "parent", "level", "granularity", "name", "class", "gaussians", "support", "segments",
     "views",
-)
+)  # fmt: skip
 
 
 @boundary
@@ -469,16 +459,8 @@ def write_node_table(
         MissingFileError: If the folder of `path` does not exist.
     """
     rows = node_rows(tree)
-    match path.suffix.lower():
-        case ".json":
-            write_json(dict(about or {}) | {"nodes": rows}, path)
-        case ".csv":
-            text = csv_text(_COLUMNS, ([row[column] for column in _COLUMNS] for row in rows))
-            # The byte order mark is what makes spreadsheets read names as UTF-8.
-            with atomic_file(path) as temporary:
-                temporary.write_text(text, encoding="utf-8-sig", newline="")
-        case _:
-            raise InputError(f"{path}: expected a table's name to end in .csv or .json.")
+    cells = [[row[column] for column in _COLUMNS] for row in rows]
+    _write_table(path, dict(about or {}) | {"nodes": rows}, _COLUMNS, cells)
 
 
 @boundary

@@ -1,4 +1,4 @@
-"""Labelled point clouds: one point a Gaussian, as PLY and as LAS."""
+"""Labelled point clouds as PLY and LAS, and labels of laser scans in the order of their files."""
 
 import math
 from collections import Counter
@@ -21,6 +21,7 @@ from splatseg.io.atomic import atomic_file, atomic_folder, path_inside
 from splatseg.io.export.objects import MADE_BY
 from splatseg.io.export.splats import check_replaceable
 from splatseg.io.json_files import write_json
+from splatseg.io.ply import ply_header
 
 FIRST_USER_CLASS = 64
 """LAS 1.4 gives the classifications 0 to 63 a meaning of their own (2 ground, 7 noise, which
@@ -31,7 +32,6 @@ _LAST_CLASS = 255
 _POINT_FORMAT = 7
 _STEPS = 2**30
 
-_PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 _DESCRIPTIONS = {
     "class_id": "class, 0 for none",
     "instance_id": "object, 0 for none",
@@ -69,12 +69,7 @@ def write_points(
         MissingPackageError: If laspy is not installed and LAS is asked for.
         MissingFileError: If the folder of `path` does not exist.
     """
-    arrays = {name: _plain(name, column) for name, column in (columns or {}).items()}
-    for name, array in arrays.items():
-        if array.shape != (len(gaussians),):
-            raise InputError(
-                f"columns[{name!r}]: expected {len(gaussians)} values, got {array.shape}."
-            )
+    arrays = _arrays(columns or {}, len(gaussians))
     points = gaussians.means.detach().cpu().double().numpy()
     if not np.isfinite(points).all():
         raise RangeError("means: expected finite values, got NaN or infinity.")
@@ -107,12 +102,7 @@ def write_scan_points(
     """
     check_shape("points", points, (None, 3))
     check_finite("points", points)
-    arrays = {name: _plain(name, column) for name, column in columns.items()}
-    for name, array in arrays.items():
-        if array.shape != (len(points),):
-            raise InputError(
-                f"columns[{name!r}]: expected {len(points)} values, got {array.shape}."
-            )
+    arrays = _arrays(columns, len(points))
     return _written(path, points.detach().cpu().double().numpy(), None, arrays)
 
 
@@ -135,14 +125,21 @@ def _written(
             )
 
 
-def _plain(name: str, column: Tensor) -> NDArray[Any]:
-    array = column.detach().cpu().numpy()
-    if array.dtype.kind in "iub":
+def _arrays(columns: Mapping[str, Tensor], count: int) -> dict[str, NDArray[Any]]:
+    """Columns of `count` rows, int32 or float32."""
+    found: dict[str, NDArray[Any]] = {}
+    for name, column in columns.items():
+        array = column.detach().cpu().numpy()
+        if array.shape != (count,):
+            raise InputError(f"columns[{name!r}]: expected {count} values, got {array.shape}.")
+        if array.dtype.kind not in "iub":
+            found[name] = array.astype(np.float32)
+            continue
         wide = array.astype(np.int64)
         if len(wide) and not -(2**31) <= wide.min() <= wide.max() < 2**31:
             raise InputError(f"columns[{name!r}]: expected ids of 32 bit, got larger ones.")
-        return wide.astype(np.int32)
-    return array.astype(np.float32)
+        found[name] = wide.astype(np.int32)
+    return found
 
 
 def _write_ply(
@@ -151,24 +148,18 @@ def _write_ply(
     colours: NDArray[np.float64] | None,
     columns: Mapping[str, NDArray[Any]],
 ) -> None:
-    fields = [(axis, points.dtype.str[1:]) for axis in "xyz"]
-    if colours is not None:
-        fields += [(name, "u1") for name in ("red", "green", "blue")]
-    fields += [(name, array.dtype.str[1:]) for name, array in columns.items()]
-    table = np.zeros(len(points), np.dtype([(name, f"<{kind}") for name, kind in fields]))
-    for k, axis in enumerate("xyz"):
-        table[axis] = points[:, k]
+    table: dict[str, NDArray[Any]] = dict(zip("xyz", points.T, strict=True))
     if colours is not None:
         bytes_ = np.floor(colours * 255 + 0.5).astype(np.uint8)
-        for k, name in enumerate(("red", "green", "blue")):
-            table[name] = bytes_[:, k]
-    for name, array in columns.items():
-        table[name] = array
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    header += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in fields]
+        table |= zip(("red", "green", "blue"), bytes_.T, strict=True)
+    table |= columns
+    fields = [(name, array.dtype.newbyteorder("<").str) for name, array in table.items()]
+    rows = np.zeros(len(points), np.dtype(fields))
+    for name, array in table.items():
+        rows[name] = array
     with path.open("wb") as file:
-        file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
-        file.write(table.tobytes())
+        file.write(ply_header([("vertex", len(points), fields)]))
+        file.write(rows.tobytes())
 
 
 def _write_las(
@@ -228,9 +219,6 @@ def _laspy(path: Path) -> Any:
             f"({missing}). Try: pip install 'splatseg[las]'."
         ) from error
     return laspy
-
-
-# Labels of laser scans in files, in the order in which the scans' files have their points.
 
 
 ScanLabelForm = Literal["npz", "label", "ply", "las"]

@@ -1,4 +1,7 @@
-"""Which folders and files an export may replace: those that an export wrote."""
+"""Labels in splat files: as columns of a PLY file with a table beside it, or a file an object.
+
+An export replaces only what an export wrote.
+"""
 
 import re
 import unicodedata
@@ -75,9 +78,6 @@ def is_ours(path: Path) -> bool:
     return content.get("made_by") == MADE_BY or {"gaussians", "columns"} <= set(content)
 
 
-# Warnings of splat writers, said of the path that a file will have.
-
-
 @contextmanager
 def retold(temporary: Path, final: Path) -> Generator[None]:
     """Repeat each `SplatWarning` of the block with `final` in the place of `temporary`."""
@@ -87,9 +87,6 @@ def retold(temporary: Path, final: Path) -> Generator[None]:
     for warning in caught:
         text = str(warning.message).replace(str(temporary), str(final))
         warnings.warn(text, warning.category, stacklevel=4)
-
-
-# Labels as columns of a PLY file, and the table beside it that says what the ids mean.
 
 
 NONE = 0
@@ -199,9 +196,6 @@ def holds_columns(path: Path, format: WritableFormat | None) -> bool:
     name = path.name.lower()
     by_name = name.endswith(".ply") and not name.endswith(".compressed.ply")
     return by_name if format is None else format == "ply"
-
-
-# One splat file an object, and the table of them.
 
 
 OBJECTS_FILE = "objects.json"

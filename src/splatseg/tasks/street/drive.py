@@ -10,7 +10,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError, brief
 from splatseg.io.atomic import path_inside
-from splatseg.io.scene_fields import (
+from splatseg.io.scene import (
     DRIVE_FILE,
     FOLDER,
     new_field_folder,
