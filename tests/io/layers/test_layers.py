@@ -304,7 +304,7 @@ def test_files_that_contradict_themselves(tmp_path, change, message) -> None:
         (lambda h, a: h.update(precision=["int8"]), "precision: "),
         (lambda h, a: h.update(precision="float32"), "'codes' of type f4 .*, got int8 of"),
         (lambda h, a: h.update(voxels=3), r"'codes' of type i1 and shape \(3, any\)"),
-        (lambda h, a: h.update(size=0), "size: expected above 0"),
+        (lambda h, a: h.update(size=0), "size: expected more than 0"),
         (lambda h, a: h.update(origin=[0, 0]), "origin: expected .*length 3"),
         (lambda h, a: a.pop("codes"), "an array 'codes', which is not there"),
         (lambda h, a: a.pop("scales"), "an array 'scales', which is not there"),

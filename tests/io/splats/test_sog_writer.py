@@ -5,14 +5,15 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+
 from splatseg.core import Gaussians
 from splatseg.errors import InputError
 from splatseg.io.splats import SplatWarning, read_splats, splat_format, write_splats
 from splatseg.io.splats._quantisation import scalar_codebook, vector_palette
-
 
 Make = Callable[..., Gaussians]
 
