@@ -463,9 +463,9 @@ def test_the_third_signal_does_not_wait(capture: Capture, path: Path, monkeypatc
 
 def test_intervals_are_checked(path: Path) -> None:
     for seconds in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=r"checkpoints\.seconds: expected a positive number"):
+        with pytest.raises(InputError, match=r"seconds: expected more than 0"):
             Checkpoints(path=path, seconds=seconds)
-    with pytest.raises(InputError, match=r"checkpoints\.steps: expected at least 1, got 0"):
+    with pytest.raises(InputError, match=r"steps: expected at least 1, got 0"):
         Checkpoints(path=path, steps=0)
 
 
