@@ -36,7 +36,7 @@ import torch
 from torch import Tensor, nn
 from word_scene import WordScene
 
-from splatseg.core.voxel_features import StoredTable
+from splatseg.core.voxels import StoredTable
 from splatseg.io.scene import load_scene
 from splatseg.lift.relevancy import TextSpace
 from splatseg.lift.voxels import TableWords, store

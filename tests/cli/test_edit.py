@@ -238,7 +238,7 @@ def test_scenes_are_joined(room, tmp_path) -> None:
         (["--remove", "--box", "-9", "-9", "-9", "9", "9", "9"], "expected to leave Gaussians"),
         (["--ids", "3", "--move", "1", "0", "0"], "expected --layer that they are of"),
         (["--rotate", "0", "0", "0", "30"], "expected an axis that is not zero"),
-        (["--scale", "0"], "scale: expected a positive finite number"),
+        (["--scale", "0"], "scale: expected more than 0"),
         (["--move", "nan", "0", "0"], "translation: 1 of 3 values are not finite"),
         (["--colour", "2", "0", "0"], "colour: expected values in [0, 1]"),
         (["--undo"], "expected a scene with an edit to undo, got one without"),

@@ -225,7 +225,7 @@ def refusals(labelled, tmp_path):
         ),
         ((*whole, "--instances", "nothing"), "nothing"),
         ((*whole, "--metadata", tmp_path / "no.json"), "no.json"),
-        ((*whole, "--metadata", tmp_path / "bad.json"), "bad.json: expected a list of classes"),
+        ((*whole, "--metadata", tmp_path / "bad.json"), "bad.json: classes: expected a list"),
         ((*whole, "--truth-instances", tmp_path / "part"), "part: expected evidence"),
         ((*layer, "--points", tmp_path / "no.npz"), "no.npz"),
         ((*layer, "--points", tmp_path / "flat.npz"), "flat.npz: expected xyz of n x 3"),

@@ -15,9 +15,8 @@ from splatseg.cli import main
 from splatseg.errors import FileFormatError
 from splatseg.io.evidence import evidence_header, open_evidence
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.lock import scene_lock
 from splatseg.io.scene import load_scene
-from splatseg.io.scene_folder import CHECKPOINT_FILE
+from splatseg.io.scene_folder import CHECKPOINT_FILE, scene_lock
 from splatseg.models import record_evidence
 from splatseg.models.classical import Classical
 
@@ -111,7 +110,8 @@ def test_old_evidence_stays_until_the_new_is_complete(small, splatseg, ending) -
 )
 def test_a_scene_that_another_process_works_on(small, splatseg, monkeypatch, words) -> None:
     program = (
-        "import sys, time; from pathlib import Path; from splatseg.io.lock import scene_lock\n"
+        "import sys, time; from pathlib import Path\n"
+        "from splatseg.io.scene_folder import scene_lock\n"
         "with scene_lock(Path(sys.argv[1]), 'fit'):\n  print(flush=True); time.sleep(60)"
     )
     with subprocess.Popen(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatseg.core.moving import MovingBox
+from splatseg.core.scans import MovingBox
 from splatseg.io.captures import read_capture
 from splatseg.io.moving import write_moving
 from splatseg.io.scene import load_scene

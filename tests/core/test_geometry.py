@@ -76,7 +76,7 @@ def test_similarity_refuses_what_is_none() -> None:
     eye, zero = torch.eye(3), torch.zeros(3)
     with pytest.raises(RangeError, match="expected a rotation"):
         Similarity(rotation=torch.diag(torch.tensor([1.0, 1, -1])), translation=zero)
-    with pytest.raises(RangeError, match="positive finite"):
+    with pytest.raises(RangeError, match="scale: expected more than 0"):
         Similarity(rotation=eye, translation=zero, scale=0.0)
     with pytest.raises(RangeError, match="non-zero"):
         normalised(torch.zeros(1, 4))

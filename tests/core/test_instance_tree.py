@@ -102,12 +102,16 @@ def test_paths_and_depth() -> None:
         TREE.node(9)
 
 
+@pytest.mark.parametrize("wrong", [{"id": 0}, {"id": 1, "support": 1.5}, {"id": 1, "views": -1}])
+def test_nodes_out_of_their_ranges_are_refused(wrong) -> None:
+    with pytest.raises(RangeError, match=f"^{list(wrong)[-1]}: expected"):
+        TreeNode(**wrong)
+
+
 @pytest.mark.parametrize(
     ("nodes", "error", "text"),
     [
-        ((TreeNode(id=0),), RangeError, "1 or more"),
         ((TreeNode(id=1), TreeNode(id=1)), InputError, "twice"),
-        ((TreeNode(id=1, support=1.5),), RangeError, "support"),
         ((TreeNode(id=1, parent=5),), InputError, "parent that is there"),
         ((TreeNode(id=1, level="part"),), InputError, "in nothing"),
         ((TreeNode(id=1), TreeNode(id=2, parent=1)), InputError, "in object"),

@@ -348,7 +348,7 @@ def test_masks_are_refused_after_things_moved(document) -> None:
                 },
             },
             RangeError,
-            "scale: expected a positive finite number, got 0",
+            "scale: expected more than 0, got 0",
         ),
         ({"kind": "recolour", "recolour": {"colour": [1, 2]}}, InputError, "expected 3 numbers"),
         (

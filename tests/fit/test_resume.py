@@ -26,7 +26,7 @@ from splatseg.fit._checkpoint import read_checkpoint, write_checkpoint
 from splatseg.fit._identity import check_identity
 from splatseg.fit._resume import CheckpointClock
 from splatseg.fit._run import FitRun
-from splatseg.io.npz_writing import discard_checkpoint_file
+from splatseg.io.arrays import discard_checkpoint_file
 
 OPTIONS = FitOptions(
     minutes=None,
@@ -411,7 +411,7 @@ def test_the_old_one_stays_until_the_new_one_is_whole(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("splatseg.io.npz_writing.write_array", broken)
+        patch.setattr("splatseg.io.arrays.write_array", broken)
         with pytest.raises(KeyboardInterrupt):
             write_checkpoint(read_checkpoint(path), path)
     assert path.read_bytes() == good
@@ -463,9 +463,9 @@ def test_the_third_signal_does_not_wait(capture: Capture, path: Path, monkeypatc
 
 def test_intervals_are_checked(path: Path) -> None:
     for seconds in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match=r"checkpoints\.seconds: expected a positive number"):
+        with pytest.raises(InputError, match=r"seconds: expected more than 0"):
             Checkpoints(path=path, seconds=seconds)
-    with pytest.raises(InputError, match=r"checkpoints\.steps: expected at least 1, got 0"):
+    with pytest.raises(InputError, match=r"steps: expected at least 1, got 0"):
         Checkpoints(path=path, steps=0)
 
 

@@ -15,7 +15,7 @@ from splatseg import _native
 from splatseg.core import LabelMap, View
 from splatseg.core.checkpoints import Checkpoints
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError
-from splatseg.io.npz_writing import discard_checkpoint_file
+from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.lift.training import (
     Batch,
     LabelTargets,
@@ -478,7 +478,7 @@ def test_a_broken_write_leaves_the_older_checkpoint(sampler, tmp_path, monkeypat
     with pytest.raises(KeyboardInterrupt):
         train(Regression(), sampler, options=options, checkpoints=checkpoints, cancelled=Stop(3))
     before = path.read_bytes()
-    monkeypatch.setattr("splatseg.io.npz_writing.write_array", fails)
+    monkeypatch.setattr("splatseg.io.arrays.write_array", fails)
     told: list[str] = []
     going_on = replace(checkpoints, resume=True, failed=told.append)
     again = train(Regression(), sampler, options=options, checkpoints=going_on)

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError, MissingPackageError
-from splatseg.io.video import write_video
+from splatseg.io.images import write_video
 from splatseg.pose import PoseOptions, _video, is_video, recover_poses
 from splatseg.pose._video import interval_of, sharpness, take_frames
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError, SplatsegError
-from splatseg.io.tensors import read_safetensors
-from splatseg.io.tensors_writing import write_tensors
+from splatseg.io.tensors import read_safetensors, write_tensors
 from splatseg.street.field import VERTEX_RULES, MeshField
 from splatseg.street.files import (
     FORMAT,

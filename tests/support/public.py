@@ -18,7 +18,6 @@ PACKAGES = (
     "io.layers",
     "io.scene",
     "io.images",
-    "io.video",
     "lift",
     "lift.training",
     "lift.point_network",

@@ -11,7 +11,7 @@ from PIL import Image
 
 from splatseg.cli.fit import Command, run
 from splatseg.core import Capture
-from splatseg.core.moving import MovingBox, pixels_of_boxes
+from splatseg.core.scans import MovingBox, pixels_of_boxes
 from splatseg.errors import InputError, MissingFileError
 from splatseg.fit import FitOptions
 from splatseg.io.captures import read_capture

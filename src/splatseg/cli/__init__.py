@@ -282,7 +282,7 @@ def _unknown(name: str) -> str:
 
 def _report_system(error: OSError, *, debug: bool) -> int:
     """An error of the system: one of writing says what to do."""
-    from splatseg.io.write_errors import failure_to_write, is_write_failure
+    from splatseg.io.atomic import failure_to_write, is_write_failure
 
     sentence = f"{type(error).__name__}: {error} (add --debug for the traceback)"
     if error.errno == errno.ENAMETOOLONG:

@@ -13,7 +13,7 @@ from splatseg.cli._work import ConsoleObserver, open_scene, print_result, typed
 from splatseg.core import Renderable, Scene
 from splatseg.errors import InputError
 from splatseg.io.scans import Scans
-from splatseg.io.scene_fields import scene_field_path
+from splatseg.io.scene import scene_field_path
 from splatseg.io.scene_folder import is_scene
 from splatseg.report.point_map import LabelledPoints
 from splatseg.report.words import counted

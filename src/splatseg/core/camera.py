@@ -2,37 +2,19 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape
-from splatseg.core._distortion import (
-    FISHEYE_PARAMETERS,
-    OPENCV_PARAMETERS,
-    THIN_PRISM_FISHEYE_PARAMETERS,
-    distort_fisheye,
-    distort_opencv,
-    distort_thin_prism_fisheye,
-    undistort_fisheye,
-    undistort_opencv,
-    undistort_thin_prism_fisheye,
-)
-from splatseg.core._mei import MEI_PARAMETERS, distort_mei, undistort_mei
+from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import boundary, convert_fields
+from splatseg.core.lenses import LENSES
+from splatseg.core.lenses import CameraModel as CameraModel
+from splatseg.core.options import Count, Positive
 from splatseg.core.rigid import Similarity, check_rotation
 from splatseg.errors import InputError, RangeError
 
-CameraModel = Literal["pinhole", "opencv", "fisheye", "mei", "thin_prism_fisheye"]
-_PARAMETERS = {
-    "pinhole": 0,
-    "opencv": OPENCV_PARAMETERS,
-    "fisheye": FISHEYE_PARAMETERS,
-    "mei": MEI_PARAMETERS,
-    "thin_prism_fisheye": THIN_PRISM_FISHEYE_PARAMETERS,
-}
 _MAX_UNDISTORTED_GROWTH = 8.0
 
 
@@ -43,16 +25,16 @@ class Camera:
     The centre of the top-left pixel is (0.5, 0.5), so that ``cx = width / 2`` is the image centre.
     """
 
-    width: int
+    width: Count
     """Pixels a row."""
 
-    height: int
+    height: Count
     """Rows."""
 
-    fx: float
+    fx: Positive
     """Focal length in pixels, horizontally."""
 
-    fy: float
+    fy: Positive
     """Focal length in pixels, vertically."""
 
     cx: float
@@ -65,7 +47,7 @@ class Camera:
     """Rigid transform into camera axes, float64. It may require a gradient."""
 
     model: CameraModel = "pinhole"
-    """Lens model, see `core._distortion` and `core._mei`."""
+    """Lens model, see `core.lenses`."""
 
     distortion: tuple[float, ...] = ()
     """opencv: k1 k2 p1 p2 k3 k4 k5 k6; fisheye: k1 k2 k3 k4; mei: xi k1 k2 p1 p2;
@@ -73,26 +55,19 @@ class Camera:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        if self.width < 1 or self.height < 1:
-            raise RangeError(
-                f"width, height: expected at least 1, got {self.width} and {self.height}."
-            )
         for name in ("fx", "fy", "cx", "cy"):
-            value = float(getattr(self, name))
-            if not math.isfinite(value) or (name[0] == "f" and value <= 0):
-                expected = "a positive number" if name[0] == "f" else "a finite number"
-                raise RangeError(f"{name}: expected {expected}, got {value}.")
-            object.__setattr__(self, name, value)
-        check_choice("model", self.model, _PARAMETERS)
-        count = _PARAMETERS[self.model]
+            object.__setattr__(self, name, float(getattr(self, name)))
+        lens = {"cx": (self.cx,), "cy": (self.cy,), "distortion": self.distortion}
+        for name, numbers in lens.items():
+            if not all(math.isfinite(number) for number in numbers):
+                raise RangeError(f"{name}: expected finite numbers, got {numbers}.")
+        count = LENSES[self.model].parameters
         if len(self.distortion) > count:
             raise InputError(
                 f"distortion: {self.model} takes at most {count} values, "
                 f"got {len(self.distortion)}."
             )
         padded = tuple(float(v) for v in self.distortion) + (0.0,) * count
-        if not all(math.isfinite(v) for v in padded):
-            raise RangeError(f"distortion: expected finite values, got {self.distortion}.")
         object.__setattr__(self, "distortion", padded[:count])
         pose = self.cam_from_world
         check_shape("cam_from_world", pose, (4, 4))
@@ -280,23 +255,10 @@ class Camera:
         plane = (pixels - self._offset(pixels)) / self._focal(pixels)
         if self.is_pinhole:
             return plane
-        if self.model == "fisheye":
-            return undistort_fisheye(plane, self.distortion)
-        if self.model == "thin_prism_fisheye":
-            return undistort_thin_prism_fisheye(plane, self.distortion)
-        if self.model == "mei":
-            return undistort_mei(plane, self.distortion)
-        return undistort_opencv(plane, self.distortion)
+        return LENSES[self.model].undistort(plane, self.distortion)
 
     def _pixels_from_plane(self, plane: Tensor, *, distorted: bool = False) -> Tensor:
         """Pixels of plane points; `distorted` says that the points need no distortion."""
         if not distorted and not self.is_pinhole:
-            if self.model == "fisheye":
-                plane = distort_fisheye(plane, self.distortion)
-            elif self.model == "thin_prism_fisheye":
-                plane = distort_thin_prism_fisheye(plane, self.distortion)
-            elif self.model == "mei":
-                plane = distort_mei(plane, self.distortion)
-            else:
-                plane = distort_opencv(plane, self.distortion)
+            plane = LENSES[self.model].distort(plane, self.distortion)
         return plane * self._focal(plane) + self._offset(plane)

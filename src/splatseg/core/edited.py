@@ -9,12 +9,13 @@ from torch import Tensor
 
 from splatseg._check import check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.evidence import UNLABELLED
 from splatseg.core.gaussians import Gaussians
 from splatseg.core.instance_tree import InstanceTree, Layer
 from splatseg.core.layers import Features, Labels, Selection
-from splatseg.core.voxel_features import VoxelFeatures
 from splatseg.errors import InputError, RangeError, ShapeError
+
+_AMOUNTS = ("evidence", "weights")
+"""Columns that parts of a Gaussian share."""
 
 NEW = -1
 """Row of what comes from elsewhere, such as the Gaussians of another scene."""
@@ -128,48 +129,13 @@ def apply_rows(layer: Layer, edited: Edited) -> Layer:
     if isinstance(layer, InstanceTree):
         return replace(layer, labels=apply_rows(layer.labels, edited))
     new = edited.rows == NEW
-    fractions = edited.fractions
     if not len(layer) and len(edited):
         raise InputError("layer: expected rows to follow, got an empty layer; leave it out.")
     taken = layer[edited.rows.clamp_min(0)]
-    match taken:
-        case Labels():
-            return replace(
-                taken,
-                ids=_filled(taken.ids, new, UNLABELLED),
-                confidence=_filled(taken.confidence, new, 0),
-                candidates=_filled_or_none(taken.candidates, new, UNLABELLED),
-                shares=_filled_or_none(taken.shares, new, 0),
-                evidence=_shared(_filled_or_none(taken.evidence, new, 0), fractions),
-                effective_views=_filled_or_none(taken.effective_views, new, 0),
-                inferred=_filled_or_none(taken.inferred, new, 0),
-            )
-        case Features():
-            return replace(
-                taken,
-                values=_filled(taken.values, new, 0),
-                weights=_shared(_filled_or_none(taken.weights, new, 0), fractions),
-            )
-        case VoxelFeatures():
-            return replace(
-                taken,
-                rows=_filled(taken.rows, new, UNLABELLED),
-                shares=_filled_or_none(taken.shares, new, 0),
-            )
-        case Selection():
-            return replace(
-                taken, mask=taken.mask & ~new, confidence=_filled_or_none(taken.confidence, new, 0)
-            )
-
-
-def _filled(column: Tensor, where: Tensor, value: float) -> Tensor:
-    mask = where.reshape(-1, *([1] * (column.ndim - 1)))
-    return column.masked_fill(mask, value)
-
-
-def _filled_or_none(column: Tensor | None, where: Tensor, value: float) -> Tensor | None:
-    return None if column is None else _filled(column, where, value)
-
-
-def _shared(column: Tensor | None, fractions: Tensor | None) -> Tensor | None:
-    return column if column is None or fractions is None else column * fractions.to(column)
+    changed: dict[str, Tensor] = {}
+    for name, column in taken.columns().items():
+        mask = new.reshape(-1, *([1] * (column.ndim - 1)))
+        changed[name] = column.masked_fill(mask, taken.COLUMNS[name])
+        if name in _AMOUNTS and edited.fractions is not None:
+            changed[name] = changed[name] * edited.fractions.to(column)
+    return replace(taken, **changed)

@@ -1,19 +1,138 @@
-"""What 2D models see in one view: masks, label maps, feature maps, depth maps."""
+"""What 2D models see in one view (masks, label, feature and depth maps), and where it is from."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape, check_values
+from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.late import preview
-from splatseg.core.rle import Rle
-from splatseg.errors import RangeError, ShapeError
+from splatseg.core.options import Count
+from splatseg.core.upward import Previewed
+from splatseg.errors import InputError, RangeError, ShapeError
+
+_MAX_BITS = 35
+"""Of a number in compressed counts: 7 characters, which hold any run and any difference of two."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rle:
+    """One binary mask as run lengths in column-major order, the first run being zeros."""
+
+    height: int
+    width: int
+    counts: NDArray[np.uint32]
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        total = int(self.counts.sum(dtype=np.uint64))
+        if total != self.height * self.width:
+            raise RangeError(
+                f"counts: expected runs that add up to {self.height} x {self.width} = "
+                f"{self.height * self.width} pixels, got {total}."
+            )
+
+    @property
+    def area(self) -> int:
+        """Number of pixels set."""
+        return int(self.counts[1::2].sum(dtype=np.uint64))
+
+    @property
+    def bbox(self) -> tuple[int, int, int, int]:
+        """x, y, width, height of the tight box; zeros where the mask is empty."""
+        ends = np.cumsum(self.counts, dtype=np.int64)
+        begins, ends = ends[0::2][: len(self.counts[1::2])], ends[1::2]
+        keep = ends > begins
+        begins, last = begins[keep], ends[keep] - 1
+        if not len(begins):
+            return (0, 0, 0, 0)
+        x0, x1 = int(begins[0] // self.height), int(last[-1] // self.height)
+        # A run that crosses into the next column touches both the bottom and the top row.
+        crosses = bool((begins // self.height != last // self.height).any())
+        y0 = 0 if crosses else int((begins % self.height).min())
+        y1 = self.height - 1 if crosses else int((last % self.height).max())
+        return (x0, y0, x1 - x0 + 1, y1 - y0 + 1)
+
+    @classmethod
+    @boundary
+    def encode(cls, mask: Bool[Tensor, "height width"]) -> "Rle":
+        """Run lengths of a boolean mask."""
+        check_shape("mask", mask, (None, None))
+        height, width = (int(s) for s in mask.shape)
+        flat = mask.to(torch.bool).cpu().numpy().T.reshape(-1)
+        changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+        edges = np.concatenate(([0], changes, [flat.size]))
+        counts = np.diff(edges).astype(np.uint32)
+        if flat.size and flat[0]:
+            counts = np.concatenate((np.zeros(1, np.uint32), counts))
+        return cls(height=height, width=width, counts=counts)
+
+    def decode(self) -> Bool[Tensor, "height width"]:
+        """The mask as booleans."""
+        values = np.arange(len(self.counts)) % 2 == 1
+        flat = np.repeat(values, self.counts)
+        return torch.from_numpy(np.ascontiguousarray(flat.reshape(self.width, self.height).T))
+
+    @classmethod
+    @boundary
+    def from_coco(cls, text: str | bytes, *, height: int, width: int) -> "Rle":
+        """Read COCO's compressed counts: 5 bits a character, least significant first.
+
+        From the third run on, a number is stored as the difference to the run before last.
+
+        Raises:
+            InputError: If a character is outside the alphabet or a number does not end.
+        """
+        # Bytes of what is not ASCII are above 127, which is refused below.
+        data = text.encode() if isinstance(text, str) else text
+        codes = np.frombuffer(data, np.uint8).astype(np.int64) - 48
+        if codes.size and (codes.min() < 0 or codes.max() > 63):
+            raise InputError("counts: expected a compressed COCO mask, got other characters.")
+        if codes.size and codes[-1] & 32:
+            raise InputError("counts: the compressed mask breaks off inside a number.")
+        counts: list[int] = []
+        value = shift = 0
+        for code in codes.tolist():
+            value |= (code & 31) << shift
+            shift += 5
+            if code & 32:
+                if shift >= _MAX_BITS:
+                    raise InputError("counts: expected runs of 32 bits, got a longer number.")
+                continue
+            if code & 16:
+                value -= 1 << shift
+            counts.append(value + (counts[-2] if len(counts) > 2 else 0))
+            value = shift = 0
+        if any(count < 0 for count in counts):
+            raise InputError("counts: the compressed mask holds a negative run.")
+        total = sum(counts)
+        if total != height * width:  # before they are forced into 32 bits
+            raise InputError(
+                f"counts: expected runs that add up to {height} x {width} = {height * width} "
+                f"pixels, got {total}."
+            )
+        return cls(height=height, width=width, counts=np.array(counts, np.uint32))
+
+    def to_coco(self) -> str:
+        """COCO's compressed counts. Inverse of `from_coco`."""
+        out: list[str] = []
+        runs = self.counts.tolist()
+        for i, run in enumerate(runs):
+            value = run - runs[i - 2] if i > 2 else run
+            more = True
+            while more:
+                code = value & 31
+                value >>= 5
+                more = value != (-1 if code & 16 else 0)
+                out.append(chr((code | 32 if more else code) + 48))
+        return "".join(out)
+
 
 UNLABELLED = -1
 """The id of a pixel or Gaussian without a label. Files write it as 0."""
@@ -23,7 +142,7 @@ DepthKind = Literal["metric", "relative"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MaskSet:
+class MaskSet(Previewed):
     """Masks of one view. They may overlap and need not cover the image."""
 
     height: int
@@ -57,9 +176,6 @@ class MaskSet:
         of = f", {levels} levels" if levels > 1 else ""
         return f"MaskSet({len(self)} masks of {self.width}x{self.height} pixels{of})"
 
-    def _repr_html_(self) -> str:
-        return preview(self)
-
     @boundary
     def dense(self, index: int) -> Bool[Tensor, "height width"]:
         """One mask as booleans."""
@@ -91,7 +207,7 @@ class MaskSet:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LabelMap:
+class LabelMap(Previewed):
     """One id a pixel."""
 
     ids: Int[Tensor, "height width"]
@@ -114,9 +230,6 @@ class LabelMap:
         count = int((present != UNLABELLED).sum())
         return f"LabelMap({self.width}x{self.height} pixels, {count} ids)"
 
-    def _repr_html_(self) -> str:
-        return preview(self)
-
     @property
     def height(self) -> int:
         """Rows."""
@@ -137,7 +250,7 @@ class FeatureMap:
 
     features: Float[Tensor, "rows columns channels"]
 
-    stride: int
+    stride: Count
     """Pixels a cell, along both axes."""
 
     height: int
@@ -149,8 +262,6 @@ class FeatureMap:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("features", self.features, (None, None, None))
-        if self.stride < 1:
-            raise RangeError(f"stride: expected at least 1, got {self.stride}.")
 
     def __repr__(self) -> str:
         rows, columns, channels = self.features.shape
@@ -178,7 +289,6 @@ class DepthMap:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("kind", self.kind, ("metric", "relative"))
         check_shape("values", self.values, (None, None))
         check_values("values", self.values, 0.0, math.inf)
         if self.confidence is not None:
@@ -264,3 +374,69 @@ def map_ids(
     present, index = torch.unique(ids, return_inverse=True)
     found = [values.get(id, id if default is None else default) for id in present.tolist()]
     return torch.tensor(found, dtype=dtype)[index]
+
+
+@runtime_checkable
+class ViewNames(Protocol):
+    """Something recorded of views."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views of which there is something."""
+        ...
+
+
+@runtime_checkable
+class LabelSource(Protocol):
+    """Label maps by view name, read when asked for: recorded evidence, or a dictionary's."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have a label map."""
+        ...
+
+    def label_map(self, name: str) -> LabelMap:
+        """The label map of one view."""
+        ...
+
+
+@runtime_checkable
+class SegmentSource(Protocol):
+    """Segments of views, each view with ids of its own."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have segments."""
+        ...
+
+    @property
+    def overlapping(self) -> bool:
+        """Whether segments of one view may overlap."""
+        ...
+
+    @property
+    def persistent(self) -> bool:
+        """Whether ids are meant to go through all views, as those of a tracker."""
+        ...
+
+    def segments_of(self, name: str) -> LabelMap | MaskSet:
+        """The segments of one view: a label map, or masks that may overlap."""
+        ...
+
+    def categories_of(self, name: str) -> Mapping[int, int]:
+        """Category by segment, where it is known."""
+        ...
+
+
+@runtime_checkable
+class FeatureSource(Protocol):
+    """Feature maps by view name, read when asked for."""
+
+    @property
+    def view_names(self) -> Sequence[str]:
+        """Views that have a feature map."""
+        ...
+
+    def features(self, name: str) -> FeatureMap:
+        """The feature map of one view."""
+        ...

@@ -1,29 +1,79 @@
-"""The Gaussians of a scene: aligned arrays, one row a Gaussian."""
+"""The Gaussians of a scene: aligned arrays, one row a Gaussian; and scales and opacities of files.
+
+Files have logs and logits. Torch computes a sigmoid in vector registers where it can and one by
+one at the end of a thread's share; the two round differently, so that one file read by two threads
+and by three gave other opacities in the last bit. `exponential` and `sigmoid` compute in float64
+and round once: the result depends on the value alone.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from dataclasses import replace as _replace
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
-from splatseg.core.late import preview
 from splatseg.core.rigid import Similarity, quaternion_from_rotation, quaternion_multiply
 from splatseg.core.sh import SH_C0, degree_of, rotate_sh
+from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, RangeError, ShapeError
+
+_BLOCK = 1 << 15
+"""Values converted at once: the float64 copies stay in the processor's cache."""
+
+
+def exponential(values: Float[np.ndarray, "*shape"]) -> NDArray[np.float32]:
+    """``exp(values)`` as float32: scales from their logs.
+
+    Minus infinity gives 0, NaN stays, and what float32 cannot hold becomes infinite.
+
+    Example:
+        >>> exponential(np.array([0.0, -np.inf], np.float32)).tolist()
+        [1.0, 0.0]
+    """
+    flat = np.ascontiguousarray(values).reshape(-1)
+    found = np.empty(flat.shape, np.float32)
+    with np.errstate(over="ignore", under="ignore"):
+        for start in range(0, len(flat), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            found[part] = np.exp(flat[part].astype(np.float64))
+    return found.reshape(values.shape)
+
+
+def sigmoid(values: Float[np.ndarray, "*shape"]) -> NDArray[np.float32]:
+    """``1 / (1 + exp(-values))`` as float32: opacities from their logits.
+
+    Minus infinity gives 0, plus infinity 1, and NaN stays.
+
+    Example:
+        >>> sigmoid(np.array([0.0, np.inf], np.float32)).tolist()
+        [0.5, 1.0]
+    """
+    flat = np.ascontiguousarray(values).reshape(-1)
+    found = np.empty(flat.shape, np.float32)
+    with np.errstate(over="ignore", under="ignore"):
+        for start in range(0, len(flat), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            found[part] = 1 / (1 + np.exp(-flat[part].astype(np.float64)))
+    return found.reshape(values.shape)
+
+
+_ARRAYS = ("means", "rotations", "scales", "opacities", "sh")
 
 LOW_PASS = 0.3
 """Variance of 3DGS's low-pass, square pixels."""
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
-class Gaussians:
+class Gaussians(Previewed):
     """3D Gaussians with colour, and any further columns, sliced and saved together.
 
     The covariance of Gaussian i is R diag(s)^2 R^T with R the rotation of its quaternion and s
@@ -92,22 +142,12 @@ class Gaussians:
         where = "" if self.device.type == "cpu" else f", device={str(self.device)!r}"
         return f"Gaussians({len(self):,}, sh_degree={self.sh_degree}{extra}{where})"
 
-    def _repr_html_(self) -> str:
-        return preview(self)
-
     def __getitem__(self, index: slice | Tensor) -> "Gaussians":
         """Rows by slice, boolean mask (n,) or integer ids, extra columns included."""
         index = as_rows("index", index, len(self))
-        return Gaussians(
-            means=self.means[index],
-            rotations=self.rotations[index],
-            scales=self.scales[index],
-            opacities=self.opacities[index],
-            sh=self.sh[index],
-            extra={name: column[index] for name, column in self.extra.items()},
-            antialiased=self.antialiased,
-            low_pass=self.low_pass,
-        )
+        arrays = {name: getattr(self, name)[index] for name in _ARRAYS}
+        extra = {name: column[index] for name, column in self.extra.items()}
+        return self.replace(**arrays, extra=extra)
 
     @property
     def sh_degree(self) -> int:
@@ -154,13 +194,9 @@ class Gaussians:
         elif target is not None:
             device = target
         device = _device(device)
-        core = {
-            f.name: getattr(self, f.name).to(device=device, dtype=dtype)
-            for f in fields(self)
-            if f.name not in ("extra", "antialiased", "low_pass")
-        }
+        arrays = {n: getattr(self, n).to(device=device, dtype=dtype) for n in _ARRAYS}
         extra = {name: column.to(device=device) for name, column in self.extra.items()}
-        return Gaussians(**core, extra=extra, antialiased=self.antialiased, low_pass=self.low_pass)
+        return self.replace(**arrays, extra=extra)
 
     def check_values(self) -> None:
         """Raise `RangeError` unless every row can be rendered.
@@ -207,9 +243,9 @@ class Gaussians:
         """
         if not parts:
             raise InputError("parts: expected at least one set of Gaussians, got none.")
-        names = set(parts[0].extra)
+        names = list(parts[0].extra)
         for i, part in enumerate(parts):
-            if set(part.extra) != names:
+            if set(part.extra) != set(names):
                 raise InputError(
                     f"parts[{i}]: expected the extra columns {sorted(names)}, "
                     f"got {sorted(part.extra)}."
@@ -225,16 +261,9 @@ class Gaussians:
                     raise InputError(
                         f"parts[{i}]: expected {name} to be {expected} as in the first, got {got}."
                     )
-        return Gaussians(
-            means=torch.cat([p.means for p in parts]),
-            rotations=torch.cat([p.rotations for p in parts]),
-            scales=torch.cat([p.scales for p in parts]),
-            opacities=torch.cat([p.opacities for p in parts]),
-            sh=torch.cat([p.sh for p in parts]),
-            extra={name: torch.cat([p.extra[name] for p in parts]) for name in parts[0].extra},
-            antialiased=parts[0].antialiased,
-            low_pass=parts[0].low_pass,
-        )
+        arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        extra = {name: torch.cat([part.extra[name] for part in parts]) for name in names}
+        return parts[0].replace(**arrays, extra=extra)
 
 
 def _device(device: torch.device | str | None) -> torch.device | None:

@@ -3,21 +3,19 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Annotated, Any, overload
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import UNLABELLED
-from splatseg.core.late import preview
-from splatseg.core.layer_info import InstanceFacts, LayerInfo
-from splatseg.core.layers import Features, Labels, Selection
-from splatseg.core.soft_labels import merged_candidates
-from splatseg.core.tree_levels import TREE_LEVELS as TREE_LEVELS
-from splatseg.core.tree_levels import TreeLevel as TreeLevel
-from splatseg.core.tree_levels import tree_level as tree_level
-from splatseg.core.voxel_features import VoxelFeatures
+from splatseg.core.layer_info import TREE_LEVELS, InstanceFacts, LayerInfo, TreeLevel, tree_level
+from splatseg.core.layers import Features, Labels, Selection, merged_candidates
+from splatseg.core.options import Natural, Share
+from splatseg.core.upward import Previewed
+from splatseg.core.voxels import VoxelFeatures
 from splatseg.errors import InputError, RangeError
 
 _FOLLOWS: dict[TreeLevel, tuple[TreeLevel | None, ...]] = {
@@ -28,16 +26,17 @@ _FOLLOWS: dict[TreeLevel, tuple[TreeLevel | None, ...]] = {
 """Levels that the parent of a node may have; None is no parent."""
 
 _OBJECT_GRANULARITY = 0.5
+_MAX_ID = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TreeNode:
     """One group, object or part."""
 
-    id: int
+    id: Annotated[int, Meta(ge=1, le=_MAX_ID)]
     """1 or more; no two nodes of a tree share one."""
 
-    parent: int = UNLABELLED
+    parent: Annotated[int, Meta(ge=UNLABELLED, le=_MAX_ID)] = UNLABELLED
     """Id of the node that it lies in, -1 for none."""
 
     level: TreeLevel = "object"
@@ -46,17 +45,17 @@ class TreeNode:
     name: str = ""
     """What it is called; empty where it has no name."""
 
-    class_id: int = 0
+    class_id: Annotated[int, Meta(ge=UNLABELLED, le=_MAX_ID)] = 0
     """Its class, 0 where it is not known."""
 
-    support: float = 1.0
+    support: Share = 1.0
     """How much speaks for it, in [0, 1]: the share of the views that could have seen it which
     did."""
 
-    segments: int = 0
+    segments: Natural = 0
     """Masks that it was made of."""
 
-    views: int = 0
+    views: Natural = 0
     """Views that these come from."""
 
     def __post_init__(self) -> None:
@@ -64,7 +63,7 @@ class TreeNode:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class InstanceTree:
+class InstanceTree(Previewed):
     """Nodes inside each other, and of every Gaussian the deepest node that it belongs to.
 
     A Gaussian of a node is one of all the nodes above it, so that children always lie inside
@@ -109,9 +108,6 @@ class InstanceTree:
         counts = {level: sum(n.level == level for n in self.nodes) for level in TREE_LEVELS}
         words = ", ".join(f"{n} {level}{'s'[: n != 1]}" for level, n in counts.items())
         return f"InstanceTree({len(self):,} rows; {words})"
-
-    def _repr_html_(self) -> str:
-        return preview(self)
 
     def __getitem__(self, index: slice | Tensor) -> "InstanceTree":
         """Rows, in step with `Gaussians.__getitem__`; all nodes stay."""
@@ -358,12 +354,6 @@ def node_row(node: TreeNode) -> dict[str, Any]:
 
 
 def _check_node(node: TreeNode, by_id: Mapping[int, TreeNode]) -> None:
-    if node.id < 1:
-        raise RangeError(f"nodes: expected ids of 1 or more, got {node.id}.")
-    if not 0 <= node.support <= 1:
-        raise RangeError(f"node {node.id}: expected a support in [0, 1], got {node.support}.")
-    if node.level not in TREE_LEVELS:
-        raise InputError(f"node {node.id}: expected a level, got {node.level!r}.")
     parent = by_id.get(node.parent)
     if parent is None and node.parent != UNLABELLED:
         raise InputError(f"node {node.id}: expected a parent that is there, got {node.parent}.")

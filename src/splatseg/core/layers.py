@@ -1,6 +1,8 @@
 """What is known of each Gaussian: labels, features, selections. One row a Gaussian."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,19 +12,51 @@ from splatseg._check import check_finite, check_shape, check_values
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.coerce import as_rows
 from splatseg.core.evidence import UNLABELLED
-from splatseg.core.late import preview
-from splatseg.core.layer_info import LayerInfo, check_layer_info
+from splatseg.core.layer_info import LayerInfo
+from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, RangeError, ShapeError
+
+_OF_EVIDENCE = ("evidence", "effective_views", "inferred")
+"""Columns of labels that say what ids rest on."""
+
+
+class RowColumns:
+    """A layer whose columns have one row a Gaussian; they are taken and filled together."""
+
+    __slots__ = ()
+    COLUMNS: ClassVar[Mapping[str, float]]
+    """Its columns, and what they have of a Gaussian of which nothing is known."""
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    def columns(self) -> dict[str, Tensor]:
+        """Those of its columns that it has."""
+        columns = {name: getattr(self, name) for name in self.COLUMNS}
+        return {name: column for name, column in columns.items() if column is not None}
+
+    def __getitem__(self, index: slice | Tensor) -> Self:
+        """Rows, in step with `Gaussians.__getitem__`."""
+        index = as_rows("index", index, len(self))
+        taken = {name: column[index] for name, column in self.columns().items()}
+        return replace(cast("Any", self), **taken)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Labels:
+class Labels(RowColumns, Previewed):
     """One id a Gaussian, with its confidence.
 
     Raises:
         ShapeError: If rows differ in number.
         RangeError: If an id is below -1, or a value is NaN or infinite.
     """
+
+    COLUMNS: ClassVar[Mapping[str, float]] = {
+        "ids": UNLABELLED,
+        "confidence": 0,
+        "candidates": UNLABELLED,
+        "shares": 0,
+    } | (dict.fromkeys(_OF_EVIDENCE, 0))
 
     ids: Int[Tensor, "n"]
     """int32 ids, -1 where there is none."""
@@ -58,7 +92,6 @@ class Labels:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("ids", self.ids, (None,))
-        check_layer_info("info", self.info)
         n = len(self.ids)
         check_shape("confidence", self.confidence, (n,))
         if n and int(self.ids.min()) < UNLABELLED:
@@ -69,18 +102,12 @@ class Labels:
         if self.candidates is not None and self.shares is not None:
             check_shape("candidates", self.candidates, (n, None))
             check_shape("shares", self.shares, tuple(self.candidates.shape))
-        if self.evidence is not None:
-            check_shape("evidence", self.evidence, (n,))
-        if self.effective_views is not None:
-            check_shape("effective_views", self.effective_views, (n,))
-        if self.inferred is not None:
-            check_shape("inferred", self.inferred, (n,))
-            if self.inferred.dtype != torch.bool:
-                raise InputError(f"inferred: expected booleans, got {self.inferred.dtype}.")
+        for name in _OF_EVIDENCE:
+            if getattr(self, name) is not None:
+                check_shape(name, getattr(self, name), (n,))
         for name in ("confidence", "shares", "evidence", "effective_views"):
-            values = getattr(self, name)
-            if values is not None:
-                check_finite(name, values)
+            if getattr(self, name) is not None:
+                check_finite(name, getattr(self, name))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -89,24 +116,6 @@ class Labels:
         none = int((self.ids == UNLABELLED).sum())
         made = "" if self.info.method is None else f", method={self.info.method!r}"
         return f"Labels({len(self):,} rows, {len(self.present)} ids, {none:,} unlabelled{made})"
-
-    def _repr_html_(self) -> str:
-        return preview(self)
-
-    def __getitem__(self, index: slice | Tensor) -> "Labels":
-        """Rows, in step with `Gaussians.__getitem__`."""
-        index = as_rows("index", index, len(self))
-        return Labels(
-            ids=self.ids[index],
-            confidence=self.confidence[index],
-            background=self.background,
-            candidates=None if self.candidates is None else self.candidates[index],
-            shares=None if self.shares is None else self.shares[index],
-            evidence=None if self.evidence is None else self.evidence[index],
-            effective_views=None if self.effective_views is None else self.effective_views[index],
-            inferred=None if self.inferred is None else self.inferred[index],
-            info=self.info,
-        )
 
     @property
     def present(self) -> Int[Tensor, "m"]:
@@ -118,13 +127,15 @@ class Labels:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Features:
+class Features(RowColumns):
     """One feature vector a Gaussian.
 
     Raises:
         ShapeError: If rows differ in number.
         RangeError: If a value is NaN or infinite.
     """
+
+    COLUMNS: ClassVar[Mapping[str, float]] = {"values": 0, "weights": 0}
 
     values: Float[Tensor, "n channels"]
 
@@ -137,7 +148,6 @@ class Features:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("values", self.values, (None, None))
-        check_layer_info("info", self.info)
         if self.weights is not None:
             check_shape("weights", self.weights, (len(self.values),))
             check_finite("weights", self.weights)
@@ -149,18 +159,9 @@ class Features:
     def __repr__(self) -> str:
         return f"Features({len(self):,} rows, {self.values.shape[1]} channels)"
 
-    def __getitem__(self, index: slice | Tensor) -> "Features":
-        """Rows, in step with `Gaussians.__getitem__`."""
-        index = as_rows("index", index, len(self))
-        return Features(
-            values=self.values[index],
-            weights=None if self.weights is None else self.weights[index],
-            info=self.info,
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Selection:
+class Selection(RowColumns):
     """A set of Gaussians. Immutable; ``& | ^ - ~`` give new ones.
 
     With confidences c and d these are, as in fuzzy sets,
@@ -183,6 +184,8 @@ class Selection:
         tensor([0.2500, 0.7500, 0.0000])
     """
 
+    COLUMNS: ClassVar[Mapping[str, float]] = {"mask": 0, "confidence": 0}
+
     mask: Bool[Tensor, "n"]
     """True where a Gaussian is selected."""
 
@@ -196,9 +199,6 @@ class Selection:
     def __post_init__(self) -> None:
         convert_fields(self)
         check_shape("mask", self.mask, (None,))
-        check_layer_info("info", self.info)
-        if self.mask.dtype != torch.bool:
-            raise InputError(f"mask: expected booleans, got {self.mask.dtype}.")
         if self.confidence is not None:
             check_shape("confidence", self.confidence, (len(self.mask),))
             check_values("confidence", self.confidence, 0, 1)
@@ -229,12 +229,6 @@ class Selection:
         mean = self.mean_confidence
         sure = "" if mean is None else f", confidence {mean:.2f}"
         return f"Selection({self.count:,} of {len(self):,}{sure})"
-
-    def __getitem__(self, index: slice | Tensor) -> "Selection":
-        """Rows, in step with `Gaussians.__getitem__`."""
-        index = as_rows("index", index, len(self))
-        confidence = None if self.confidence is None else self.confidence[index]
-        return Selection(mask=self.mask[index], confidence=confidence, info=self.info)
 
     @property
     def count(self) -> int:
@@ -292,3 +286,16 @@ class Selection:
                 f"selection: expected one over {len(self)} Gaussians, got one over {len(other)}."
             )
         return other.mask
+
+
+def merged_candidates(candidates: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+    """Candidates of which several may be the same id, with their shares added up."""
+    columns = list(candidates.unbind(dim=1))
+    sums = [column.float().clone() for column in shares.unbind(dim=1)]
+    for later in range(1, len(columns)):
+        for first in range(later):
+            same = (columns[later] == columns[first]) & (columns[later] != UNLABELLED)
+            sums[first] += torch.where(same, sums[later], 0.0)
+            columns[later] = torch.where(same, UNLABELLED, columns[later])
+    found, added = torch.stack(columns, dim=1), torch.stack(sums, dim=1)
+    return found, torch.where(found == UNLABELLED, 0.0, added)

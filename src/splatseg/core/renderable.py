@@ -13,15 +13,13 @@ from typing import Literal, Protocol, Self, runtime_checkable
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseg._check import check_choice, check_finite, check_shape
+from splatseg._check import check_finite, check_shape
 from splatseg.core.boundary import convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.evidence import UNLABELLED, LabelMap
 from splatseg.core.layer_info import LayerInfo
 from splatseg.core.layers import Labels, Selection
 from splatseg.errors import InputError
-
-_KINDS = ("labels", "selection", "features")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +86,6 @@ class RenderableLayer:
 
     def __post_init__(self) -> None:
         convert_fields(self)
-        check_choice("kind", self.kind, _KINDS)
         if list(self.ids) != sorted({id for id in self.ids if id != UNLABELLED}):
             raise InputError(f"ids: expected distinct ids, ascending, without -1, got {self.ids}.")
 

@@ -5,9 +5,11 @@ Quaternions are (w, x, y, z) with the Hamilton product; transforms are named
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
@@ -128,15 +130,13 @@ class Similarity:
 
     rotation: Float[Tensor, "3 3"]
     translation: Float[Tensor, "3"]
-    scale: float = 1.0
+    scale: Annotated[float, Meta(gt=0)] = 1.0
 
     def __post_init__(self) -> None:
         convert_fields(self)
         check_rotation("rotation", self.rotation)
         check_shape("translation", self.translation, (3,))
         check_finite("translation", self.translation)
-        if not 0 < self.scale < float("inf"):
-            raise RangeError(f"scale: expected a positive finite number, got {self.scale}.")
 
     @classmethod
     def identity(cls) -> "Similarity":

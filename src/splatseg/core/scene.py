@@ -1,8 +1,14 @@
-"""Views, captures and scenes: what was photographed, and what was made of it."""
+"""Views, captures and scenes: what was photographed, and what was made of it.
+
+Views are named by files that others made, and name files that are written: label maps, masks,
+renders. A name that climbs, or that one file system takes for another name, must not get there.
+"""
 
 import difflib
+import re
+import unicodedata
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,17 +17,164 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg.core import upward
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.camera import Camera
 from splatseg.core.gaussians import Gaussians
-from splatseg.core.late import late, preview
-from splatseg.core.scene_layers import SceneLayers
-from splatseg.core.view_names import check_view_name
+from splatseg.core.instance_tree import Layer
+from splatseg.core.upward import Previewed
 from splatseg.errors import InputError, ShapeError
+
+MAX_PART = 200
+"""Most bytes of a name between two slashes, as UTF-8. File systems allow 255, suffixes included."""
+
+MAX_NAME = 800
+"""Most bytes of a whole name."""
+
+_TABLES = ("evidence", "segments", "tracks", "legend", "quant", "basis", "text_embeddings")
+"""Files that lie beside those of views; a view of this name would be taken for one."""
+
+_REFUSED = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode categories: control characters, lone surrogates (bytes that are no UTF-8), line ends."""
+
+
+_DIGITS = 18
+_NUMBER = re.compile(r"(\d+)\D*$")
+
+
+def frame_number(name: str) -> tuple[str, int] | None:
+    """The rest of a name and its last number, which counts the frames; None without one.
+
+    Numbers of more than 18 digits count nothing.
+
+    Example:
+        >>> frame_number("image_01/0000000003"), frame_number("train_0003_L"), frame_number("a")
+        (('image_01/', 3), ('train__L', 3), None)
+    """
+    found = _NUMBER.search(name)
+    if found is None or len(found[1]) > _DIGITS:
+        return None
+    return name[: found.start(1)] + name[found.end(1) :], int(found[1])
+
+
+def view_name_fault(name: str) -> str | None:
+    """What is wrong with a name, as the end of a sentence; None where nothing is.
+
+    Example:
+        >>> view_name_fault("left/0001"), view_name_fault("../0001")
+        (None, "expected a view's name without . or .. at the start of a part, got '../0001'")
+    """
+    got = f"got {name!r:.60}"
+    if any(unicodedata.category(letter) in _REFUSED for letter in name):
+        return f"expected a view's name of UTF-8 without control characters, {got}"
+    parts = name.split("/")
+    if "" in parts or "\\" in name:
+        return f"expected a view's name as of a file below a folder, {got}"
+    if any(part.startswith(".") for part in parts):
+        return f"expected a view's name without . or .. at the start of a part, {got}"
+    longest = max(len(part.encode()) for part in parts)
+    if longest > MAX_PART or len(name.encode()) > MAX_NAME:
+        return (
+            f"expected a view's name of at most {MAX_NAME} bytes, {MAX_PART} between slashes, "
+            f"got {len(name.encode())}"
+        )
+    return None
+
+
+def check_view_name(name: str) -> None:
+    """Raise `InputError` unless `name` can be that of a view."""
+    fault = view_name_fault(name)
+    if fault is not None:
+        raise InputError(f"view: {fault}.")
+
+
+def clean_view_names(names: Sequence[str]) -> list[str]:
+    """Names of views that are valid and distinct on every file system, as near as can be.
+
+    Names that are good stay; of several that differ only in case, or in how their accents are
+    written, the first by code point does, and the others get a number.
+
+    Args:
+        names: What photographs are called; distinct.
+
+    Example:
+        >>> clean_view_names(["000", "../../000", "a", "A"])
+        ['000', '000_2', 'a_2', 'A']
+    """
+    cleaned = [_cleaned(name) for name in names]
+    found = list(cleaned)
+    taken = {_folded(name) for name in _TABLES}
+    others: list[int] = []
+    # Names that can stay come first, so that no other one takes theirs.
+    for i in sorted(range(len(names)), key=lambda i: (cleaned[i] != names[i], names[i])):
+        if _folded(found[i]) in taken:
+            others.append(i)
+        taken.add(_folded(found[i]))
+    for i in others:
+        number = 2
+        while _folded(found[i]) in taken:
+            found[i] = f"{cleaned[i]}_{number}"
+            number += 1
+        taken.add(_folded(found[i]))
+    return found
+
+
+def _cleaned(name: str) -> str:
+    parts = [_cleaned_part(part) for part in name.replace("\\", "/").split("/")]
+    parts = [part for part in parts if part]
+    while len("/".join(parts).encode()) > MAX_NAME - MAX_PART:
+        del parts[0]
+    return "/".join(parts) or "view"
+
+
+def _cleaned_part(part: str) -> str:
+    letters = ("_" if unicodedata.category(letter) in _REFUSED else letter for letter in part)
+    # Room for a number: 150 bytes, none of them half a letter.
+    return "".join(letters).lstrip(".").encode()[: MAX_PART - 50].decode(errors="ignore")
+
+
+def _folded(name: str) -> str:
+    """The same for names that some file system holds for one."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+class SceneLayers(Mapping[str, Layer]):
+    """Layers by name, read from the scene's folder each time one is asked for.
+
+    A scene that was not saved has none. What another program writes meanwhile is seen.
+
+    Raises:
+        InputError: If there is no layer of the name; the message lists those there are.
+    """
+
+    def __init__(self, root: Path | None) -> None:
+        self._root = root
+
+    def _names(self) -> tuple[str, ...]:
+        return () if self._root is None else upward.scene_layer_names(self._root)
+
+    def __getitem__(self, name: str) -> Layer:
+        where = "a scene that was not saved" if self._root is None else self._root
+        if self._root is None or name not in self._names():
+            known = ", ".join(self._names()) or "it has none"
+            raise InputError(f"layer: expected one of {where} ({known}), got {name!r}.")
+        return upward.load_scene_layer(self._root, name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names())
+
+    def __len__(self) -> int:
+        return len(self._names())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names()
+
+    def __repr__(self) -> str:
+        return f"SceneLayers({', '.join(self._names()) or 'none'})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
+class View(Previewed):
     """One photograph with its camera. The pixels stay on disk until somebody asks."""
 
     name: str
@@ -55,9 +208,6 @@ class View:
         photograph = "" if self.image is not None else ", no photograph"
         return f"View({self.name!r}, {self.split}, {size} pixels{photograph})"
 
-    def _repr_html_(self) -> str:
-        return preview(self)
-
     def read_image(self, *, longest: int | None = None) -> UInt8[Tensor, "height width 3"]:
         """The photograph, upright, 8 bit sRGB; see `io.images.load_image`.
 
@@ -68,7 +218,7 @@ class View:
             InputError: If the view has no photograph.
             MissingFileError: If the photograph is not where it was.
         """
-        return late("io.images", "load_image")(self, longest=longest)
+        return upward.load_image(self, longest=longest)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,7 +297,7 @@ class ClassTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _WithViews(ABC):
+class _WithViews(Previewed, ABC):
     """What a capture and a scene have in common: views with names of their own, in splits."""
 
     views: tuple[View, ...]
@@ -216,9 +366,6 @@ class Capture(_WithViews):
         points = "no points" if self.points is None else f"{len(self.points):,} points"
         return f"Capture({str(self.path)!r}, {self.format}: {_counted(self)}, {points})"
 
-    def _repr_html_(self) -> str:
-        return preview(self)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene(_WithViews):
@@ -242,9 +389,6 @@ class Scene(_WithViews):
     def __repr__(self) -> str:
         where = "not saved" if self.root is None else repr(str(self.root))
         return f"Scene({where}: {len(self.gaussians):,} Gaussians, {_counted(self)})"
-
-    def _repr_html_(self) -> str:
-        return preview(self)
 
     @property
     def evidence_folders(self) -> list[Path]:

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, quoted
 from splatseg.fit._state import FitState
+from splatseg.io.arrays import Npz, open_npz, write_checkpoint_file
 from splatseg.io.json_files import parse_object
-from splatseg.io.npz import Npz, open_npz
-from splatseg.io.npz_writing import write_checkpoint_file
 
 FORMAT = "splatseg-fit"
 VERSION = 1

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseg.core import Capture, View
-from splatseg.core.recorded_options import DIFFERENCES, differing_names, option_differences
+from splatseg.core.checkpoints import DIFFERENCES, differing_names, option_differences
 from splatseg.errors import InputError, brief
 from splatseg.fit._options import FitOptions
 from splatseg.io.digests import camera_numbers, digest, file_mark

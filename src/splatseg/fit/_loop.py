@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 from splatseg.core import Capture
 from splatseg.core.boundary import boundary
-from splatseg.core.checkpoints import Checkpoints
-from splatseg.core.interrupts import Interrupts, deferred_interrupts
+from splatseg.core.checkpoints import Checkpoints, Interrupts, deferred_interrupts
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
 from splatseg.fit._identity import fit_identity

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from splatseg import _native
 from splatseg.core import Camera, Gaussians
-from splatseg.core.activations import exponential, sigmoid
+from splatseg.core.gaussians import exponential, sigmoid
 
 # 2 ln 255: beyond this Mahalanobis distance squared even an opaque Gaussian's alpha is < 1/255.
 _MAX_SIGMAS = 3.34

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from splatseg.core import Camera, Capture, Gaussians, PointCloud, Similarity, View
+from splatseg.core import Camera, Capture, Gaussians, PointCloud, Similarity
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
 from splatseg.errors import InputError
@@ -93,8 +92,11 @@ def align(
     if not views:
         raise InputError(f"{capture.path}: expected photographs to compare with, got none.")
     index = np.unique(np.linspace(0, len(views) - 1, min(_VIEWS, len(views))).round().astype(int))
-    photographs = [_photograph(views[int(i)]) for i in index]
-    unchanged = _move(np.eye(3))
+    photographs = [
+        (image_camera(views[i], _LONGEST), load_image(views[i], longest=_LONGEST).float() / 255)
+        for i in index.tolist()
+    ]
+    unchanged = PointCorrection(matrix=np.eye(3))
     as_is = _compare(gaussians, unchanged, photographs, backend)
     if as_is[0] >= FITS:
         return _alignment(unchanged, as_is, as_is)
@@ -102,7 +104,7 @@ def align(
     candidates = [
         *declared_transforms(capture.path),
         *(declared_transforms(splats.parent) if splats is not None else ()),
-        *(_move(matrix) for matrix in axis_rotations()[1:]),
+        *(PointCorrection(matrix=matrix) for matrix in axis_rotations()[1:]),
     ]
     best, figures = _best(gaussians, candidates, photographs, backend)
     if figures[0] < FITS:
@@ -136,21 +138,8 @@ def similarity_of(move: PointCorrection) -> Similarity:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Photograph:
-    camera: Camera
-    pixels: Tensor
-
-
-def _photograph(view: View) -> _Photograph:
-    return _Photograph(
-        camera=image_camera(view, _LONGEST),
-        pixels=load_image(view, longest=_LONGEST).float() / 255,
-    )
-
-
-def _move(matrix: NDArray[np.float64]) -> PointCorrection:
-    return PointCorrection(matrix=matrix)
+_Photograph = tuple[Camera, Tensor]
+"""A small camera, and what it photographed in [0, 1]."""
 
 
 def _best(
@@ -178,13 +167,13 @@ def _compare(
     file_from_capture = similarity_of(move).inverse()
     correlations: list[float] = []
     decibels: list[float] = []
-    for photograph in photographs:
-        camera = photograph.camera.moved(file_from_capture)
+    for camera, pixels in photographs:
+        moved = camera.moved(file_from_capture)
         with torch.no_grad():
-            drawn = render(gaussians, camera, backend=backend).image.clamp(0, 1).cpu()
-        error = float(((drawn - photograph.pixels) ** 2).mean())
+            drawn = render(gaussians, moved, backend=backend).image.clamp(0, 1).cpu()
+        error = float(((drawn - pixels) ** 2).mean())
         decibels.append(-10 * float(np.log10(max(error, 1e-10))))
-        correlations.append(_correlation(drawn, photograph.pixels))
+        correlations.append(_correlation(drawn, pixels))
     return sum(correlations) / len(correlations), sum(decibels) / len(decibels)
 
 

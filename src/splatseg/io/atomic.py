@@ -3,7 +3,8 @@
 Everything is written in a hidden folder beside the target (same file system, so that the rename
 is one step) and renamed only when the block ended well. The hidden folder's name has the number
 of the process, and the process holds a lock on it: what a killed process left is told from what
-another one is writing, and `sweep` removes it.
+another one is writing, and `sweep` removes it. What data names is written below its folder, see
+`path_inside`, and what the system says of a failure becomes a sentence that says what to do.
 """
 
 import contextlib
@@ -15,10 +16,146 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
-from splatseg.errors import InputError, MissingFileError
-from splatseg.io.file_locks import try_lock
-from splatseg.io.write_errors import named_write_failures
+from splatseg.errors import InputError, MissingFileError, OutputError, SplatsegError
+
+_WHAT_TO_DO = {
+    errno.ENOSPC: "the disk is full; free some space and give the command again",
+    errno.EDQUOT: "the disk quota is used up; free some space and give the command again",
+    errno.EFBIG: "the file would be larger than is allowed here",
+    errno.EROFS: "it lies on a disk that can only be read; choose another folder",
+    errno.EACCES: "there is no permission to write there; change it or choose another folder",
+    errno.EPERM: "there is no permission to write there; change it or choose another folder",
+    errno.ENAMETOOLONG: "its name is too long; choose a shorter one",
+}
+
+# Of talking to other processes and people, not of files.
+_OF_NO_FILE = (ConnectionError, ChildProcessError, ProcessLookupError, TimeoutError)
+
+
+def failure_to_write(path: Path | str, error: OSError) -> str:
+    """The sentence: what cannot be written, why, and what to do.
+
+    Example:
+        >>> failure_to_write("a.ply", OSError(28, "No space left on device"))
+        'a.ply: cannot be written: the disk is full; free some space and give the command again.'
+    """
+    reason = _WHAT_TO_DO.get(error.errno or 0, error.strerror or str(error))
+    return f"{path}: cannot be written: {reason}."
+
+
+def is_write_failure(error: OSError) -> bool:
+    """Whether an error that has no file of its own to name is about one that is written."""
+    return error.errno in _WHAT_TO_DO and not isinstance(error, SplatsegError)
+
+
+@contextmanager
+def named_write_failures(path: Path, *, within: Path | None = None) -> Generator[None]:
+    """Turn what the system says of writing in the block into an `OutputError`.
+
+    Errors about other files than those below `within`, and our own, go through as they are.
+
+    Args:
+        path: What is being written, for the message.
+        within: Where it is written for now; None takes errors about any file.
+    """
+    try:
+        yield
+    except (SplatsegError, *_OF_NO_FILE):
+        raise
+    except OSError as error:
+        if not _is_of(error, path, within):
+            raise
+        raise OutputError(failure_to_write(path, error)) from error
+
+
+def _is_of(error: OSError, path: Path, within: Path | None) -> bool:
+    if within is None or error.filename is None or error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return True
+    named = Path(str(error.filename))
+    return named in (path, within) or within in named.parents
+
+
+def path_inside(folder: Path, *names: str, make: bool = True) -> Path:
+    """A path below a folder, which it cannot leave: every file named by data is written so.
+
+    Args:
+        folder: The folder. It may itself be a link, and need not be there yet.
+        names: What is below it; names with a slash lie in further folders.
+        make: Make the folders that the path needs.
+
+    Returns:
+        The path, as it is written.
+
+    Raises:
+        InputError: If a name climbs, is absolute or no name at all, or a link that is there leads
+            out of the folder.
+
+    Example:
+        >>> path_inside(Path("masks"), "left/0001.json", make=False).as_posix()
+        'masks/left/0001.json'
+    """
+    parts = [part for name in names for part in name.split("/")]
+    if any(part in ("", ".", "..") or "\\" in part or "\0" in part for part in parts):
+        raise InputError(f"{folder}: expected the name of a file below it, got {names[-1]!r:.60}.")
+    path = folder.joinpath(*parts)
+    try:
+        leaves = not path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError) as error:  # links in a circle
+        raise InputError(f"{path}: cannot be followed ({error}).") from error
+    if leaves:
+        raise InputError(
+            f"{path}: expected a place in {folder}, but a link leads out of it to "
+            f"{path.resolve()}; nothing is written there."
+        )
+    if make:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def check_utf8(path: Path) -> None:
+    """Refuse a path that no JSON file can hold, as its bytes are not UTF-8.
+
+    Raises:
+        InputError: If it is one.
+    """
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError as error:
+        shown = os.fsencode(path)
+        raise InputError(
+            f"{str(path).encode(errors='replace').decode()}: expected a name in UTF-8, got the "
+            f"bytes {shown!r:.200}; rename it (`convmv -f latin1 -t utf8`)."
+        ) from error
+
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+Lock = Literal["taken", "held", "unknown"]
+"""We have it now; another one has it; the file system or the system has no such locks."""
+
+
+def try_lock(handle: int, *, shared: bool = False) -> Lock:
+    """Lock an open file or folder without waiting; closing the handle gives it back.
+
+    Args:
+        handle: Its descriptor.
+        shared: Others may have it at the same time, if theirs is shared too.
+    """
+    if fcntl is None:
+        return "unknown"
+    try:
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return "held"
+    except OSError:
+        return "unknown"
+    return "taken"
+
 
 TEMPORARY = ".splatseg-"
 """How the names of files and folders begin that are ours and not the user's."""

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from splatseg.core import Camera, View
-from splatseg.core.view_names import view_name_fault
+from splatseg.core.scene import view_name_fault
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures.nerfstudio import (
     LENS_KEYS,

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from splatseg.core import DepthKind, DepthMap, View
 from splatseg.errors import FileFormatError, InputError
+from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import npz_names, read_npz
 
 DEPTH_NAME = "depth"
 """The array of an npz that is a depth map of evidence."""

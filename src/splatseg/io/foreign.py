@@ -38,6 +38,18 @@ _DAMAGED = (
 documents it, and flipped bits have found each of these."""
 
 
+def expect(fits: object, where: object, what: str) -> None:
+    """Raise `FileFormatError` unless a file is as it should be.
+
+    Args:
+        fits: Whether it is.
+        where: The file, and the place in it; starts the message.
+        what: What is expected and what came, after the word "expected".
+    """
+    if not fits:
+        raise FileFormatError(f"{where}: expected {what}.")
+
+
 @contextmanager
 def reading(where: object, expected: str) -> Generator[None]:
     """Raise the documented error for whatever a decoder raises inside the block.

@@ -1,12 +1,18 @@
-"""Photographs: read upright, made smaller where asked, and pictures written.
+"""Photographs, read upright and made smaller where asked; pictures and films, written.
 
 A photograph is read as a person sees it: its EXIF orientation is applied, and a camera refers
-to the pixels after that (see ``docs/conventions.md``).
+to the pixels after that (see ``docs/conventions.md``). Films need the extra ``video``.
 """
 
+import contextlib
 import math
+import os
+import subprocess
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -15,11 +21,20 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from torch import Tensor
 
+from splatseg._check import check_shape
 from splatseg.core import Camera, View
 from splatseg.core.boundary import boundary
-from splatseg.errors import FileFormatError, InputError, MissingFileError, ShapeError
+from splatseg.errors import (
+    BackendError,
+    FileFormatError,
+    InputError,
+    MissingFileError,
+    MissingPackageError,
+    RangeError,
+    ShapeError,
+)
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import is_file, reading
+from splatseg.io.foreign import expect, is_file, reading
 from splatseg.io.limits import FREE, OPTION, check_unpacked
 
 DEFAULT_LONGEST = 1600
@@ -108,18 +123,10 @@ def load_image(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heig
         FileFormatError: If it cannot be decoded, or its size is not the camera's.
     """
     path = _photograph(view)
-    camera = view.camera
     with open_image(path) as image:
         pixels = _decode(image, path)
-    if pixels.size != (camera.width, camera.height):
-        raise FileFormatError(
-            f"{path}: expected {camera.width}x{camera.height} pixels as the camera of view "
-            f"{view.name!r} has, got {pixels.size[0]}x{pixels.size[1]}."
-        )
-    target = reduced_size(*pixels.size, longest)
-    if target != pixels.size:
-        pixels = pixels.resize(target, Image.Resampling.BOX)
-    return torch.from_numpy(np.array(pixels, dtype=np.uint8))
+    _check_size(path, view, pixels.size)
+    return torch.from_numpy(np.array(_reduced(pixels, *pixels.size, longest), dtype=np.uint8))
 
 
 @boundary
@@ -135,24 +142,17 @@ def load_mask(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heigh
     """
     if view.mask is None:
         return None
-    camera = view.camera
-    with open_image(view.mask) as image:
-        upright = _upright(image, view.mask)
-    grey = _array(upright, view.mask)
-    if upright.mode in ("RGBA", "LA"):
-        grey = grey[..., -1]
-    grey = grey.max(axis=2) if grey.ndim == 3 else grey
-    if not same_shape(camera.width, camera.height, grey.shape[1], grey.shape[0]):
-        raise FileFormatError(
-            f"{view.mask}: expected {camera.width}x{camera.height} pixels as the photograph of "
-            f"view {view.name!r} has, or a uniform scale of it, got "
-            f"{grey.shape[1]}x{grey.shape[0]}."
-        )
-    keep = Image.fromarray(np.where(grey > 0, 255, 0).astype(np.uint8))
-    target = reduced_size(camera.width, camera.height, longest)
-    if target != keep.size:
-        keep = keep.resize(target, Image.Resampling.BOX)
-    return torch.from_numpy((np.asarray(keep) == 255).astype(np.uint8))
+    width, height = view.camera.width, view.camera.height
+    grey = _grey(view.mask)
+    expect(
+        same_shape(width, height, grey.shape[1], grey.shape[0]),
+        view.mask,
+        f"{width}x{height} pixels as the photograph of view {view.name!r} has, or a uniform scale "
+        f"of it, got {grey.shape[1]}x{grey.shape[0]}",
+    )
+    used = Image.fromarray(np.where(grey > 0, 255, 0).astype(np.uint8))
+    used = _reduced(used, width, height, longest)
+    return torch.from_numpy((np.asarray(used) == 255).astype(np.uint8))
 
 
 @boundary
@@ -190,32 +190,50 @@ def load_alpha(view: View, *, longest: int | None = None) -> UInt8[Tensor, "heig
         MissingFileError: If a file is not where it was.
         FileFormatError: If a file cannot be decoded, or its size is not the camera's.
     """
-    path = _photograph(view) if view.mask is None else view.mask
-    camera = view.camera
-    with open_image(path) as image:
-        upright = _upright(image, path)
-    if view.mask is None:
-        if not (upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info):
+    if view.mask is not None:
+        path = view.mask
+        grey = _grey(path)
+        if grey.dtype != np.uint8 or grey.max(initial=0) <= 1:
+            grey = np.where(grey > 0, 255, 0).astype(np.uint8)
+    else:
+        path = _photograph(view)
+        with open_image(path) as image:
+            upright = _upright(image, path)
+        if not _is_transparent(upright):
             return None
         with reading(path, "an image"):
             grey = np.asarray(upright.convert("RGBA"))[..., -1]
-    else:
-        grey = _array(upright, path)
-        if upright.mode in ("RGBA", "LA"):
-            grey = grey[..., -1]
-        grey = grey.max(axis=2) if grey.ndim == 3 else grey
-        if grey.dtype != np.uint8 or grey.max(initial=0) <= 1:
-            grey = np.where(grey > 0, 255, 0).astype(np.uint8)
-    if grey.shape != (camera.height, camera.width):
-        raise FileFormatError(
-            f"{path}: expected {camera.width}x{camera.height} pixels as the photograph of "
-            f"view {view.name!r} has, got {grey.shape[1]}x{grey.shape[0]}."
-        )
-    opaque = Image.fromarray(grey)
-    target = reduced_size(camera.width, camera.height, longest)
-    if target != opaque.size:
-        opaque = opaque.resize(target, Image.Resampling.BOX)
+    _check_size(path, view, (grey.shape[1], grey.shape[0]))
+    opaque = _reduced(Image.fromarray(grey), grey.shape[1], grey.shape[0], longest)
     return torch.from_numpy(np.array(opaque, dtype=np.uint8))
+
+
+def _check_size(path: Path, view: View, size: tuple[int, int]) -> None:
+    """Refuse an image of another size than the photograph of a view has."""
+    camera = view.camera
+    expect(
+        size == (camera.width, camera.height),
+        path,
+        f"{camera.width}x{camera.height} pixels as the camera of view {view.name!r} has, got "
+        f"{size[0]}x{size[1]}",
+    )
+
+
+def _grey(path: Path) -> NDArray[Any]:
+    """The pixels of a mask: its alpha, or the largest of its channels."""
+    with open_image(path) as image:
+        upright = _upright(image, path)
+    with reading(path, "an image"):
+        grey = np.asarray(upright)
+    if upright.mode in ("RGBA", "LA"):
+        grey = grey[..., -1]
+    return grey.max(axis=2) if grey.ndim == 3 else grey
+
+
+def _reduced(image: Image.Image, width: int, height: int, longest: int | None) -> Image.Image:
+    """An image in the size that one of width x height is reduced to, area-weighted."""
+    target = reduced_size(width, height, longest)
+    return image if target == image.size else image.resize(target, Image.Resampling.BOX)
 
 
 @boundary
@@ -281,32 +299,14 @@ def open_image(path: Path) -> Image.Image:
             f"{path}: expected a picture of at most {2 * most} pixels, got more; if you trust it, "
             f"{OPTION} with a larger size than {FREE} bytes reads it."
         ) from error
+    width, height = image.size
+    what = f"a picture of {width}x{height} pixels"
     try:
-        _check_pixels(path, image, packed=size)
+        check_unpacked(path, width * height * _BYTES_OF_PIXEL, packed=size, what=what)
     except FileFormatError:
         image.close()
         raise
     return image
-
-
-def _check_pixels(where: object, image: Image.Image, *, packed: int) -> None:
-    """Refuse a picture whose pixels would take more than a file of its size may unpack to.
-
-    Args:
-        where: The file; starts the message.
-        image: The picture, not decoded yet.
-        packed: Bytes of the file.
-
-    Raises:
-        FileFormatError: If there are too many.
-    """
-    width, height = image.size
-    check_unpacked(
-        where,
-        width * height * _BYTES_OF_PIXEL,
-        packed=packed,
-        what=f"a picture of {width}x{height} pixels",
-    )
 
 
 def _photograph(view: View) -> Path:
@@ -334,19 +334,16 @@ def _upright(image: Image.Image, path: Path) -> Image.Image:
         return ImageOps.exif_transpose(image)
 
 
-def _array(image: Image.Image, path: Path) -> NDArray[Any]:
-    with reading(path, "an image"):
-        return np.asarray(image)
+def _is_transparent(image: Image.Image) -> bool:
+    return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 
 
 def _decode(image: Image.Image, path: Path) -> Image.Image:
     upright = _upright(image, path)
-    if upright.mode.startswith(("I", "F")):
-        raise FileFormatError(
-            f"{path}: expected a photograph of 8 bits a channel, got mode {upright.mode}."
-        )
+    deep = upright.mode.startswith(("I", "F"))
+    expect(not deep, path, f"a photograph of 8 bits a channel, got mode {upright.mode}")
     with reading(path, "an image"):
-        if upright.mode in ("RGBA", "LA", "PA") or "transparency" in upright.info:
+        if _is_transparent(upright):
             upright = upright.convert("RGBA")
             white = Image.new("RGBA", upright.size, (255, 255, 255, 255))
             return Image.alpha_composite(white, upright).convert("RGB")
@@ -368,3 +365,119 @@ def _to_integers(array: NDArray[np.generic]) -> NDArray[np.uint8] | NDArray[np.u
     if low < 0 or high > 65535:
         raise InputError(f"image: expected values in [0, 65535], got [{low}, {high}].")
     return array.astype(np.uint16)
+
+
+# Constant rate factor: 18 is hardly told from the original.
+_CRF = 18
+
+
+@boundary
+def write_video(
+    frames: Iterable[UInt8[Tensor, "height width 3"]],
+    path: str | os.PathLike[str],
+    *,
+    fps: float = 24.0,
+) -> int:
+    """Write pictures as an H.264 film that browsers play; gives the number of frames.
+
+    The encoder halves the colours' resolution, so width and height must be even: an odd last
+    row or column is left out. The file appears when the film is complete.
+
+    Args:
+        frames: sRGB pictures of one size. They are taken one by one and not kept.
+        path: The file, ``.mp4``.
+        fps: Frames a second.
+
+    Raises:
+        InputError: If there are no frames, or the name does not end in ``.mp4``.
+        ShapeError: If sizes differ.
+        RangeError: If `fps` is not positive, or a picture has less than two rows or columns.
+        MissingPackageError: If imageio-ffmpeg is not installed.
+    """
+    if not str(path).lower().endswith(".mp4"):
+        raise InputError(f"{path}: expected a name that ends in .mp4.")
+    encoder = check_encoder(fps)
+    rest = iter(frames)
+    first = next(rest, None)
+    if first is None:
+        raise InputError("frames: expected at least one picture, got none.")
+    check_shape("frames", first, (None, None, 3))
+    height, width = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2
+    if not height or not width:
+        raise RangeError(
+            f"frames: expected at least 2x2 pixels, got {first.shape[1]}x{first.shape[0]}."
+        )
+    command = _command(encoder.get_ffmpeg_exe(), width, height, fps)
+    with atomic_file(path) as temporary, TemporaryFile() as complaints:
+        frame_bytes = (_bytes(frame, first.shape, height, width) for frame in chain((first,), rest))
+        count = _fed([*command, str(temporary)], frame_bytes, complaints, path)
+    return count
+
+
+def _command(program: str, width: int, height: int, fps: float) -> list[str]:
+    """The encoder's words, without the file: raw RGB comes in on the standard input."""
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps)]
+    film = ["-c:v", "libx264", "-crf", str(_CRF), "-pix_fmt", "yuv420p"]
+    # The table of contents comes first, so that a browser plays before it has everything.
+    film += ["-movflags", "+faststart"]
+    return [program, "-v", "error", "-y", *source, "-i", "-", *film]
+
+
+def _fed(
+    command: Sequence[str],
+    frame_bytes: Iterable[bytes],
+    complaints: IO[bytes],
+    path: str | os.PathLike[str],
+) -> int:
+    """Run the encoder on pictures; gives their number.
+
+    Raises:
+        BackendError: If the encoder fails; the message has its last words.
+    """
+    count = 0
+    # The words are ours, the program is that of the package, and there is no shell.
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=complaints)  # noqa: S603
+    try:
+        pipe = process.stdin or contextlib.nullcontext()
+        # An encoder that ended early says why by its status and words.
+        with contextlib.suppress(BrokenPipeError), pipe as into:
+            for one_frame in frame_bytes:
+                if into is not None:
+                    into.write(one_frame)
+                count += 1
+        process.wait()
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    if process.returncode:
+        complaints.seek(0)
+        words = complaints.read().decode(errors="replace").strip().splitlines()
+        reason = words[-1] if words else f"status {process.returncode}"
+        raise BackendError(f"{path}: the video encoder failed: {reason}.")
+    return count
+
+
+def _bytes(frame: Tensor, shape: tuple[int, ...], height: int, width: int) -> bytes:
+    check_shape("frames", frame, shape)
+    return frame[:height, :width].contiguous().cpu().numpy().tobytes()
+
+
+@boundary
+def check_encoder(fps: float) -> Any:
+    """The module that encodes, after a check that it can: for commands that film at their end.
+
+    Raises:
+        RangeError: If `fps` is not in (0, 1000).
+        MissingPackageError: If imageio-ffmpeg is not installed.
+    """
+    if not 0 < fps < 1000:
+        raise RangeError(f"fps: expected a number in (0, 1000), got {fps}.")
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise MissingPackageError(
+            "a film needs a package that is not installed (imageio-ffmpeg). "
+            "Try: pip install 'splatseg[video]'."
+        ) from error
+    return imageio_ffmpeg

@@ -9,7 +9,7 @@ from typing import Any, cast
 from splatseg.core.json_values import plain_json
 from splatseg.errors import FileFormatError, InputError, quoted, reason
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import read_bytes
+from splatseg.io.foreign import expect, read_bytes
 
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 _LONE = re.compile("[\ud800-\udfff]")
@@ -93,6 +93,25 @@ def json_text(name: str, value: Mapping[str, Any], *, indent: int | None = None)
         around = text[max(error.start - 20, 0) : error.end + 20]
         raise InputError(f"{name}: expected text that UTF-8 can hold, got {around!r}.") from error
     return text
+
+
+def check_version(
+    path: Path, content: Mapping[str, Any], *, format: str, version: int, what: str
+) -> None:
+    """Refuse a file of ours that is of another format, or of a later version.
+
+    Raises:
+        FileFormatError: If it is.
+    """
+    found = content.get("version")
+    if content.get("format") != format or type(found) is not int:
+        raise FileFormatError(f"{path}: expected {what}, got {quoted(content.get('format'))}.")
+    expect(
+        1 <= found <= version,
+        path,
+        f"{what} of version {version} or less, got version {quoted(found)}; a later splatseg wrote "
+        "it",
+    )
 
 
 def write_json(value: Mapping[str, Any], path: Path) -> None:

@@ -5,11 +5,13 @@ stamps, so that the same layer gives the same bytes.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from msgspec import Meta
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -21,23 +23,23 @@ from splatseg.core import (
     Layer,
     LayerInfo,
     Selection,
+    StoredTable,
     TreeNode,
     VoxelFeatures,
+    VoxelGrid,
     layer_info_from_json,
     layer_info_from_metadata,
     layer_info_to_json,
     node_row,
 )
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_integer, json_number
-from splatseg.errors import FileFormatError, InputError, quoted, reason
+from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.errors import FileFormatError, InputError, reason
+from splatseg.io.arrays import HEADER, open_npz, save_arrays
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import made_from
-from splatseg.io.json_files import parse_object
-from splatseg.io.layer_arrays import checked_array
-from splatseg.io.npz import open_npz
-from splatseg.io.npz_writing import save_arrays
-from splatseg.io.voxel_arrays import VOXEL_ARRAYS, voxel_arrays, voxels_of
+from splatseg.io.foreign import expect, made_from
+from splatseg.io.json_files import check_version, parse_object
+from splatseg.io.schema import structured
 
 FORMAT = "splatseg-layer"
 VERSION = 5
@@ -52,15 +54,44 @@ _WITH_VOXELS = 5
 _INFO_VERSION = 3
 """Files before it have a flat object of any keys instead, under ``metadata``."""
 
-_HEADER = "header"
+_VOID = 0
+_MAX_ID = 2**31 - 1
+
+_Columns = dict[str, NDArray[Any]]
+_Number = Annotated[float, Meta(ge=-MAX_NUMBER, le=MAX_NUMBER)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    """What the header of a file must have besides its format."""
+
+    version: int
+    count: Annotated[int, Meta(ge=0)]
+    """Gaussians."""
+
+    kind: Literal["labels", "features", "tree", "selection", "voxels"]
+    background: Annotated[int, Meta(ge=0, le=_MAX_ID)] | None = None
+    """Of labels and trees."""
+
+    nodes: list[dict[str, Any]] | None = None
+    """Of trees, see `node_row`."""
+
+    voxels: Annotated[int, Meta(ge=0)] = 0
+    size: _Number = 0
+    origin: tuple[_Number, _Number, _Number] = (0, 0, 0)
+    precision: Literal["float32", "float16", "int8", "product"] = "float32"
+    info: dict[str, Any] | None = None
+    metadata: dict[str, Any] | None = None
+
+
 _ARRAYS = (
-    _HEADER, "ids", "confidence", "candidates", "shares", "evidence", "effective_views",
-    "inferred", "values", "weights", "mask", *VOXEL_ARRAYS,
+    HEADER, "ids", "confidence", "candidates", "shares", "evidence", "effective_views", "inferred",
+    "values", "weights", "mask", "cells", "codes", "scales", "codebooks", "voxel_weights", "rows",
 )  # fmt: skip
 """All that some kind of layer has; nothing else of a file is unpacked."""
 
-_VOID = 0
-_MAX_ID = 2**31 - 1
+_CODES = {"float32": "f4", "float16": "f2", "int8": "i1", "product": "u1"}
+"""Types of the rows of voxels, by how numbers are kept."""
 
 
 @boundary
@@ -84,44 +115,78 @@ def save_layer(layer: Layer, path: Path) -> None:
             arrays = _label_arrays(layer)
         case Features():
             header |= {"kind": "features"}
-            arrays = {"values": _floats(layer.values)}
-            if layer.weights is not None:
-                arrays |= {"weights": _floats(layer.weights)}
+            arrays = _arrays_of(values=layer.values, weights=layer.weights)
         case InstanceTree():
-            labels = layer.labels
             header |= {
                 "kind": "tree",
-                "background": _void(labels.background),
+                "background": _void(layer.labels.background),
                 "nodes": [node_row(node) for node in layer.nodes],
             }
-            if labels.candidates is not None:
+            if layer.labels.candidates is not None:
                 header |= {"version": _WITH_CONFIDENCE}
-            arrays = _label_arrays(labels)
+            arrays = _label_arrays(layer.labels)
         case Selection():
             header |= {"kind": "selection"}
-            arrays = {"mask": layer.mask.cpu().numpy()}
             if layer.confidence is not None:
                 header |= {"version": _WITH_CONFIDENCE}
-                arrays |= {"confidence": _floats(layer.confidence.float())}
+            arrays = _arrays_of(mask=layer.mask, confidence=_single(layer.confidence))
         case VoxelFeatures():
-            fields, arrays = voxel_arrays(layer)
-            header |= {"kind": "voxels", "version": _WITH_VOXELS, **fields}
+            table, grid = layer.table, layer.grid
+            header |= {
+                "kind": "voxels",
+                "version": _WITH_VOXELS,
+                "voxels": len(grid),
+                "size": grid.size,
+                "origin": grid.origin.tolist(),
+                "precision": table.precision,
+            }
+            arrays = _arrays_of(
+                cells=grid.cells,
+                codes=table.codes,
+                voxel_weights=layer.weights.float(),
+                rows=layer.rows + 1,  # 0 is none in files
+                scales=_single(table.scales),
+                codebooks=_single(table.codebooks),
+                shares=_single(layer.shares),
+            )
     header["info"] = layer_info_to_json(layer.info)
     with atomic_file(path, durable=True) as temporary:
         save_arrays(header, arrays, temporary, name=path)
 
 
-def _label_arrays(labels: Labels) -> dict[str, NDArray[Any]]:
-    arrays = {"ids": _ids(labels.ids), "confidence": _floats(labels.confidence)}
-    if labels.candidates is not None and labels.shares is not None:
-        arrays |= {"candidates": _ids(labels.candidates), "shares": _floats(labels.shares.float())}
-    if labels.evidence is not None:
-        arrays |= {"evidence": _floats(labels.evidence.float())}
-    if labels.effective_views is not None:
-        arrays |= {"effective_views": _floats(labels.effective_views.float())}
-    if labels.inferred is not None:
-        arrays |= {"inferred": labels.inferred.cpu().numpy()}
+def _label_arrays(labels: Labels) -> _Columns:
+    arrays = _arrays_of(
+        ids=_ids(labels.ids),
+        confidence=labels.confidence,
+        candidates=None if labels.candidates is None else _ids(labels.candidates),
+        shares=_single(labels.shares),
+        evidence=_single(labels.evidence),
+        effective_views=_single(labels.effective_views),
+        inferred=labels.inferred,
+    )
     return arrays
+
+
+def _arrays_of(**columns: Tensor | None) -> _Columns:
+    """Arrays of those columns that are there."""
+    there = {name: column for name, column in columns.items() if column is not None}
+    return {name: column.detach().cpu().contiguous().numpy() for name, column in there.items()}
+
+
+def _single(values: Tensor | None) -> Tensor | None:
+    return None if values is None else values.float()
+
+
+def _void(id: int) -> int:
+    if id == _VOID:
+        raise InputError("ids: expected -1 (none) or 1 and more, got 0, which is void in files.")
+    return _VOID if id == UNLABELLED else id
+
+
+def _ids(ids: Tensor) -> Tensor:
+    if bool((ids == _VOID).any()):
+        _void(_VOID)
+    return torch.where(ids == UNLABELLED, _VOID, ids).to(torch.int32)
 
 
 @boundary
@@ -132,169 +197,149 @@ def load_layer(path: Path) -> Layer:
         MissingFileError: If there is no such file.
         FileFormatError: If it is no layer, cut short, or of a later version.
     """
-    arrays = _arrays(path)
-    header = _header(path, arrays)
-    info = _info(path, header)
+    with open_npz(path, expected="a layer") as archive:
+        arrays = {name: archive.array(name) for name in _ARRAYS if name in archive}
+    raw = arrays.get(HEADER)
+    if raw is None or raw.dtype != np.uint8 or raw.ndim != 1:
+        raise FileFormatError(f"{path}: expected a layer, got an archive without a header.")
+    content = parse_object(raw.tobytes(), where=str(path))
+    check_version(path, content, format=FORMAT, version=VERSION, what="a layer")
+    header = structured(content, _Header, where=str(path))
+    key = "info" if header.version >= _INFO_VERSION else "metadata"
+    record = header.info if key == "info" else header.metadata
+    if record is None:
+        raise FileFormatError(f"{path}: expected an object {key!r} in the header, got none.")
+    read = layer_info_from_json if key == "info" else layer_info_from_metadata
+    info = read(record, where=f"{path}: {key}")
     with made_from(path):
-        return _layer(path, header, arrays, info)
+        return _File(path, header, arrays, info).layer()
 
 
-def _layer(
-    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
-) -> Layer:
-    """The layer that checked arrays make."""
-    count = int(header["count"])
-    match header.get("kind"):
-        case "labels":
-            return _labels(path, header, arrays, info)
-        case "features":
-            return Features(
-                values=torch.from_numpy(checked_array(path, arrays, "values", "f", (count, None))),
-                weights=torch.from_numpy(checked_array(path, arrays, "weights", "f", (count,)))
-                if "weights" in arrays
-                else None,
-                info=info,
-            )
-        case "tree":
-            return _tree(path, header, arrays, info)
-        case "selection":
-            mask = torch.from_numpy(checked_array(path, arrays, "mask", "?", (count,)))
-            confidence = (
-                torch.from_numpy(checked_array(path, arrays, "confidence", "f4", (count,)))
-                if int(header["version"]) > _WITHOUT_CONFIDENCE and "confidence" in arrays
-                else None
-            )
-            return Selection(mask=mask, confidence=confidence, info=info)
-        case "voxels":
-            return voxels_of(path, header, arrays, info)
-        case kind:
-            raise FileFormatError(
-                f"{path}: expected a layer of labels, features, voxels, a tree or a selection, "
-                f"got {quoted(kind)}."
-            )
+@dataclass(frozen=True, slots=True)
+class _File:
+    """A file whose header is as it must be."""
 
+    path: Path
+    header: _Header
+    arrays: Mapping[str, NDArray[Any]]
+    info: LayerInfo
 
-def _labels(
-    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
-) -> Labels:
-    count = int(header["count"])
-    # A tree has candidates since version 4; what an older one has of that name is not its own.
-    soft = header.get("kind") != "tree" or int(header["version"]) > _WITHOUT_CONFIDENCE
-    pair = soft and ("candidates" in arrays or "shares" in arrays)
+    def layer(self) -> Layer:
+        """The layer, made of arrays that are checked one by one."""
+        count, info = self.header.count, self.info
+        match self.header.kind:
+            case "labels":
+                return self._labels(soft=True)
+            case "features":
+                values = self._read("values", "f", count, None)
+                return Features(values=values, weights=self._optional("weights", "f"), info=info)
+            case "tree":
+                # It has candidates since version 4; what an older one has so called is not its own.
+                labels = self._labels(soft=self.header.version > _WITHOUT_CONFIDENCE)
+                return self._tree(labels)
+            case "selection":
+                later = self.header.version > _WITHOUT_CONFIDENCE
+                confidence = self._optional("confidence", "f4") if later else None
+                mask = self._read("mask", "?", count)
+                return Selection(mask=mask, confidence=confidence, info=info)
+            case "voxels":
+                return self._voxels()
 
-    def optional(name: str, kind: str) -> Tensor | None:
-        found = name in arrays
-        return (
-            torch.from_numpy(checked_array(path, arrays, name, kind, (count,))) if found else None
+    def _labels(self, *, soft: bool) -> Labels:
+        count, background = self.header.count, self.header.background
+        expect(background is not None, self.path, "a background, got none")
+        pair = soft and ("candidates" in self.arrays or "shares" in self.arrays)
+        return Labels(
+            ids=self._read_ids("ids", count),
+            confidence=self._read("confidence", "f4", count),
+            background=background or UNLABELLED,
+            candidates=self._read_ids("candidates", count, None) if pair else None,
+            shares=self._read("shares", "f4", count, None) if pair else None,
+            evidence=self._optional("evidence", "f4"),
+            effective_views=self._optional("effective_views", "f4"),
+            inferred=self._optional("inferred", "?"),
+            info=self.info,
         )
 
-    return Labels(
-        ids=_from_file(checked_array(path, arrays, "ids", "i4", (count,))),
-        confidence=torch.from_numpy(checked_array(path, arrays, "confidence", "f4", (count,))),
-        background=_background(path, header),
-        candidates=_from_file(checked_array(path, arrays, "candidates", "i4", (count, None)))
-        if pair
-        else None,
-        shares=torch.from_numpy(checked_array(path, arrays, "shares", "f4", (count, None)))
-        if pair
-        else None,
-        evidence=optional("evidence", "f4"),
-        effective_views=optional("effective_views", "f4"),
-        inferred=optional("inferred", "?"),
-        info=info,
-    )
+    def _tree(self, labels: Labels) -> InstanceTree:
+        expect(self.header.nodes is not None, self.path, "a list of nodes, got none")
+        try:
+            nodes = tuple(_node(row) for row in self.header.nodes or ())
+            return InstanceTree(nodes=nodes, labels=labels)
+        except (InputError, KeyError) as error:
+            raise FileFormatError(
+                f"{self.path}: expected nodes of a tree, got others ({reason(error)})."
+            ) from error
 
+    def _voxels(self) -> VoxelFeatures:
+        header = self.header
+        voxels, precision = header.voxels, header.precision
+        # Signed bytes and cells may be negative, which no id is.
+        codes = self._read("codes", _CODES[precision], voxels, None, signed=True)
+        table = StoredTable(
+            codes=codes,
+            scales=self._read("scales", "f4", voxels) if precision == "int8" else None,
+            codebooks=self._read("codebooks", "f4", codes.shape[1], None, None)
+            if precision == "product"
+            else None,
+        )
+        rows = self._read("rows", "i4", header.count, None)
+        grid = VoxelGrid(
+            cells=self._read("cells", "i4", voxels, 3, signed=True),
+            size=header.size,
+            origin=torch.tensor(header.origin, dtype=torch.float64),
+        )
+        return VoxelFeatures(
+            grid=grid,
+            table=table,
+            weights=self._read("voxel_weights", "f4", voxels),
+            rows=rows - 1,
+            shares=self._read("shares", "f4", *rows.shape) if "shares" in self.arrays else None,
+            info=self.info,
+        )
 
-def _tree(
-    path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], info: LayerInfo
-) -> InstanceTree:
-    rows = header.get("nodes")
-    if not isinstance(rows, list):
-        raise FileFormatError(f"{path}: expected a list of nodes, got {type(rows).__name__}.")
-    labels = _labels(path, header, arrays, info)
-    try:
-        nodes = tuple(_node(row) for row in cast("list[Any]", rows))
-        return InstanceTree(nodes=nodes, labels=labels)
-    except (InputError, KeyError, TypeError) as error:
-        raise FileFormatError(
-            f"{path}: expected nodes of a tree, got others ({reason(error)})."
-        ) from error
+    def _optional(self, name: str, kind: str) -> Tensor | None:
+        return self._read(name, kind, self.header.count) if name in self.arrays else None
+
+    def _read_ids(self, name: str, *shape: int | None) -> Tensor:
+        ids = self._read(name, "i4", *shape)
+        return torch.where(ids == _VOID, UNLABELLED, ids)
+
+    def _read(self, name: str, kind: str, *shape: int | None, signed: bool = False) -> Tensor:
+        """An array after checking its type (exact, or its kind letter), shape and values."""
+        array = self.arrays.get(name)
+        if array is None:
+            raise FileFormatError(f"{self.path}: expected an array {name!r}, which is not there.")
+        typed = array.dtype.kind == kind if kind == "f" else array.dtype == np.dtype(kind)
+        fits = typed and array.ndim == len(shape)
+        fits = fits and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        expect(
+            fits,
+            self.path,
+            f"{name!r} of type {kind} and shape ({wanted}), got {array.dtype} of {array.shape}",
+        )
+        if array.dtype.kind == "f":
+            bad = int(array.size - np.isfinite(array).sum())
+            expect(
+                not bad,
+                self.path,
+                f"finite {name!r}, got {bad} of {array.size} values that are NaN or infinite",
+            )
+        elif array.dtype.kind == "i" and not signed:
+            low = array.min(initial=0)
+            expect(low >= 0, self.path, f"{name!r} of 0 (none) or more, got {low}")
+        return torch.from_numpy(array)
 
 
 def _node(row: Mapping[str, Any]) -> TreeNode:
-    whole = {
-        key: json_integer(row[key], where=key, low=-1, high=_MAX_ID)
-        for key in ("id", "parent", "class", "segments", "views")
-    }
-    if not isinstance(row["name"], str):
-        raise InputError(f"name: expected a string, got {quoted(row['name'])}.")
     return TreeNode(
-        id=whole["id"],
-        parent=UNLABELLED if whole["parent"] == _VOID else whole["parent"],
+        id=row["id"],
+        parent=UNLABELLED if row["parent"] == _VOID else row["parent"],
         level=row["level"],
         name=row["name"],
-        class_id=whole["class"],
-        support=json_number(row["support"], where="support"),
-        segments=whole["segments"],
-        views=whole["views"],
+        class_id=row["class"],
+        support=row["support"],
+        segments=row["segments"],
+        views=row["views"],
     )
-
-
-def _void(id: int) -> int:
-    if id == _VOID:
-        raise InputError("ids: expected -1 (none) or 1 and more, got 0, which is void in files.")
-    return _VOID if id == UNLABELLED else id
-
-
-def _ids(ids: torch.Tensor) -> NDArray[Any]:
-    array = ids.cpu().numpy().astype(np.int32)
-    if (array == _VOID).any():
-        _void(_VOID)
-    return np.where(array == UNLABELLED, np.int32(_VOID), array)
-
-
-def _floats(values: torch.Tensor) -> NDArray[Any]:
-    return values.detach().cpu().numpy()
-
-
-def _from_file(ids: NDArray[Any]) -> torch.Tensor:
-    return torch.from_numpy(np.where(ids == _VOID, np.int32(UNLABELLED), ids))
-
-
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    with open_npz(path, expected="a layer") as archive:
-        return {name: archive.array(name) for name in _ARRAYS if name in archive}
-
-
-def _header(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    raw = arrays.get(_HEADER)
-    if raw is None or raw.dtype != np.uint8 or raw.ndim != 1:
-        raise FileFormatError(f"{path}: expected a layer, got an archive without a header.")
-    header = parse_object(raw.tobytes(), where=str(path))
-    version, count = header.get("version"), header.get("count")
-    if header.get("format") != FORMAT or not isinstance(version, int):
-        raise FileFormatError(f"{path}: expected a layer, got {quoted(header.get('format'))}.")
-    if not 1 <= version <= VERSION:
-        raise FileFormatError(
-            f"{path}: expected a layer of version {VERSION} or less, "
-            f"got version {quoted(version)}; a later splatseg wrote it."
-        )
-    header["count"] = json_integer(count, where=f"{path}: count")
-    return header
-
-
-def _info(path: Path, header: Mapping[str, Any]) -> LayerInfo:
-    """The record of how the layer was made, of whatever version the file is."""
-    key = "info" if int(header["version"]) >= _INFO_VERSION else "metadata"
-    record = header.get(key)
-    if not isinstance(record, dict):
-        raise FileFormatError(
-            f"{path}: expected an object {key!r} in the header, got {type(record).__name__}."
-        )
-    read = layer_info_from_json if key == "info" else layer_info_from_metadata
-    return read(cast("dict[str, Any]", record), where=f"{path}: {key}")
-
-
-def _background(path: Path, header: Mapping[str, Any]) -> int:
-    value = json_integer(header.get("background"), where=f"{path}: background", high=_MAX_ID)
-    return UNLABELLED if value == _VOID else value

@@ -1,18 +1,18 @@
-"""PLY files of any kind: a header, and tables whose columns are numbers or lists of numbers.
+"""PLY files: a header, and tables whose columns are numbers or lists of numbers.
 
-    ply                                  rows of an element follow each other in the order of the
-    format binary_little_endian 1.0      header, big or little endian, or one a line in ASCII
-    element vertex 3
-    property float x
-    ...
-    element face 1
-    property list uchar int vertex_indices
-    end_header
-
-Splat files have a stricter reader of their own, `splatseg.io.splats`.
+ply                                  rows of an element follow each other in the order of the
+format binary_little_endian 1.0      header, big or little endian, or one a line in ASCII
+element vertex 3
+property float x
+...
+element face 1
+property list uchar int vertex_indices
+end_header
 """
 
-from collections.abc import Collection, Mapping
+import itertools
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted, reason
-from splatseg.io.foreign import read_bytes, reading
+from splatseg.io.foreign import expect, read_bytes, reading
 from splatseg.io.text_numbers import number_table
+
+MAX_HEADER = 1 << 20
+"""Bytes in which the header must end; real ones have two or three thousand."""
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -30,8 +33,11 @@ _TYPES = {
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+_WRITTEN = {_TYPES[name]: name for name in ("char", "uchar", "short", "ushort", "int", "uint")} | {
+    "f4": "float",
+    "f8": "double",
+}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-_HEADER_LIMIT = 65536
 _KIND = "a PLY file"
 
 
@@ -57,6 +63,20 @@ class PlyElement:
 
     properties: tuple[PlyProperty, ...] = ()
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Columns of numbers."""
+        return tuple(one.name for one in self.properties if one.count_code is None)
+
+    @property
+    def lists(self) -> tuple[str, ...]:
+        """Columns of lists."""
+        return tuple(one.name for one in self.properties if one.count_code is not None)
+
+    def dtype(self, order: str = "=") -> np.dtype[np.void]:
+        """A row of an element without lists, in a byte order."""
+        return np.dtype([(one.name, (order or "=") + one.code) for one in self.properties])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlyHeader:
@@ -69,6 +89,12 @@ class PlyHeader:
     offset: int
     """Byte at which the rows of the first element start."""
 
+    comments: tuple[str, ...] = ()
+
+    def element(self, name: str) -> PlyElement | None:
+        """An element by its name, None where there is none."""
+        return next((one for one in self.elements if one.name == name), None)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlyLists:
@@ -80,11 +106,11 @@ class PlyLists:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlyTable:
-    """The rows of one element, column by column."""
+    """The rows of one element."""
 
     count: int
     numbers: Mapping[str, NDArray[Any]]
-    """Columns of one number a row, in the file's type; in ASCII files of float as float64."""
+    """Columns of numbers by name; integers keep their type, those of text are int64 or float64."""
 
     lists: Mapping[str, PlyLists] = field(default_factory=dict[str, PlyLists])
 
@@ -97,19 +123,20 @@ def read_ply_header(path: Path) -> PlyHeader:
         FileFormatError: If it is no PLY file, or its header says what PLY has no word for.
     """
     with reading(path, _KIND), path.open("rb") as file:
-        head = file.read(_HEADER_LIMIT)
-    end = head.find(b"end_header")
-    newline = head.find(b"\n", end)
-    if not head.startswith(b"ply") or end < 0 or newline < 0:
-        raise FileFormatError(f"{path}: expected a PLY file, but its header is not one.")
-    order: str | None = None
+        head = file.read(MAX_HEADER)
+    expect(head.startswith((b"ply\n", b"ply\r\n")), path, "a PLY file, which starts with 'ply'")
+    lines, offset = _header_lines(path, head)
+    orders: list[str] = []
+    comments: list[str] = []
     elements: list[PlyElement] = []
-    for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
+    for line in lines[1:]:
         match line.split():
-            case [] | ["comment" | "obj_info", *_]:
+            case [] | ["obj_info", *_]:
                 pass
+            case ["comment", *_]:
+                comments.append(line.strip()[8:])
             case ["format", word, _] if word in _ORDERS:
-                order = _ORDERS[word]
+                orders.append(_ORDERS[word])
             case ["element", name, count] if count.isdecimal() and len(count) < 16:
                 if any(one.name == name for one in elements):
                     raise FileFormatError(f"{path}: the PLY element {quoted(name)} stands twice.")
@@ -117,10 +144,24 @@ def read_ply_header(path: Path) -> PlyHeader:
             case ["property", *words] if elements:
                 elements[-1] = _with_property(path, elements[-1], words, line)
             case _:
-                raise FileFormatError(f"{path}: PLY header line {quoted(line)} is not understood.")
-    if order is None:
-        raise FileFormatError(f"{path}: expected a PLY file that names its format.")
-    return PlyHeader(order=order, elements=tuple(elements), offset=newline + 1)
+                raise FileFormatError(f"{path}: cannot read the PLY header line {quoted(line)}.")
+    expect(len(orders) == 1, path, f"one PLY line of the format, got {len(orders)}")
+    return PlyHeader(
+        order=orders[0], elements=tuple(elements), offset=offset, comments=tuple(comments)
+    )
+
+
+def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
+    """The header's lines without the last, and its length in bytes."""
+    lines: list[str] = []
+    at = 0
+    while (end := head.find(b"\n", at)) >= 0:
+        line = head[at:end].decode("latin-1").strip()
+        at = end + 1
+        if line == "end_header":
+            return lines, at
+        lines.append(line)
+    raise FileFormatError(f"{path}: expected a PLY header that ends with 'end_header', got none.")
 
 
 def _with_property(path: Path, element: PlyElement, words: list[str], line: str) -> PlyElement:
@@ -132,12 +173,34 @@ def _with_property(path: Path, element: PlyElement, words: list[str], line: str)
         ):
             added = PlyProperty(name=name, code=_TYPES[kind], count_code=_TYPES[length])
         case _:
-            raise FileFormatError(f"{path}: PLY property {quoted(line)} is not understood.")
+            raise FileFormatError(f"{path}: cannot read the PLY header line {quoted(line)}.")
     if any(one.name == added.name for one in element.properties):
         raise FileFormatError(f"{path}: the PLY property {quoted(added.name)} stands twice.")
     return PlyElement(
         name=element.name, count=element.count, properties=(*element.properties, added)
     )
+
+
+def ply_header(
+    tables: Sequence[tuple[str, int, Sequence[tuple[str, str]]]], comments: Sequence[str] = ()
+) -> bytes:
+    """The header of a little-endian file: name, rows, and columns (name, NumPy's code) of each."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {one}" for one in comments)]
+    for name, count, columns in tables:
+        lines.append(f"element {name} {count}")
+        lines += [f"property {_WRITTEN[code[-2:]]} {column}" for column, code in columns]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")
+
+
+def ply_columns(path: Path) -> tuple[str, ...]:
+    """Names of the columns of all elements of a PLY file, from its header alone.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If its header is not one of a PLY file.
+    """
+    elements = read_ply_header(path).elements
+    return tuple(one.name for element in elements for one in element.properties)
 
 
 def read_ply_tables(path: Path, header: PlyHeader, names: Collection[str]) -> dict[str, PlyTable]:
@@ -150,7 +213,7 @@ def read_ply_tables(path: Path, header: PlyHeader, names: Collection[str]) -> di
     """
     found: dict[str, PlyTable] = {}
     wanted = [element.name for element in header.elements if element.name in names]
-    reader = _TextRows(path, header) if not header.order else _BinaryRows(path, header)
+    reader = _BinaryRows(path, header) if header.order else _TextRows(path, header)
     for element in header.elements:
         if len(found) == len(wanted):
             break
@@ -160,19 +223,132 @@ def read_ply_tables(path: Path, header: PlyHeader, names: Collection[str]) -> di
     return found
 
 
-def end_of_rows(path: Path, name: str) -> int:
-    """Byte at which the rows of an element of a binary file end, whose lists must be gone through.
+def read_ply_vertices(path: Path) -> Mapping[str, NDArray[Any]]:
+    """Columns of numbers of the element ``vertex``, by name; x, y and z are among them.
 
     Raises:
-        FileFormatError: If the file ends early, or there is no such element.
+        MissingFileError: If there is no such file.
+        FileFormatError: If it is no PLY whose first element is ``vertex`` with x, y and z, or it
+            ends early.
     """
     header = read_ply_header(path)
+    first = header.elements[0] if header.elements else PlyElement(name="", count=0)
+    expect(first.name == "vertex", path, "a PLY whose first element is vertex")
+    names = quoted(", ".join(first.names))
+    expect({"x", "y", "z"} <= set(first.names), path, f"vertices with x, y and z, got {names}")
+    return read_ply_tables(path, header, ["vertex"])["vertex"].numbers
+
+
+def vertex_positions(path: Path, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Positions (n, 3) of what `read_ply_vertices` gives.
+
+    Raises:
+        FileFormatError: If one is NaN or infinite.
+    """
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    if not np.isfinite(points).all():
+        bad = int((~np.isfinite(points)).any(axis=1).sum())
+        raise FileFormatError(f"{path}: {bad} of {len(points)} points are not finite.")
+    return points
+
+
+def ply_offsets(path: Path, header: PlyHeader) -> dict[str, int]:
+    """Where rows of elements start, of a file that is exactly as long as its header says.
+
+    They are bytes of the file, in ASCII lines after the header. Elements that have lists and
+    follow ``vertex`` end the table, as only their rows would tell their lengths.
+
+    Raises:
+        FileFormatError: If the file is longer or shorter.
+    """
+    with reading(path, _KIND):
+        size = path.stat().st_size
+    offsets: dict[str, int] = {}
+    if not header.order:
+        at = least = 0
+        for element in header.elements:
+            offsets[element.name] = at
+            at += element.count if element.properties else 0
+            # A value takes a digit and what parts it from the next, a list its length.
+            least += 2 * element.count * len(element.properties)
+        have = size - header.offset
+        expect(
+            have >= least - 1,
+            path,
+            f"lines of values of at least {least - 1} bytes, got {have}: the file is truncated",
+        )
+        return offsets
     reader = _BinaryRows(path, header)
     for element in header.elements:
-        reader.next(element)
-        if element.name == name:
-            return reader.at
-    raise FileFormatError(f"{path}: expected a PLY element {quoted(name)}, got none.")
+        offsets[element.name] = reader.at
+        if not element.lists:
+            reader.at += element.count * element.dtype().itemsize
+        elif "vertex" in offsets:
+            return offsets
+        else:
+            reader.next(element)
+    fault = "truncated" if size < reader.at else "longer than its counts"
+    expect(
+        size == reader.at,
+        path,
+        f"{reader.at} bytes as its header promises, got {size}: the file is {fault}",
+    )
+    return offsets
+
+
+def read_ply_rows(
+    path: Path, header: PlyHeader, name: str, offsets: Mapping[str, int], *, block: int
+) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """Rows of an element without lists, `block` at once, as arrays of records.
+
+    Raises:
+        FileFormatError: If lines of an ASCII file are fewer or more than its header says, or one
+            is not the numbers of a row.
+    """
+    element = header.element(name) or PlyElement(name=name, count=0)
+    dtype = element.dtype(header.order)
+    with path.open("rb") as file:
+        parts = (
+            slice(start, min(start + block, element.count))
+            for start in range(0, element.count, block)
+        )
+        if header.order:
+            file.seek(offsets[name])
+            for part in parts:
+                yield part, np.fromfile(file, dtype, part.stop - part.start)
+            return
+        file.seek(header.offset)
+        total = sum(one.count for one in header.elements if one.properties)
+        lines = (line for line in file if not line.isspace())
+        at = sum(1 for _ in itertools.islice(lines, offsets[name]))
+        for part in parts:
+            wanted = part.stop - part.start
+            with _parsing(path, f"lines of {len(element.properties)} numbers", element):
+                table = number_table(list(itertools.islice(lines, wanted)), len(element.properties))
+            at += len(table)
+            expect(
+                len(table) == wanted,
+                path,
+                f"{total} lines of values, the file ends at {at}: it is truncated",
+            )
+            rows = np.empty(wanted, dtype)
+            with np.errstate(over="ignore"), _parsing(path, "numbers", element):
+                for one, values in zip(element.properties, table.T, strict=True):
+                    rows[one.name] = _typed(values, one)
+            yield part, rows
+        at += sum(1 for _ in lines)
+        expect(at == total, path, f"{total} lines of values, got {at}")
+
+
+@contextmanager
+def _parsing(path: Path, expected: str, element: PlyElement) -> Generator[None]:
+    """Name the element in what text that is no numbers raises."""
+    try:
+        yield
+    except (ValueError, OverflowError) as error:
+        raise FileFormatError(
+            f"{path}: expected {expected} for the element {quoted(element.name)} ({reason(error)})."
+        ) from error
 
 
 class _BinaryRows:
@@ -183,125 +359,61 @@ class _BinaryRows:
         self._order = header.order
         self.at = header.offset
         with reading(path, _KIND):
-            self._size = path.stat().st_size
+            self._data = np.memmap(path, np.uint8, "r")
 
     def next(self, element: PlyElement) -> PlyTable:
         """The table of the next element."""
-        lengths = self._lengths_of_first(element)
-        dtype = self._row(element, lengths)
-        lists = [one for one in element.properties if one.count_code is not None]
-        if lists and dtype.itemsize * element.count > self._size - self.at:
-            return self._walked(element)
-        rows = self._read(element, dtype)
-        for i, one in enumerate(lists):
-            if bool((rows[f"n {one.name}"] != lengths[i]).any()):
-                return self._walked(element)
-        self.at += dtype.itemsize * element.count
-        return PlyTable(
-            count=element.count,
-            numbers={p.name: rows[p.name] for p in element.properties if p.count_code is None},
-            lists={
-                one.name: PlyLists(
-                    starts=np.arange(element.count + 1, dtype=np.int64) * lengths[i],
-                    values=rows[one.name].reshape(-1),
-                )
-                for i, one in enumerate(lists)
-            },
-        )
-
-    def _lengths_of_first(self, element: PlyElement) -> list[int]:
-        """Lengths of the lists of the first row; most files have them in all rows."""
-        lengths: list[int] = []
-        at = self.at
-        if not element.count:
-            return [0 for one in element.properties if one.count_code is not None]
-        for one in element.properties:
-            size = np.dtype(one.code).itemsize
-            if one.count_code is None:
-                at += size
-                continue
-            width = np.dtype(one.count_code).itemsize
-            lengths.append(self._length(at, one.count_code))
-            at += width + size * lengths[-1]
-        return lengths
-
-    def _length(self, at: int, code: str) -> int:
-        width = np.dtype(code).itemsize
-        with reading(self._path, _KIND), self._path.open("rb") as file:
-            file.seek(at)
-            raw = file.read(width)
-        if len(raw) < width:
-            raise FileFormatError(f"{self._path}: expected rows of lists, the file ends early.")
-        length = int(np.frombuffer(raw, self._order + code)[0])
-        if not 0 <= length <= self._size - at:
-            raise FileFormatError(
-                f"{self._path}: expected a list that fits the file, got one of {length} numbers."
-            )
-        return length
-
-    def _row(self, element: PlyElement, lengths: list[int]) -> np.dtype[np.void]:
+        # Most files have lists of one length: that of the first row is tried for all.
+        lengths = dict.fromkeys(element.lists, 0)
+        if element.count and lengths:
+            first, _ = self._row(element, self.at)
+            lengths = {name: len(first[name]) for name in lengths}
         fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-        left = iter(lengths)
         for one in element.properties:
             if one.count_code is None:
                 fields.append((one.name, self._order + one.code))
             else:
                 fields.append((f"n {one.name}", self._order + one.count_code))
-                fields.append((one.name, self._order + one.code, (next(left),)))
-        return np.dtype(fields)
-
-    def _read(self, element: PlyElement, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-        have = self._size - self.at
-        if have < dtype.itemsize * element.count:
-            raise FileFormatError(
-                f"{self._path}: expected {element.count} rows of {element.name} of "
-                f"{dtype.itemsize} bytes, got {have} bytes: the file ends early."
-            )
-        with reading(self._path, _KIND):
-            return np.fromfile(self._path, dtype, element.count, offset=self.at)
-
-    def _walked(self, element: PlyElement) -> PlyTable:
-        """The table where lists differ in length: row by row."""
-        rest = read_bytes(self._path, _KIND)[self.at :]
-        at = 0
-        numbers: dict[str, list[float]] = {}
-        lists: dict[str, tuple[list[int], list[NDArray[Any]]]] = {}
-        for one in element.properties:
-            if one.count_code is None:
-                numbers[one.name] = []
-            else:
-                lists[one.name] = ([0], [])
-        for _ in range(element.count):
-            for one in element.properties:
-                count = 1
-                if one.count_code is not None:
-                    (count,), at = self._values(rest, at, one.count_code, 1)
-                values, at = self._values(rest, at, one.code, int(count))
-                if one.count_code is None:
-                    numbers[one.name].append(values[0])
-                else:
-                    starts, parts = lists[one.name]
-                    starts.append(starts[-1] + int(count))
-                    parts.append(values)
-        self.at += at
-        codes = {one.name: one.code for one in element.properties}
-        return PlyTable(
-            count=element.count,
-            numbers={name: np.array(one, codes[name]) for name, one in numbers.items()},
-            lists={
-                name: PlyLists(
-                    starts=np.array(starts, np.int64),
-                    values=np.concatenate([np.zeros(0, codes[name]), *parts]).astype(codes[name]),
+                fields.append((one.name, self._order + one.code, (lengths[one.name],)))
+        dtype = np.dtype(fields)
+        have, needed = len(self._data) - self.at, dtype.itemsize * element.count
+        if needed <= have:
+            rows = self._data[self.at : self.at + needed].view(dtype)
+            if all((rows[f"n {name}"] == length).all() for name, length in lengths.items()):
+                self.at += needed
+                starts = np.arange(element.count + 1, dtype=np.int64)
+                return PlyTable(
+                    count=element.count,
+                    numbers={name: rows[name].copy() for name in element.names},
+                    lists={
+                        name: PlyLists(starts=starts * length, values=rows[name].flatten())
+                        for name, length in lengths.items()
+                    },
                 )
-                for name, (starts, parts) in lists.items()
-            },
-        )
+        what = f"{element.count} rows of {element.name} of {dtype.itemsize} bytes, got {have} bytes"
+        expect(lengths, self._path, f"{what}: the file ends early")
+        columns = _Columns(element)
+        for _ in range(element.count):
+            row, self.at = self._row(element, self.at)
+            for i, one in enumerate(element.properties):
+                columns.add(i, row[one.name].tolist())
+        return columns.table()
 
-    def _values(self, rest: bytes, at: int, code: str, count: int) -> tuple[NDArray[Any], int]:
+    def _row(self, element: PlyElement, at: int) -> tuple[dict[str, NDArray[Any]], int]:
+        """The numbers of each column in the row at a byte, and the byte at which it ends."""
+        row: dict[str, NDArray[Any]] = {}
+        for one in element.properties:
+            count = 1
+            if one.count_code is not None:
+                (count,), at = self._values(at, one.count_code, 1)
+            row[one.name], at = self._values(at, one.code, int(count))
+        return row, at
+
+    def _values(self, at: int, code: str, count: int) -> tuple[NDArray[Any], int]:
         end = at + np.dtype(code).itemsize * count
-        if count < 0 or end > len(rest):
-            raise FileFormatError(f"{self._path}: expected lists that fit the file, got others.")
-        return np.frombuffer(rest, self._order + code, count, offset=at), end
+        fits = count >= 0 and end <= len(self._data)
+        expect(fits, self._path, f"a list that fits the file, got one of {count} numbers")
+        return np.frombuffer(self._data, self._order + code, count, offset=at), end
 
 
 class _TextRows:
@@ -316,31 +428,25 @@ class _TextRows:
     def next(self, element: PlyElement) -> PlyTable:
         """The table of the next element."""
         lines = self._lines[self._at : self._at + element.count]
-        if len(lines) < element.count:
-            raise FileFormatError(f"{self._path}: expected {element.count} rows, got {len(lines)}.")
         self._at += element.count
-        try:
+        expect(
+            len(lines) == element.count,
+            self._path,
+            f"{element.count} rows of {quoted(element.name)}, got {len(lines)}",
+        )
+        with _parsing(
+            self._path, f"{element.count} rows of {len(element.properties)} numbers", element
+        ):
             return _parsed(element, lines)
-        except (ValueError, OverflowError) as error:
-            raise FileFormatError(
-                f"{self._path}: expected {element.count} rows of {len(element.properties)} numbers "
-                f"({reason(error)})."
-            ) from error
 
 
 def _parsed(element: PlyElement, lines: list[bytes]) -> PlyTable:
-    if all(one.count_code is None for one in element.properties):
+    if not element.lists:
         table = number_table(lines, len(element.properties))
-        numbers: dict[str, NDArray[Any]] = {}
-        for one, values in zip(element.properties, table.T, strict=True):
-            numbers[one.name] = values.copy() if one.code[0] == "f" else _whole(values, one)
+        columns = zip(element.properties, table.T, strict=True)
+        numbers = {one.name: _typed(values, one).copy() for one, values in columns}
         return PlyTable(count=element.count, numbers=numbers)
-    return _parsed_lists(element, lines)
-
-
-def _parsed_lists(element: PlyElement, lines: list[bytes]) -> PlyTable:
-    columns: list[list[float]] = [[] for _ in element.properties]
-    starts = [[0] for _ in element.properties]
+    rows = _Columns(element)
     for line in lines:
         words = [float(word) for word in line.split()]
         at = 0
@@ -351,25 +457,44 @@ def _parsed_lists(element: PlyElement, lines: list[bytes]) -> PlyTable:
                 at += 1
             if not 0 <= count <= len(words) - at:
                 raise ValueError("a row is missing or has the wrong number of values")
-            columns[i] += words[at : at + count]
-            starts[i].append(len(columns[i]))
+            rows.add(i, words[at : at + count])
             at += count
         if at != len(words):
             raise ValueError("a row is missing or has the wrong number of values")
-    numbers: dict[str, NDArray[Any]] = {}
-    lists: dict[str, PlyLists] = {}
-    for one, column, ends in zip(element.properties, columns, starts, strict=True):
-        values = np.array(column, np.float64)
-        if one.code[0] != "f":
-            values = _whole(values, one)
-        if one.count_code is None:
-            numbers[one.name] = values
-        else:
-            lists[one.name] = PlyLists(starts=np.array(ends, np.int64), values=values)
-    return PlyTable(count=element.count, numbers=numbers, lists=lists)
+    return rows.table()
 
 
-def _whole(values: NDArray[np.float64], column: PlyProperty) -> NDArray[Any]:
+class _Columns:
+    """Columns of an element with lists, gathered row by row."""
+
+    def __init__(self, element: PlyElement) -> None:
+        self._element = element
+        self._values: list[list[float]] = [[] for _ in element.properties]
+        self._starts = [[0] for _ in element.properties]
+
+    def add(self, column: int, values: Sequence[float]) -> None:
+        """The number, or the list, of the next row."""
+        self._values[column] += values
+        self._starts[column].append(len(self._values[column]))
+
+    def table(self) -> PlyTable:
+        """All rows."""
+        numbers: dict[str, NDArray[Any]] = {}
+        lists: dict[str, PlyLists] = {}
+        parts = zip(self._element.properties, self._values, self._starts, strict=True)
+        for one, column, starts in parts:
+            values = _typed(np.array(column, np.float64), one)
+            if one.count_code is None:
+                numbers[one.name] = values
+            else:
+                lists[one.name] = PlyLists(starts=np.array(starts, np.int64), values=values)
+        return PlyTable(count=self._element.count, numbers=numbers, lists=lists)
+
+
+def _typed(values: NDArray[np.float64], column: PlyProperty) -> NDArray[Any]:
+    """Numbers of text in the type of their column; real ones stay float64."""
+    if column.code[0] == "f":
+        return values
     kind = np.iinfo(np.dtype(column.code))
     if not ((values >= kind.min) & (values <= kind.max) & (values == np.floor(values))).all():
         raise ValueError(f"{quoted(column.name)} has a value that its type has not")

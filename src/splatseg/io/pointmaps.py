@@ -22,12 +22,10 @@ from torch import Tensor
 from splatseg.core.boundary import boundary
 from splatseg.core.models import Pointmap
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.atomic import atomic_file
+from splatseg.io.arrays import read_npz, save_arrays
+from splatseg.io.atomic import atomic_file, named_write_failures
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.npz import read_npz
-from splatseg.io.npz_writing import save_arrays
-from splatseg.io.write_errors import named_write_failures
 
 FORMAT = "splatseg-pointmaps"
 VERSION = 1

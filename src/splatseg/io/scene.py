@@ -6,6 +6,7 @@
       cameras/transforms.json   views, in nerfstudio's layout
       evidence/<name>/          what 2D models saw
       layers/<name>.npz         what is known of each Gaussian
+      fields/<name>.safetensors, fields/<name>/drive.json    fields that are no Gaussians
       reports/
       fit/checkpoint.npz        state of a fit that was stopped
       training/<layer>.npz      state of a training of this layer that was stopped
@@ -21,26 +22,34 @@ import os
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from splatseg.core import Layer, Scene, View
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import json_integer, json_number
-from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.atomic import atomic_folder, hidden_folder, is_vacant, sync, sync_tree
+from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.errors import InputError, MissingFileError
+from splatseg.io.atomic import (
+    atomic_folder,
+    hidden_folder,
+    is_vacant,
+    named_write_failures,
+    sync,
+    sync_tree,
+)
 from splatseg.io.cameras import (
     cameras_content,
     relative_path,
     source_paths,
     views_from_content,
 )
-from splatseg.io.class_tables import class_rows, class_table
-from splatseg.io.foreign import is_file, is_folder, made_from
-from splatseg.io.json_files import read_json, write_json
+from splatseg.io.foreign import expect, is_file, is_folder, made_from
+from splatseg.io.json_files import check_version, read_json, write_json
 from splatseg.io.layers import load_layer, save_layer
-from splatseg.io.lock import scene_lock
 from splatseg.io.scene_folder import (
     CAMERAS_FILE,
     FOLDERS,
@@ -51,14 +60,42 @@ from splatseg.io.scene_folder import (
     finish_pending,
     is_scene,
     is_unfinished,
+    scene_lock,
     scene_path,
 )
+from splatseg.io.schema import structured
 from splatseg.io.splats import read_scene_splats, write_splats
-from splatseg.io.write_errors import named_write_failures
+from splatseg.io.tables import class_rows, class_table
 
 FORMAT = "splatseg-scene"
 VERSION = 1
 """Version of the folders written; all versions up to it are read."""
+
+_Number = Annotated[float, Meta(ge=-MAX_NUMBER, le=MAX_NUMBER)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Where the capture was: seen from the scene, and absolute."""
+
+    absolute: str
+    relative: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _SceneFile:
+    """What scene.json must have besides its format and version."""
+
+    gaussians: Annotated[int, Meta(ge=0)]
+    split: dict[str, list[str]]
+    source: _Source | None = None
+    up: tuple[_Number, _Number, _Number] | None = None
+    metres_per_unit: _Number | None = None
+    classes: Any = None
+    """Rows of `tables.class_table`."""
+
+    provenance: dict[str, Any] | None = None
+
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 
@@ -124,31 +161,38 @@ def load_scene(root: Path | str, *, data: Path | str | None = None) -> Scene:
         FileFormatError: If a file of it is broken, or of a later version.
     """
     root = Path(root)
+    where = root / SCENE_FILE
     content = _scene_content(root)
     cameras = read_json(current_file(root, CAMERAS_FILE))
-    source = _source(root, content, cameras, None if data is None else Path(data))
+    source = _source(root, content.source, cameras, None if data is None else Path(data))
     views = views_from_content(
         cameras, folder=root / "cameras", source=source, path=root / CAMERAS_FILE
     )
     gaussians = read_scene_splats(current_file(root, GAUSSIANS_FILE))
-    if len(gaussians) != content["gaussians"]:
-        raise FileFormatError(
-            f"{root / GAUSSIANS_FILE}: expected {content['gaussians']} Gaussians as {SCENE_FILE} "
-            f"says, got {len(gaussians)}."
-        )
-    classes, metres = content.get("classes"), content.get("metres_per_unit")
-    with made_from(root / SCENE_FILE):
+    expect(
+        len(gaussians) == content.gaussians,
+        root / GAUSSIANS_FILE,
+        f"{content.gaussians} Gaussians as {SCENE_FILE} says, got {len(gaussians)}",
+    )
+    of_view = {name: split for split, names in content.split.items() for name in names}
+    once = sum(len(names) for names in content.split.values()) == len(views)
+    expect(
+        once and set(of_view) == {view.name for view in views},
+        where,
+        f"a split that names each view of {CAMERAS_FILE} once",
+    )
+    classes = None if content.classes is None else class_table(content.classes, where=str(where))
+    with made_from(where):
         return Scene(
             gaussians=gaussians,
-            views=_with_splits(root, content, views),
-            classes=None if classes is None else class_table(classes, where=str(root / SCENE_FILE)),
-            up=_up(root, content),
-            metres_per_unit=None
-            if metres is None
-            else json_number(metres, where=f"{root / SCENE_FILE}: metres_per_unit"),
+            # The splits of scene.json come before those of the cameras file.
+            views=tuple(replace(view, split=of_view[view.name]) for view in views),
+            classes=classes,
+            up=content.up,
+            metres_per_unit=content.metres_per_unit,
             source=source,
             root=root,
-            provenance=_provenance(root, content),
+            provenance=content.provenance or {},
         )
 
 
@@ -172,12 +216,13 @@ def load_scene_layer(root: Path | str, name: str) -> Layer:
         known = ", ".join(names) if names else "it has none"
         raise InputError(f"layer: expected one of {root} ({known}), got {name!r}.")
     layer = load_layer(root / "layers" / f"{name}.npz")
-    count = _scene_content(root)["gaussians"]
-    if len(layer) != count:
-        raise FileFormatError(
-            f"{root / 'layers' / name}.npz: expected {count} rows as the scene has Gaussians, "
-            f"got {len(layer)}; the layer is from before the Gaussians changed."
-        )
+    count = _scene_content(root).gaussians
+    expect(
+        len(layer) == count,
+        root / "layers" / f"{name}.npz",
+        f"{count} rows as the scene has Gaussians, got {len(layer)}; the layer is from before the "
+        "Gaussians changed",
+    )
     return layer
 
 
@@ -192,7 +237,7 @@ def save_scene_layer(layer: Layer, root: Path | str, name: str) -> Path:
         OutputError: If the disk is full, or there is no permission.
     """
     root = Path(root)
-    _check_layer(name, layer, _scene_content(root)["gaussians"])
+    _check_layer(name, layer, _scene_content(root).gaussians)
     with scene_lock(root, "saving"):
         path = scene_path(root, "layers", f"{name}.npz")
         save_layer(layer, path)
@@ -276,28 +321,17 @@ def _absolute(view: View) -> View:
     )
 
 
-def _scene_content(root: Path) -> dict[str, Any]:
+def _scene_content(root: Path) -> _SceneFile:
     path = current_file(root, SCENE_FILE)
     if not path.is_file():
         raise MissingFileError(f"{root}: expected a scene folder, got none (no {SCENE_FILE}).")
     content = read_json(path)
-    version = content.get("version")
-    if content.get("format") != FORMAT or not isinstance(version, int):
-        raise FileFormatError(f"{path}: expected a scene, got {quoted(content.get('format'))}.")
-    if not 1 <= version <= VERSION:
-        raise FileFormatError(
-            f"{path}: expected a scene of version {VERSION} or less, "
-            f"got version {quoted(version)}; a later splatseg wrote it."
-        )
-    json_integer(content.get("gaussians"), where=f"{path}: gaussians")
-    return content
+    check_version(path, content, format=FORMAT, version=VERSION, what="a scene")
+    return structured(content, _SceneFile, where=str(path))
 
 
 def _source(
-    root: Path,
-    content: Mapping[str, Any],
-    cameras: Mapping[str, Any],
-    data: Path | None,
+    root: Path, source: _Source | None, cameras: Mapping[str, Any], data: Path | None
 ) -> Path | None:
     photographs = source_paths(cameras)
     if data is not None:
@@ -310,63 +344,102 @@ def _source(
                 f"there ({', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''})."
             )
         return data
-    source = content.get("source")
-    if not isinstance(source, dict):
+    if source is None:
         return None
-    entry = cast(dict[str, Any], source)
-    if any("\0" in str(entry.get(key)) for key in ("relative", "absolute")):
-        raise FileFormatError(
-            f"{root / SCENE_FILE}: expected paths of the source, got {quoted(source)}."
-        )
-    candidates = [
-        Path(os.path.normpath(root / str(entry.get("relative")))),
-        Path(str(entry.get("absolute"))),
-    ]
+    sound = "\0" not in source.relative + source.absolute
+    expect(sound, root / SCENE_FILE, "paths of the source, got others")
+    candidates = [Path(os.path.normpath(root / source.relative)), Path(source.absolute)]
     there = [candidate for candidate in candidates if is_folder(candidate)]
     with_photographs = [p for p in there if not photographs or is_file(p / photographs[0])]
     return next(iter([*with_photographs, *there, candidates[1]]))
 
 
-def _with_splits(
-    root: Path, content: Mapping[str, Any], views: tuple[View, ...]
-) -> tuple[View, ...]:
-    """Views with the splits of scene.json, which come before those of the cameras file."""
-    split = content.get("split")
-    if not isinstance(split, dict) or not all(isinstance(v, list) for v in split.values()):  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]
-        raise FileFormatError(f"{root / SCENE_FILE}: expected a split of lists of view names.")
-    entries = cast(dict[str, list[object]], split)
-    if not all(isinstance(name, str) for names in entries.values() for name in names):
-        raise FileFormatError(f"{root / SCENE_FILE}: expected a split of names, got others.")
-    lists = cast(dict[str, list[str]], split)
-    of_view = {name: key for key, names in lists.items() for name in names}
-    names = {view.name for view in views}
-    if set(of_view) != names or sum(len(n) for n in lists.values()) != len(names):
-        raise FileFormatError(
-            f"{root / SCENE_FILE}: expected a split that names each view of {CAMERAS_FILE} once."
-        )
-    return tuple(
-        view if view.split == of_view[view.name] else replace(view, split=of_view[view.name])
-        for view in views
-    )
+# Fields, which are no Gaussians: a file, or the folder of a drive in blocks. What is in them is the
+# business of who makes them (`splatseg.street`); here is where they are, and how they are called.
+
+FOLDER = "fields"
+SUFFIX = ".safetensors"
+DRIVE_FILE = "drive.json"
+"""What makes a folder that of a drive in blocks."""
 
 
-def _provenance(root: Path, content: Mapping[str, Any]) -> dict[str, Any]:
-    provenance = content.get("provenance") or {}
-    if not isinstance(provenance, dict):
-        raise FileFormatError(
-            f"{root / SCENE_FILE}: expected an object as provenance, got {quoted(provenance)}."
-        )
-    return cast(dict[str, Any], provenance)
+@boundary
+def scene_field_names(root: Path) -> tuple[str, ...]:
+    """Names of the fields of a scene folder, sorted. Other files in their folder are none."""
+    folder = root / FOLDER
+    files = {p.name.removesuffix(SUFFIX) for p in folder.glob(f"*{SUFFIX}") if p.is_file()}
+    drives = {path.parent.name for path in folder.glob(f"*/{DRIVE_FILE}")}
+    return tuple(sorted(name for name in files | drives if _NAME.fullmatch(name)))
 
 
-def _up(root: Path, content: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    up = content.get("up")
-    if up is None:
-        return None
-    values = cast(list[object], up) if isinstance(up, list) else []
-    if len(values) != 3:
-        raise FileFormatError(
-            f"{root / SCENE_FILE}: expected up as three numbers, got {quoted(up)}."
-        )
-    x, y, z = (json_number(v, where=f"{root / SCENE_FILE}: up") for v in values)
-    return (x, y, z)
+@boundary
+def scene_field_path(root: Path, name: str) -> Path:
+    """The file of a field that a scene has, or the folder of a drive in blocks.
+
+    Raises:
+        InputError: If it has none of this name.
+    """
+    names = scene_field_names(root)
+    if name not in names:
+        known = ", ".join(names) if names else "it has none; `splatseg street` makes one"
+        raise InputError(f"field: expected one of {root} ({known}), got {name!r:.80}.")
+    file = root / FOLDER / f"{name}{SUFFIX}"
+    return file if file.is_file() else root / FOLDER / name
+
+
+@boundary
+def new_field_file(root: Path, name: str) -> Path:
+    """Where the file of a field is to be written; its folder is made.
+
+    Raises:
+        InputError: If the name cannot be a file's, or a link leads out of the scene.
+        OutputError: If the folder cannot be made.
+    """
+    check_name("field", name)
+    return scene_path(root, FOLDER, f"{name}{SUFFIX}")
+
+
+@boundary
+def new_field_folder(root: Path, name: str) -> Path:
+    """The folder of a field in blocks, which is made where it is not there.
+
+    Raises:
+        InputError: If the name cannot be a folder's, or a link leads out of the scene.
+        OutputError: If the folder cannot be made.
+    """
+    check_name("field", name)
+    return scene_path(root, FOLDER, name, DRIVE_FILE).parent
+
+
+@boundary
+def remove_field_file(root: Path, name: str) -> None:
+    """Remove a field that is a file, where there is one.
+
+    Raises:
+        InputError: If a link leads out of the scene.
+        OutputError: If it cannot be removed.
+    """
+    path = new_field_file(root, name)
+    with named_write_failures(path):
+        path.unlink(missing_ok=True)
+
+
+@boundary
+def remove_field_folder(root: Path, name: str) -> None:
+    """Remove a field in blocks, where there is one; what else its folder holds stays.
+
+    Raises:
+        InputError: If a link leads out of the scene.
+        OutputError: If it cannot be removed.
+    """
+    check_name("field", name)
+    if not (root / FOLDER / name).is_dir():
+        return
+    folder = new_field_folder(root, name)
+    with named_write_failures(folder):
+        # The table first: without it the rest is no field.
+        (folder / DRIVE_FILE).unlink(missing_ok=True)
+        for block in folder.glob(f"[0-9]*{SUFFIX}"):
+            block.unlink()
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from splatseg.core import UNLABELLED
 from splatseg.core.boundary import boundary
-from splatseg.core.surfaces import LabelledMesh, LabelledPoints
+from splatseg.core.scans import LabelledMesh, LabelledPoints
 from splatseg.errors import FileFormatError, InputError, quoted
-from splatseg.io.foreign import made_from
-from splatseg.io.npz import read_npz
+from splatseg.io.arrays import read_npz
+from splatseg.io.foreign import expect, made_from
 from splatseg.io.ply import PlyLists, PlyTable, read_ply_header, read_ply_tables
 
 _FACES = ("vertex_indices", "vertex_index")
@@ -54,26 +54,24 @@ def read_surface(
     """
     if path.suffix.lower() == ".npz":
         return _from_arrays(path, zero_is_class=zero_is_class, void=void)
-    if path.suffix.lower() != ".ply":
-        raise FileFormatError(f"{path}: expected labelled surfaces as .ply or .npz, got another.")
+    expect(path.suffix.lower() == ".ply", path, "labelled surfaces as .ply or .npz, got another")
     tables = read_ply_tables(path, read_ply_header(path), ["vertex", "face"])
-    if "vertex" not in tables or not {"x", "y", "z"} <= set(tables["vertex"].numbers):
-        raise FileFormatError(f"{path}: expected a PLY file with vertices that have x, y and z.")
+    expect(
+        "vertex" in tables and {"x", "y", "z"} <= set(tables["vertex"].numbers),
+        path,
+        "a PLY file with vertices that have x, y and z",
+    )
     vertices = _positions(tables["vertex"], "xyz")
     labels = _labels(path, tables["vertex"], zero_is_class=zero_is_class, void=void)
     if "face" not in tables or not tables["face"].count:
-        if not labels:
-            raise FileFormatError(f"{path}: expected points with ids, got none{_seen(tables)}.")
+        expect(labels, path, f"points with ids, got none{_seen(tables)}")
         normals = None
         if set(_NORMALS) <= set(tables["vertex"].numbers):
             normals = _positions(tables["vertex"], _NORMALS)
         with made_from(path):
             return LabelledPoints(points=vertices, labels=labels, normals=normals)
     of_faces = _labels(path, tables["face"], zero_is_class=zero_is_class, void=void)
-    if not labels and not of_faces:
-        raise FileFormatError(
-            f"{path}: expected vertices or faces with ids, got neither{_seen(tables)}."
-        )
+    expect(labels or of_faces, path, f"vertices or faces with ids, got neither{_seen(tables)}")
     faces, source = _triangles(path, tables["face"])
     with made_from(path):
         return LabelledMesh(
@@ -125,10 +123,13 @@ def ids_of(
     Raises:
         FileFormatError: If one is no whole number, or too large.
     """
-    if values.dtype.kind == "f" and not (np.isfinite(values) & (values == np.floor(values))).all():
-        raise FileFormatError(f"{where}: expected whole ids, got others.")
-    if len(values) and float(values.max()) > _MAX_ID:
-        raise FileFormatError(f"{where}: expected ids up to {_MAX_ID}, got {values.max():.0f}.")
+    expect(
+        values.dtype.kind != "f" or (np.isfinite(values) & (values == np.floor(values))).all(),
+        where,
+        "whole ids, got others",
+    )
+    largest = float(values.max(initial=0))
+    expect(largest <= _MAX_ID, where, f"ids up to {_MAX_ID}, got {largest:.0f}")
     ids = torch.from_numpy(values.astype(np.int64)).clamp_min(UNLABELLED)
     nothing = (ids < 0) | (ids == (UNLABELLED if void is None else void))
     ids = ids + 1 if zero_is_class else torch.where(ids == 0, UNLABELLED, ids)
@@ -155,10 +156,8 @@ def _triangles(path: Path, table: PlyTable) -> tuple[Tensor, Tensor]:
     if lists is None or lists.values.dtype.kind not in "iu":
         raise FileFormatError(f"{path}: expected faces with a list of {' or '.join(_FACES)}.")
     corners = np.diff(lists.starts)
-    if (corners < 3).any():
-        raise FileFormatError(
-            f"{path}: expected faces of at least 3 corners, got one of {int(corners.min())}."
-        )
+    fewest = int(corners.min(initial=3))
+    expect(fewest >= 3, path, f"faces of at least 3 corners, got one of {fewest}")
     return _fans(lists, corners)
 
 
@@ -187,8 +186,7 @@ def _from_arrays(path: Path, *, zero_is_class: bool, void: int | None) -> Labell
             labels[name] = ids_of(
                 values, where=f"{path}: {name}", zero_is_class=zero_is_class, void=void
             )
-    if not labels:
-        raise FileFormatError(f"{path}: expected ids under {' or '.join(_ARRAYS)}, got none.")
+    expect(labels, path, f"ids under {' or '.join(_ARRAYS)}, got none")
     with made_from(path):
         try:
             normals = arrays.get("normal")

@@ -1,35 +1,40 @@
-"""Tensors by name from a file that runs no code: safetensors, or NumPy's npz.
+"""Tensors by name in files that run no code (safetensors, npz), and PyTorch's own, not run."""
 
-PyTorch's own ``.pth`` files are pickles and are not read here; see `read_tensors`.
-"""
-
+import json
 import math
+import pickle
+import zipfile
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 
-from splatseg.core.json_numbers import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
-from splatseg.io.foreign import read_bytes, reading
+from splatseg.io.arrays import open_npz
+from splatseg.io.atomic import atomic_file
+from splatseg.io.foreign import expect, read_bytes, reading
 from splatseg.io.json_files import parse_object
-from splatseg.io.npz import open_npz
+from splatseg.io.schema import structured
 
 _TYPES = {
-    "F64": (torch.float64, 8),
-    "F32": (torch.float32, 4),
-    "F16": (torch.float16, 2),
-    "BF16": (torch.bfloat16, 2),
-    "I64": (torch.int64, 8),
-    "I32": (torch.int32, 4),
-    "U8": (torch.uint8, 1),
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "U8": torch.uint8,
 }
-SAFETENSORS_NAMES = {dtype: name for name, (dtype, _) in _TYPES.items()}
+_NAMES = {dtype: name for name, dtype in _TYPES.items()}
 """What safetensors call the types that are read and written."""
 
 _MAX_HEADER = 100_000_000
-_MAX_SIDE = 1 << 40
+_KIND = "a safetensors file"
 _CONVERT = (
     "python -c \"import numpy, torch; numpy.savez('weights.npz', "
     "**torch.load('weights.pth', weights_only=True))\""
@@ -71,6 +76,15 @@ def _npz(path: Path) -> dict[str, Tensor]:
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """A tensor in the header of a safetensors file."""
+
+    dtype: Literal["F64", "F32", "F16", "BF16", "I64", "I32", "U8"]
+    shape: list[Annotated[int, Meta(ge=0, le=1 << 40)]]
+    data_offsets: tuple[int, int]
+
+
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """All tensors of a ``.safetensors`` file by name, and the words that its header has of them.
 
@@ -78,15 +92,9 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         MissingFileError: If there is no such file.
         FileFormatError: If it is damaged, or holds types that are not numbers.
     """
-    data = read_bytes(path, "a safetensors file")
-    length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(_MAX_HEADER, len(data) - 8):
-        raise FileFormatError(f"{path}: expected a safetensors file, its header is cut off.")
-    header = parse_object(data[8 : 8 + length], where=f"{path}: header")
-    body = memoryview(data)[8 + length :]
-    words = _words(path, header.pop("__metadata__", {}))
-    tensors = {name: _tensor(path, name, entry, body) for name, entry in header.items()}
-    return tensors, words
+    header, words, start = _header(path)
+    body = memoryview(read_bytes(path, _KIND))[start:]
+    return {name: _tensor(path, name, entry, body) for name, entry in header.items()}, words
 
 
 def read_safetensors_words(path: Path) -> dict[str, str]:
@@ -96,34 +104,132 @@ def read_safetensors_words(path: Path) -> dict[str, str]:
         MissingFileError: If there is no such file.
         FileFormatError: If its header is damaged.
     """
-    with reading(path, "a safetensors file"), path.open("rb") as file:
-        length = int.from_bytes(file.read(8), "little")
+    return _header(path)[1]
+
+
+def _header(path: Path) -> tuple[dict[str, Any], dict[str, str], int]:
+    """Entries of tensors, words about them, and the byte at which values start."""
+    with reading(path, _KIND), path.open("rb") as file:
+        first = file.read(8)
+        length = int.from_bytes(first, "little")
         text = file.read(length) if length <= _MAX_HEADER else b""
-    if len(text) != length:
-        raise FileFormatError(f"{path}: expected a safetensors file, its header is cut off.")
-    return _words(path, parse_object(text, where=f"{path}: header").get("__metadata__", {}))
+    whole = len(first) == 8 and len(text) == length
+    expect(whole, path, "a safetensors file, its header is cut off")
+    header = parse_object(text, where=f"{path}: header")
+    words = header.pop("__metadata__", {})
+    return header, structured(words, dict[str, str], where=f"{path}: __metadata__"), 8 + length
 
 
-def _words(path: Path, words: object) -> dict[str, str]:
-    if not isinstance(words, dict) or not all(isinstance(text, str) for text in words.values()):  # pyright: ignore[reportUnknownVariableType]
-        raise FileFormatError(f"{path}: expected text in __metadata__, got {quoted(words)}.")
-    return cast("dict[str, str]", words)
-
-
-def _tensor(path: Path, name: str, entry: Any, body: memoryview) -> Tensor:
-    fields = cast("dict[str, Any]", entry) if isinstance(entry, dict) else {}
-    kind, sides, place = (fields.get(key) for key in ("dtype", "shape", "data_offsets"))
+def _tensor(path: Path, name: str, value: object, body: memoryview) -> Tensor:
     where = f"{path}: tensor {quoted(name)}"
-    if not isinstance(sides, list) or not isinstance(place, list) or len(place) != 2:  # pyright: ignore[reportUnknownArgumentType]
-        raise FileFormatError(f"{where}: expected its type, shape and place, got {quoted(entry)}.")
-    if not isinstance(kind, str) or kind not in _TYPES:
-        raise FileFormatError(f"{where}: expected {', '.join(_TYPES)}, got {quoted(kind)}.")
-    shape = [json_integer(n, where=where, high=_MAX_SIDE) for n in cast("list[object]", sides)]
-    begin, end = (json_integer(n, where=where) for n in cast("list[object]", place))
-    dtype, size = _TYPES[kind]
-    if not begin <= end <= len(body) or end - begin != size * math.prod(shape):
-        raise FileFormatError(f"{where}: it has not the size that its shape asks for.")
+    entry = structured(value, _Entry, where=where)
+    dtype, (begin, end) = _TYPES[entry.dtype], entry.data_offsets
+    fits = 0 <= begin <= end <= len(body)
+    size = dtype.itemsize * math.prod(entry.shape)
+    expect(fits and end - begin == size, where, f"{size} bytes within the file, as its shape says")
     if begin == end:
         with reading(where, "a tensor"):
-            return torch.zeros(shape, dtype=dtype)
-    return torch.frombuffer(bytearray(body[begin:end]), dtype=dtype).reshape(shape)
+            return torch.zeros(entry.shape, dtype=dtype)
+    return torch.frombuffer(bytearray(body[begin:end]), dtype=dtype).reshape(entry.shape)
+
+
+_ALIGNED = 8
+"""Bytes that the header's length is a multiple of, so that numbers stand at even places."""
+
+
+def write_tensors(
+    tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping[str, str]
+) -> None:
+    """Write tensors to a ``.safetensors`` file; the same values give the same bytes.
+
+    `splatseg.io.tensors.read_safetensors` is the inverse.
+
+    Args:
+        tensors: By name, of types that `read_tensors` reads, in the order in which they are
+            written.
+        path: The file.
+        metadata: Text about them.
+
+    Raises:
+        InputError: If the name does not end in ``.safetensors``, or a tensor has another type.
+        MissingFileError: If the folder of `path` does not exist.
+        OutputError: If it cannot be written.
+    """
+    if path.suffix != ".safetensors":
+        raise InputError(f"{path}: expected .safetensors, got {path.suffix or 'no suffix'}.")
+    header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
+    end = 0
+    for name, tensor in tensors.items():
+        kind = _NAMES.get(tensor.dtype)
+        if kind is None:
+            raise InputError(f"{name}: expected a type of safetensors, got {tensor.dtype}.")
+        begin, end = end, end + tensor.numel() * tensor.element_size()
+        header[name] = {"dtype": kind, "shape": list(tensor.shape), "data_offsets": [begin, end]}
+    words = json.dumps(header, separators=(",", ":")).encode()
+    words += b" " * (-len(words) % _ALIGNED)
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        file.write(len(words).to_bytes(8, "little"))
+        file.write(words)
+        for tensor in tensors.values():
+            values = tensor.detach().cpu().contiguous().reshape(-1)
+            file.write(values.view(torch.uint8).numpy().tobytes())
+
+
+_EXPECTED = "a checkpoint of PyTorch 1.6 or later, or safetensors"
+
+
+class PickleStub:
+    """Stands for every class and function that a checkpoint names besides those of tensors.
+
+    Checkpoints of Lightning hold callbacks and options, which are of no use here. Whatever would
+    be made of them becomes a dictionary that nobody reads.
+    """
+
+    def __new__(cls, *arguments: object) -> Any:
+        """Make a dictionary, of a kind that takes both items and a state."""
+        return OrderedDict[Any, Any]()
+
+
+class NumpyStub:
+    """Stands for NumPy's numbers and arrays, whose states are not those of dictionaries.
+
+    Training programs leave their best scores in checkpoints.
+    """
+
+    def __init__(self, *arguments: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        """Forget it."""
+
+
+def read_torch_file(path: Path) -> object:
+    """What a file of PyTorch holds, by `torch.load` with ``weights_only``: nothing in it is run.
+
+    Classes that it names, other than those of tensors, become `PickleStub` or `NumpyStub`. Tensors
+    are mapped from the file: they must be copied before it is changed.
+
+    Raises:
+        MissingFileError: If there is no such file.
+        FileFormatError: If it cannot be read so.
+    """
+    with reading(path, _EXPECTED):
+        if path.stat().st_size and not zipfile.is_zipfile(path):
+            raise FileFormatError(f"{path}: expected {_EXPECTED}, got another kind of file.")
+        try:
+            named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+            with torch.serialization.safe_globals([(_stand_in(name), name) for name in named]):
+                # Mapped and not read: optimizers' states, which are as large as the weights,
+                # are never touched.
+                return cast(
+                    object, torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+                )
+        except (pickle.UnpicklingError, AssertionError) as error:
+            raise FileFormatError(
+                f"{path}: expected a checkpoint of tensors and plain values, got one that only the "
+                "program it is of can read; its state_dict saved as safetensors is taken."
+            ) from error
+
+
+def _stand_in(name: str) -> type:
+    return NumpyStub if name.startswith("numpy.") else PickleStub

@@ -34,9 +34,9 @@ from splatseg.core.models import (
     TextFeatures,
 )
 from splatseg.errors import InputError, reason
+from splatseg.io.arrays import open_npz
 from splatseg.io.atomic import atomic_file
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.io.npz import open_npz
 from splatseg.models._content import image_digest
 from splatseg.models._packing import Answer, Precision, pack, unpack
 

@@ -24,6 +24,7 @@ from splatseg.core.models import (
     TextFeaturesWithWords,
 )
 from splatseg.errors import InputError, ShapeError
+from splatseg.io.atomic import path_inside
 from splatseg.io.evidence import (
     SEGMENTS_FILE,
     EvidenceKind,
@@ -36,7 +37,6 @@ from splatseg.io.evidence import (
 )
 from splatseg.io.images import load_image
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.paths import path_inside
 from splatseg.models._cache import ModelCache
 from splatseg.models._sources import SEGMENT_PARTS, Source, What, some, without_empty
 from splatseg.models._words import word_vectors

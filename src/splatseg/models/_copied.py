@@ -12,7 +12,7 @@ from typing_extensions import override
 from splatseg.core import UNLABELLED, ClassTable, LabelMap, View, camera_of_map
 from splatseg.errors import InputError, ShapeError
 from splatseg.io.annotations import AREA_KINDS, AnnotationEvidence
-from splatseg.io.atomic import atomic_file
+from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.evidence import (
     TEXT_FILE,
     Evidence,
@@ -31,7 +31,6 @@ from splatseg.io.evidence import (
     save_tracks,
     view_files,
 )
-from splatseg.io.paths import path_inside
 from splatseg.models._recorded_features import check_grid
 from splatseg.models._recording import check_size
 from splatseg.models._sources import Source, some, without_empty

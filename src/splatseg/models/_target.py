@@ -9,10 +9,17 @@ from pathlib import Path
 from typing import Any, cast
 
 from splatseg.core import View
+from splatseg.core.checkpoints import ABSENT, OptionDifference, option_differences
 from splatseg.core.models import Model, ModelWithDefaults
-from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
 from splatseg.errors import InputError
-from splatseg.io.atomic import TEMPORARY, hidden_folder, is_vacant, replace_folder, sweep
+from splatseg.io.atomic import (
+    TEMPORARY,
+    hidden_folder,
+    is_vacant,
+    named_write_failures,
+    replace_folder,
+    sweep,
+)
 from splatseg.io.evidence import (
     EvidenceKind,
     create_evidence,
@@ -20,7 +27,6 @@ from splatseg.io.evidence import (
     view_files,
 )
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.io.write_errors import named_write_failures
 from splatseg.models._sources import Source, some, views_done
 
 _SAME = ("model", "settings", "what")

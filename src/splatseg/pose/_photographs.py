@@ -15,10 +15,10 @@ from torch import Tensor
 from splatseg.core import Camera, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.atomic import check_utf8
 from splatseg.io.captures import bare_photographs
 from splatseg.io.foreign import reading
 from splatseg.io.images import image_size, load_image, open_image, reduced_size
-from splatseg.io.paths import check_utf8
 from splatseg.pose._exif import LensFacts, lens_facts
 from splatseg.pose._options import PoseOptions
 from splatseg.pose._report import LeftOut

@@ -18,8 +18,7 @@ from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, parse_object
-from splatseg.io.tensors import read_safetensors, read_safetensors_words
-from splatseg.io.tensors_writing import write_tensors
+from splatseg.io.tensors import read_safetensors, read_safetensors_words, write_tensors
 from splatseg.street.field import VERTEX_RULES, MeshField, VertexRule
 from splatseg.street.mesh import PrimitiveMesh
 from splatseg.street.radiance import RadianceModel, RadianceOptions

@@ -21,8 +21,8 @@ from splatseg.evaluate import (
     SemanticScore,
 )
 from splatseg.evaluate.overlaps import InstanceScore
+from splatseg.io.arrays import read_npz
 from splatseg.io.json_files import read_json
-from splatseg.io.npz import read_npz
 
 
 def semantic_figures(report: SemanticReport, name_of: Callable[[int], str]) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from torch import Tensor
 from splatseg.core import ClassTable, Renderable, Scene, View
 from splatseg.errors import InputError, RangeError
 from splatseg.io.cameras import cameras_content
+from splatseg.io.images import check_encoder, write_video
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.video import check_encoder, write_video
 from splatseg.render.paths import camera_path, is_forward_facing
 from splatseg.report.images import colour_depth
 from splatseg.report.legend import colour_labels

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatseg.core import Capture, ScanSource, View
-from splatseg.core.moving import MovingBox
+from splatseg.core.scans import MovingBox
 from splatseg.errors import InputError
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import load_mask

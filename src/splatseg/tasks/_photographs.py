@@ -5,8 +5,8 @@ from typing import Literal
 
 from splatseg.core import Capture
 from splatseg.errors import InputError
+from splatseg.io.atomic import check_utf8
 from splatseg.io.captures import find_formats, read_capture
-from splatseg.io.paths import check_utf8
 from splatseg.io.scene_folder import POSES_FOLDER
 from splatseg.pose import (
     PoseOptions,

@@ -5,7 +5,7 @@ from pathlib import Path
 from splatseg.core import Capture
 from splatseg.core.models import PointmapModel
 from splatseg.errors import InputError, MissingFileError
-from splatseg.io.paths import check_utf8
+from splatseg.io.atomic import check_utf8
 from splatseg.io.pointmaps import HEADER_FILE, RecordedPointmaps, holds_pointmaps, open_pointmaps
 from splatseg.io.scene_folder import POSES_FOLDER
 from splatseg.models import model_names

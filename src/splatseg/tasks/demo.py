@@ -15,9 +15,8 @@ from splatseg.errors import InputError, RangeError
 from splatseg.fit import FitOptions
 from splatseg.io.atomic import is_vacant
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.lock import check_unlocked
 from splatseg.io.scene import load_scene, save_scene_layer
-from splatseg.io.scene_folder import work_on_scene
+from splatseg.io.scene_folder import check_unlocked, work_on_scene
 from splatseg.render import BackendName
 from splatseg.report.demo_report import DemoFigures, machine_score, write_report
 from splatseg.report.fit_verdict import scored_of

@@ -26,10 +26,21 @@ from splatseg.io.captures import FORMATS, bare_photographs, find_formats, read_c
 from splatseg.io.evidence import Evidence, evidence_names, open_evidence
 from splatseg.io.images import DEFAULT_LONGEST, image_size
 from splatseg.io.layers import load_layer
-from splatseg.io.lock import lock_owner
-from splatseg.io.scene import load_scene, load_scene_layer, scene_layer_names
-from splatseg.io.scene_fields import DRIVE_FILE, scene_field_names, scene_field_path
-from splatseg.io.scene_folder import CHECKPOINT_FILE, is_scene, is_unfinished, training_files
+from splatseg.io.scene import (
+    DRIVE_FILE,
+    load_scene,
+    load_scene_layer,
+    scene_field_names,
+    scene_field_path,
+    scene_layer_names,
+)
+from splatseg.io.scene_folder import (
+    CHECKPOINT_FILE,
+    is_scene,
+    is_unfinished,
+    lock_owner,
+    training_files,
+)
 from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format, trained_splats
 from splatseg.tasks.stopped_fit import where_it_stopped
 from splatseg.tasks.stopped_training import where_training_stopped

@@ -19,9 +19,9 @@ from splatseg.evaluate import (
     matched_miou,
 )
 from splatseg.evaluate.lpips import Lpips, load_lpips
-from splatseg.io.class_tables import class_table
 from splatseg.io.evidence import Evidence, check_map_sizes, open_evidence
 from splatseg.io.json_files import read_json
+from splatseg.io.tables import class_table
 from splatseg.lift import PointLabelOptions, PointRule
 from splatseg.render import BackendName
 from splatseg.tasks._figures import (

@@ -10,8 +10,8 @@ from splatseg.core import Capture, Gaussians, Scene
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.importing import Alignment, VirtualViews, align, place_cameras
+from splatseg.io.atomic import check_utf8
 from splatseg.io.captures import read_capture
-from splatseg.io.paths import check_utf8
 from splatseg.io.scene import save_scene
 from splatseg.io.splats import SplatWarning, Values, read_splats, splat_format
 from splatseg.render import BackendName

@@ -9,8 +9,7 @@ from typing import Any
 
 from splatseg.core import Capture, Scene
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.checkpoints import Checkpoints
-from splatseg.core.interrupts import deferred_interrupts
+from splatseg.core.checkpoints import Checkpoints, deferred_interrupts
 from splatseg.errors import InputError
 from splatseg.evaluate import PhotographReport
 from splatseg.fit import (
@@ -22,8 +21,8 @@ from splatseg.fit import (
     random_point_count,
     reduction_note,
 )
+from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.io.captures import read_start_points
-from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scans import read_scans
 from splatseg.io.scene import save_scene
 from splatseg.io.scene_folder import CHECKPOINT_FILE

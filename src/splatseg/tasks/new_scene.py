@@ -3,11 +3,9 @@
 from pathlib import Path
 
 from splatseg.errors import InputError
-from splatseg.io.atomic import check_writable, is_vacant, sweep
-from splatseg.io.lock import check_unlocked
-from splatseg.io.paths import check_utf8
+from splatseg.io.atomic import check_utf8, check_writable, is_vacant, sweep
 from splatseg.io.scene import scene_layer_names
-from splatseg.io.scene_folder import is_scene, is_unfinished
+from splatseg.io.scene_folder import check_unlocked, is_scene, is_unfinished
 
 
 def check_new_folder(folder: Path) -> None:

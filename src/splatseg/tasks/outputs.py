@@ -8,10 +8,10 @@ from pathlib import Path
 from splatseg.core import TREE_LEVELS, Features, InstanceTree, Layer, Scene
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
+from splatseg.io.atomic import named_write_failures
 from splatseg.io.evidence import Evidence
 from splatseg.io.export import write_node_table
 from splatseg.io.scene_folder import scene_path
-from splatseg.io.write_errors import named_write_failures
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName
 from splatseg.report.segment_report import SegmentationRun, write_segmentation_report

@@ -12,8 +12,8 @@ from torch import Tensor
 from splatseg.core import Scene, Selection, View
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
+from splatseg.io.atomic import path_inside
 from splatseg.io.images import save_png
-from splatseg.io.paths import path_inside
 from splatseg.lift.field_layers import selection_labels
 from splatseg.lift.label_maps import view_label_map
 from splatseg.render import BackendName, PreparedView, prepare

@@ -26,11 +26,10 @@ from splatseg.core import (
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.errors import InputError
 from splatseg.evaluate.held_out import label_map_in
-from splatseg.io.atomic import atomic_folder, sweep
+from splatseg.io.arrays import read_npy
+from splatseg.io.atomic import atomic_folder, path_inside, sweep
 from splatseg.io.images import save_png
 from splatseg.io.json_files import read_json, write_json
-from splatseg.io.npy import read_npy
-from splatseg.io.paths import path_inside
 from splatseg.io.scene import scene_layer_names
 from splatseg.lift import GaussianField
 from splatseg.render import BackendName

@@ -16,8 +16,7 @@ from splatseg.core import (
 from splatseg.errors import InputError
 from splatseg.evaluate.photographs import MaskUse
 from splatseg.io.evidence import Evidence
-from splatseg.io.scene import load_scene_layer, scene_layer_names
-from splatseg.io.scene_fields import scene_field_path
+from splatseg.io.scene import load_scene_layer, scene_field_path, scene_layer_names
 from splatseg.lift import GaussianField, PointLabelOptions
 from splatseg.render import BackendName
 from splatseg.tasks._film import path_views

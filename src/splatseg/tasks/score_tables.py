@@ -8,7 +8,7 @@ from typing import Any
 
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_file
-from splatseg.io.csv_files import csv_text
+from splatseg.io.tables import csv_text
 
 Cell = str | int | float
 

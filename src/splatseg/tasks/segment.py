@@ -23,6 +23,7 @@ from splatseg.core import (
 from splatseg.core.boundary import boundary
 from splatseg.core.instance_tree import layer_kind
 from splatseg.errors import InputError
+from splatseg.io.arrays import discard_checkpoint_file
 from splatseg.io.evidence import (
     Evidence,
     TrackedEvidence,
@@ -31,7 +32,6 @@ from splatseg.io.evidence import (
     open_evidence,
     without_masked,
 )
-from splatseg.io.npz_writing import discard_checkpoint_file
 from splatseg.io.scene import check_name, save_scene_layer
 from splatseg.lift.completion.complete import CompletionOptions, complete
 from splatseg.lift.segments.panoptic import merge_panoptic

@@ -10,8 +10,8 @@ from torch import Tensor
 from splatseg.core import Scene, Selection
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, MissingFileError
+from splatseg.io.atomic import path_inside
 from splatseg.io.images import save_png
-from splatseg.io.paths import path_inside
 from splatseg.io.splats import write_splats
 from splatseg.lift.field_layers import selection_labels
 from splatseg.lift.label_maps import view_label_map

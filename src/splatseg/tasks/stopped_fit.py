@@ -7,8 +7,8 @@ from pathlib import Path
 
 from splatseg.errors import FileFormatError, InputError
 from splatseg.fit import CheckpointSummary, CheckpointVersionError, checkpoint_summary
+from splatseg.io.atomic import named_write_failures
 from splatseg.io.scene_folder import CHECKPOINT_FILE, MASKS_FOLDER, is_scene, work_on_scene
-from splatseg.io.write_errors import named_write_failures
 from splatseg.tasks.checkpoint_options import CheckpointOptions
 from splatseg.tasks.new_scene import check_replaceable_scene
 

@@ -197,7 +197,7 @@ def test_ply_points(tmp_path, order) -> None:
     ("text", "message"),
     [
         ("hello", "expected a PLY file"),
-        ("ply\nelement vertex 1\nproperty float x\nend_header\n", "names its format"),
+        ("ply\nelement vertex 1\nproperty float x\nend_header\n", "one PLY line of the format"),
         ("ply\nformat ascii 1.0\nelement face 1\nend_header\n", "first element is vertex"),
         (
             "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
@@ -219,10 +219,10 @@ def test_ply_files_that_are_no_points(tmp_path, text, message) -> None:
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ([{"id": 1}], r"classes\[0\]: expected an integer id and a name"),
+        ([{"id": 1}], r"classes\[0\]: expected a field name"),
         ([{"id": 1, "name": "a"}, {"id": 1, "name": "b"}], "distinct ids"),
-        ([{"id": 1, "name": "a", "colour": [1, 2, 300]}], "three bytes"),
-        ("walls", "a list of classes"),
+        ([{"id": 1, "name": "a", "colour": [1, 2, 300]}], r"classes\[0\].colour\[2\]: expected"),
+        ("walls", "classes: expected a list"),
     ],
 )
 def test_broken_class_tables_are_named(nerfstudio, rows, message) -> None:

@@ -10,8 +10,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import Camera, Capture, ScanSource, View
-from splatseg.core.moving import MovingBox, boxes_at, inside_boxes, pixels_of_boxes
-from splatseg.core.scans import Scan
+from splatseg.core.scans import MovingBox, Scan, boxes_at, inside_boxes, pixels_of_boxes
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, ShapeError
 from splatseg.io.captures import read_capture
 from splatseg.io.evidence import open_evidence
@@ -106,7 +105,7 @@ def test_a_file_may_leave_out_what_is_as_usual(tmp_path):
         ({"boxes": [{"centre": [0, 0, 1e99], "size": [1, 1, 1]}]}, "centre: expected a finite"),
         (
             {"boxes": [{"centre": [0, 0, 0], "size": [1, 0, 1]}]},
-            r"boxes\[0\]: size: expected three",
+            r"boxes\[0\]: size\[1\]: expected more than 0",
         ),
         ({"boxes": [{"centre": [0, 0, 0], "size": [1, 1, 1], "yaw": 3}]}, "got 'yaw'"),
         (

@@ -13,7 +13,7 @@ import torch
 from splatseg.core import Gaussians
 from splatseg.errors import InputError
 from splatseg.io.splats import SplatWarning, read_splats, splat_format, write_splats
-from splatseg.io.splats._codebooks import scalar_codebook, vector_palette
+from splatseg.io.splats._quantisation import scalar_codebook, vector_palette
 
 Make = Callable[..., Gaussians]
 

@@ -118,8 +118,8 @@ def test_unknown_kernels_and_colour_spaces_are_told(golden: Path, tmp_path: Path
     with pytest.warns(SplatWarning) as caught:
         g = read_splats(written(tmp_path, document))
     messages = " ".join(str(warning.message) for warning in caught)
-    assert "the kernel customShape is not known" in messages
-    assert "the colour space custom_space_display is not known" in messages
+    assert "the kernel 'customShape' is not known" in messages
+    assert "the colour space 'custom_space_display' is not known" in messages
     assert torch.equal(g.sh, plain.sh)
 
 
@@ -127,8 +127,8 @@ def test_unknown_kernel_and_colour_space_fall_back(shared_data: Path) -> None:
     with pytest.warns(SplatWarning) as caught:
         g = read_splats(shared_data / "splats" / "khr_extensible_fallback.gltf")
     messages = " ".join(str(warning.message) for warning in caught)
-    assert "the kernel customShape is not known" in messages
-    assert "the colour space custom_space_display is not known" in messages
+    assert "the kernel 'customShape' is not known" in messages
+    assert "the colour space 'custom_space_display' is not known" in messages
     assert g.opacities.tolist() == [0.5]
     assert g.scales.tolist() == [[1, 1, 1]]  # logs: linear zeros could not be seen
     torch.testing.assert_close(g.colours, torch.tensor([[0.282095, 0.56419, 0.846285]]))
@@ -283,18 +283,21 @@ REST = "KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.pop("asset"), "expected a member 'asset' at the root"),
+        (lambda d: d.pop("asset"), "expected a field asset"),
         (set_in("asset", "version", value="1.0"), "expected glTF version 2"),
         (
             set_in("extensionsRequired", value=["EXT_meshopt_compression"]),
-            "needs the glTF extension EXT_meshopt_compression",
+            "needs the glTF extension 'EXT_meshopt_compression'",
         ),
         (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "got a glTF without"),
         (set_in("meshes", 0, "primitives", 0, "mode", value=4), "points .mode 0."),
         (set_in("scenes", 0, "nodes", value=[]), "got a glTF without"),
         (set_in("scenes", 0, "nodes", value=[0, 0]), "this one has two parents"),
-        (set_in("scenes", 0, "nodes", value=[7]), "expected a list with an element 7 at nodes"),
-        (set_in("scenes", 0, "nodes", value=[-1]), "a whole number of at least 0 at scenes"),
+        (set_in("scenes", 0, "nodes", value=[7]), "expected a list nodes with an element 7, got 1"),
+        (
+            set_in("scenes", 0, "nodes", value=[-1]),
+            "scenes\\[0\\].nodes\\[0\\]: expected .*, got -1",
+        ),
         (set_in("nodes", 0, "children", value=[0]), "this one has two parents"),
         (set_in("nodes", 0, "rotation", value=[0, 0, 0, 0]), "a quaternion that is not zero"),
         (lambda d: attributes(d).pop(SCALE), "the attribute SCALE of Gaussians, got none"),
@@ -308,9 +311,15 @@ REST = "KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"
             lambda d: attributes(d).update({"KHR_gaussian_splatting:SH_DEGREE_2_COEF_0": 0}),
             "got 1 of 5 of degree 2 after degree 1",
         ),
-        (lambda d: extension(d).pop("kernel"), "expected a member 'kernel'"),
-        (set_in("accessors", 0, "componentType", value=5130), "a component type of glTF"),
-        (set_in("accessors", 0, "type", value="MAT4"), "SCALAR, VEC2, VEC3 or VEC4"),
+        (lambda d: extension(d).pop("kernel"), "expected a field kernel"),
+        (
+            set_in("accessors", 0, "componentType", value=5130),
+            "a component type and shape of glTF, got 5130",
+        ),
+        (
+            set_in("accessors", 0, "type", value="MAT4"),
+            "a component type and shape of glTF, .*MAT4",
+        ),
         (set_in("accessors", 1, "type", value="VEC3"), r"shape \(3, 4\) of the attribute ROTATION"),
         (set_in("accessors", 0, "count", value=2), r"expected the shape \(2, 4\)"),
         (
@@ -319,7 +328,7 @@ REST = "KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"
         ),
         (set_in("accessors", 0, "sparse", value={}), "got a sparse accessor"),
         (lambda d: d["accessors"][0].pop("bufferView"), "compressed or empty accessor"),
-        (set_in("accessors", 0, "byteOffset", value=4), "expected 40 bytes for accessors.0."),
+        (set_in("accessors", 0, "byteOffset", value=4), "accessors.0.: expected 40 bytes"),
         (set_in("bufferViews", 0, "byteStride", value=8), "one row each 8 bytes"),
         (set_in("bufferViews", 0, "byteOffset", value=10**9), "at byte 1000000000 of"),
         (set_in("buffers", 0, "byteLength", value=10**9), "truncated"),
@@ -361,7 +370,7 @@ def test_glb_headers(golden: Path, tmp_path: Path) -> None:
 
     edited(4, 1, "expected .glb version 2, got 1")
     edited(8, 12, "expected 12 bytes as its header says")
-    edited(12, 10**9, "the .glb part at byte 12 is truncated")
+    edited(12, 10**9, "a part of 1000000000 bytes at byte 12, got a truncated one")
     edited(16, 0, "expected a JSON part")
     path.write_bytes(b"glTF\2\0")
     with pytest.raises(FileFormatError, match=r"a \.glb header of 12 bytes, got 6"):

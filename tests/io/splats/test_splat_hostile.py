@@ -129,8 +129,8 @@ def test_ply_headers(golden: Path, tmp_path: Path) -> None:
         refused(tmp_path / "a.ply", edited_ply(golden, old, new), message)
 
     edited(b"binary_little_endian", b"ascii", "expected lines of 28 numbers|expected 3 lines")
-    edited(b"binary_little_endian", b"morse", "expected one PLY line 'format binary_little")
-    edited(b"format binary_little_endian 1.0\n", b"", "got 0 format lines")
+    edited(b"binary_little_endian", b"morse", "cannot read the PLY header line 'format morse")
+    edited(b"format binary_little_endian 1.0\n", b"", "one PLY line of the format, got 0")
     edited(b"vertex 3\n", b"vertex 4\n", "truncated")
     edited(b"vertex 3\n", b"vertex 2\n", "longer than its counts")
     edited(b"vertex 3\n", b"vertex 99999999999999\n", "truncated")
@@ -303,7 +303,7 @@ def test_spz_headers(golden: Path, tmp_path: Path) -> None:
     refused(tmp_path / "a.spz", gzip.compress(b"NGSP"), "expected an SPZ header of 16 bytes, got 4")
     refused(tmp_path / "a.spz", spz_header(version=3), "version 4 outside gzip, got 3")
     good = gzip.compress(spz_header() + body)
-    refused(tmp_path / "a.spz", good[:-5], "end without their check sum: truncated")
+    refused(tmp_path / "a.spz", good[:-5], "gzip data with their check sum, got none: truncated")
     refused(tmp_path / "a.spz", good[:-8] + b"\0" * 8, "expected gzip data of an SPZ file")
     with_extension = gzip.compress(spz_header(flags=2) + body + b"\1\0\0\0\0\0\0\0")
     (tmp_path / "a.spz").write_bytes(with_extension)
@@ -337,15 +337,17 @@ def test_spz_4_streams(tmp_path: Path) -> None:
     refused(path, spz_4(good, degree=1), "expected 6 streams for degree 1, got 5")
     refused(path, spz_4([*good[:1], bytes(4), *good[2:]]), "3 bytes in stream 1 .* got 4")
     wrong = [27, 3, 9, 9, 12]
-    refused(path, spz_4([bytes(26), *good[1:]], sizes=wrong), "27 bytes in stream 0, got 26")
-    refused(path, spz_4([bytes(28), *good[1:]], sizes=wrong), "27 bytes in stream 0, got more")
+    refused(path, spz_4([bytes(26), *good[1:]], sizes=wrong), "27 bytes in stream 0 .*, got 26")
+    refused(path, spz_4([bytes(28), *good[1:]], sizes=wrong), "27 bytes in stream 0 .*, got more")
     refused(path, spz_4(good) + b"x", "too long")
     refused(path, spz_4(good)[:-1], "truncated")
-    refused(path, spz_4(good)[:20], "the header is truncated at 20 bytes")
+    refused(path, spz_4(good)[:20], "a header of 32 bytes, got 20: truncated")
     for table in (0, 31, 2000, 2**32 - 1):
         data = bytearray(spz_4(good))
         struct.pack_into("<I", data, 16, table)
-        refused(path, bytes(data), f"table of streams at byte {table} lies outside")
+        refused(
+            path, bytes(data), f"a table of streams within the file .*, got one at byte {table}"
+        )
     data = bytearray(spz_4(good))
     data[32 + 5 * 16] ^= 255
     refused(path, bytes(data), "stream 0 is no zstd data")
@@ -385,8 +387,10 @@ def test_sog_bundles(golden: Path, tmp_path: Path) -> None:
         refused(path, bundle({n: d for n, d in new.items() if n not in dropped}), message)
 
     edited("expected a member 'quats.webp', got none", quats_webp=None)
-    edited("expected at least 3 pixels in 'sh0.webp', got 1 x 2", sh0_webp=picture(1, 2))
-    edited("expected about 3 pixels in 'sh0.webp'", sh0_webp=picture(3000, 3000))
+    edited("expected at least 3 pixels in 'sh0.webp'.*, got 1 x 2", sh0_webp=picture(1, 2))
+    edited(
+        "expected at least 3 pixels in 'sh0.webp', and not many more", sh0_webp=picture(3000, 3000)
+    )
     edited("expected a WebP picture in 'sh0.webp'", sh0_webp=b"no picture")
     edited("expected a WebP picture in 'sh0.webp'", sh0_webp=picture(4, 4, format="PNG"))
     broken = files["sh0.webp"][:30] + b"\xff" + files["sh0.webp"][31:]
@@ -415,26 +419,29 @@ def edited_meta(files: dict[str, bytes], change: Callable[[dict], object]) -> by
     ("change", "message"),
     [
         (lambda m: m.update(version=3), "expected SOG version 1 or 2, got 3"),
-        (lambda m: m.update(count=-1), r"a whole number of at least 0 at count, got -1"),
-        (lambda m: m.update(count=True), r"a whole number of at least 0 at count, got True"),
+        (lambda m: m.update(count=-1), r"count: expected .*, got -1"),
+        (lambda m: m.update(count=True), r"count: expected .*, got True"),
         (lambda m: m.update(count=10**12), "1000000000000 Gaussians, which is 236000 GB"),
         (lambda m: m.update(count=2000), "expected at least 2000 pixels in"),
-        (lambda m: m.pop("scales"), "expected a member 'scales' at the root"),
-        (lambda m: m["means"].pop("mins"), "expected a member 'mins' at means"),
-        (lambda m: m["means"].update(mins=[0, 1]), "expected 3 numbers at means.mins"),
+        (lambda m: m.pop("scales"), "expected a field scales, got none"),
+        (lambda m: m["means"].pop("mins"), "means: expected a field mins, got none"),
+        (lambda m: m["means"].update(mins=[0, 1]), "means.mins: expected .*length 3"),
         (
             lambda m: m["means"].update(mins=[0, 1, None]),
-            r"a finite number at means\.mins\[2\], got None",
+            r"means\.mins\[2\]: expected .*, got None",
         ),
-        (lambda m: m["means"].update(maxs=[0, 1, float("nan")]), "expected a finite number"),
+        (lambda m: m["means"].update(maxs=[0, 1, float("nan")]), r"means\.maxs\[2\]: expected"),
         (lambda m: m["means"].update(maxs=[0, 1, 1e9]), "hold values that are NaN or infinite"),
-        (lambda m: m["means"].update(files=["a"]), "expected 2 names of files at means.files"),
-        (lambda m: m["means"].update(files=[1, 2]), r"expected a string at means\.files\[0\]"),
-        (lambda m: m["quats"].update(files="x"), "expected a list at quats.files"),
-        (lambda m: m.update(quats=3), "expected an object at quats, got 3"),
-        (lambda m: m["scales"].update(codebook=[]), "1 to 256 numbers at scales.codebook"),
+        (lambda m: m["means"].update(files=["a"]), "means.files: expected .*length 2"),
+        (lambda m: m["means"].update(files=[1, 2]), r"means\.files\[0\]: expected text, got 1"),
+        (lambda m: m["quats"].update(files="x"), "quats.files: expected a list"),
+        (lambda m: m.update(quats=3), "quats: expected an object, got 3"),
+        (lambda m: m["scales"].update(codebook=[]), "scales.codebook: expected .*length"),
         (lambda m: m["scales"].update(codebook=[0.0]), "hold values that are NaN"),
-        (lambda m: m["shN"].update(bands=2), "the degree of 3 coefficients at shN.bands, got 2"),
+        (
+            lambda m: m["shN"].update(bands=2),
+            "shN.bands: expected the degree of 3 coefficients, got 2",
+        ),
         (lambda m: m["shN"].update(count=65), "at most the 64 entries of the palette"),
         (lambda m: m["shN"].update(count=2), "1 of 3 Gaussians have a label beyond the palette"),
     ],

@@ -8,7 +8,7 @@ import torch
 
 from splatseg.core import Camera, Gaussians
 from splatseg.io.splats import read_splats, write_splats
-from splatseg.io.splats._common import logits
+from splatseg.io.splats._rows import logits
 from splatseg.render import render
 
 COUNT = 80_003

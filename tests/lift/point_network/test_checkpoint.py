@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.tensors import read_safetensors
-from splatseg.io.tensors_writing import write_tensors
+from splatseg.io.tensors import read_safetensors, write_tensors
 from splatseg.lift.point_network import (
     PUBLISHED_S3DIS,
     PointInputs,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatseg.errors import FileFormatError, MissingFileError
-from splatseg.io.tensors_writing import write_tensors
+from splatseg.io.tensors import write_tensors
 from splatseg.lift.point_network import PointInputs, load_point_encoder, point_pyramid
 from splatseg.lift.point_network.pyramid import PyramidOptions
 

@@ -11,9 +11,9 @@ import torch
 from splatseg.cli import main
 from splatseg.core import VoxelFeatures
 from splatseg.errors import FileFormatError, InputError, RangeError
+from splatseg.io.arrays import save_arrays
 from splatseg.io.evidence import FeatureEvidence, open_evidence
 from splatseg.io.layers import load_layer, save_layer
-from splatseg.io.npz_writing import save_arrays
 from splatseg.io.scene import load_scene, load_scene_layer
 from splatseg.lift.vocabulary import vocabulary_of
 from splatseg.lift.voxels import HitOptions, VoxelWords, surface_points, voxelise

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
-from splatseg.io.tensors_writing import write_tensors
+from splatseg.io.tensors import write_tensors
 from splatseg.street.shapes import (
     ShapeAutoEncoder,
     ShapeConfig,

@@ -12,7 +12,7 @@ from PIL import Image
 
 from splatseg.cli import main
 from splatseg.core.benchmark import BenchmarkScene, TrueMaps
-from splatseg.core.surfaces import LabelledPoints
+from splatseg.core.scans import LabelledPoints
 from splatseg.evaluate import SurfaceField
 from splatseg.io.benchmarks import read_benchmark
 from splatseg.io.evidence import create_evidence, save_label_map

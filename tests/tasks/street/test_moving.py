@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from splatseg.core import Scene, View
-from splatseg.core.moving import MovingBox, inside_boxes, pixels_of_boxes
+from splatseg.core.scans import MovingBox, inside_boxes, pixels_of_boxes
 from splatseg.errors import FileFormatError, InputError, MissingFileError, ShapeError
 from splatseg.io.evidence import open_evidence
 from splatseg.io.images import load_mask

@@ -23,10 +23,10 @@ from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.annotations._base import AnnotatedPicture, Annotations, renumbered
 from splatseg.io.annotations._regions import Canvas, Region, corners_of
+from splatseg.io.atomic import path_inside
 from splatseg.io.foreign import is_folder, made_from, reading
 from splatseg.io.images import open_image
 from splatseg.io.limits import check_unpacked
-from splatseg.io.paths import path_inside
 
 _FOLDERS = ("panoptic", "panoptic_seg", ".")
 """Where the PNGs of panoptic segments lie beside their JSON, if not in a folder of its name."""

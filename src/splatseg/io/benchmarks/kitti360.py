@@ -44,8 +44,7 @@ from splatseg.io.captures.kitti360_drive import (
 from splatseg.io.foreign import is_file, is_folder, read_lines, reading
 from splatseg.io.images import open_image
 from splatseg.io.label_tables import label_table, learned_as
-from splatseg.io.ply import read_ply_header
-from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
+from splatseg.io.ply import read_ply_header, read_ply_vertices, vertex_positions
 
 LAYOUT = "kitti360"
 

@@ -25,7 +25,7 @@ from splatseg.io.benchmarks._masks import true_ids
 from splatseg.io.benchmarks._views import read_views, scene_folders, trained_on_all
 from splatseg.io.captures.scannet import find_scannet, labelled_mesh
 from splatseg.io.foreign import is_file, read_lines
-from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
+from splatseg.io.ply import read_ply_vertices, vertex_positions
 
 LAYOUT = "scannet"
 

@@ -16,7 +16,7 @@ from splatseg.io.benchmarks._views import read_views, scene_folders
 from splatseg.io.captures.scannetpp import find_scannetpp
 from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json
-from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
+from splatseg.io.ply import read_ply_vertices, vertex_positions
 from splatseg.io.surfaces import read_triangles
 
 LAYOUT = "scannetpp"

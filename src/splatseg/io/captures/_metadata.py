@@ -7,8 +7,8 @@ from typing import Any
 
 from splatseg.core import ClassTable
 from splatseg.core.boundary import boundary
-from splatseg.io.class_tables import class_table
 from splatseg.io.json_files import read_json
+from splatseg.io.tables import class_table
 
 _UP_AXES = {
     f"{sign}{axis}": (

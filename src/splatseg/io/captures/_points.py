@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from splatseg.core import PointCloud
 from splatseg.core.sh import SH_C0
-from splatseg.io.ply_vertices import ply_columns, read_ply_vertices
+from splatseg.io.ply import ply_columns, read_ply_vertices
 
 
 def point_cloud(points: NDArray[np.floating], colours: NDArray[np.uint8] | None) -> PointCloud:

@@ -112,7 +112,7 @@ def _fitted(
     *,
     ratio: float,
 ) -> tuple[Intrinsics, float]:
-    """The lens of `core._distortion` nearest to these pixels, and pixels it is off at most.
+    """The lens of `core.lenses` nearest to these pixels, and pixels it is off at most.
 
     With (u, v) the equidistant coordinates, the pixel is linear in f, f k, f p, f s and the
     principal point, where ``ratio`` = fx / fy is known and pixels down are multiplied by it.

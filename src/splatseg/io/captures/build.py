@@ -13,8 +13,9 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from splatseg.core import Camera, Capture, PointCloud, View
-from splatseg.core.view_names import clean_view_names
+from splatseg.core.scene import clean_view_names
 from splatseg.errors import InputError, MissingFileError, quoted
+from splatseg.io.atomic import check_utf8
 from splatseg.io.captures._metadata import read_metadata
 from splatseg.io.captures._photographs import Photographs, moves
 from splatseg.io.captures.raw_views import (
@@ -25,7 +26,6 @@ from splatseg.io.captures.raw_views import (
 )
 from splatseg.io.foreign import is_file, made_from
 from splatseg.io.images import DEFAULT_LONGEST, image_size, reduced_size, same_shape
-from splatseg.io.paths import check_utf8
 
 TEST_EVERY = 8
 """Without a split of its own, views 0, 8, 16 ... of a capture by sorted name are test views."""

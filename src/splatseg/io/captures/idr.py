@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, InputError, MissingFileError
+from splatseg.io.arrays import open_npz
 from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.images import find_images, image_size
-from splatseg.io.npz import open_npz
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
 _IMAGE_FOLDERS = ("images", "image")

@@ -33,7 +33,7 @@ from splatseg.io.captures.replica import inverse_pose
 from splatseg.io.foreign import is_folder, read_lines
 from splatseg.io.images import find_images
 from splatseg.io.keyed_numbers import keyed_matrix
-from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
+from splatseg.io.ply import read_ply_vertices, vertex_positions
 
 PERSPECTIVE = {"image_00": "data_rect", "image_01": "data_rect"}
 FISHEYE = {"image_02": "data_rgb", "image_03": "data_rgb"}

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, InputError
+from splatseg.io.arrays import read_npy
 from splatseg.io.captures._points_beside import points_beside
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics, RawView
 from splatseg.io.images import find_images
-from splatseg.io.npy import read_npy
 
 FILE = "poses_bounds.npy"
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", ".")

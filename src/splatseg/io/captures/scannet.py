@@ -15,7 +15,7 @@ from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.captures.replica import inverse_pose
 from splatseg.io.foreign import is_file
 from splatseg.io.images import image_size
-from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
+from splatseg.io.ply import read_ply_vertices, vertex_positions
 from splatseg.io.text_numbers import read_numbers
 
 INTRINSICS = Path("intrinsic/intrinsic_color.txt")

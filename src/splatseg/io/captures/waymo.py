@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splatseg.core import Capture
 from splatseg.errors import FileFormatError, MissingFileError, SplatsegError
-from splatseg.io.atomic import atomic_folder, sweep
+from splatseg.io.atomic import atomic_folder, path_inside, sweep
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.raw_views import MAX_SIDE, Intrinsics, RawView
 from splatseg.io.captures.replica import inverse_pose
@@ -31,7 +31,6 @@ from splatseg.io.captures.waymo_tfrecord import ENDING
 from splatseg.io.foreign import is_file
 from splatseg.io.json_files import read_json, write_json
 from splatseg.io.parquet import RowReader, bytes_of, integer_of, number_of, read_rows
-from splatseg.io.paths import path_inside
 
 CALIBRATIONS = "camera_calibration"
 PHOTOGRAPHS = "photographs"

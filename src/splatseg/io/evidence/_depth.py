@@ -8,9 +8,9 @@ from typing_extensions import override
 
 from splatseg.core import DepthKind, DepthMap, FeatureMap, MaskSet
 from splatseg.errors import FileFormatError, InputError
+from splatseg.io.arrays import npz_names
 from splatseg.io.depths import DEPTH_NAME, depth_kind, read_depth_map
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
-from splatseg.io.npz import npz_names
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -22,6 +22,7 @@ from splatseg.core import FeatureMap, MaskSet
 from splatseg.core.boundary import boundary
 from splatseg.core.models import DeepFeatures
 from splatseg.errors import FileFormatError, InputError
+from splatseg.io.arrays import npz_names, read_npz
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._own_features import (
     check_finite_numbers,
@@ -30,7 +31,6 @@ from splatseg.io.evidence._own_features import (
     own_features,
     whole_pixels,
 )
-from splatseg.io.npz import npz_names, read_npz
 
 QUANTISATION_FILE = "quant.npz"
 BASIS_FILE = "basis.npz"

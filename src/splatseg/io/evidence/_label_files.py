@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from splatseg.core import ClassTable
 from splatseg.errors import FileFormatError, brief
+from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.evidence._base import MAX_FILE_ID
 from splatseg.io.foreign import reading
 from splatseg.io.images import open_image
 from splatseg.io.limits import check_unpacked
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import npz_names, read_npz
 
 SOFT_NAMES = ("probabilities", "logits")
 """Arrays of an npz that is a soft map."""

@@ -17,12 +17,11 @@ from typing_extensions import override
 from splatseg.core import FeatureMap, MaskSet, Rle
 from splatseg.core.json_numbers import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, quoted, reason
+from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.evidence._base import EvidenceKind, IdFreeEvidence, refuse
 from splatseg.io.evidence._label_files import read_id_map
 from splatseg.io.json_files import read_json_value
 from splatseg.io.limits import check_unpacked
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import npz_names, read_npz
 
 MASK_TABLE = "metadata.csv"
 """What SAM's tool writes beside the pictures of masks of one photograph."""

@@ -10,8 +10,8 @@ from splatseg.core import ClassTable
 from splatseg.core.boundary import boundary
 from splatseg.core.json_values import id_of_key
 from splatseg.errors import FileFormatError, InputError, MissingFileError, RangeError, quoted
+from splatseg.io.arrays import npz_names
 from splatseg.io.captures import read_metadata
-from splatseg.io.class_tables import class_table
 from splatseg.io.evidence._base import (
     HEADER_FILE,
     Evidence,
@@ -42,7 +42,7 @@ from splatseg.io.evidence._segments import (
 )
 from splatseg.io.json_files import read_json, read_json_value
 from splatseg.io.label_tables import LabelTable, label_table, training_table
-from splatseg.io.npz import npz_names
+from splatseg.io.tables import class_table
 
 FORMAT = "splatseg-evidence"
 VERSION = 2

@@ -13,7 +13,7 @@ from splatseg._check import check_finite
 from splatseg.core import FeatureMap
 from splatseg.core.models import DeepFeatures
 from splatseg.errors import FileFormatError, InputError
-from splatseg.io.npz import read_npz
+from splatseg.io.arrays import read_npz
 
 _MAX_PIXELS = 1 << 24
 _BLOCKS, _TOKEN = "blocks", "class_token"

@@ -23,10 +23,9 @@ from splatseg.core import (
 )
 from splatseg.core.boundary import boundary
 from splatseg.core.models import DeepFeatures
-from splatseg.core.view_names import check_view_name
+from splatseg.core.scene import check_view_name
 from splatseg.errors import InputError, MissingFileError, RangeError, ShapeError
-from splatseg.io.atomic import atomic_file
-from splatseg.io.class_tables import class_rows
+from splatseg.io.atomic import atomic_file, named_write_failures, path_inside
 from splatseg.io.depths import DEPTH_NAME
 from splatseg.io.evidence._base import (
     CONFIDENCE_FOLDER,
@@ -42,8 +41,7 @@ from splatseg.io.evidence._own_features import features_content
 from splatseg.io.evidence._segments import SEGMENTS_FILE, TRACKS_FILE
 from splatseg.io.images import save_png, write_png
 from splatseg.io.json_files import json_text, write_json
-from splatseg.io.paths import path_inside
-from splatseg.io.write_errors import named_write_failures
+from splatseg.io.tables import class_rows
 
 _WRITTEN = ("labels", "panoptic", "tracked", "masks", "features", "depth")
 _MAX_ID = 65535

@@ -13,9 +13,9 @@ from typing import Any
 
 from splatseg.core import ClassInfo, ClassTable
 from splatseg.errors import FileFormatError, InputError, quoted
-from splatseg.io.class_tables import class_table
 from splatseg.io.foreign import read_lines
 from splatseg.io.json_files import read_json
+from splatseg.io.tables import class_table
 
 TABLES = ("ade20k", "coco", "cityscapes", "scannet", "kitti360", "semantic-kitti", "voc")
 """Data sets whose tables are known by name."""

@@ -17,7 +17,7 @@ import torch
 
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_matrix, json_number
-from splatseg.core.moving import MovingBox
+from splatseg.core.scans import MovingBox
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import read_json, write_json

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatseg.core.moving import MovingBox
 from splatseg.core.rigid import quaternion_from_rotation
+from splatseg.core.scans import MovingBox
 from splatseg.errors import FileFormatError, MissingFileError
 from splatseg.io.captures.kitti360_drive import SCANS, VELODYNE, Drive, find_drive
 from splatseg.io.foreign import is_file, made_from

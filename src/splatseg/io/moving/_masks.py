@@ -13,13 +13,13 @@ from torch.nn.functional import interpolate, max_pool2d
 from splatseg._check import check_choice
 from splatseg.core import Capture, View
 from splatseg.core.boundary import boundary, convert_fields
-from splatseg.core.moving import MovingBox, boxes_at, pixels_of_boxes
+from splatseg.core.scans import MovingBox, boxes_at, pixels_of_boxes
 from splatseg.core.scene import camera_of_map
 from splatseg.errors import InputError, RangeError
+from splatseg.io.atomic import path_inside
 from splatseg.io.evidence import Evidence
 from splatseg.io.images import load_mask, save_png
 from splatseg.io.moving._times import CLOCKS, Clock, view_times
-from splatseg.io.paths import path_inside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

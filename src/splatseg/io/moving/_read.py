@@ -4,7 +4,7 @@ from pathlib import Path
 
 from splatseg._check import check_choice
 from splatseg.core.boundary import boundary
-from splatseg.core.moving import MovingBox
+from splatseg.core.scans import MovingBox
 from splatseg.io.foreign import is_file, is_folder
 from splatseg.io.moving._json import read_json_boxes
 from splatseg.io.moving._kitti360 import kitti360_boxes, read_kitti360_boxes

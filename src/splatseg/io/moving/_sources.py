@@ -7,8 +7,7 @@ import torch
 from splatseg._check import check_choice
 from splatseg.core import ScanSource
 from splatseg.core.boundary import boundary
-from splatseg.core.moving import MovingBox, boxes_at, inside_boxes
-from splatseg.core.scans import Scan
+from splatseg.core.scans import MovingBox, Scan, boxes_at, inside_boxes
 from splatseg.io.moving._times import CLOCKS, Clock, scan_time
 
 

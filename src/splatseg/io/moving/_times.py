@@ -7,7 +7,7 @@ from splatseg._check import check_choice
 from splatseg.core import Capture, Scan
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import is_json_number
-from splatseg.core.view_names import frame_number
+from splatseg.core.scene import frame_number
 from splatseg.errors import InputError
 from splatseg.io.captures.kitti360_drive import SCANS, VELODYNE, find_drive
 from splatseg.io.captures.nerfstudio import FILE

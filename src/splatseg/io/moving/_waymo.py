@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from splatseg.core.json_numbers import MAX_NUMBER
-from splatseg.core.moving import MovingBox
 from splatseg.core.rigid import quaternion_from_rotation
+from splatseg.core.scans import MovingBox
 from splatseg.errors import FileFormatError, quoted
 from splatseg.io.captures.waymo_segment import (
     BOXES,

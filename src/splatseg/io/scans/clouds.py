@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, quoted
+from splatseg.io.arrays import npz_names, read_npy, read_npz
 from splatseg.io.foreign import reading
-from splatseg.io.npy import read_npy
-from splatseg.io.npz import npz_names, read_npz
 from splatseg.io.ply import PlyHeader, read_ply_header, read_ply_tables
 from splatseg.io.scans._source import RawScan
 

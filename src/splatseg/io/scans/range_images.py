@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatseg.errors import FileFormatError, MissingFileError
+from splatseg.io.arrays import npz_names, read_npz
 from splatseg.io.captures import read_metadata
 from splatseg.io.captures.raw_views import checked_pose
-from splatseg.io.npz import npz_names, read_npz
 from splatseg.io.scans._source import RawScan, Scans
 
 FILE = "lidar.npz"

@@ -2,23 +2,38 @@
 
 Which layout a file has is told by its first bytes, and by its name only where those say
 nothing (``.splat`` has no header, ``.ksplat`` nothing that is its own). Each format's bytes are
-described in docs/formats/splats.md.
+described in docs/formats/splats.md. A new format is a row of `_READERS`, one of `_WRITERS` where it
+is written, and its mark in `_format_of_content`.
 """
 
 import zlib
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from splatseg._check import check_choice
 from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
+from splatseg.core.gaussians import LOW_PASS
 from splatseg.errors import FileFormatError, InputError
 from splatseg.io.atomic import atomic_file
-from splatseg.io.foreign import is_folder
+from splatseg.io.foreign import expect, is_folder
 from splatseg.io.json_files import read_json
-from splatseg.io.splats._common import Losses, StrPath, check_file, warn
-from splatseg.io.splats._common import SplatWarning as SplatWarning
+from splatseg.io.ply import read_ply_header
+from splatseg.io.splats._rows import Losses, StrPath, check_file, warn
+from splatseg.io.splats._rows import SplatWarning as SplatWarning
+from splatseg.io.splats.compressed_ply import (
+    is_compressed,
+    read_compressed_ply,
+    write_compressed_ply,
+)
+from splatseg.io.splats.gltf import read_gltf
+from splatseg.io.splats.ply import read_ply, write_ply
+from splatseg.io.splats.sog import read_sog, write_sog
+from splatseg.io.splats.splat import read_ksplat, read_splat, write_splat
+from splatseg.io.splats.spz import read_spz, write_spz
 
 Values = Literal["scales", "opacities"]
 """What a file may have as it is, where 3DGS has logs and logits."""
@@ -26,14 +41,42 @@ Values = Literal["scales", "opacities"]
 SplatFormat = Literal["ply", "compressed.ply", "splat", "ksplat", "spz", "sog", "gltf"]
 WritableFormat = Literal["ply", "compressed.ply", "splat", "spz", "spz3", "sog"]
 
-_WRITABLE: dict[WritableFormat, str] = {
-    "compressed.ply": "a compressed PLY file",
-    "ply": "a PLY file",
-    "splat": "a .splat file",
-    "spz": "an SPZ file",
-    "spz3": "an SPZ file",
-    "sog": "a SOG file",
+
+_READERS: Mapping[SplatFormat, Callable[..., Gaussians]] = {
+    "compressed.ply": read_compressed_ply,
+    "splat": read_splat,
+    "ksplat": read_ksplat,
+    "spz": read_spz,
+    "sog": read_sog,
+    "gltf": read_gltf,
 }
+"""All formats but PLY, whose reader has more to be told."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Writer:
+    label: str
+    write: Callable[[Gaussians, Path, Losses], None]
+    keeps: tuple[Literal["extra", "antialiased", "low_pass"], ...] = ()
+    """What it has a place for beside the Gaussians."""
+
+
+_WRITERS: Mapping[WritableFormat, _Writer] = {
+    "compressed.ply": _Writer(
+        "a compressed PLY file", write_compressed_ply, ("antialiased", "low_pass")
+    ),
+    "ply": _Writer(
+        "a PLY file",
+        lambda gaussians, path, _: write_ply(gaussians, path),
+        ("extra", "antialiased", "low_pass"),
+    ),
+    "splat": _Writer("a .splat file", write_splat),
+    "spz": _Writer("an SPZ file", partial(write_spz, version=4), ("antialiased",)),
+    "spz3": _Writer("an SPZ file", partial(write_spz, version=3), ("antialiased",)),
+    "sog": _Writer("a SOG file", write_sog, ("antialiased",)),
+}
+"""In the order in which names are looked at."""
+
 _PEEK = 4096
 
 
@@ -79,27 +122,12 @@ def read_splats(
         source = trained
     format = splat_format(source)
     if format == "ply":
-        from splatseg.io.splats.ply import read_ply
-
-        return read_ply(source, strict=strict, linear=linear)
+        return read_ply(source, read_ply_header(source), strict=strict, linear=linear)
     if linear:
         raise InputError(
             f"linear: expected a PLY file of 3DGS, whose values may be logs or not, got {source}."
         )
-    match format:
-        case "compressed.ply":
-            from splatseg.io.splats.compressed_ply import read_compressed_ply as read
-        case "splat":
-            from splatseg.io.splats.splat import read_splat as read
-        case "ksplat":
-            from splatseg.io.splats.ksplat import read_ksplat as read
-        case "spz":
-            from splatseg.io.splats.spz import read_spz as read
-        case "sog":
-            from splatseg.io.splats.sog import read_sog as read
-        case "gltf":
-            from splatseg.io.splats.gltf import read_gltf as read
-    return read(source, strict=strict)
+    return _READERS[format](source, strict=strict)
 
 
 @boundary
@@ -126,9 +154,7 @@ def read_scene_splats(path: StrPath) -> Gaussians:
     source = Path(path)
     if splat_format(source) != "ply":
         return read_splats(source, strict=True)
-    from splatseg.io.splats.ply import read_ply
-
-    return read_ply(source, strict=True, own=True)
+    return read_ply(source, read_ply_header(source), strict=True, own=True)
 
 
 @boundary
@@ -168,36 +194,24 @@ def write_splats(
     """
     target = Path(path)
     chosen = _format_of_name(target) if format is None else format
-    check_choice("format", chosen, _WRITABLE)
-    losses = Losses(target, _WRITABLE[chosen])
+    check_choice("format", chosen, _WRITERS)
+    writer = _WRITERS[chosen]
+    losses = Losses(target, writer.label)
     with atomic_file(target) as temporary:
-        if chosen == "ply":
-            from splatseg.io.splats.ply import write_ply
-
-            write_ply(gaussians, temporary)
-        elif chosen == "compressed.ply":
-            from splatseg.io.splats.compressed_ply import write_compressed_ply
-
-            write_compressed_ply(gaussians, temporary, losses=losses)
-        elif chosen == "splat":
-            from splatseg.io.splats.splat import write_splat
-
-            write_splat(gaussians, temporary, losses=losses)
-        elif chosen == "sog":
-            from splatseg.io.splats._sog_writer import write_sog
-
-            write_sog(gaussians, temporary, losses=losses)
-        else:
-            from splatseg.io.splats.spz import write_spz
-
-            write_spz(gaussians, temporary, version=4 if chosen == "spz" else 3, losses=losses)
+        writer.write(gaussians, temporary, losses)
+    if gaussians.extra and "extra" not in writer.keeps:
+        losses.drop("the extra columns " + ", ".join(sorted(gaussians.extra)))
+    if gaussians.antialiased and "antialiased" not in writer.keeps:
+        losses.drop("a note that they are meant for antialiased rendering")
+    if gaussians.low_pass != LOW_PASS and "low_pass" not in writer.keeps:
+        losses.drop(f"a note that they are meant for a low-pass of {gaussians.low_pass:g}")
     losses.tell()
 
 
 def _format_of_name(path: Path) -> WritableFormat:
     """The format that a name's ending stands for."""
     name = path.name.lower()
-    for known in _WRITABLE:
+    for known in _WRITERS:
         if name.endswith(f".{known}") and known != "spz3":
             return known
     raise InputError(
@@ -220,22 +234,18 @@ def splat_format(path: StrPath) -> SplatFormat:
     source = Path(path)
     source = trained_splats(source) or source
     if is_folder(source):
-        if (source / "meta.json").is_file():
-            return "sog"
-        raise FileFormatError(
-            f"{source}: expected a splat file, got a folder without the meta.json of SOG or the "
-            "point_cloud of a model of 3DGS."
-        )
+        what = "a splat file, got a folder without the meta.json of SOG or the point_cloud of a "
+        expect((source / "meta.json").is_file(), source, what + "model of 3DGS")
+        return "sog"
     check_file(source)
     with source.open("rb") as file:
         head = file.read(_PEEK)
     found = _format_of_content(source, head)
     if found is not None:
         return found
-    if source.suffix.lower() == ".splat":
-        return "splat"
-    if source.suffix.lower() == ".ksplat":
-        return "ksplat"
+    for format in ("splat", "ksplat"):
+        if source.suffix.lower() == f".{format}":
+            return format
     raise FileFormatError(
         f"{source}: expected a splat file (PLY, compressed PLY, .splat, .ksplat, SPZ, SOG or "
         f"glTF with Gaussians), but it starts with {head[:8]!r}."
@@ -245,9 +255,6 @@ def splat_format(path: StrPath) -> SplatFormat:
 def _format_of_content(path: Path, head: bytes) -> SplatFormat | None:
     """The format that the first bytes tell, None if they tell nothing."""
     if head.startswith((b"ply\n", b"ply\r\n")):
-        from splatseg.io.splats._ply_header import read_ply_header
-        from splatseg.io.splats.compressed_ply import is_compressed
-
         return "compressed.ply" if is_compressed(read_ply_header(path)) else "ply"
     if head.startswith(b"NGSP"):
         return "spz"

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE, SH_C0
 from splatseg.errors import FileFormatError, quoted
-from splatseg.io.splats._common import (
+from splatseg.io.foreign import expect
+from splatseg.io.ply import PlyElement, PlyHeader, ply_header, ply_offsets, read_ply_header
+from splatseg.io.splats._quantisation import pack_smallest_three, unpack_smallest_three
+from splatseg.io.splats._rows import (
     Array,
     Filter,
     Losses,
@@ -27,8 +30,6 @@ from splatseg.io.splats._common import (
     to_rows,
     unsigned,
 )
-from splatseg.io.splats._ply_header import PlyElement, PlyHeader, read_ply_header
-from splatseg.io.splats._quaternions import pack_smallest_three, unpack_smallest_three
 
 CHUNK = 256
 """Gaussians that share one set of bounds."""
@@ -50,8 +51,8 @@ _LOG_SCALE_RANGE = 20.0
 
 def is_compressed(header: PlyHeader) -> bool:
     """Whether a PLY file has the elements and columns of this layout."""
-    vertex = header.elements.get("vertex")
-    return vertex is not None and "packed_position" in (vertex.row.names or ())
+    vertex = header.element("vertex")
+    return vertex is not None and "packed_position" in vertex.names
 
 
 def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
@@ -63,13 +64,21 @@ def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
         MissingFileError: If there is no such file.
     """
     header = read_ply_header(path)
+    offsets = ply_offsets(path, header)
     vertex, chunk, sh = _elements(path, header)
-    names = sh.row.names or () if sh else ()
+    names = sh.names if sh else ()
     rows = Rows.empty(vertex.count, 1 + len(names) // 3)
-    bounds = np.fromfile(path, chunk.row, chunk.count, offset=chunk.offset)
+    bounds = np.fromfile(path, chunk.dtype(header.order), chunk.count, offset=offsets["chunk"])
     packed = np.memmap(path, np.uint8, "r") if vertex.count else np.empty(0, np.uint8)
+
+    def rows_of(element: PlyElement, part: slice) -> np.ndarray:
+        """Some rows of an element of the mapped file."""
+        dtype = element.dtype(header.order)
+        first, last = (offsets[element.name] + i * dtype.itemsize for i in (part.start, part.stop))
+        return packed[first:last].view(dtype)
+
     for part in blocks(vertex.count, 64 * CHUNK):
-        block = _rows_of(packed, vertex, part)
+        block = rows_of(vertex, part)
         of_row = bounds[np.arange(part.start, part.stop) // CHUNK]
         position = _fractions(block["packed_position"])
         rows.means[part] = _between(position, of_row, ("x", "y", "z"))
@@ -78,12 +87,12 @@ def read_compressed_ply(path: Path, *, strict: bool = False) -> Gaussians:
         rows.rotations[part] = unpack_smallest_three(block["packed_rotation"])
         colour = ((block["packed_color"][:, None] >> _BYTE_SHIFTS) & 255) / 255
         rgb = colour[:, :3]
-        if "min_r" in (chunk.row.names or ()):
+        if "min_r" in chunk.names:
             rgb = _between(rgb, of_row, ("r", "g", "b"))
         rows.sh[part, 0] = (rgb - 0.5) / SH_C0
         rows.opacities[part] = colour[:, 3]
         if sh is not None:
-            table = _rows_of(packed, sh, part).view(np.uint8).reshape(-1, 3, len(names) // 3)
+            table = rows_of(sh, part).view(np.uint8).reshape(-1, 3, len(names) // 3)
             rows.sh[part, 1:] = _HARMONIC[table].transpose(0, 2, 1)
     with np.errstate(over="ignore"):
         np.exp(rows.scales, out=rows.scales)
@@ -102,56 +111,51 @@ _HARMONIC = _harmonic_of_byte()
 
 def _elements(path: Path, header: PlyHeader) -> tuple[PlyElement, PlyElement, PlyElement | None]:
     """The vertex, chunk and sh elements, checked."""
-    vertex, chunk, sh = (header.elements.get(name) for name in ("vertex", "chunk", "sh"))
-    if header.ascii or any(one.lists for one in header.elements.values()):
-        raise FileFormatError(
-            f"{path}: expected a compressed PLY file in binary and without lists, got another."
-        )
+    vertex, chunk, sh = (header.element(name) for name in ("vertex", "chunk", "sh"))
+    lists = any(one.lists for one in header.elements)
+    expect(
+        header.order and not lists,
+        path,
+        "a compressed PLY file in binary and without lists, got another",
+    )
     if vertex is None or chunk is None:
+        names = quoted(", ".join(one.name for one in header.elements) or "none")
         raise FileFormatError(
-            f"{path}: expected the elements chunk and vertex of a compressed PLY file, "
-            f"got {quoted(', '.join(header.elements) or 'none')}."
+            f"{path}: expected the elements chunk and vertex of a compressed PLY file, got {names}."
         )
     _check_columns(path, vertex, _PACKED, "u4")
-    coloured = any(name in (chunk.row.names or ()) for name in _MIN_MAX[12:])
+    coloured = any(name in chunk.names for name in _MIN_MAX[12:])
     _check_columns(path, chunk, _MIN_MAX if coloured else _MIN_MAX[:12], "f4")
-    if chunk.count != -(-vertex.count // CHUNK):
-        raise FileFormatError(
-            f"{path}: expected {-(-vertex.count // CHUNK)} chunks for {vertex.count} Gaussians, "
-            f"got {chunk.count}."
-        )
+    chunks = -(-vertex.count // CHUNK)
+    expect(
+        chunk.count == chunks,
+        path,
+        f"{chunks} chunks for {vertex.count} Gaussians, got {chunk.count}",
+    )
     if sh is not None:
         known = [3 * ((degree + 1) ** 2 - 1) for degree in range(1, MAX_DEGREE + 1)]
-        names = sh.row.names or ()
-        if len(names) not in known or sh.count != vertex.count:
-            raise FileFormatError(
-                f"{path}: expected {vertex.count} rows of 9, 24 or 45 harmonics, "
-                f"got {sh.count} rows of {len(names)}."
-            )
-        expected = tuple(f"f_rest_{i}" for i in range(len(names)))
+        expect(
+            len(sh.names) in known and sh.count == vertex.count,
+            path,
+            f"{vertex.count} rows of 9, 24 or 45 harmonics, got {sh.count} rows of {len(sh.names)}",
+        )
+        expected = tuple(f"f_rest_{i}" for i in range(len(sh.names)))
         _check_columns(path, sh, expected, "u1")
-        if names != expected:
-            raise FileFormatError(f"{path}: expected the harmonics f_rest_0, ... in order.")
+        expect(sh.names == expected, path, "the harmonics f_rest_0, ... in order")
     return vertex, chunk, sh
 
 
-def _check_columns(path: Path, element: PlyElement, names: tuple[str, ...], kind: str) -> None:
+def _check_columns(path: Path, element: PlyElement, names: tuple[str, ...], code: str) -> None:
     """Refuse an element that lacks a column or has it in another type."""
-    have = element.row.names or ()
-    wrong = [n for n in names if n not in have or element.row[n].str[1:] != kind]
-    if wrong:
-        listed, got = quoted(", ".join(wrong), 100), quoted(", ".join(have), 100)
-        raise FileFormatError(
-            f"{path}: expected the columns {listed} of type {np.dtype(kind)} in the element "
-            f"{quoted(element.name)}, got {got}."
-        )
-
-
-def _rows_of(packed: NDArray[np.uint8], element: PlyElement, part: slice) -> np.ndarray:
-    """Some rows of an element of a mapped file."""
-    size = element.row.itemsize
-    start = element.offset + part.start * size
-    return packed[start : start + (part.stop - part.start) * size].view(element.row)
+    codes = {one.name: one.code for one in element.properties}
+    wrong = [name for name in names if codes.get(name) != code]
+    listed, got = quoted(", ".join(wrong), 100), quoted(", ".join(codes), 100)
+    expect(
+        not wrong,
+        path,
+        f"the columns {listed} of type {np.dtype(code)} in the element {quoted(element.name)}, "
+        f"got {got}",
+    )
 
 
 def _fractions(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
@@ -169,7 +173,7 @@ def _between(
     return low * (1 - share) + high * share
 
 
-def write_compressed_ply(gaussians: Gaussians, path: Path, *, losses: Losses) -> None:
+def write_compressed_ply(gaussians: Gaussians, path: Path, losses: Losses) -> None:
     """Write a compressed PLY file. Gaussians are put in Morton order of their positions.
 
     The order is what makes chunks small and with them the steps of positions; `Gaussians`
@@ -179,7 +183,6 @@ def write_compressed_ply(gaussians: Gaussians, path: Path, *, losses: Losses) ->
         RangeError: If a row cannot be rendered.
     """
     rows = to_rows(gaussians)
-    losses.drop_extra(gaussians)
     count = len(gaussians)
     order = morton_order(rows.means)
     chunks = -(-count // CHUNK)
@@ -201,8 +204,13 @@ def write_compressed_ply(gaussians: Gaussians, path: Path, *, losses: Losses) ->
         rgba = np.concatenate([rgb, opacity], axis=1) << _BYTE_SHIFTS
         packed[part, 3] = rgba.sum(axis=1, dtype=np.uint32)
     with path.open("wb") as file:
-        rest = 3 * (rows.sh.shape[1] - 1)
-        file.write(_header(count, chunks, rest, comments=Filter.of(gaussians).comments()))
+        tables = [
+            ("chunk", chunks, [(name, "<f4") for name in _MIN_MAX]),
+            ("vertex", count, [(name, "<u4") for name in _PACKED]),
+        ]
+        rest = [(f"f_rest_{i}", "|u1") for i in range(3 * (rows.sh.shape[1] - 1))]
+        tables += [("sh", count, rest)] if rest else []
+        file.write(ply_header(tables, Filter.of(gaussians).comments()))
         file.write(bounds.tobytes())
         file.write(packed.tobytes())
         if rows.sh.shape[1] > 1:
@@ -251,18 +259,3 @@ def _harmonic_bytes(sh: Array, losses: Losses) -> bytes:
     steps = np.floor((sh / 8 + 0.5) * 256)
     losses.clamp("harmonics", (sh < -4) | (sh > 4))
     return np.clip(steps, 0, 255).astype(np.uint8).transpose(0, 2, 1).tobytes()
-
-
-def _header(count: int, chunks: int, rest: int, *, comments: list[str]) -> bytes:
-    """The header of a file with `rest` harmonics a Gaussian."""
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {line}" for line in comments]
-    lines.append(f"element chunk {chunks}")
-    lines += [f"property float {name}" for name in _MIN_MAX]
-    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
-    if rest:
-        lines += [
-            f"element sh {count}",
-            *(f"property uchar f_rest_{i}" for i in range(rest)),
-        ]
-    return "\n".join([*lines, "end_header\n"]).encode("ascii")

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 from splatseg.core import Gaussians
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, RangeError, reason
-from splatseg.io.splats._common import (
+from splatseg.io.foreign import expect
+from splatseg.io.splats._quantisation import pack_signed_three, unpack_signed_three
+from splatseg.io.splats._rows import (
     Array,
     Filter,
     Losses,
@@ -34,7 +36,6 @@ from splatseg.io.splats._common import (
     to_rows,
     unsigned,
 )
-from splatseg.io.splats._quaternions import pack_signed_three, unpack_signed_three
 
 MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -51,9 +52,9 @@ _FLIP_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.fl
 """Sign of each basis function of degree 1 to 3 when y and z change sign."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _Header:
-    """The first 16 bytes, checked."""
+    """The first 16 bytes after the magic."""
 
     version: int
     count: int
@@ -113,29 +114,20 @@ def read_spz(path: Path, *, strict: bool = False) -> Gaussians:
 
 def _header(path: Path, data: bytes) -> _Header:
     """Parse and check the first 16 bytes."""
-    if len(data) < _HEADER.size:
-        raise FileFormatError(
-            f"{path}: expected an SPZ header of {_HEADER.size} bytes, got {len(data)}."
-        )
-    magic, version, count, degree, bits, flags, streams = _HEADER.unpack_from(data)
-    if magic != MAGIC:
-        raise FileFormatError(f"{path}: expected the SPZ magic {MAGIC!r}, got {magic!r}.")
-    if version not in (2, 3, 4):
-        raise FileFormatError(f"{path}: expected SPZ version 2, 3 or 4, got {version}.")
-    if degree > MAX_DEGREE + 1:
-        raise FileFormatError(
-            f"{path}: expected harmonics of degree 0 to {MAX_DEGREE + 1}, got {degree}."
-        )
-    if bits > 24:
-        raise FileFormatError(f"{path}: expected at most 24 fractional bits, got {bits}.")
-    return _Header(
-        version=version,
-        count=count,
-        degree=degree,
-        fractional_bits=bits,
-        flags=flags,
-        streams=streams,
+    expect(
+        len(data) >= _HEADER.size,
+        path,
+        f"an SPZ header of {_HEADER.size} bytes, got {len(data)}",
     )
+    magic, *fields = _HEADER.unpack_from(data)
+    header = _Header(*fields)
+    expect(magic == MAGIC, path, f"the SPZ magic {MAGIC!r}, got {magic!r}")
+    expect(header.version in (2, 3, 4), path, f"SPZ version 2, 3 or 4, got {header.version}")
+    degrees = f"harmonics of degree 0 to {MAX_DEGREE + 1}, got {header.degree}"
+    expect(header.degree <= MAX_DEGREE + 1, path, degrees)
+    bits = header.fractional_bits
+    expect(bits <= 24, path, f"at most 24 fractional bits, got {bits}")
+    return header
 
 
 def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
@@ -143,10 +135,8 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
     stream = zlib.decompressobj(wbits=31)
     try:
         header = _header(path, stream.decompress(data, _HEADER.size))
-        if header.version > 3:
-            raise FileFormatError(
-                f"{path}: expected SPZ version 2 or 3 inside gzip, got {header.version}."
-            )
+        version = header.version
+        expect(version <= 3, path, f"SPZ version 2 or 3 inside gzip, got {version}")
         check_size(path, header.count, header.degree, packed=len(data))
         body = sum(header.sizes) * header.count
         content = stream.decompress(stream.unconsumed_tail, body) if body else b""
@@ -156,18 +146,11 @@ def _unpack_gzip(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
         raise FileFormatError(
             f"{path}: expected gzip data of an SPZ file: {reason(error)}."
         ) from error
-    if len(content) < body:
-        raise FileFormatError(
-            f"{path}: expected {body} bytes for {header.count} Gaussians of degree "
-            f"{header.degree}, got {len(content)}: the file is truncated."
-        )
-    if more and not header.flags & _EXTENSIONS:
-        raise FileFormatError(
-            f"{path}: expected {body} bytes for {header.count} Gaussians of degree "
-            f"{header.degree}, got more."
-        )
-    if not more and not stream.eof:
-        raise FileFormatError(f"{path}: the gzip data end without their check sum: truncated.")
+    wanted = f"{body} bytes for {header.count} Gaussians of degree {header.degree}"
+    enough = len(content) == body
+    expect(enough, path, f"{wanted}, got {len(content)}: the file is truncated")
+    expect(not more or header.flags & _EXTENSIONS, path, f"{wanted}, got more")
+    expect(more or stream.eof, path, "gzip data with their check sum, got none: truncated")
     view = memoryview(content)
     parts: list[memoryview] = []
     for size in header.sizes:
@@ -181,52 +164,42 @@ def _unpack_zstd(path: Path, data: bytes) -> tuple[_Header, list[memoryview]]:
     import zstandard
 
     header = _header(path, data)
-    if header.version != 4:
-        raise FileFormatError(f"{path}: expected SPZ version 4 outside gzip, got {header.version}.")
-    if header.streams != len(header.sizes):
-        raise FileFormatError(
-            f"{path}: expected {len(header.sizes)} streams for degree {header.degree}, "
-            f"got {header.streams}."
-        )
-    if len(data) < _HEADER.size + _HEADER_4.size:
-        raise FileFormatError(f"{path}: the header is truncated at {len(data)} bytes.")
+    expect(header.version == 4, path, f"SPZ version 4 outside gzip, got {header.version}")
+    streams = f"{len(header.sizes)} streams for degree {header.degree}, got {header.streams}"
+    expect(header.streams == len(header.sizes), path, streams)
+    start = _HEADER.size + _HEADER_4.size
+    expect(len(data) >= start, path, f"a header of {start} bytes, got {len(data)}: truncated")
     (table,) = _HEADER_4.unpack_from(data, _HEADER.size)
     at = table + _STREAM.size * header.streams
-    if table < _HEADER.size + _HEADER_4.size or at > len(data):
-        raise FileFormatError(
-            f"{path}: the table of streams at byte {table} lies outside the file of "
-            f"{len(data)} bytes."
-        )
+    expect(
+        start <= table and at <= len(data),
+        path,
+        f"a table of streams within the file of {len(data)} bytes, got one at byte {table}",
+    )
     check_size(path, header.count, header.degree, packed=len(data))
     entries = [_STREAM.unpack_from(data, table + i * _STREAM.size) for i in range(header.streams)]
     end = at + sum(compressed for compressed, _ in entries)
-    if end != len(data):
-        raise FileFormatError(
-            f"{path}: expected {end} bytes as its table of streams says, got {len(data)}: "
-            f"the file is {'truncated' if end > len(data) else 'too long'}."
-        )
+    fault = "truncated" if end > len(data) else "too long"
+    expect(
+        end == len(data),
+        path,
+        f"{end} bytes as its table of streams says, got {len(data)}: the file is {fault}",
+    )
     parts: list[memoryview] = []
     for i, ((compressed, unpacked), size) in enumerate(zip(entries, header.sizes, strict=True)):
-        if unpacked != size * header.count:
-            raise FileFormatError(
-                f"{path}: expected {size * header.count} bytes in stream {i} for "
-                f"{header.count} Gaussians, got {unpacked}."
-            )
-        frame = data[at : at + compressed]
-        at += compressed
+        wanted = f"{size * header.count} bytes in stream {i} for {header.count} Gaussians"
+        expect(unpacked == size * header.count, path, f"{wanted}, got {unpacked}")
         try:
-            reader = zstandard.ZstdDecompressor().stream_reader(frame)
+            reader = zstandard.ZstdDecompressor().stream_reader(data[at : at + compressed])
             part = reader.read(unpacked) if unpacked else b""
             more = reader.read(1)
         except zstandard.ZstdError as error:
             raise FileFormatError(
                 f"{path}: stream {i} is no zstd data: {reason(error)}."
             ) from error
-        if len(part) != unpacked or more:
-            raise FileFormatError(
-                f"{path}: expected {unpacked} bytes in stream {i}, "
-                f"got {'more' if more else len(part)}."
-            )
+        at += compressed
+        came = "more" if more else len(part)
+        expect(len(part) == unpacked and not more, path, f"{wanted}, got {came}")
         parts.append(memoryview(part))
     return header, parts
 
@@ -248,7 +221,7 @@ def _rotations(packed: NDArray[np.uint8], version: int) -> NDArray[np.float64]:
     return np.concatenate([w[:, None], xyz], axis=1)
 
 
-def write_spz(gaussians: Gaussians, path: Path, *, version: Literal[3, 4], losses: Losses) -> None:
+def write_spz(gaussians: Gaussians, path: Path, losses: Losses, *, version: Literal[3, 4]) -> None:
     """Write an SPZ file of version 3 or 4, rows in the order they have.
 
     Positions get as many fractional bits as the largest coordinate leaves room for, up to
@@ -258,8 +231,6 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: Literal[3, 4], losse
         RangeError: If a coordinate is beyond 2^23 or a row cannot be rendered.
     """
     rows = to_rows(gaussians)
-    losses.drop_extra(gaussians)
-    losses.drop_low_pass(gaussians)
     bits = _fractional_bits(rows.means)
     streams = _pack(rows, bits, losses)
     header = _HEADER.pack(
@@ -309,20 +280,20 @@ def _pack(rows: Rows, bits: int, losses: Losses) -> list[bytes]:
     scales = np.empty((count, 3), np.uint8)
     rotations = np.empty(count, "<u4")
     rest = np.empty((count, coefficients - 1, 3), np.uint8)
+
+    def clamped(name: str, values: NDArray[np.floating]) -> NDArray[np.uint32]:
+        steps, outside = unsigned(values, 255)
+        losses.clamp(name, outside)
+        return steps
+
+    signs = _FLIP_SH[: coefficients - 1, None]
     for part in blocks(count):
         fixed = np.floor(rows.means[part] * _FLIP * 2.0**bits + 0.5).astype("<i4")
         positions[part] = fixed[:, :, None].view(np.uint8)[:, :, :3]
         opacities[part] = unsigned(rows.opacities[part] * 255.0, 255)[0]
-        steps, outside = unsigned((rows.sh[part, 0] * _COLOUR_SCALE + 0.5) * 255.0, 255)
-        colours[part] = steps
-        losses.clamp("colours", outside)
-        steps, outside = unsigned((logs(rows.scales[part]) + 10.0) * 16.0, 255)
-        scales[part] = steps
-        losses.clamp("scales", outside)
+        colours[part] = clamped("colours", (rows.sh[part, 0] * _COLOUR_SCALE + 0.5) * 255.0)
+        scales[part] = clamped("scales", (logs(rows.scales[part]) + 10.0) * 16.0)
         rotations[part] = pack_signed_three(rows.rotations[part] * _FLIP_ROTATION)
-        signs = _FLIP_SH[: coefficients - 1, None]
-        steps, outside = unsigned(rows.sh[part, 1:] * signs * 128.0 + 128.0, 255)
-        rest[part] = steps
-        losses.clamp("harmonics", outside)
+        rest[part] = clamped("harmonics", rows.sh[part, 1:] * signs * 128.0 + 128.0)
     arrays = [positions, opacities, colours, scales, rotations, rest]
     return [array.tobytes() for array in (arrays if coefficients > 1 else arrays[:5])]

@@ -13,9 +13,7 @@ from splatseg.core.boundary import boundary
 from splatseg.core.json_values import plain_object
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.foreign import is_file
-from splatseg.io.tensors import read_safetensors, read_tensors
-from splatseg.io.tensors_writing import write_tensors
-from splatseg.io.torch_files import read_torch_file
+from splatseg.io.tensors import read_safetensors, read_tensors, read_torch_file, write_tensors
 from splatseg.lift.point_network.about import About, Part, parse_about
 from splatseg.lift.point_network.config import RandlaConfig
 from splatseg.lift.point_network.encoder import RandlaEncoder

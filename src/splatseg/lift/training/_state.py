@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
+from splatseg.core.checkpoints import DIFFERENCES, differing_names, option_differences
 from splatseg.core.json_numbers import json_integer, json_number
-from splatseg.core.recorded_options import DIFFERENCES, differing_names, option_differences
 from splatseg.errors import FileFormatError, InputError, brief, quoted
+from splatseg.io.arrays import open_npz, write_checkpoint_file
 from splatseg.io.json_files import parse_object
-from splatseg.io.npz import open_npz
-from splatseg.io.npz_writing import write_checkpoint_file
 from splatseg.lift.training._adam import RowMoments
 
 FORMAT = "splatseg-training"

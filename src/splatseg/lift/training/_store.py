@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splatseg.errors import SplatsegError
-from splatseg.io.npy import read_npy
+from splatseg.io.arrays import read_npy
 from splatseg.lift.training._targets import Ragged, Target, Targets
 from splatseg.render import SparseWeights
 

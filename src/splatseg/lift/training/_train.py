@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseg.core.boundary import boundary
-from splatseg.core.checkpoints import Checkpoints
-from splatseg.core.interrupts import Interrupts, deferred_interrupts
+from splatseg.core.checkpoints import Checkpoints, Interrupts, deferred_interrupts
 from splatseg.core.threads import one_torch_thread
 from splatseg.lift.training._adam import AdamConstants, RowAdam
 from splatseg.lift.training._file import TrainingFile

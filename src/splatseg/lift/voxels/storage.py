@@ -16,7 +16,7 @@ from splatseg._check import check_choice, check_finite, check_shape
 from splatseg._native import code_sums, row_products
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
-from splatseg.core.voxel_features import CODES, StoredPrecision, StoredTable
+from splatseg.core.voxels import CODES, StoredPrecision, StoredTable
 from splatseg.errors import RangeError
 
 _HALF_MAX = 65504.0

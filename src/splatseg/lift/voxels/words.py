@@ -15,7 +15,7 @@ from torch import Tensor
 from splatseg._check import check_shape
 from splatseg.core.boundary import boundary
 from splatseg.core.threads import one_torch_thread
-from splatseg.core.voxel_features import StoredTable, VoxelFeatures
+from splatseg.core.voxels import StoredTable, VoxelFeatures
 from splatseg.errors import InputError, ShapeError
 from splatseg.lift.relevancy import TextSpace
 from splatseg.lift.vocabulary import Vocabulary

@@ -10,7 +10,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from splatseg.errors import SplatsegError
-from splatseg.io.npy import read_npy
+from splatseg.io.arrays import read_npy
 from splatseg.methods.cosseg._fusion import FusionInputs
 from splatseg.methods.cosseg._points import PointSet
 

@@ -7,8 +7,7 @@ from typing import Any, cast
 from torch import Tensor
 
 from splatseg.errors import FileFormatError
-from splatseg.io.tensors import read_tensors
-from splatseg.io.torch_files import read_torch_file
+from splatseg.io.tensors import read_tensors, read_torch_file
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:

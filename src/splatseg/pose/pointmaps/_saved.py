@@ -19,14 +19,12 @@ from torch import Tensor
 from splatseg.core import Capture, PointCloud
 from splatseg.core.boundary import boundary
 from splatseg.errors import FileFormatError, InputError, quoted
-from splatseg.io.atomic import atomic_file
+from splatseg.io.arrays import HEADER, read_npz, save_arrays
+from splatseg.io.atomic import atomic_file, named_write_failures
 from splatseg.io.captures.build import build_capture
 from splatseg.io.captures.raw_views import Intrinsics, RawView
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import parse_object
-from splatseg.io.npz import read_npz
-from splatseg.io.npz_writing import HEADER, save_arrays
-from splatseg.io.write_errors import named_write_failures
 from splatseg.pose._photographs import Photograph
 from splatseg.pose._saved import estimated_up
 from splatseg.pose.pointmaps._report import PointmapReport

@@ -16,11 +16,10 @@ from torch import Tensor
 from splatseg.core.boundary import boundary
 from splatseg.core.json_numbers import json_number
 from splatseg.errors import FileFormatError, MissingFileError, quoted
+from splatseg.io.atomic import named_write_failures, path_inside
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import json_text, read_json, write_json
-from splatseg.io.paths import path_inside
-from splatseg.io.scene_fields import DRIVE_FILE
-from splatseg.io.write_errors import named_write_failures
+from splatseg.io.scene import DRIVE_FILE
 from splatseg.street.blocks.cut import Drive, DriveBlock
 from splatseg.street.blocks.field import DriveField, joined_layers
 from splatseg.street.field import MeshField, VertexRule, with_vertex_rule

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg.core import UNLABELLED, PointLabels
-from splatseg.io.npy import read_npy
-from splatseg.io.write_errors import named_write_failures
+from splatseg.io.arrays import read_npy
+from splatseg.io.atomic import named_write_failures
 
 _LAST = np.iinfo(np.int64).max
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatseg.core import View
 from splatseg.core.boundary import boundary
-from splatseg.core.view_names import frame_number
+from splatseg.core.scene import frame_number
 from splatseg.errors import InputError
 
 RIG = 5.0

@@ -29,9 +29,9 @@ from torch import Tensor
 
 from splatseg.core.json_numbers import json_integer
 from splatseg.errors import FileFormatError, InputError, MissingFileError, quoted
+from splatseg.io.arrays import map_values
 from splatseg.io.atomic import atomic_folder, is_vacant
 from splatseg.io.json_files import json_text, read_json
-from splatseg.io.npy import map_values
 from splatseg.street.hits import MeshHits
 
 FORMAT = "splatseg.street.ray-hits"

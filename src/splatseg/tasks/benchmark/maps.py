@@ -20,7 +20,7 @@ from splatseg.core import (
     with_info,
 )
 from splatseg.core.benchmark import TrueMaps
-from splatseg.core.surfaces import LabelledMesh, LabelledPoints
+from splatseg.core.scans import LabelledMesh, LabelledPoints
 from splatseg.errors import InputError
 from splatseg.evaluate import (
     Confusion,
@@ -33,8 +33,8 @@ from splatseg.evaluate import (
 )
 from splatseg.evaluate.held_out import drawn_and_true
 from splatseg.evaluate.protocols import MapSwitches
+from splatseg.io.atomic import path_inside
 from splatseg.io.evidence import save_label_map
-from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.tasks.benchmark.fits import held_out_views
 from splatseg.tasks.benchmark.job import Job

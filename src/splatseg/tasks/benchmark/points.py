@@ -24,10 +24,9 @@ from splatseg.core.benchmark import TruePoints
 from splatseg.errors import InputError
 from splatseg.evaluate import Confusion, semantic_score
 from splatseg.evaluate.protocols import PointSwitches
-from splatseg.io.atomic import atomic_file
+from splatseg.io.arrays import save_arrays
+from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.evidence import open_evidence
-from splatseg.io.npz_writing import save_arrays
-from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.lift.heads import ClassifierHead, has_classifier
 from splatseg.tasks.benchmark.job import Job

@@ -18,8 +18,8 @@ from splatseg.evaluate.protocols import (
     mask_scores,
     recorded,
 )
+from splatseg.io.atomic import path_inside
 from splatseg.io.json_files import json_text, parse_object, read_json, write_json
-from splatseg.io.paths import path_inside
 
 RESULTS_FOLDER = "results"
 _ROW_FIELDS = tuple(MaskRow.__dataclass_fields__)

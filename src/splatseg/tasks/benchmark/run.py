@@ -22,8 +22,7 @@ from splatseg.evaluate.protocols import (
     mask_scores,
     switch_value,
 )
-from splatseg.io.paths import path_inside
-from splatseg.io.write_errors import named_write_failures
+from splatseg.io.atomic import named_write_failures, path_inside
 from splatseg.methods import find_method
 from splatseg.render import BackendName
 from splatseg.tasks._observer import SILENT, Observer

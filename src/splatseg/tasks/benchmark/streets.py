@@ -32,10 +32,9 @@ from splatseg.evaluate.protocols import (
     merged_name,
     street_class,
 )
-from splatseg.io.atomic import atomic_file
+from splatseg.io.arrays import save_arrays
+from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.evidence import open_evidence
-from splatseg.io.npz_writing import save_arrays
-from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.lift.points import RegionOptions, region_labels
 from splatseg.methods import Method

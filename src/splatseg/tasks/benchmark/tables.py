@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatseg.evaluate.protocols import TABLE_1, PublishedFigure, published_figures
-from splatseg.io.atomic import atomic_file
+from splatseg.io.atomic import atomic_file, path_inside
 from splatseg.io.json_files import write_json
-from splatseg.io.paths import path_inside
 from splatseg.report.html import Commands, Notice, Report, Table, report_html
 from splatseg.tasks.benchmark.results import MethodResult, switches_of
 from splatseg.tasks.benchmark.run import BenchRun

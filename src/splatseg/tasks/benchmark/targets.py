@@ -28,9 +28,9 @@ from splatseg.evaluate.protocols import (
     resized_mask,
     score_mask,
 )
+from splatseg.io.atomic import path_inside
 from splatseg.io.evidence import create_evidence, save_label_map
 from splatseg.io.images import save_png
-from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.heads import has_classifier
 from splatseg.methods.prompt import mask_points

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from splatseg.errors import InputError
-from splatseg.io.scene_fields import scene_field_names, scene_field_path
+from splatseg.io.scene import scene_field_names, scene_field_path
 from splatseg.street.blocks import missing_blocks
 
 

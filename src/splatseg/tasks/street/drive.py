@@ -9,8 +9,8 @@ from splatseg.core import Scene
 from splatseg.core.boundary import boundary
 from splatseg.core.json_values import plain_object
 from splatseg.errors import InputError, brief
-from splatseg.io.paths import path_inside
-from splatseg.io.scene_fields import (
+from splatseg.io.atomic import path_inside
+from splatseg.io.scene import (
     DRIVE_FILE,
     FOLDER,
     new_field_folder,

@@ -17,12 +17,11 @@ from torch import Tensor
 from splatseg.core import UNLABELLED
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError
-from splatseg.io.atomic import atomic_folder
-from splatseg.io.export._folders import check_replaceable
-from splatseg.io.export._tables import MADE_BY
+from splatseg.io.atomic import atomic_folder, path_inside
+from splatseg.io.export.objects import MADE_BY
+from splatseg.io.export.splats import check_replaceable
 from splatseg.io.images import write_png
 from splatseg.io.json_files import write_json
-from splatseg.io.paths import path_inside
 
 PANOPTIC_FILE = "panoptic.json"
 PANOPTIC_FOLDER = "panoptic"

@@ -3,7 +3,7 @@
 import pytest
 
 from splatseg.errors import FileFormatError
-from splatseg.io.class_tables import class_rows, class_table
+from splatseg.io.tables import class_rows, class_table
 
 
 def test_rows_come_back_and_void_is_no_class() -> None:
@@ -28,5 +28,5 @@ def test_rows_come_back_and_void_is_no_class() -> None:
     ],
 )
 def test_other_rows_are_refused_by_the_files_name(row) -> None:
-    with pytest.raises(FileFormatError, match=r"f\.json: classes\[1\]: .*expected"):
+    with pytest.raises(FileFormatError, match=r"f\.json: classes\[1\].*: expected"):
         class_table([{"id": 3, "name": "b"}, row], where="f.json")

@@ -9,7 +9,7 @@ import inspect
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias
@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatseg.core import Gaussians
-from splatseg.core.activations import exponential, sigmoid
-from splatseg.core.gaussians import LOW_PASS
+from splatseg.core.gaussians import LOW_PASS, exponential, sigmoid
 from splatseg.core.sh import MAX_DEGREE
 from splatseg.errors import FileFormatError, MissingFileError, quoted
-from splatseg.io.foreign import is_file, is_folder, read_bytes
+from splatseg.io.foreign import expect, is_file, is_folder, read_bytes
 from splatseg.io.limits import check_unpacked
 
 StrPath: TypeAlias = str | PathLike[str]
@@ -75,7 +74,8 @@ def check_size(path: Path, count: int, degree: int, *, packed: int) -> None:
     Raises:
         FileFormatError: If these are too many, see `io.limits`.
     """
-    check_unpacked(path, count * bytes_in_memory(degree), packed=packed, what=f"{count} Gaussians")
+    bytes_of_one = 4 * (3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2)
+    check_unpacked(path, count * bytes_of_one, packed=packed, what=f"{count} Gaussians")
 
 
 def rendered_degree(path: Path, degree: int, *, strict: bool) -> int:
@@ -93,11 +93,6 @@ def rendered_degree(path: Path, degree: int, *, strict: bool) -> int:
     return MAX_DEGREE
 
 
-def bytes_in_memory(degree: int) -> int:
-    """Bytes that a Gaussian takes in memory."""
-    return 4 * (3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2)
-
-
 def read_file(path: Path) -> bytes:
     """All bytes of a file that must exist, be a file and not be empty."""
     check_file(path)
@@ -111,13 +106,11 @@ def check_file(path: Path) -> int:
         MissingFileError: If it does not exist.
         FileFormatError: If it is a folder or empty.
     """
-    if is_folder(path):
-        raise FileFormatError(f"{path}: expected a splat file, got a folder.")
+    expect(not is_folder(path), path, "a splat file, got a folder")
     if not is_file(path):
         raise MissingFileError(f"{path}: no such file.")
     size = path.stat().st_size
-    if size == 0:
-        raise FileFormatError(f"{path}: expected a splat file, got an empty file.")
+    expect(size, path, "a splat file, got an empty file")
     return size
 
 
@@ -167,13 +160,7 @@ class Rows:
 
     def __getitem__(self, kept: NDArray[np.bool_]) -> "Rows":
         """Some of the rows."""
-        return Rows(
-            means=self.means[kept],
-            rotations=self.rotations[kept],
-            scales=self.scales[kept],
-            opacities=self.opacities[kept],
-            sh=self.sh[kept],
-        )
+        return Rows(**{one.name: getattr(self, one.name)[kept] for one in fields(self)})
 
 
 ANTIALIASED = "splatseg antialiased"
@@ -226,8 +213,8 @@ def _variance(path: Path, text: str) -> float:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not (math.isfinite(value) and value >= 0):
-        raise FileFormatError(f"{path}: expected 'low_pass' to be 0 or more, got {quoted(text)}.")
+    fits = math.isfinite(value) and value >= 0
+    expect(fits, path, f"'low_pass' to be 0 or more, got {quoted(text)}")
     return value
 
 
@@ -407,21 +394,6 @@ class Losses:
     def drop(self, what: str) -> None:
         """Note a part of the Gaussians that the format has no place for."""
         self._dropped.append(what)
-
-    def drop_extra(self, gaussians: Gaussians) -> None:
-        """Note all extra columns as dropped."""
-        if gaussians.extra:
-            self.drop("the extra columns " + ", ".join(sorted(gaussians.extra)))
-
-    def drop_antialiased(self, gaussians: Gaussians) -> None:
-        """Note that the format cannot say that Gaussians are meant for antialiased rendering."""
-        if gaussians.antialiased:
-            self.drop("a note that they are meant for antialiased rendering")
-
-    def drop_low_pass(self, gaussians: Gaussians) -> None:
-        """Note that the format cannot say what low-pass Gaussians are meant for."""
-        if gaussians.low_pass != LOW_PASS:
-            self.drop(f"a note that they are meant for a low-pass of {gaussians.low_pass:g}")
 
     def tell(self) -> None:
         """Warn once if anything was lost."""

@@ -13,13 +13,12 @@ import pytest
 
 from splatseg.errors import InputError
 from splatseg.io.atomic import TEMPORARY, check_writable, sweep
-from splatseg.io.lock import LOCK_FILE, lock_owner, scene_lock
-from splatseg.io.scene_folder import work_on_scene
+from splatseg.io.scene_folder import LOCK_FILE, lock_owner, scene_lock, work_on_scene
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from splatseg.io.lock import scene_lock
+from splatseg.io.scene_folder import scene_lock
 with scene_lock(Path(sys.argv[1]), "fit"):
     print("held", flush=True)
     time.sleep(60)
@@ -143,7 +142,7 @@ def test_a_lock_whose_file_its_owner_has_just_removed_is_taken_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between opening and locking the file its owner may end: who locks it then locks nothing."""
-    from splatseg.io import lock
+    from splatseg.io import scene_folder as lock
 
     ends = [lambda: (tmp_path / LOCK_FILE).unlink()]
 
@@ -171,7 +170,7 @@ def test_what_a_longer_file_said_before_is_gone(tmp_path: Path) -> None:
 def test_where_there_are_no_locks_the_number_of_the_process_has_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from splatseg.io import lock
+    from splatseg.io import scene_folder as lock
 
     monkeypatch.setattr(lock, "try_lock", lambda handle, **more: "unknown")
     here, ended = socket.gethostname(), _ended()

@@ -1,6 +1,6 @@
 """Options of interrupted work: which are the same although the program has grown."""
 
-from splatseg.core.recorded_options import ABSENT, OptionDifference, option_differences
+from splatseg.core.checkpoints import ABSENT, OptionDifference, option_differences
 
 
 def found(recorded, wanted, defaults=None, recorded_defaults=None) -> dict[str, tuple]:

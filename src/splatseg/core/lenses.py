@@ -1,4 +1,4 @@
-r"""Lens distortion: OpenCV's polynomial and fisheye models, and their inverses.
+r"""Lens models: distortion on the normalised image plane, and its inverse.
 
 Points are on the normalised image plane: :math:`(x, y) = (X / Z, Y / Z)`, before focal length
 and principal point.
@@ -20,12 +20,20 @@ thin_prism_fisheye (k1 k2 p1 p2 k3 k4 s1 s2), with :math:`(u, v) = \theta \, (x,
     x' = u (1 + k_1 \theta^2 + k_2 \theta^4 + k_3 \theta^6 + k_4 \theta^8)
          + 2 p_1 u v + p_2 (\theta^2 + 2 u^2) + s_1 \theta^2
 
-(y' alike with p1 and p2 exchanged and s2).
+(y' alike with p1 and p2 exchanged and s2). mei (xi k1 k2 p1 p2), the unified model of Mei and
+Rives, a sphere seen from a point at the distance xi behind its centre, then OpenCV's polynomial of
 
-References: OpenCV documentation, calib3d and fisheye modules; COLMAP's ThinPrismFisheyeCameraModel.
+.. math:: (m_x, m_y) = \frac{(x, y)}{1 + \xi \sqrt{x^2 + y^2 + 1}}
+
+A plane holds what lies less than 90 degrees from the axis.
+
+References: OpenCV documentation, calib3d and fisheye modules; COLMAP's ThinPrismFisheyeCameraModel;
+Mei and Rives, Single View Point Omnidirectional Camera Calibration from Planar Grids, ICRA 2007.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -33,9 +41,7 @@ from torch import Tensor
 
 from splatseg.errors import InputError
 
-OPENCV_PARAMETERS = 8
-FISHEYE_PARAMETERS = 4
-THIN_PRISM_FISHEYE_PARAMETERS = 8
+_EQUIDISTANT = (0.0, 0.0, 0.0, 0.0)
 _NEWTON_STEPS = 50
 _TOLERANCE = 1e-10
 _MAX_RADIUS = 1e4
@@ -80,7 +86,7 @@ def distort_thin_prism_fisheye(
     plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
 ) -> Float[Tensor, "*batch 2"]:
     """Distort points of the normalised plane with COLMAP's thin prism fisheye model."""
-    return _thin_prism(distort_fisheye(plane, (0.0,) * FISHEYE_PARAMETERS), parameters)
+    return _thin_prism(distort_fisheye(plane, _EQUIDISTANT), parameters)
 
 
 def undistort_thin_prism_fisheye(
@@ -92,7 +98,7 @@ def undistort_thin_prism_fisheye(
         InputError: If a point lies beyond 90 degrees from the axis, or has no inverse.
     """
     angles = _inverted(plane, lambda at: _thin_prism(at, parameters))
-    return undistort_fisheye(angles, (0.0,) * FISHEYE_PARAMETERS).to(plane)
+    return undistort_fisheye(angles, _EQUIDISTANT).to(plane)
 
 
 def _thin_prism(angles: Tensor, parameters: Sequence[float]) -> Tensor:
@@ -202,3 +208,62 @@ def _require_converged(error: Tensor) -> None:
             "distortion: the lens model has no inverse at some pixels "
             f"(error {worst:.2g} on the normalised plane); check its parameters."
         )
+
+
+def distort_mei(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    """Distort points of the normalised plane."""
+    xi, *polynomial = parameters
+    length = torch.sqrt((plane * plane).sum(-1, keepdim=True) + 1)
+    return distort_opencv(plane / (1 + xi * length), (*polynomial, 0, 0, 0, 0))
+
+
+def undistort_mei(
+    plane: Float[Tensor, "*batch 2"], parameters: Sequence[float]
+) -> Float[Tensor, "*batch 2"]:
+    r"""Invert `distort_mei`: the polynomial by Newton steps, the sphere in closed form.
+
+    With :math:`\rho^2 = m_x^2 + m_y^2`, the point of the sphere is
+    :math:`(\eta m_x, \eta m_y, \eta - \xi)` where
+    :math:`\eta = (\xi + \sqrt{1 + (1 - \xi^2) \rho^2}) / (1 + \rho^2)`.
+
+    Raises:
+        InputError: If a pixel sees 90 degrees or more from the axis, or nothing of the sphere, or
+            the polynomial has no inverse there.
+    """
+    xi, *polynomial = parameters
+    seen = undistort_opencv(plane.double(), (*polynomial, 0, 0, 0, 0))
+    square = (seen * seen).sum(-1, keepdim=True)
+    under = 1 + (1 - xi * xi) * square
+    eta = (xi + torch.sqrt(under.clamp_min(0))) / (1 + square)
+    forward = eta - xi
+    radius = torch.sqrt(square) * eta
+    beyond = (under < 0) | (forward <= 0) | (radius > _MAX_RADIUS * forward)
+    if bool(beyond.any()):
+        raise InputError(
+            "distortion: expected a view narrower than 180 degrees, got "
+            f"{int(beyond.sum())} of {beyond.numel()} pixels that see 90 degrees from the axis or "
+            "more, or past the image of the lens."
+        )
+    return (seen * eta / forward).to(plane)
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A lens model: how many parameters it has, and its maps of the normalised plane."""
+
+    parameters: int
+    distort: Callable[[Tensor, Sequence[float]], Tensor]
+    undistort: Callable[[Tensor, Sequence[float]], Tensor]
+
+
+CameraModel = Literal["pinhole", "opencv", "fisheye", "mei", "thin_prism_fisheye"]
+
+LENSES: dict[CameraModel, Lens] = {
+    "pinhole": Lens(0, lambda plane, _: plane, lambda plane, _: plane),
+    "opencv": Lens(8, distort_opencv, undistort_opencv),
+    "fisheye": Lens(4, distort_fisheye, undistort_fisheye),
+    "mei": Lens(5, distort_mei, undistort_mei),
+    "thin_prism_fisheye": Lens(8, distort_thin_prism_fisheye, undistort_thin_prism_fisheye),
+}
