@@ -33,7 +33,7 @@ from splatseg.core import (
     node_row,
 )
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import FileFormatError, InputError, reason
 from splatseg.io.arrays import HEADER, open_npz, save_arrays
 from splatseg.io.atomic import atomic_file

@@ -31,7 +31,7 @@ from msgspec import Meta
 
 from splatseg.core import Layer, Scene, View
 from splatseg.core.boundary import boundary
-from splatseg.core.json_numbers import MAX_NUMBER
+from splatseg.core.json_values import MAX_NUMBER
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.atomic import (
     atomic_folder,

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from splatseg._check import check_shape, check_values
+from splatseg._native import NeighbourIndex as NativeIndex
 from splatseg.core import Gaussians
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError, ShapeError

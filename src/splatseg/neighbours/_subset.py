@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from splatseg._check import check_shape
+from splatseg._native import Subset as NativeSubset
 from splatseg.core.boundary import boundary
 from splatseg.errors import InputError, RangeError
 from splatseg.neighbours._index import NeighbourIndex

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatseg.core.boundary import boundary
 from splatseg.core.checkpoints import DIFFERENCES, differing_names, option_differences
-from splatseg.core.json_numbers import json_integer, json_number
+from splatseg.core.json_values import json_integer, json_number
 from splatseg.errors import FileFormatError, InputError, brief, quoted
 from splatseg.io.arrays import open_npz, write_checkpoint_file
 from splatseg.io.json_files import parse_object

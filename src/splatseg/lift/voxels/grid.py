@@ -7,7 +7,7 @@ from jaxtyping import Float, Float64, Int, Int32, Int64
 from torch import Tensor
 
 from splatseg._check import check_finite, check_shape
-from splatseg.core.voxels import VoxelGrid as NativeGrid
+from splatseg._native import VoxelGrid as NativeGrid
 from splatseg.core.boundary import boundary
 from splatseg.core.voxels import VoxelGrid, cell_order
 from splatseg.errors import InputError, RangeError

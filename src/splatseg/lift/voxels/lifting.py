@@ -22,7 +22,7 @@ from jaxtyping import Float, Float64, Int32, Int64
 from torch import Tensor
 
 from splatseg._check import check_choice, check_range, check_shape
-from splatseg.lift.voxels.reference import add_hit_features
+from splatseg._native import add_hit_features
 from splatseg.core import UNLABELLED, FeatureMap, FeatureSource, Gaussians, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.voxels import VoxelGrid
