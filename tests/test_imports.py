@@ -86,6 +86,7 @@ def test_a_private_import_is_found(tmp_path) -> None:
         ("core/sh.py", "import scipy", "The core needs torch and numpy"),
         ("evaluate/metrics.py", "import splatseg.report", "Packages import downwards only"),
         ("tasks/segment.py", "import splatseg.cli", "Packages import downwards only"),
+        ("tasks/segment.py", "import splatseg_bench", "Benchmarks are another distribution"),
         ("render/paths.py", "import splatseg.models", "Packages import downwards only"),
     ],
 )

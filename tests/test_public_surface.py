@@ -12,7 +12,6 @@ import splatseg
 
 SURFACE = {
     "AttachLayersOptions",
-    "BenchOptions",
     "Camera",
     "Capture",
     "CheckpointOptions",
@@ -47,7 +46,6 @@ SURFACE = {
     "StreetOptions",
     "View",
     "attach_layers",
-    "bench",
     "back_project",
     "contributors",
     "create_evidence",
@@ -150,6 +148,12 @@ def test_each_package_is_there_without_an_import_of_its_own(name: str) -> None:
 def test_a_missing_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="No splatseg attribute Gausians"):
         splatseg.__getattr__("Gausians")
+
+
+@pytest.mark.parametrize("name", ["bench", "BenchOptions"])
+def test_what_moved_says_where(name: str) -> None:
+    with pytest.raises(AttributeError, match=f"is now splatseg_bench.{name}; install"):
+        getattr(splatseg, name)
 
 
 def test_no_public_name_hides_a_package() -> None:

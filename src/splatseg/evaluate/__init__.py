@@ -47,5 +47,6 @@ from splatseg.evaluate.photographs import render_and_photograph as render_and_ph
 from splatseg.evaluate.solid import gaussian_score as gaussian_score
 from splatseg.evaluate.solid import gaussian_weights as gaussian_weights
 from splatseg.evaluate.solid import labels_from_points as labels_from_points
+from splatseg.evaluate.street_names import street_class as street_class
 from splatseg.evaluate.truth_maps import PointSurfaceOptions as PointSurfaceOptions
 from splatseg.evaluate.truth_maps import SurfaceField as SurfaceField

@@ -1,0 +1,33 @@
+"""Protocols of published benchmarks as data: what is asked, every choice, the published figures."""
+
+from splatseg_bench.protocols._catalogue import CANONICAL_NEGATIVES as CANONICAL_NEGATIVES
+from splatseg_bench.protocols._catalogue import PROTOCOLS as PROTOCOLS
+from splatseg_bench.protocols._catalogue import find_protocol as find_protocol
+from splatseg_bench.protocols._masks import MaskRow as MaskRow
+from splatseg_bench.protocols._masks import mask_scores as mask_scores
+from splatseg_bench.protocols._masks import resized_mask as resized_mask
+from splatseg_bench.protocols._masks import score_mask as score_mask
+from splatseg_bench.protocols._protocol import Protocol as Protocol
+from splatseg_bench.protocols._protocol import switch_value as switch_value
+from splatseg_bench.protocols._published import PublishedFigure as PublishedFigure
+from splatseg_bench.protocols._scene_lists import SCENE_LISTS as SCENE_LISTS
+from splatseg_bench.protocols._scene_lists import SceneList as SceneList
+from splatseg_bench.protocols._streets import SKY as SKY
+from splatseg_bench.protocols._streets import TABLE_1 as TABLE_1
+from splatseg_bench.protocols._streets import merged_name as merged_name
+from splatseg_bench.protocols._switches import ALL_WINDOWS as ALL_WINDOWS
+from splatseg_bench.protocols._switches import MapSwitches as MapSwitches
+from splatseg_bench.protocols._switches import PointSwitches as PointSwitches
+from splatseg_bench.protocols._switches import RoomSwitches as RoomSwitches
+from splatseg_bench.protocols._switches import SpokenSwitches as SpokenSwitches
+from splatseg_bench.protocols._switches import StreetSwitches as StreetSwitches
+from splatseg_bench.protocols._switches import Switches as Switches
+from splatseg_bench.protocols._switches import TargetSwitches as TargetSwitches
+from splatseg_bench.protocols._switches import differences as differences
+from splatseg_bench.protocols._switches import recorded as recorded
+from splatseg_bench.protocols._words import box_filtered as box_filtered
+from splatseg_bench.protocols._words import peak_in_boxes as peak_in_boxes
+from splatseg_bench.protocols._words import relevancy_mask as relevancy_mask
+from splatseg_bench.protocols._words import smoothed_relevancy as smoothed_relevancy
+from splatseg_bench.protocols._words import stretched as stretched
+from splatseg_bench.protocols.published import published_figures as published_figures
