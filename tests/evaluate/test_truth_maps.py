@@ -11,7 +11,8 @@ from splatseg.core.renderable import RenderableView
 from splatseg.errors import InputError, RangeError
 from splatseg.evaluate import PointSurfaceOptions, SurfaceField, truth_maps
 from splatseg.raycast import reference
-from splatseg.synthetic import SyntheticScene, cameras, cast, look_at, room, scene_mesh
+from splatseg.synthetic import SyntheticScene, cameras, cast, look_at, room
+from splatseg_bench.worlds import scene_mesh
 
 LENSES = {
     "pinhole": {},

@@ -9,6 +9,8 @@ Names that data sets give to different things (other ground, static, dynamic, ob
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
+from splatseg.core.boundary import boundary
+
 _SAME: tuple[tuple[str, ...], ...] = (
     ("traffic sign", "sign"),
     ("terrain", "ground", "walkable"),
@@ -57,6 +59,7 @@ _MOVING = "moving "
 """SemanticKITTI's classes of what moves begin so."""
 
 
+@boundary
 def street_class(name: str, true: Collection[str], own: Collection[str] = ()) -> str | None:
     """The class of a truth that a class of a label map is, by its name.
 

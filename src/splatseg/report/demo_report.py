@@ -299,7 +299,7 @@ def _step_table(figures: DemoFigures) -> Table:
 def _facts(folder: Path, scene: Scene, seed: int) -> dict[str, Any]:
     capture = read_json(folder / "capture" / "metadata.json")
     return {
-        "room": f"splatseg.synthetic.room(seed={seed})",
+        "room": f"splatseg.synthetic.furnishing(seed={seed})",
         "photographs": f"{len(scene.train_views)} train and {len(scene.test_views)} held out, "
         f"{capture['width']} x {capture['height']} pixels",
         "fit": f"{scene.provenance.get('steps')} steps",

@@ -1,4 +1,4 @@
-"""Labelled points of what photographs of a scene would see, clean or as Gaussians lie."""
+"""Generated worlds as cameras on a car, labelled meshes and labelled points record them."""
 
 import math
 from dataclasses import dataclass
@@ -9,12 +9,160 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseg._check import check_range
+from splatseg.core import LabelledMesh, View
 from splatseg.core.boundary import boundary, convert_fields
 from splatseg.core.evidence import UNLABELLED
 from splatseg.errors import InputError
-from splatseg.synthetic._raycast import cast, classes_of, film, shade
-from splatseg.synthetic._scene import SyntheticScene
-from splatseg.synthetic._views import look_at
+from splatseg.synthetic.photographs import look_at
+from splatseg.synthetic.raycast import cast, classes_of, film, shade
+from splatseg.synthetic.solids import Primitive, SyntheticScene
+
+_EYE_HEIGHT = 1.55
+_AHEAD = 14.0
+
+
+@boundary
+def drive_cameras(
+    scene: SyntheticScene,
+    count: int = 40,
+    *,
+    test_every: int = 8,
+    width: int = 352,
+    height: int = 192,
+    field_of_view: float = 90.0,
+    reach: float = 0.7,
+) -> tuple[View, ...]:
+    """Forward-looking pinhole cameras along the drive of a street, in the order of the drive.
+
+    They stand 1.55 m above the road, evenly spaced, and look along the line that is driven,
+    with a little sway. The same scene gives the same views.
+
+    Args:
+        scene: A scene with a `drive`.
+        count: Number of views.
+        test_every: Of how many views one has the split ``test``; 0 for none.
+        width: Pixels a row.
+        height: Rows.
+        field_of_view: Horizontal, degrees.
+        reach: Share of the drive that is driven, in (0, 1]; the rest is what the last sees ahead.
+
+    Returns:
+        Views named ``drive_0000`` ..., without photographs.
+
+    Raises:
+        InputError: If the scene has no drive, as rooms have none.
+    """
+    check_range("count", count, 1, 100000)
+    check_range("test_every", test_every, 0, 100000)
+    check_range("reach", reach, 0.01, 1.0)
+    if len(scene.drive) < 2:
+        raise InputError(
+            f"scene: expected one with a drive, such as a street, {scene.name!r:.60} has none."
+        )
+    line = np.array(scene.drive)
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    along = np.concatenate(([0.0], np.cumsum(steps)))
+    rng = np.random.default_rng([scene.seed, 31])
+
+    def place(s: float) -> np.ndarray:
+        """On the line; before its ends and beyond them straight on."""
+        inside = min(max(s, 0.0), float(along[-1]))
+        point = np.array([np.interp(inside, along, line[:, k]) for k in range(3)])
+        end = line[-1] - line[-2] if s > inside else line[1] - line[0]
+        return point + (s - inside) * end / np.linalg.norm(end)
+
+    views: list[View] = []
+    for i, s in enumerate(np.linspace(0.0, reach * float(along[-1]), count)):
+        eye, ahead = place(float(s)), place(float(s) + _AHEAD)
+        eye[2] += _EYE_HEIGHT + rng.uniform(-0.02, 0.02)
+        eye[:2] += rng.uniform(-0.06, 0.06, size=2)
+        sway = math.tan(math.radians(0.8)) * _AHEAD
+        ahead[:2] += rng.uniform(-sway, sway, size=2)
+        ahead[2] += _EYE_HEIGHT - 0.35 + rng.uniform(-0.1, 0.1)
+        camera = look_at(
+            eye.tolist(), ahead.tolist(), width=width, height=height, field_of_view=field_of_view
+        )
+        split = "test" if test_every and i % test_every == test_every // 2 else "train"
+        views.append(View(name=f"drive_{i:04d}", camera=camera, split=split))
+    return tuple(views)
+
+
+# A generated scene as a labelled mesh.
+
+
+_Triangles = tuple[Float[Tensor, "v 3"], Int[Tensor, "m 3"]]
+_BOX = (
+    (0, 1, 3), (0, 3, 2), (4, 7, 5), (4, 6, 7), (0, 5, 1), (0, 4, 5),
+    (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
+)  # fmt: skip
+
+
+@boundary
+def scene_mesh(scene: SyntheticScene, *, segments: int = 96) -> LabelledMesh:
+    """The solids of a scene as triangles, their faces labelled ``semantic`` and ``instance``.
+
+    Boxes and planes are exact. Spheres and cylinders are polyhedra with corners on the solid,
+    off it by up to 1 - cos(pi / segments) of the radius.
+
+    Args:
+        scene: The solids.
+        segments: Corners around a sphere or cylinder.
+    """
+    check_range("segments", segments, 3, 10000)
+    vertices: list[Tensor] = []
+    faces: list[Tensor] = []
+    classes: list[Tensor] = []
+    instances: list[Tensor] = []
+    count = 0
+    for item in scene.primitives:
+        unit, triangles = _unit(item, segments)
+        half = torch.tensor(item.half_size, dtype=torch.float64)
+        centre = torch.tensor(item.centre, dtype=torch.float64)
+        vertices.append((unit * half) @ item.rotation.T + centre)
+        faces.append(triangles + count)
+        count += len(unit)
+        rows = torch.ones(len(triangles), dtype=torch.int32)
+        classes.append(rows * scene.class_of(item.instance))
+        instances.append(rows * item.instance)
+    return LabelledMesh(
+        vertices=torch.cat(vertices),
+        faces=torch.cat(faces),
+        face_labels={"semantic": torch.cat(classes), "instance": torch.cat(instances)},
+    )
+
+
+def _unit(item: Primitive, segments: int) -> _Triangles:
+    """The unit solid."""
+    if item.shape == "plane":
+        corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        return corners.double(), torch.tensor([[0, 1, 2], [0, 2, 3]])
+    if item.shape == "box":
+        # Vertex 4 i + 2 j + k has the signs of (i, j, k).
+        sign = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+        return torch.cartesian_prod(sign, sign, sign), torch.tensor(_BOX)
+    if item.shape == "sphere":
+        up = torch.linspace(0, math.pi, segments // 2 + 1, dtype=torch.float64)
+        return _turned(up.sin(), -up.cos(), segments)
+    radii = torch.tensor([0.0, 1.0, item.taper, 0.0], dtype=torch.float64)
+    return _turned(radii, torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64), segments)
+
+
+def _turned(radii: Tensor, heights: Tensor, segments: int) -> _Triangles:
+    """The surface of a line turned about the z axis."""
+    turn = torch.arange(segments, dtype=torch.float64) * (2 * math.pi / segments)
+    ring = torch.stack((turn.cos(), turn.sin()), dim=-1)
+    flat = radii[:, None, None] * ring
+    vertices = torch.cat((flat, heights[:, None, None].expand(-1, segments, 1)), dim=-1)
+    low = torch.arange(len(radii) - 1)[:, None] * segments
+    here = torch.arange(segments)
+    after = (here + 1) % segments
+    a, b, c, d = low + here, low + after, low + segments + after, low + segments + here
+    faces = torch.stack((torch.stack((a, b, c), -1), torch.stack((a, c, d), -1)), dim=2)
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+# Labelled points of what photographs of a scene would see, clean or as Gaussians lie.
+
 
 _WIDTH, _HEIGHT = 96, 64
 _POINTS_A_VIEW = 2000

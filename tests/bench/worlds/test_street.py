@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError
-from splatseg.synthetic import STREET_CLASSES, drive_cameras, render_truth, room, street
+from splatseg.synthetic import render_truth, room
+from splatseg_bench.worlds import STREET_CLASSES, drive_cameras, street
 
 SEEDS = range(5)
 

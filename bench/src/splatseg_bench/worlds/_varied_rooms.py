@@ -7,14 +7,12 @@ import numpy as np
 
 from splatseg._check import check_range
 from splatseg.core.boundary import boundary
-from splatseg.synthetic import _fittings as fittings
-from splatseg.synthetic import _furniture as furniture
-from splatseg.synthetic import _small_things as small
-from splatseg.synthetic._builder import Builder, shades
-from splatseg.synthetic._classes import INTERIOR_CLASSES, INTERIOR_RELATED
-from splatseg.synthetic._plan import WALLS, FloorPlan, Stand
-from splatseg.synthetic._scene import SyntheticScene
-from splatseg.synthetic._shapes import Texture, Vector
+from splatseg.synthetic.builder import Builder, shades
+from splatseg.synthetic.solids import SyntheticScene, Texture, Vector
+from splatseg_bench.worlds import _fittings as fittings
+from splatseg_bench.worlds import _furniture as furniture
+from splatseg_bench.worlds._classes import INTERIOR_CLASSES, INTERIOR_RELATED
+from splatseg_bench.worlds._furniture import WALLS, FloorPlan, Stand
 
 _ON_TABLES = ("mug", "bottle", "vase", "books", "box")
 
@@ -113,14 +111,14 @@ def _desk(b: Builder, plan: FloorPlan) -> None:
     for i in range(screens):
         x = 0.0 if screens == 1 else (i - 0.5) * 0.72
         b.frame = frame
-        small.monitor(b, b.spot((x, d / 2 - 0.16, height)), stand.yaw, desk)
+        fittings.monitor(b, b.spot((x, d / 2 - 0.16, height)), stand.yaw, desk)
     b.frame = frame
-    small.keyboard(b, b.spot((b.jitter(0.05), -0.12, height)), stand.yaw, desk)
+    fittings.keyboard(b, b.spot((b.jitter(0.05), -0.12, height)), stand.yaw, desk)
     b.frame = frame
     sides = [(x * (w / 2 - 0.15), y, height) for x in (-1, 1) for y in (d / 2 - 0.2, -0.12)]
     # Where two monitors stand, only the front corners are free.
     places = sides if screens == 1 and w > 1.25 else sides[1::2]
-    small.things_on(b, places, desk, kinds=(*_ON_TABLES, "lamp", "mug"), share=0.65)
+    fittings.things_on(b, places, desk, kinds=(*_ON_TABLES, "lamp", "mug"), share=0.65)
     seat = furniture.office_chair if b.rng.random() < 0.75 else furniture.chair
     turned = at(-(d / 2 - 0.375) - 0.12 + b.jitter(0.06))
     seat(b, Stand(x=turned.x, y=turned.y, yaw=stand.yaw + math.pi))
@@ -140,7 +138,7 @@ def _table_with_chairs(b: Builder, plan: FloorPlan) -> None:
     places = [
         (float(x), y, top) for x in np.arange(-w / 2 + 0.25, w / 2 - 0.2, 0.35) for y in (-0.2, 0.2)
     ]
-    small.things_on(b, places, table, kinds=_ON_TABLES, share=float(b.rng.uniform(0.1, 0.5)))
+    fittings.things_on(b, places, table, kinds=_ON_TABLES, share=float(b.rng.uniform(0.1, 0.5)))
     swivel = b.rng.random() < 0.3
     each = 1 if is_round else max(1, int(w / 0.65))
     for side in (-1, 1):
@@ -180,7 +178,7 @@ def _sitting_group(b: Builder, plan: FloorPlan) -> None:
     w, d, h = float(b.rng.uniform(0.8, 1.1)), 0.5, float(b.rng.uniform(0.36, 0.45))
     table = furniture.table(b, at(-0.42), (w, d, h), is_round=bool(b.rng.random() < 0.2))
     places = [(x, 0.0, _top_of(b, table)) for x in (-0.28, 0.0, 0.28)]
-    small.things_on(b, places, table, kinds=_ON_TABLES, share=0.6)
+    fittings.things_on(b, places, table, kinds=_ON_TABLES, share=0.6)
 
 
 def _bed(b: Builder, plan: FloorPlan) -> None:
@@ -195,7 +193,7 @@ def _bedside(b: Builder, plan: FloorPlan) -> None:
     if stand is not None:
         cabinet = furniture.cabinet(b, stand, (0.45, 0.38, 0.5))
         kinds = ("lamp", "books", "mug")
-        small.things_on(b, [(0.0, 0.0, 0.5)], cabinet, kinds=kinds, share=0.9)
+        fittings.things_on(b, [(0.0, 0.0, 0.5)], cabinet, kinds=kinds, share=0.9)
 
 
 def _cabinet(b: Builder, plan: FloorPlan) -> None:
@@ -208,7 +206,7 @@ def _cabinet(b: Builder, plan: FloorPlan) -> None:
     cabinet = furniture.cabinet(b, stand, (w, d, h))
     places = [(float(x), 0.0, h) for x in np.arange(-w / 2 + 0.2, w / 2 - 0.15, 0.35)]
     kinds = _ON_TABLES if h < 1.4 else ("box", "box", "vase")
-    small.things_on(b, places, cabinet, kinds=kinds, share=0.4)
+    fittings.things_on(b, places, cabinet, kinds=kinds, share=0.4)
 
 
 def _shelf(b: Builder, plan: FloorPlan) -> None:
@@ -234,11 +232,11 @@ def _shelf(b: Builder, plan: FloorPlan) -> None:
         length = filled * (2 * w - 0.06)
         if length > 0.15:
             at = b.spot((-w + 0.03 + length / 2, 0.0, z + 0.017))
-            small.row_of_books(b, at, frame[3], shelf, length=length)
+            fittings.row_of_books(b, at, frame[3], shelf, length=length)
         b.frame = frame
         free = np.arange(-w + 0.18 + length, w - 0.12, 0.3)
         places = [(float(x), 0.0, z + 0.016) for x in free]
-        small.things_on(b, places, shelf, kinds=("box", "vase", "bottle", "mug"), share=0.5)
+        fittings.things_on(b, places, shelf, kinds=("box", "vase", "bottle", "mug"), share=0.5)
 
 
 def _standing_plant(b: Builder, plan: FloorPlan) -> None:
@@ -246,7 +244,7 @@ def _standing_plant(b: Builder, plan: FloorPlan) -> None:
     stand = plan.stand_free(0.55 * size, 0.55 * size)
     if stand is not None:
         at = (stand.x, stand.y, 0.0)
-        small.plant(b, at, stand.yaw, furniture.FLOOR, size=size)
+        fittings.plant(b, at, stand.yaw, furniture.FLOOR, size=size)
 
 
 def _standing_lamp(b: Builder, plan: FloorPlan) -> None:
@@ -267,17 +265,17 @@ def _boxes(b: Builder, plan: FloorPlan) -> None:
     if stand is None:
         return
     at, size = (stand.x, stand.y, 0.0), float(b.rng.uniform(0.14, 0.22))
-    small.box(b, at, stand.yaw, furniture.FLOOR, size=size)
+    fittings.box(b, at, stand.yaw, furniture.FLOOR, size=size)
     if b.rng.random() < 0.5:
         lower = len(b.objects)
         top = _top_of(b, lower)
-        small.box(b, (stand.x, stand.y, top), stand.yaw, lower, size=size * 0.65)
+        fittings.box(b, (stand.x, stand.y, top), stand.yaw, lower, size=size * 0.65)
 
 
 def _waste_bin(b: Builder, plan: FloorPlan) -> None:
     stand = plan.stand_back(0.34, 0.34, 0.5)
     if stand is not None:
-        small.bin_(b, (stand.x, stand.y, 0.0), stand.yaw, furniture.FLOOR)
+        fittings.bin_(b, (stand.x, stand.y, 0.0), stand.yaw, furniture.FLOOR)
 
 
 def _lone_chair(b: Builder, plan: FloorPlan) -> None:

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from splatseg.core import ClassInfo, ClassTable
-from splatseg.synthetic._scene import ObjectInfo
-from splatseg.synthetic._shapes import Primitive, ShapeName, Texture, TextureName, Vector
+from splatseg.synthetic.solids import ObjectInfo, Primitive, ShapeName, Texture, TextureName, Vector
 
 ROOM_CLASSES = ClassTable(
     rows=tuple(
@@ -131,6 +130,7 @@ class Builder:
     def legs(
         self, half_x: float, half_y: float, height: float, thick: float, texture: Texture
     ) -> None:
+        """Four legs at the corners of what stands on them."""
         for x in (-half_x, half_x):
             for y in (-half_y, half_y):
                 self.solid("box", (x, y, height / 2), (thick, thick, height / 2), texture)
@@ -142,13 +142,17 @@ class Builder:
         return (x + c * offset[0] - s * offset[1], y + s * offset[0] + c * offset[1], z + offset[2])
 
     def wood(self, *, scale: float = 0.16) -> Texture:
+        """The texture of some wood."""
         return Texture(kind="wood", palette=WOODS[self.rng.integers(len(WOODS))], scale=scale)
 
     def cloth(self, *, kind: TextureName = "weave", scale: float = 0.12) -> Texture:
+        """The texture of some cloth."""
         return Texture(kind=kind, palette=shades(self.accent()), scale=scale)
 
     def accent(self) -> Vector:
+        """A strong colour."""
         return _ACCENTS[self.rng.integers(len(_ACCENTS))]
 
     def jitter(self, size: float) -> float:
+        """A number between -size and size."""
         return float(self.rng.uniform(-size, size))

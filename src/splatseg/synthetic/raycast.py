@@ -11,10 +11,8 @@ from splatseg._check import check_shape
 from splatseg.core import Camera
 from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
-from splatseg.synthetic._light import light_volume
-from splatseg.synthetic._scene import SyntheticScene
-from splatseg.synthetic._shapes import Vector, intersect, normals
-from splatseg.synthetic._textures import palette_colour, pattern
+from splatseg.synthetic.shading import light_volume, palette_colour, pattern
+from splatseg.synthetic.solids import SyntheticScene, Vector, intersect, normals
 
 _BUNDLE = 256
 _EXPOSURE = 1.35

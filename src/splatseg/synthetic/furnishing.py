@@ -6,9 +6,8 @@ import numpy as np
 
 from splatseg._check import check_range
 from splatseg.core.boundary import boundary
-from splatseg.synthetic._builder import RELATED, ROOM_CLASSES, WOODS, Builder, shades
-from splatseg.synthetic._scene import SyntheticScene
-from splatseg.synthetic._shapes import Texture, TextureName, Vector
+from splatseg.synthetic.builder import RELATED, ROOM_CLASSES, WOODS, Builder, shades
+from splatseg.synthetic.solids import SyntheticScene, Texture, TextureName, Vector
 
 _HALF_X, _HALF_Y, _HEIGHT = 2.6, 2.1, 2.5
 

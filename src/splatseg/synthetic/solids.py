@@ -1,9 +1,4 @@
-"""The solids that generated scenes are made of, and where rays meet them.
-
-Every solid is the image of a unit solid: a point of the world becomes a unit point by
-``q = (R^T (p - c)) / half_size``. A ray keeps its parameter t under that map, so four unit
-solids are all the ray-caster needs to know.
-"""
+"""What generated scenes are made of: solids and where rays meet them, objects, classes, the sun."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,8 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatseg._check import check_choice, check_range
+from splatseg.core import ClassTable
 from splatseg.core.boundary import convert_fields
-from splatseg.errors import RangeError
+from splatseg.errors import InputError, RangeError
 
 ShapeName = Literal["box", "cylinder", "sphere", "plane"]
 TextureName = Literal[
@@ -251,3 +247,76 @@ def _cylinder(origins: Tensor, directions: Tensor, *, taper: float, near: float)
         good = (x * x + y * y <= radius * radius) & (t > near) & (t < nearest)
         nearest = torch.where(good, t, nearest)
     return nearest
+
+
+# What a generated scene is: solids, the objects they belong to, classes, and the sun.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectInfo:
+    """One object of a generated scene."""
+
+    id: int
+    """Instance id, from 1."""
+
+    class_id: int
+    name: str
+    """A phrase that tells it from the others: ``the red chair by the window``."""
+
+    parent: int | None = None
+    """Instance that it stands or hangs on; None for the room itself."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SyntheticScene:
+    """Solids with exact class and instance, inside a box; metres, z up."""
+
+    name: str
+    seed: int
+    primitives: tuple[Primitive, ...]
+    objects: tuple[ObjectInfo, ...]
+    classes: ClassTable
+
+    related_classes: tuple[tuple[str, ...], ...] = ()
+    """Groups of classes that a network takes for one another."""
+
+    bounds: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    """Lowest and highest corner of the space where light is computed and cameras stand."""
+
+    sun: Vector | None = None
+    """Direction towards the sun; None is a night, or overcast. In a room it shines in through the
+    planes that glow."""
+
+    is_outdoor: bool = False
+    """Whether there is a sky instead of walls around `bounds`: the sun shines everywhere."""
+
+    drive: tuple[Vector, ...] = ()
+    """Corners of a line on the ground that a vehicle with cameras follows; none in a room."""
+
+    ambient: float = 1.0
+    """Brightness of the light that comes from everywhere; 1 suits a room with a window."""
+
+    def __post_init__(self) -> None:
+        convert_fields(self)
+        check_range("ambient", self.ambient, 0.0, 100.0)
+        ids = [item.id for item in self.objects]
+        if len(set(ids)) != len(ids):
+            raise InputError(f"objects: expected distinct ids, got {sorted(ids)}.")
+        unknown = sorted({p.instance for p in self.primitives} - set(ids))
+        if unknown:
+            raise InputError(f"primitives: expected instances of `objects`, got {unknown} as well.")
+        known = {row.id for row in self.classes.rows}
+        strange = sorted({item.class_id for item in self.objects} - known)
+        if strange:
+            raise InputError(f"objects: expected classes of `classes`, got {strange} as well.")
+
+    def class_of(self, instance: int) -> int:
+        """Class id of an instance.
+
+        Raises:
+            InputError: If there is no such instance.
+        """
+        for item in self.objects:
+            if item.id == instance:
+                return item.class_id
+        raise InputError(f"instance: expected one of 1 to {len(self.objects)}, got {instance}.")

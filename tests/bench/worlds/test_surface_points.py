@@ -4,14 +4,8 @@ import pytest
 import torch
 
 from splatseg.errors import InputError, RangeError
-from splatseg.synthetic import (
-    SurfaceCloud,
-    SurfaceOptions,
-    SyntheticScene,
-    street,
-    surface_points,
-    varied_room,
-)
+from splatseg.synthetic import SyntheticScene
+from splatseg_bench.worlds import SurfaceCloud, SurfaceOptions, street, surface_points, varied_room
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,9 @@ from splatseg.core.boundary import boundary
 from splatseg.core.evidence import UNLABELLED
 from splatseg.errors import InputError
 from splatseg.io.atomic import atomic_folder
-from splatseg.synthetic._labels import machine_labels
-from splatseg.synthetic._raycast import Truth, render_truth
-from splatseg.synthetic._scene import SyntheticScene
-from splatseg.synthetic._views import cameras, start_points
+from splatseg.synthetic.photographs import cameras, machine_labels, start_points
+from splatseg.synthetic.raycast import Truth, render_truth
+from splatseg.synthetic.solids import SyntheticScene
 
 _JPEG_QUALITY = 92
 _DEPTH_UNIT = 0.001

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from splatseg.errors import RangeError
-from splatseg.synthetic import INTERIOR_CLASSES, SyntheticScene, room, varied_room
-from splatseg.synthetic._shapes import Primitive
+from splatseg.synthetic import SyntheticScene, room
+from splatseg.synthetic.solids import Primitive
+from splatseg_bench.worlds import INTERIOR_CLASSES, varied_room
 
 SEEDS = range(12)
 SMALL = 0.02

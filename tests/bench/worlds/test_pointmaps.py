@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from splatseg.errors import RangeError
-from splatseg.synthetic import PointmapErrors, look_at, synthetic_pointmaps
+from splatseg.synthetic import look_at
+from splatseg_bench.worlds import PointmapErrors, synthetic_pointmaps
 
 SIZE = (30, 40)
 EXACT = PointmapErrors(noise=0, warp=0, wrong_confidence=0)
