@@ -1,19 +1,87 @@
-"""Colours of a layer's ids: neighbours in the scene look unlike each other.
-
-The same layer has the same colours in reports, coloured label maps, legends and tables, since
-they follow from its Gaussians alone.
-"""
+"""The colour and the name of each id, the same in every picture, and ids written on pictures."""
 
 import colorsys
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
-from scipy import sparse
+from PIL import Image, ImageDraw, ImageFont
+from scipy import ndimage, sparse
 from torch import Tensor
 
+from splatseg._check import check_shape
 from splatseg.core import UNLABELLED, ClassInfo, ClassTable, Gaussians, Labels, RenderableLayer
-from splatseg.report.legend import Colour, colour_of, names_of
+
+Colour = tuple[int, int, int]
+
+NOTHING: Colour = (24, 24, 28)
+"""Where there is no id, or nothing at all."""
+
+
+def colour_of(id: int, classes: ClassTable | None = None) -> Colour:
+    """The class table's colour of an id, else a colour of its own; -1 is nearly black.
+
+    Colours that are made up walk round the hues by the golden ratio, and through brightness by
+    another irrational step, so that no two of the first forty look alike.
+    """
+    if id < 0:
+        return NOTHING
+    if classes is not None:
+        for row in classes.rows:
+            if row.id == id and row.colour is not None:
+                return row.colour
+    hue = (id * 0.6180339887) % 1.0
+    light = 0.40 + 0.38 * ((id * 0.7548776662) % 1.0)
+    red, green, blue = colorsys.hls_to_rgb(hue, light, 0.62)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def colour_labels(
+    ids: Int[Tensor, "height width"], classes: ClassTable | None = None
+) -> UInt8[Tensor, "height width 3"]:
+    """A label map in colours, see `colour_of`."""
+    check_shape("ids", ids, (None, None))
+    present, index = torch.unique(ids, return_inverse=True)
+    colours = [colour_of(id, classes) for id in present.tolist()]
+    return torch.tensor(colours, dtype=torch.uint8)[index]
+
+
+def names_of(layer: RenderableLayer, classes: ClassTable | None) -> dict[int, str]:
+    """Names of the ids in use: the layer's own, or the scene's where it has none."""
+    present = set(layer.ids)
+    rows = () if classes is None else classes.rows
+    return dict(layer.info.names) or {row.id: row.name for row in rows if row.id in present}
+
+
+def legend_of(
+    layer: RenderableLayer, classes: ClassTable | None, *, colours: ClassTable | None = None
+) -> dict[str, Any]:
+    """The content of legend.json for a layer.
+
+    Args:
+        layer: What is known of it.
+        classes: Of the scene.
+        colours: Of its ids, see `splatseg.report.colours`; None takes those of the classes.
+    """
+    colours = classes if colours is None else colours
+    names = names_of(layer, classes)
+    sources = layer.info.source_ids or {}
+    rows: dict[str, dict[str, Any]] = {}
+    for id in layer.ids:
+        rows[str(id)] = {"name": names.get(id, ""), "colour": list(colour_of(id, colours))}
+        if id in sources:
+            rows[str(id)]["source_id"] = sources[id]
+    background = 0 if layer.background == UNLABELLED else layer.background
+    return {"none": 0, "background": background, "ids": rows}
+
+
+# Colours of a layer's ids: neighbours in the scene look unlike each other.
+#
+# The same layer has the same colours in reports, coloured label maps, legends and tables, since
+# they follow from its Gaussians alone.
+
 
 _MAX_CELLS, _MIN_CELLS = 64, 8
 """Cells along the longest side of the scene; things in one cell or in two that share a side are
@@ -151,3 +219,52 @@ def _oklab(rgb: NDArray[np.float64]) -> NDArray[np.float64]:
             [-0.0040720468, 0.4505937099, -0.8086757660],
         ]
     )
+
+
+# Ids written on a picture, each where its thing is widest.
+
+
+_SMALLEST, _SHARE = 11, 1 / 30
+"""Height of the letters, pixels, and as a share of the longest side; the larger counts."""
+
+
+def draw_ids(
+    image: UInt8[Tensor, "height width 3"], ids: Int[Tensor, "height width"]
+) -> UInt8[Tensor, "height width 3"]:
+    """A picture with the ids of a label map written on it; too small areas go without."""
+    check_shape("ids", ids, image.shape[:2])
+    size = max(_SMALLEST, round(_SHARE * max(image.shape[:2])))
+    picture = Image.fromarray(image.cpu().numpy())
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size)
+    for id, x, y in _places(ids, radius=0.45 * size):
+        draw.text(
+            (x, y),
+            str(id),
+            fill=(255, 255, 255),
+            font=font,
+            anchor="mm",
+            stroke_width=max(1, size // 8),
+            stroke_fill=(16, 16, 20),
+        )
+    return torch.from_numpy(np.array(picture))
+
+
+def _places(ids: Tensor, *, radius: float) -> list[tuple[int, float, float]]:
+    """Id and centre of the largest circle that its area holds, where that is wide enough."""
+    present, index = torch.unique(ids, return_inverse=True)
+    # Labels of `find_objects` begin with 1.
+    numbered = index.cpu().numpy() + 1
+    found: list[tuple[int, float, float]] = []
+    for k, (id, box) in enumerate(
+        zip(present.tolist(), ndimage.find_objects(numbered), strict=True), start=1
+    ):
+        if id == UNLABELLED or box is None:
+            continue
+        # A rim, so that the border of the picture is a border of the thing.
+        inside = np.pad(numbered[box] == k, 1)
+        depth = np.asarray(ndimage.distance_transform_edt(inside))
+        row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
+        if depth[row, column] < radius:
+            continue
+        found.append((id, float(box[1].start + column) - 0.5, float(box[0].start + row) - 0.5))
+    return found

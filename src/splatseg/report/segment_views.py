@@ -1,7 +1,7 @@
-"""What a report of a segmentation shows of single views."""
+"""What a report of a segmentation shows of single views, and of a tree of instances."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,8 +10,11 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from splatseg.core import (
+    TREE_LEVELS,
     UNLABELLED,
     ClassTable,
+    Gaussians,
+    InstanceTree,
     LabelMap,
     LabelSource,
     Renderable,
@@ -25,8 +28,10 @@ from splatseg.evaluate.held_out import label_map_in
 from splatseg.evaluate.metrics import psnr
 from splatseg.evaluate.overlaps import Overlaps, instance_score
 from splatseg.io.evidence import Evidence
+from splatseg.io.export import node_rows
 from splatseg.io.images import image_camera, load_image, reduced_size
-from splatseg.report.drawn_ids import draw_ids
+from splatseg.report.colours import colour_labels, draw_ids, layer_colours
+from splatseg.report.html import Block, Table
 from splatseg.report.images import (
     Gallery,
     GalleryImage,
@@ -34,7 +39,6 @@ from splatseg.report.images import (
     mark_errors,
     overlay_labels,
 )
-from splatseg.report.legend import colour_labels
 
 _LONGEST = 1024
 """Pixels at which views without a truth are drawn."""
@@ -187,7 +191,7 @@ def gallery(
         size = _size(panel.image, longest)
         photograph = _resized(panel.image, size)
         drawn = _nearest(panel.drawn, size)
-        shown = [GalleryImage(image=photograph)]
+        shown = [GalleryImage(photograph)]
         if with_photographs:
             shown.append(_rendered(panel, size))
         if with_evidence:
@@ -195,16 +199,16 @@ def gallery(
             shown.append(_evidence_image(panel, table, size))
         confidence = _nearest(panel.confidence, size)
         shown += [
-            GalleryImage(image=draw_ids(overlay_labels(photograph, drawn, classes), drawn)),
-            GalleryImage(image=colour_share(confidence, low=low, high=high)),
+            GalleryImage(draw_ids(overlay_labels(photograph, drawn, classes), drawn)),
+            GalleryImage(colour_share(confidence, low=low, high=high)),
         ]
         if with_truth:
             shown += _truth_images(panel, classes, truth_names, photograph)
         rows.append((f"{panel.name}, held out" if panel.held_out else panel.name, tuple(shown)))
     return Gallery(
-        title="What it looks like",
-        columns=tuple(columns),
-        rows=tuple(rows),
+        "What it looks like",
+        tuple(columns),
+        tuple(rows),
         note="Numbers are ids of the layer. A click, or the Enter key, enlarges a picture. "
         + (
             "Errors: red is a wrong label, blue none; grey pixels are right or void."
@@ -218,7 +222,7 @@ def _rendered(panel: ViewPanel, size: tuple[int, int]) -> GalleryImage:
     if panel.rendered is None:
         return _nothing(size)
     likeness = psnr(panel.rendered, panel.image)
-    return GalleryImage(image=_resized(panel.rendered, size), caption=f"{likeness:.1f} dB")
+    return GalleryImage(_resized(panel.rendered, size), f"{likeness:.1f} dB")
 
 
 def _picture_name(panels: Sequence[ViewPanel]) -> str:
@@ -239,7 +243,7 @@ def _evidence_image(
     if panel.evidence is None or panel.agreement is None:
         return _nothing(size)
     return GalleryImage(
-        image=colour_labels(_nearest(panel.evidence, size), classes),
+        colour_labels(_nearest(panel.evidence, size), classes),
         kind="chart",
         caption=f"{panel.agreement.differ:.1%} differs",
     )
@@ -261,14 +265,14 @@ def _truth_images(
         photograph, _nearest(panel.drawn, size).long(), truth=_nearest(truth, size).long()
     )
     return [
-        GalleryImage(image=colour_labels(_nearest(truth, size), classes), kind="chart"),
-        GalleryImage(image=marked, caption=f"{right:.1%} right"),
+        GalleryImage(colour_labels(_nearest(truth, size), classes), kind="chart"),
+        GalleryImage(marked, f"{right:.1%} right"),
     ]
 
 
 def _nothing(size: tuple[int, int]) -> GalleryImage:
     grey = torch.full((*size, 3), 128, dtype=torch.uint8)
-    return GalleryImage(image=grey, kind="chart", caption="there is none of this view")
+    return GalleryImage(grey, kind="chart", caption="there is none of this view")
 
 
 def _evidence_ids(evidence: LabelSource | None, name: str) -> Int[Tensor, "height width"] | None:
@@ -309,3 +313,113 @@ def _resized(
     planes = image.movedim(-1, 0)[None].float()
     small = torch.nn.functional.interpolate(planes, size=size, mode="bilinear", antialias=True)
     return small[0].movedim(0, -1).round().clamp(0, 255).to(torch.uint8)
+
+
+# What a report shows of a tree of instances: its nodes, and pictures of its cuts.
+
+
+_CUT_LONGEST = 448
+_MAX_ROWS = 400
+
+
+def tree_section(
+    field: Renderable,
+    layer: str,
+    tree: InstanceTree,
+    views: Sequence[View],
+    *,
+    gaussians: Gaussians,
+) -> tuple[Block, ...]:
+    """The pictures of three cuts in some views, and a table of all nodes, children indented.
+
+    Args:
+        field: What is rendered.
+        layer: Name of the layer of the field.
+        tree: The layer.
+        views: Those that are rendered.
+        gaussians: Who carries the labels; colours follow from them.
+    """
+    pictures = (_cuts(field, layer, tree, views, gaussians),) if views else ()
+    return (*pictures, _nodes(tree))
+
+
+def _cuts(
+    field: Renderable, layer: str, tree: InstanceTree, views: Sequence[View], gaussians: Gaussians
+) -> Gallery:
+    tables = {
+        level: layer_colours(
+            field.layer(f"{layer}@{level}"), None, gaussians=gaussians, labels=tree.cut(level)
+        )
+        for level in TREE_LEVELS
+    }
+    rows: list[tuple[str, tuple[GalleryImage, ...]]] = []
+    for view in views:
+        camera = image_camera(view, _CUT_LONGEST)
+        size = (camera.height, camera.width)
+        with field.view(camera) as looked_at:
+            drawn = [
+                label_map_in(looked_at, f"{layer}@{level}", camera).ids for level in TREE_LEVELS
+            ]
+            if view.image is None:
+                photograph = rendered_image(looked_at, size)
+            else:
+                photograph = load_image(view, longest=_CUT_LONGEST)
+        rows.append(
+            (
+                view.name,
+                tuple(
+                    _picture(photograph, ids, tables[level])
+                    for level, ids in zip(TREE_LEVELS, drawn, strict=True)
+                ),
+            )
+        )
+    return Gallery(
+        "The tree at three levels",
+        tuple(f"{level}s" for level in TREE_LEVELS),
+        tuple(rows),
+        note="Groups hold objects, objects hold parts. What has no level above it, or none below, "
+        "is shown at the next.",
+    )
+
+
+def _picture(photograph: Tensor, ids: Tensor, colours: ClassTable) -> GalleryImage:
+    return GalleryImage(draw_ids(overlay_labels(photograph, ids, colours), ids))
+
+
+def _nodes(tree: InstanceTree) -> Table:
+    rows = {row["id"]: row for row in node_rows(tree)}
+    order = _depth_first(tree, {id: row["gaussians"] for id, row in rows.items()})
+    cells = tuple(
+        (
+            "\u2003" * (len(tree.path(id)) - 1) + str(rows[id]["name"]),
+            id,
+            rows[id]["level"],
+            rows[id]["gaussians"],
+            f"{rows[id]['support']:.2f}",
+            rows[id]["segments"],
+            rows[id]["views"],
+        )
+        for id in order[:_MAX_ROWS]
+    )
+    more = f" The first {_MAX_ROWS} of {len(order)} are shown." if len(order) > _MAX_ROWS else ""
+    return Table(
+        "The tree",
+        ("node", "id", "level", "Gaussians", "support", "masks", "views"),
+        cells,
+        note="Support is the share of the views that could have seen a node which have a mask of "
+        f"it.{more}",
+    )
+
+
+def _depth_first(tree: InstanceTree, size: Mapping[int, int]) -> list[int]:
+    """Ids of all nodes, each followed by those below it, the largest first."""
+    below: dict[int, list[int]] = {}
+    for node in tree.nodes:
+        below.setdefault(node.parent, []).append(node.id)
+    stack = sorted(below.get(UNLABELLED, []), key=lambda id: (size[id], -id))
+    found: list[int] = []
+    while stack:
+        id = stack.pop()
+        found.append(id)
+        stack += sorted(below.get(id, []), key=lambda id: (size[id], -id))
+    return found

@@ -16,9 +16,9 @@ from splatseg.core import (
     RenderableLayer,
 )
 from splatseg.evaluate.agreement import SEEN_WEIGHT, contested, rivals
-from splatseg.report._segment_panels import ViewPanel
 from splatseg.report.chart import Chart, Line
 from splatseg.report.html import Bars, Block, Cell, Curves, Table
+from splatseg.report.segment_views import ViewPanel
 from splatseg.report.words import count_text
 
 _BINS = 10
@@ -48,11 +48,7 @@ def support_table(labels: Labels) -> Table:
     if labels.evidence is not None:
         add("that no evidence spoke for", labels.evidence <= 0)
         add("with less evidence than one fully visible pixel", labels.evidence < 1)
-    return Table(
-        title="What the labels rest on",
-        columns=("Gaussians", "count", "share"),
-        rows=tuple(rows),
-    )
+    return Table("What the labels rest on", ("Gaussians", "count", "share"), tuple(rows))
 
 
 def confidence_bars(labels: Labels) -> Bars:
@@ -69,9 +65,9 @@ def confidence_bars(labels: Labels) -> Bars:
         for i in reversed(range(_BINS))
     )
     return Bars(
-        title="Confidence",
-        series=tuple(series),
-        rows=rows,
+        "Confidence",
+        tuple(series),
+        rows,
         note="The share of a Gaussian's evidence that speaks for its label.",
     )
 
@@ -81,9 +77,9 @@ def coverage_bars(seen: Int[Tensor, "n"], *, views: int) -> Bars:
     steps = [n for n in _MIN_VIEWS if n <= views] or [1]
     count = max(len(seen), 1)
     return Bars(
-        title="Coverage",
-        series=("share of the Gaussians",),
-        rows=tuple(
+        "Coverage",
+        ("share of the Gaussians",),
+        tuple(
             (f"at least {n} view{'s' if n > 1 else ''}", (int((seen >= n).sum()) / count,))
             for n in steps
         ),
@@ -99,9 +95,9 @@ def conflict_tables(labels: Labels, classes: ClassTable) -> list[Block]:
         close = [(ratio, contested(labels, ratio=ratio)) for ratio in _CLOSE]
         blocks.append(
             Bars(
-                title="Conflicts",
-                series=("share of the Gaussians",),
-                rows=tuple(
+                "Conflicts",
+                ("share of the Gaussians",),
+                tuple(
                     (f"second has {ratio:.0%} of the first or more", (float(mask.double().mean()),))
                     for ratio, mask in close
                 ),
@@ -112,9 +108,9 @@ def conflict_tables(labels: Labels, classes: ClassTable) -> list[Block]:
         if pairs:
             blocks.append(
                 Table(
-                    title="Who contests whom",
-                    columns=("label", "second", "Gaussians"),
-                    rows=tuple(
+                    "Who contests whom",
+                    ("label", "second", "Gaussians"),
+                    tuple(
                         (
                             classes.name_of(pair.winner),
                             classes.name_of(pair.second),
@@ -130,9 +126,9 @@ def conflict_tables(labels: Labels, classes: ClassTable) -> list[Block]:
         share = float((weak < 0.5).double().mean()) if len(weak) else 0.0
         blocks.append(
             Table(
-                title="Conflicts",
-                columns=("Gaussians", "share"),
-                rows=(("whose label has less than half of the votes", f"{share:.1%}"),),
+                "Conflicts",
+                ("Gaussians", "share"),
+                (("whose label has less than half of the votes", f"{share:.1%}"),),
                 note="The layer keeps one candidate a Gaussian; with more, this says who contests "
                 "whom.",
             )
@@ -148,9 +144,9 @@ def difference_tables(panels: Sequence[ViewPanel]) -> list[Table]:
     compared.sort(key=lambda row: (-row[1].differ, row[0]))
     return [
         Table(
-            title="Evidence that differs from the layer",
-            columns=("view", "pixels compared", "differ"),
-            rows=tuple((name, one.pixels, f"{one.differ:.1%}") for name, one in compared),
+            "Evidence that differs from the layer",
+            ("view", "pixels compared", "differ"),
+            tuple((name, one.pixels, f"{one.differ:.1%}") for name, one in compared),
             note="Pixels where both have a label, the most contested view first. Evidence "
             "with ids of its own: pixels that are not of the id that most of their segment "
             "has.",
@@ -167,16 +163,14 @@ def association_tables(info: LayerInfo) -> list[Block]:
     blocks: list[Block] = []
     plain = fact_rows({k: v for k, v in facts.items() if not isinstance(v, list | Mapping)})
     if plain:
-        blocks.append(
-            Table(title="Segments to instances", columns=("what", "value"), rows=tuple(plain))
-        )
+        blocks.append(Table("Segments to instances", ("what", "value"), tuple(plain)))
     for name, value in facts.items():
         if isinstance(value, list) and value:
             blocks.append(_listed(name, cast(list[Any], value)))
         elif isinstance(value, Mapping) and value:
             rows = fact_rows(cast(Mapping[str, Any], value))
             title = name.replace("_", " ").capitalize()
-            blocks.append(Table(title=title, columns=("what", "value"), rows=tuple(rows[:_ROWS])))
+            blocks.append(Table(title, ("what", "value"), tuple(rows[:_ROWS])))
     return blocks
 
 
@@ -185,15 +179,15 @@ def training_blocks(info: LayerInfo) -> list[Block]:
     blocks: list[Block] = []
     curve = _points(info.details.get(LOSS_CURVE))
     if curve:
-        line = Line(name="training views", points=curve)
-        chart = Chart(title="Loss", across="steps", lines=(line,))
-        blocks.append(Curves(title="How it was trained", charts=(chart,)))
+        line = Line("training views", curve)
+        chart = Chart("Loss", "steps", (line,))
+        blocks.append(Curves("How it was trained", (chart,)))
     said = {
         key: info.details[key] for key in TRAINING_FACTS if isinstance(info.details.get(key), str)
     }
     if said:
         rows = fact_rows(said)
-        blocks.append(Table(title="Training", columns=("what", "value"), rows=tuple(rows)))
+        blocks.append(Table("Training", ("what", "value"), tuple(rows)))
     return blocks
 
 
@@ -279,9 +273,7 @@ def _largest_first(columns: Sequence[str], rows: list[tuple[Cell, ...]], scored:
     if scored:
         notes.append(f"IoU is of {scored}; a dash where the truth has none of it.")
         columns = (*columns, "IoU")
-    return Table(
-        title="Labels", columns=tuple(columns), rows=tuple(rows[:_ROWS]), note=" ".join(notes)
-    )
+    return Table("Labels", tuple(columns), tuple(rows[:_ROWS]), note=" ".join(notes))
 
 
 def fact_rows(values: object) -> list[tuple[Cell, ...]]:
@@ -304,10 +296,8 @@ def _listed(name: str, values: list[Any]) -> Table:
         keys = tuple(dict.fromkeys(str(key) for row in rows for key in row))
         cells = tuple(tuple(_cell(row.get(key)) for key in keys) for row in rows)
         columns = tuple(key.replace("_", " ") for key in keys)
-        return Table(title=title, columns=columns or ("",), rows=cells if keys else (), note=note)
-    return Table(
-        title=title, columns=(name,), rows=tuple((_cell(value),) for value in shown), note=note
-    )
+        return Table(title, columns or ("",), cells if keys else (), note=note)
+    return Table(title, (name,), tuple((_cell(value),) for value in shown), note=note)
 
 
 def _cell(value: Any) -> Cell:
