@@ -26,7 +26,6 @@ from splatseg.evaluate import (
     SurfaceField,
     evaluate_instances,
     evaluate_panoptic,
-    matched_instance_score,
     per_image_miou,
     semantic_score,
 )
@@ -36,6 +35,7 @@ from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg_bench.fits import held_out_views
 from splatseg_bench.job import Job
+from splatseg_bench.matched_instances import matched_instance_score
 from splatseg_bench.points import read_by_words, read_in_words, true_ids_of
 from splatseg_bench.protocols import MapSwitches
 from splatseg_bench.scene import TrueMaps

@@ -20,18 +20,12 @@ from splatseg.core import (
     with_info,
 )
 from splatseg.errors import InputError, MissingFileError
-from splatseg.evaluate import (
-    Confusion,
-    PanopticReport,
-    evaluate_panoptic,
-    frames_per_second,
-    learned_bytes,
-)
-from splatseg.evaluate.frame_rate import TimedMaps, timed_label_maps
+from splatseg.evaluate import Confusion, PanopticReport, evaluate_panoptic
 from splatseg.lift import GaussianField
 from splatseg.lift.heads import has_classifier
 from splatseg.render import get_backend
 from splatseg_bench.class_names import ids_in_truth, room_table
+from splatseg_bench.costs import TimedMaps, frames_per_second, learned_bytes, timed_label_maps
 from splatseg_bench.job import Job
 from splatseg_bench.maps import Scores, TrueMapSource, class_scores, keep_map
 from splatseg_bench.points import read_by_words

@@ -19,8 +19,7 @@ from splatseg.core import (
     layer_address,
 )
 from splatseg.core.boundary import boundary
-from splatseg.edit._operation import CutBy, Operation
-from splatseg.edit.document import Document
+from splatseg.edit.document import CutBy, Document, Operation
 from splatseg.errors import InputError
 from splatseg.io.evidence import find_evidence, open_evidence
 from splatseg.lift import label_map

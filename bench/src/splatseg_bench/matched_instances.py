@@ -1,17 +1,4 @@
-r"""Instances matched over a scene by their mean IoU over views, as Gaga's evaluation does it.
-
-For a true instance t and a predicted one p, with the views :math:`V_t` in which t occurs,
-
-.. math:: s_{tp} = \frac{1}{|V_t|} \sum_{v \in V_t} \mathrm{IoU}_v(t, p)
-
-where a view in which p does not occur counts 0. One to one pairs with the largest sum of s are
-the matches; a match counts as found above 0.5. `splatseg.evaluate.instance_score` pools pixels of
-all views instead, so that there a view counts by how large the instance is in it.
-
-References:
-    Lyu, Li, Kundu, Tsai and Yang, Gaga: Group Any Gaussians via 3D-aware Memory Bank (2024):
-    matching of multi-view segmentations with the Hungarian method.
-"""
+"""Gaga's score of instances: matched over a scene by their mean IoU over views."""
 
 from collections.abc import Iterable
 from types import MappingProxyType
@@ -35,9 +22,16 @@ def matched_instance_score(
     *,
     none_is_object: bool = True,
 ) -> InstanceScore:
-    """Match instances one to one so that the sum of their mean IoU over views is largest.
+    r"""Match instances one to one by their mean IoU over views, as Gaga's evaluation does it.
 
-    Views are looked at one after the other; memory is needed for pairs that overlap somewhere.
+    For a true instance t and a predicted one p, with the views :math:`V_t` in which t occurs,
+
+    .. math:: s_{tp} = \frac{1}{|V_t|} \sum_{v \in V_t} \mathrm{IoU}_v(t, p)
+
+    where a view in which p does not occur counts 0. The pairs with the largest sum of s are the
+    matches; a match counts as found above 0.5. `instance_score` pools pixels of all views instead,
+    so that there a view counts by how large the instance is in it. Views are looked at one after
+    the other; memory is needed for pairs that overlap somewhere.
 
     Args:
         views: Name, predicted ids and true ids of each view, -1 none.
@@ -60,6 +54,9 @@ def matched_instance_score(
         >>> score = matched_instance_score([one, two])
         >>> score.miou, dict(score.matches)
         (0.625, {1: (8, 0.75), 2: (9, 0.5)})
+
+    References:
+        Lyu, Li, Kundu, Tsai and Yang, Gaga: Group Any Gaussians via 3D-aware Memory Bank (2024).
     """
     seen: set[str] = set()
     sums: dict[tuple[int, int], float] = {}

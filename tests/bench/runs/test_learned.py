@@ -14,9 +14,9 @@ from splatseg.core import (
     TreeNode,
     with_info,
 )
-from splatseg.evaluate import LearnedBytes, learned_bytes
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.heads import ClassifierHead
+from splatseg_bench.costs import LearnedBytes, learned_bytes
 
 COUNT = 5
 
