@@ -1,22 +1,42 @@
-"""One method in one scene under a protocol: what the parts of a run share."""
+"""One method in one scene under a protocol: its evidence, words, and selections by its layer."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from splatseg.core import Layer, Model, Scene, VoxelFeatures
-from splatseg.core.models import GroundedMasks
+from splatseg.core import (
+    Features,
+    InstanceTree,
+    Labels,
+    Layer,
+    Model,
+    Scene,
+    Selection,
+    VoxelFeatures,
+)
+from splatseg.core.models import GroundedMasks, TextFeatures
 from splatseg.errors import InputError
+from splatseg.io.evidence import FeatureEvidence, open_evidence
+from splatseg.lift import GaussianField
+from splatseg.lift.affinity import KIND
+from splatseg.lift.vocabulary import Vocabulary, vocabulary_of
+from splatseg.lift.voxels import VoxelWords
+from splatseg.lift.words import WordIndex
 from splatseg.methods import Method
+from splatseg.prompting.prompts import ViewPrompt
 from splatseg.render import BackendName
 from splatseg.tasks._observer import Observer
 from splatseg.tasks.segment import segment
 from splatseg.tasks.segment_options import SegmentOptions
+from splatseg.tasks.select import open_selector
+from splatseg.tasks.select_options import SelectOptions
+from splatseg.tasks.select_session import SelectionSession
+from splatseg_bench.evidence import Seen, companion_for, kinds_wanted, seen_for
 from splatseg_bench.options import BenchOptions
-from splatseg_bench.protocols import Protocol
+from splatseg_bench.protocols import Protocol, TargetSwitches
 from splatseg_bench.scene import BenchmarkScene
-from splatseg_bench.sight import Seen, companion_for, kinds_wanted, seen_for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,3 +155,153 @@ class Job:
                 f"{', '.join(self.options.companions)}."
             )
         return named
+
+
+# Words for the features of a scene under test: who encodes them, and what answers.
+
+
+_SURE = 0.5
+
+
+def words_of(scene: Scene, seen: Seen) -> Vocabulary:
+    """The words of a model, or those that were recorded with its features.
+
+    Raises:
+        InputError: If the evidence is of no words.
+    """
+    if scene.root is None:
+        raise InputError("scene: expected one that was read from its folder, got one without.")
+    folder = scene.root / "evidence" / seen.name
+    evidence = open_evidence(folder)
+    if not isinstance(evidence, FeatureEvidence):
+        raise InputError(f"{folder}: expected features, got {evidence.kind}.")
+    return vocabulary_of(evidence, seen.made if isinstance(seen.made, TextFeatures) else None)
+
+
+def word_index(layer: Features | VoxelFeatures, vocabulary: Vocabulary) -> WordIndex | VoxelWords:
+    """Who answers words in the span of a layer's features, as `query` answers."""
+    if isinstance(layer, VoxelFeatures):
+        return VoxelWords(layer, vocabulary)
+    return WordIndex(layer, vocabulary)
+
+
+class SpokenLayer:
+    """A method's features and the words for them, made when they are first asked for.
+
+    Args:
+        job: The method and the scene.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+
+    @cached_property
+    def layer(self) -> Features | VoxelFeatures:
+        """The features.
+
+        Raises:
+            InputError: If the method gives others than features.
+        """
+        layer = self._job.whole_layer(self._seen.name)
+        if not isinstance(layer, Features | VoxelFeatures):
+            raise InputError(
+                f"method {self._job.method.name}: expected one that gives features, as words are "
+                f"asked for by features, got {self._job.method.returns}."
+            )
+        return layer
+
+    @cached_property
+    def vocabulary(self) -> Vocabulary:
+        """The words."""
+        return words_of(self._job.scene, self._seen)
+
+    def selection(self, words: str) -> Selection:
+        """What likelier is the thing than anything else, as `query` answers.
+
+        Args:
+            words: What is asked for.
+        """
+        index = self._index
+        sure = index.of_gaussians(index.ask([words]).probabilities)[:, 0].clamp(0, 1)
+        return Selection(mask=sure >= _SURE, confidence=sure)
+
+    @cached_property
+    def _seen(self) -> Seen:
+        return self._job.seen(words=True)
+
+    @cached_property
+    def _index(self) -> WordIndex | VoxelWords:
+        return word_index(self.layer, self.vocabulary)
+
+
+def asks_for_all(words: str) -> bool:
+    """Whether words ask for everything that they mean, such as "all of the flowers"."""
+    return words.lower().split()[:1] == ["all"]
+
+
+# Prompts of a protocol answered by `select`, from the layer that a method made.
+
+
+_LAYER = "layer"
+
+
+class LayerSelector:
+    """Selects by one layer, again and again; a context that releases what it holds.
+
+    Args:
+        job: The method, the scene, and the protocol, which says the granularity.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._session: SelectionSession | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def select(self, layer: Layer, prompt: ViewPrompt) -> Selection:
+        """The Gaussians that a prompt means.
+
+        Args:
+            layer: The method's layer, the same in each call.
+            prompt: What the protocol gives.
+
+        Raises:
+            InputError: If the prompt shows nothing that the layer knows.
+        """
+        if self._session is None:
+            self._session = self._opened(layer)
+        return self._session.select(prompt, advise=False).selection
+
+    def _opened(self, layer: Layer) -> SelectionSession:
+        switches = self._job.protocol.switches
+        if not isinstance(switches, TargetSwitches):
+            raise InputError("protocol: expected one of things asked for, got one of maps.")
+        affinity = isinstance(layer, Features) and is_affinity(layer)
+        if not affinity and not isinstance(layer, Labels | InstanceTree):
+            # The labels that features with a classifier give to Gaussians.
+            field = GaussianField(self._job.scene.gaussians, {_LAYER: layer})
+            layer = field.labels(_LAYER)
+        options = SelectOptions(
+            source="features" if affinity else "layer",
+            from_layer=_LAYER,
+            granularity=switches.granularity,
+            seed=self._job.options.seed,
+        )
+        return open_selector(
+            self._job.scene,
+            options=options,
+            layers={_LAYER: layer},
+            backend=self._job.backend,
+            observer=self._job.observer,
+        )
+
+
+def is_affinity(layer: Features) -> bool:
+    """Whether features were trained to be compared with each other (`lift.affinity`)."""
+    return (layer.info.head or {}).get("kind") == KIND

@@ -33,13 +33,13 @@ from splatseg.evaluate.held_out import drawn_and_true
 from splatseg.io.evidence import save_label_map
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
-from splatseg_bench.fits import held_out_views
+from splatseg_bench.evidence import Seen, evidence_wanted
 from splatseg_bench.job import Job
-from splatseg_bench.matched_instances import matched_instance_score
+from splatseg_bench.measures import matched_instance_score
 from splatseg_bench.points import read_by_words, read_in_words, true_ids_of
 from splatseg_bench.protocols import MapSwitches
 from splatseg_bench.scene import TrueMaps
-from splatseg_bench.sight import Seen, evidence_wanted
+from splatseg_bench.scenes import held_out_views
 
 _LAYER = "layer"
 _SURFACE = "label"

@@ -1,18 +1,18 @@
 """What a run of a protocol is told: methods, models, fits, other choices than its own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from splatseg.core.boundary import convert_fields
+from splatseg.core.options import Count, options
 from splatseg.core.typed_text import typed_field
 from splatseg.errors import InputError
 from splatseg.fit import FitOptions, Preset
 from splatseg.methods import Method
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@options
 class BenchOptions:
     """What is run under a protocol, and with what."""
 
@@ -48,10 +48,10 @@ class BenchOptions:
     preset: Preset = "default"
     """Preset of the fits."""
 
-    steps: int | None = None
+    steps: Count | None = None
     """Length of the fits in steps; None is the preset's."""
 
-    max_gaussians: int | None = None
+    max_gaussians: Count | None = None
     """Most Gaussians of a fit; None is the preset's, for its length."""
 
     switches: tuple[str, ...] = ()
@@ -77,7 +77,6 @@ class BenchOptions:
     """Where networks run."""
 
     def __post_init__(self) -> None:
-        convert_fields(self)
         if not self.methods:
             raise InputError("methods: expected at least one method, got none.")
         if len(set(self.methods)) != len(self.methods):

@@ -28,11 +28,10 @@ from splatseg.io.npz_writing import save_arrays
 from splatseg.io.paths import path_inside
 from splatseg.lift import GaussianField
 from splatseg.lift.heads import ClassifierHead, has_classifier
-from splatseg_bench.job import Job
+from splatseg_bench.evidence import Seen, evidence_wanted
+from splatseg_bench.job import Job, word_index, words_of
 from splatseg_bench.protocols import PointSwitches
 from splatseg_bench.scene import TruePoints
-from splatseg_bench.sight import Seen, evidence_wanted
-from splatseg_bench.spoken import word_index, words_of
 
 _LAYER = "layer"
 _MOVED = 1e-4

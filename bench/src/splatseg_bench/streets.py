@@ -35,13 +35,13 @@ from splatseg.street.field import MeshField
 from splatseg.tasks.scan_labels import viewed_points
 from splatseg.tasks.street.field import save_street_field, street_field
 from splatseg.tasks.street.options import StreetOptions
-from splatseg_bench.fits import held_out_views, scans_of
+from splatseg_bench.evidence import Seen, evidence_wanted
 from splatseg_bench.job import Job
 from splatseg_bench.maps import Scores, TrueMapSource, class_scores, keep_map
 from splatseg_bench.points import read_by_words, read_in_words
 from splatseg_bench.protocols import SKY, TABLE_1, Protocol, StreetSwitches, merged_name
 from splatseg_bench.scene import BenchmarkScene, TruePoints
-from splatseg_bench.sight import Seen, evidence_wanted
+from splatseg_bench.scenes import held_out_views, scans_of
 
 _LAYER = "layer"
 _OF_GAUSSIANS = ("views", "density", "region", "fair")

@@ -27,26 +27,25 @@ from splatseg.lift import GaussianField, TextSpace
 from splatseg.lift.heads import has_classifier
 from splatseg.methods.prompt import mask_points
 from splatseg.prompting.prompts import ViewPrompt
-from splatseg_bench.chosen import (
+from splatseg_bench.answers import (
     Answer,
     Answering,
     ByFeatures,
     ByIds,
     BySelection,
     Cuttable,
+    PromptedMask,
     best_cut,
     ids_mask,
     mask_overlap,
-    segments_inside,
-)
-from splatseg_bench.job import Job
-from splatseg_bench.prompts import (
-    PromptedMask,
     mask_prompt,
     prompted_mask,
+    segments_inside,
     stroke_prompt,
     worded_mask,
 )
+from splatseg_bench.evidence import Seen
+from splatseg_bench.job import Job, LayerSelector, SpokenLayer, asks_for_all, is_affinity
 from splatseg_bench.protocols import (
     MaskRow,
     TargetSwitches,
@@ -55,9 +54,6 @@ from splatseg_bench.protocols import (
     score_mask,
 )
 from splatseg_bench.scene import TargetTask, TrueMask
-from splatseg_bench.selecting import LayerSelector, is_affinity
-from splatseg_bench.sight import Seen
-from splatseg_bench.spoken import SpokenLayer, asks_for_all
 
 _LAYER = "layer"
 _THING, _REST = 1, 2

@@ -10,7 +10,7 @@ from PIL import Image
 
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg_bench.layouts import read_benchmark
-from splatseg_bench.layouts.replica_classes import REPLICA_CLASSES
+from splatseg_bench.layouts.replica import REPLICA_CLASSES
 from splatseg_bench.layouts.scannet import (
     CLASS_SUBSETS,
     NYU40,

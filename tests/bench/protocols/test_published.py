@@ -6,7 +6,7 @@ import pytest
 
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg_bench.protocols import TABLE_1, published_figures
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published._rows import SECOND_HAND, Table
 
 # All figures, and those read in their papers.

@@ -16,7 +16,7 @@ from splatseg.io.scene import save_scene
 from splatseg.render import render
 from splatseg_bench import BenchOptions, bench
 from splatseg_bench.layouts import read_benchmark
-from splatseg_bench.walks import walk_splits
+from splatseg_bench.scenes import walk_splits
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence
 from support.benchmark_layouts.sparse import write_sparse

@@ -8,7 +8,7 @@ import torch
 
 from splatseg.core import Camera, LabelMap, RenderableView, View
 from splatseg.errors import InputError, RangeError
-from splatseg_bench.costs import frames_per_second, timed_label_maps
+from splatseg_bench.measures import frames_per_second, timed_label_maps
 
 CAMERA = Camera(
     width=8, height=6, fx=8, fy=8, cx=4, cy=3, cam_from_world=torch.eye(4, dtype=torch.float64)

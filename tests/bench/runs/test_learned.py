@@ -16,7 +16,7 @@ from splatseg.core import (
 )
 from splatseg.lift.affinity import AffinityHead
 from splatseg.lift.heads import ClassifierHead
-from splatseg_bench.costs import LearnedBytes, learned_bytes
+from splatseg_bench.measures import LearnedBytes, learned_bytes
 
 COUNT = 5
 

@@ -9,7 +9,7 @@ import torch
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.evaluate import instance_score
 from splatseg.evaluate.overlaps import Overlaps
-from splatseg_bench.matched_instances import matched_instance_score
+from splatseg_bench.measures import matched_instance_score
 
 
 def maps(*rows):

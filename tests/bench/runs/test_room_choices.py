@@ -12,9 +12,9 @@ from splatseg.cli import main
 from splatseg.errors import InputError, MissingFileError
 from splatseg.io.scene import load_scene
 from splatseg_bench.layouts import read_benchmark
-from splatseg_bench.layouts.replica_classes import REPLICA_CLASSES
+from splatseg_bench.layouts.replica import REPLICA_CLASSES
 from splatseg_bench.scene import BenchmarkScene
-from splatseg_bench.walks import walk_splits
+from splatseg_bench.scenes import walk_splits
 from support.walks import EVIDENCE, copied, write_fits
 
 

@@ -22,7 +22,7 @@ from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg_bench import load_result
 from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.scene import BenchmarkScene
-from splatseg_bench.walks import walk_splits
+from splatseg_bench.scenes import walk_splits
 from support import recorded
 from support.walks import SCENES, copied, fits, models
 

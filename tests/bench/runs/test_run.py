@@ -27,11 +27,11 @@ from splatseg.methods import Method, MethodInputs, _registry, find_method, regis
 from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import SILENT, Observer
 from splatseg_bench import BenchOptions, BenchRun, bench, bench_table, load_result
-from splatseg_bench.fits import held_out_views
+from splatseg_bench.evidence import bench_model, companion_for, seen_for
 from splatseg_bench.job import Job
 from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.protocols import find_protocol
-from splatseg_bench.sight import bench_model, companion_for, seen_for
+from splatseg_bench.scenes import held_out_views
 from support.red_square import NAMES, SIZE, save_strokes
 
 

@@ -29,9 +29,8 @@ from splatseg.methods.uplift import UpliftMethodOptions
 from splatseg.tasks import select_session
 from splatseg.tasks._select_sources import Offer, OpenedSource, open_source
 from splatseg_bench import BenchOptions, BenchRun, bench
-from splatseg_bench.chosen import BySelection
+from splatseg_bench.answers import BySelection, stroke_prompt
 from splatseg_bench.layouts import read_benchmark
-from splatseg_bench.prompts import stroke_prompt
 from splatseg_bench.protocols import find_protocol
 from splatseg_bench.scene import Scribble, TargetTask, TrueMask
 from support.red_square import NAMES, SIZE, camera, save_strokes, wall

@@ -8,7 +8,7 @@ import torch
 from splatseg.core import Gaussians
 from splatseg.errors import InputError, RangeError, ShapeError
 from splatseg.evaluate.metrics import Confusion
-from splatseg_bench.solid import gaussian_score, gaussian_weights, labels_from_points
+from splatseg_bench.measures import gaussian_score, gaussian_weights, labels_from_points
 
 
 def gaussians_at(means, *, scales=0.1, opacities=0.9, rotations=None) -> Gaussians:

@@ -20,10 +20,10 @@ from splatseg.methods import Method, register_method, uplift
 from splatseg.methods import _registry as registry
 from splatseg.tasks.scene_parts import scene_field
 from splatseg_bench import BenchOptions, BenchRun, bench, bench_table, load_result
-from splatseg_bench.fits import scans_of
 from splatseg_bench.layouts import read_benchmark
 from splatseg_bench.protocols import TABLE_1, find_protocol, merged_name
 from splatseg_bench.scene import BenchmarkScene
+from splatseg_bench.scenes import scans_of
 from support.benchmark_layouts import read_source, write_layout
 from support.benchmark_layouts.evidence import write_evidence
 
@@ -363,7 +363,7 @@ def test_truth_without_points_is_scored_in_views_alone(sets, tmp_path, monkeypat
     assert [one.method for one in done.methods] == ["uplift-views"]
     said = "there are no scans beside the photographs"
     assert not any(said in note for note in done.methods[0].scenes[0].notes)
-    monkeypatch.setattr("splatseg_bench.fits.scan_formats", lambda _: ())
+    monkeypatch.setattr("splatseg_bench.scenes.scan_formats", lambda _: ())
     again = bench("waymo", data.folder, tmp_path / "again", options=options)
     assert any(said in note for note in again.methods[0].scenes[0].notes)
     assert set(done.methods[0].scores) == {"view_miou", "psnr", "ssim"}

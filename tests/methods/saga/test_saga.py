@@ -20,7 +20,7 @@ from splatseg.methods._trained_labels import TrainingContext, loss_curve
 from splatseg.methods.saga import SagaOptions, train_saga, trained_as_published
 from splatseg.methods.saga._targets import SagaTargets
 from splatseg.render import weights
-from splatseg_bench.costs import learned_bytes
+from splatseg_bench.measures import learned_bytes
 
 from .conftest import Grids, Masks
 

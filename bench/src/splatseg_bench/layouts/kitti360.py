@@ -34,8 +34,7 @@ from splatseg.io.images import open_image
 from splatseg.io.label_tables import label_table, learned_as
 from splatseg.io.ply import read_ply_header
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
-from splatseg_bench.layouts._masks import check_proportions, true_ids
-from splatseg_bench.layouts._views import read_views
+from splatseg_bench.layouts._reading import check_proportions, read_views, true_ids
 from splatseg_bench.scene import BenchmarkScene, TrueMaps, TruePoints
 
 LAYOUT = "kitti360"

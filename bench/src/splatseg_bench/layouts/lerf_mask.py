@@ -10,8 +10,13 @@ from splatseg.core import Capture, View
 from splatseg.errors import InputError, MissingFileError, quoted
 from splatseg.io.captures import find_formats
 from splatseg.io.images import find_images
-from splatseg_bench.layouts._masks import true_mask
-from splatseg_bench.layouts._views import ViewsByFile, read_views, scene_folders, split_by
+from splatseg_bench.layouts._reading import (
+    ViewsByFile,
+    read_views,
+    scene_folders,
+    split_by,
+    true_mask,
+)
 from splatseg_bench.scene import BenchmarkScene, TargetTask, TrueMask
 
 LAYOUT = "lerf-mask"

@@ -22,8 +22,12 @@ from splatseg.io.captures import find_formats
 from splatseg.io.foreign import made_from
 from splatseg.io.json_files import read_json
 from splatseg.io.limits import check_unpacked
-from splatseg_bench.layouts._masks import check_proportions
-from splatseg_bench.layouts._views import ViewsByFile, read_views, trained_on_all
+from splatseg_bench.layouts._reading import (
+    ViewsByFile,
+    check_proportions,
+    read_views,
+    trained_on_all,
+)
 from splatseg_bench.scene import BenchmarkScene, TargetTask, TrueMask
 
 LAYOUT = "lerf-ovs"

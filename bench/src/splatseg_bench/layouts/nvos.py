@@ -16,8 +16,13 @@ from splatseg.core import View
 from splatseg.errors import FileFormatError, InputError, MissingFileError
 from splatseg.io.captures import find_formats
 from splatseg.io.images import find_images
-from splatseg_bench.layouts._masks import read_mask, true_mask
-from splatseg_bench.layouts._views import ViewsByFile, read_views, trained_on_all
+from splatseg_bench.layouts._reading import (
+    ViewsByFile,
+    read_mask,
+    read_views,
+    trained_on_all,
+    true_mask,
+)
 from splatseg_bench.scene import BenchmarkScene, Scribble, TargetTask
 
 LAYOUT = "nvos"

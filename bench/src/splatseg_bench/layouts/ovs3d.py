@@ -10,8 +10,13 @@ from splatseg.errors import InputError, MissingFileError
 from splatseg.io.captures import find_formats
 from splatseg.io.foreign import made_from, read_lines
 from splatseg.io.images import find_images
-from splatseg_bench.layouts._masks import true_mask
-from splatseg_bench.layouts._views import ViewsByFile, read_views, scene_folders, trained_on_all
+from splatseg_bench.layouts._reading import (
+    ViewsByFile,
+    read_views,
+    scene_folders,
+    trained_on_all,
+    true_mask,
+)
 from splatseg_bench.scene import BenchmarkScene, TargetTask, TrueMask
 
 LAYOUT = "3d-ovs"

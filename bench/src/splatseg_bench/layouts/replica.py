@@ -16,9 +16,36 @@ from splatseg.io.captures.replica import SEQUENCE, find_replica
 from splatseg.io.foreign import made_from
 from splatseg.io.images import find_images
 from splatseg.io.json_files import read_json
-from splatseg_bench.layouts._masks import true_ids
-from splatseg_bench.layouts._views import ViewsByFile, read_views, scene_folders, split_by
+from splatseg_bench.layouts._reading import (
+    ViewsByFile,
+    read_views,
+    scene_folders,
+    split_by,
+    true_ids,
+)
 from splatseg_bench.scene import BenchmarkScene, TrueMaps
+
+_CLASS_NAMES = (
+    "backpack", "base-cabinet", "basket", "bathtub", "beam", "beanbag", "bed", "bench", "bike",
+    "bin", "blanket", "blinds", "book", "bottle", "box", "bowl", "camera", "cabinet", "candle",
+    "chair", "chopping-board", "clock", "cloth", "clothing", "coaster", "comforter",
+    "computer-keyboard", "cup", "cushion", "curtain", "ceiling", "cooktop", "countertop", "desk",
+    "desk-organizer", "desktop-computer", "door", "exercise-ball", "faucet", "floor", "handbag",
+    "hair-dryer", "handrail", "indoor-plant", "knife-block", "kitchen-utensil", "lamp", "laptop",
+    "major-appliance", "mat", "microwave", "monitor", "mouse", "nightstand", "pan", "panel",
+    "paper-towel", "phone", "picture", "pillar", "pillow", "pipe", "plant-stand", "plate", "pot",
+    "rack", "refrigerator", "remote-control", "scarf", "sculpture", "shelf", "shoe",
+    "shower-stall", "sink", "small-appliance", "sofa", "stair", "stool", "switch", "table",
+    "table-runner", "tablet", "tissue-paper", "toilet", "toothbrush", "towel", "tv-screen",
+    "tv-stand", "umbrella", "utensil-holder", "vase", "vent", "wall", "wall-cabinet", "wall-plug",
+    "wardrobe", "window", "rug", "logo", "bag", "set-of-clothing",
+)  # fmt: skip
+
+REPLICA_CLASSES = ClassTable(
+    rows=tuple(ClassInfo(id=id, name=name) for id, name in enumerate(_CLASS_NAMES, start=1))
+)
+"""All 101 of them."""
+
 
 LAYOUT = "replica"
 SEQUENCES = ("Sequence_1", "Sequence_2")

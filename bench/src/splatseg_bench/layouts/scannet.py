@@ -14,8 +14,7 @@ from splatseg.errors import FileFormatError, MissingFileError, quoted
 from splatseg.io.captures.scannet import find_scannet, labelled_mesh
 from splatseg.io.foreign import is_file, read_lines
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
-from splatseg_bench.layouts._masks import true_ids
-from splatseg_bench.layouts._views import read_views, scene_folders, trained_on_all
+from splatseg_bench.layouts._reading import read_views, scene_folders, trained_on_all, true_ids
 from splatseg_bench.scene import BenchmarkScene, TrueMaps, TruePoints
 
 LAYOUT = "scannet"

@@ -17,7 +17,7 @@ from splatseg.io.foreign import made_from, reading
 from splatseg.io.json_files import read_json
 from splatseg.io.ply_vertices import read_ply_vertices, vertex_positions
 from splatseg.io.surfaces import read_triangles
-from splatseg_bench.layouts._views import read_views, scene_folders
+from splatseg_bench.layouts._reading import read_views, scene_folders
 from splatseg_bench.scene import BenchmarkScene, TruePoints
 
 LAYOUT = "scannetpp"

@@ -27,7 +27,7 @@ from splatseg.io.foreign import made_from, reading
 from splatseg.io.limits import check_unpacked
 from splatseg.io.parquet import RowReader, bytes_of, integer_of, read_rows
 from splatseg.io.scans.waymo import find_waymo_scans, labelled_scans, read_waymo_scans
-from splatseg_bench.layouts._masks import check_proportions
+from splatseg_bench.layouts._reading import check_proportions
 from splatseg_bench.scene import BenchmarkScene, TrueMaps, TruePoints
 
 LAYOUT = "waymo"

@@ -1,21 +1,196 @@
-"""The protocols that are known, each with every choice that its authors state or their code shows.
-
-What is stated where: `docs/benchmarks.md`.
-"""
+"""The protocols that are known, with every choice that their authors state or their code shows."""
 
 import difflib
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal
 
 from splatseg.errors import InputError
-from splatseg_bench.protocols._protocol import Protocol
-from splatseg_bench.protocols._rooms import ROOMS
-from splatseg_bench.protocols._scene_lists import SCENE_LISTS
-from splatseg_bench.protocols._streets import STREETS
-from splatseg_bench.protocols._switches import (
+from splatseg_bench.protocols._protocol import (
     MapSwitches,
     PointSwitches,
+    Protocol,
+    RoomSwitches,
+    SceneList,
     SpokenSwitches,
+    StreetSwitches,
     TargetSwitches,
 )
+
+_GAGA_SCANNET = (
+    "scene0010_00", "scene0012_00", "scene0033_00", "scene0038_00", "scene0088_00",
+    "scene0113_00", "scene0192_00",
+)  # fmt: skip
+
+SCENE_LISTS: Mapping[str, Mapping[str, SceneList]] = MappingProxyType(
+    {
+        "replica": MappingProxyType(
+            {
+                "dm-nerf": SceneList(
+                    scenes=(
+                        "office_0", "office_2", "office_3", "office_4", "room_0", "room_1",
+                        "room_2",
+                    ),
+                    source="the README and configs/replica of vLAR-group/DM-NeRF",
+                )
+            }
+        ),
+        "scannet": MappingProxyType(
+            {
+                "dm-nerf": SceneList(
+                    scenes=tuple(sorted((*_GAGA_SCANNET, "scene0024_00"))),
+                    source="the README and configs/scannet of vLAR-group/DM-NeRF",
+                ),
+                "gaga": SceneList(scenes=_GAGA_SCANNET, source="Gaga (Lyu et al. 2024)"),
+            }
+        ),
+    }
+)  # fmt: skip
+"""By layout of the data set, then by the name that a protocol's ``scene_list`` has."""
+
+
+# CoSSegGaussians' experiments: two data sets, each in classes and in panoptic segments.
+#
+# What the paper says (Dou et al. 2024, section 4.1): seven scenes of each data set, "similar to"
+# DM-NeRF; Replica as Semantic-NeRF rendered it; all test poses; mIoU, mAP at an IoU of 0.5, PQ over
+# the scene, frames per second, learnable parameters. What it leaves open is a switch, or stands in
+# the notes.
+
+
+_REFERENCE = "CoSSegGaussians (Dou et al. 2024), Table {}; PQ of Siddiqui et al. 2023"
+_STUFF = ("wall", "floor", "ceiling")
+_OPEN = (
+    "fps are label maps drawn per second on the machine that measured; the paper does not say how "
+    "ADE20K's classes became those of the truth (aliases), which classes are stuff, whether mAP50 "
+    "is over classes, or what a megabyte is (here 1 000 000 bytes)"
+)
+_REPLICA_OPEN = (
+    "of public code, not of the paper: the seven scenes are DM-NeRF's, the walk is Sequence_1, and "
+    "the test poses are Semantic-NeRF's"
+)
+_SCANNET_OPEN = (
+    "the paper has seven scenes without their names and DM-NeRF names eight, all of which are run; "
+    "the split is Semantic-NeRF's, whose code trains on every 100th frame: every fifth of those "
+    "that are read of a whole scan"
+)
+_TABLES: dict[Literal["semantic", "panoptic"], int] = {"semantic": 1, "panoptic": 2}
+
+
+def _replica(task: Literal["semantic", "panoptic"]) -> Protocol:
+    return Protocol(
+        name=f"cosseg-replica-{task}",
+        summary=f"{_asked(task)} of Replica's rooms, frames per second and learned bytes",
+        layouts=("replica",),
+        reference=_REFERENCE.format(_TABLES[task]),
+        switches=RoomSwitches(task=task, scene_list="dm-nerf", sequence="Sequence_1", stuff=_STUFF),
+        measure=_measure(task),
+        scene_lists=SCENE_LISTS["replica"],
+        note=f"{_REPLICA_OPEN}; {_OPEN}",
+    )
+
+
+def _scannet(task: Literal["semantic", "panoptic"]) -> Protocol:
+    return Protocol(
+        name=f"cosseg-scannet-{task}",
+        summary=f"{_asked(task)} of ScanNet's rooms, frames per second and learned bytes",
+        layouts=("scannet",),
+        reference=_REFERENCE.format(_TABLES[task]),
+        switches=RoomSwitches(task=task, scene_list="dm-nerf", stuff=_STUFF),
+        measure=_measure(task),
+        scene_lists=SCENE_LISTS["scannet"],
+        note=f"{_SCANNET_OPEN}; {_OPEN}",
+    )
+
+
+def _asked(task: Literal["semantic", "panoptic"]) -> str:
+    return "classes" if task == "semantic" else "panoptic segments"
+
+
+def _measure(task: Literal["semantic", "panoptic"]) -> str:
+    return "miou" if task == "semantic" else "pq_scene"
+
+
+ROOMS = (_replica("semantic"), _replica("panoptic"), _scannet("semantic"), _scannet("panoptic"))
+"""The four of them."""
+
+
+# Drives along streets as the paper of the mesh field has them: KITTI-360 and Waymo.
+#
+# What the paper says (Unifying Street Scene Point Cloud Semantic Segmentation with Deformable
+# Mesh-based Neural Representation, section 4): mIoU of the points of lasers over 13 classes (Table
+# 1), and PSNR, SSIM and mIoU of held-out views (Table 2); every second image of KITTI-360 is for
+# testing, of Waymo every fifth. What it leaves open is a switch, or stands in the notes.
+
+
+TABLE_1 = (
+    "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign",
+    "vegetation", "terrain", "car", "truck", "others",
+)  # fmt: skip
+"""Columns of the paper's Table 1."""
+
+OTHERS = "others"
+SKY = "sky"
+
+MERGED: Mapping[str, str] = MappingProxyType(
+    {
+        **{name: name for name in (*TABLE_1, SKY)},
+        # KITTI-360, as its authors train: kitti360scripts, trainId.
+        "garage": "building", "gate": "fence", "smallpole": "pole",
+        # Waymo.
+        "lane marker": "road", "road marker": "road", "curb": "sidewalk",
+        "construction cone pole": "pole", "sign": "traffic sign", "tree trunk": "vegetation",
+    }
+)  # fmt: skip
+"""Column by name of a class, lower case; classes of other names are others."""
+
+_NOT_SEEN = frozenset({"ego vehicle", "rectification border", "out of roi"})
+"""Names of what no method is asked for."""
+
+_NOT_SAID = (
+    "the paper does not say which classes others are, how points without a label count, how large "
+    "the ball of region voting is, or which two segments of each data set it has"
+)
+
+
+def _drive(name: str, tables: str, note: str) -> Protocol:
+    return Protocol(
+        name=name,
+        summary="classes of the points of lasers and of held-out views of drives along streets",
+        layouts=(name,),
+        reference=f"Semantic DNMP (papers/002), {tables}",
+        switches=StreetSwitches(),
+        measure="miou",
+        note=f"{note}; {_NOT_SAID}",
+    )
+
+
+STREETS = (
+    _drive(
+        "kitti360",
+        "Tables 1 and 2",
+        "every second frame is held out; Table 1 is taken to be of KITTI-360, for Waymo has no "
+        "terrain, fence and wall",
+    ),
+    _drive("waymo", "Table 2", "every fifth frame is held out"),
+)
+"""Both of them."""
+
+
+def merged_name(name: str) -> str | None:
+    """The column of Table 1, or sky, that a class of some name counts as; None is void.
+
+    Example:
+        >>> merged_name("Lane marker"), merged_name("bus"), merged_name("ego vehicle")
+        ('road', 'others', None)
+    """
+    name = name.strip().lower()
+    return None if name in _NOT_SEEN else MERGED.get(name, OTHERS)
+
+
+# The protocols that are known, each with every choice that its authors state or their code shows.
+#
+# What is stated where: `docs/benchmarks.md`.
+
 
 CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
 """Words that LERF holds every query against."""

@@ -7,7 +7,7 @@ itself repeat others. Figures that contradict each other are all kept, and their
 from types import MappingProxyType
 
 from splatseg.errors import InputError, quoted
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published import (
     _cosseg,
     _lerf_mask,

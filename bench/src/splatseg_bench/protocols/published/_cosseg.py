@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Literal
 
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published._rows import Table
 
 DataSet = Literal["replica", "scannet"]

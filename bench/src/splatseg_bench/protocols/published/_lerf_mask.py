@@ -1,6 +1,6 @@
 """LERF-Mask: IoU and Boundary IoU of objects by words in held-out views."""
 
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published._rows import SECOND_HAND, Table
 
 _SECOND = Table(protocol="lerf-mask", measures=("iou", "boundary_iou"))

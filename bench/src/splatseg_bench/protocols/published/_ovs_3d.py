@@ -1,6 +1,6 @@
 """3D-OVS: IoU of objects of long-tail classes by words, in five scenes."""
 
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published._rows import Table
 
 _SECOND = Table(protocol="3d-ovs", measures=("iou",))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from splatseg.core.boundary import convert_fields
 from splatseg.errors import ShapeError
-from splatseg_bench.protocols._published import AMOUNTS, PublishedFigure
+from splatseg_bench.protocols._protocol import AMOUNTS, PublishedFigure
 
 SECOND_HAND = "second-hand"
 """Source of figures that were read in somebody else's table or text."""

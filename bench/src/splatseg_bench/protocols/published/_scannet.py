@@ -1,6 +1,6 @@
 """ScanNet's points by OpenGaussian's protocol: 19, 15 and 10 classes, mIoU and mean accuracy."""
 
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published._rows import SECOND_HAND, Table
 
 _MEASURES = ("miou", "mean_accuracy")

@@ -1,6 +1,6 @@
 """SPIn-NeRF: IoU and share of right pixels, mean over its ten scenes."""
 
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published._rows import HIGHER, LOWER, Table
 
 _MEASURES = ("iou", "accuracy")

@@ -1,7 +1,7 @@
 """The paper of the mesh field: Table 1 (points) and Table 2 (views)."""
 
-from splatseg_bench.protocols._published import PublishedFigure
-from splatseg_bench.protocols._streets import TABLE_1
+from splatseg_bench.protocols._catalogue import TABLE_1
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published._rows import Table
 
 _PAPER = "Semantic DNMP"

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from splatseg_bench.protocols._published import PublishedFigure
+from splatseg_bench.protocols._protocol import PublishedFigure
 from splatseg_bench.protocols.published import _cosseg
 from splatseg_bench.protocols.published._rows import SECOND_HAND, Table
 
