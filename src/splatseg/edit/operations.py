@@ -6,6 +6,7 @@ Nothing is changed in place. Rows that stay keep their order; what is added come
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -315,11 +316,7 @@ def _joined_trees(
         nodes=own.nodes + moved.nodes,
         labels=replace(
             first,
-            ids=torch.where(new, second.ids, first.ids),
-            confidence=torch.where(new, second.confidence, first.confidence),
-            evidence=_either(first.evidence, second.evidence, new),
-            effective_views=_either(first.effective_views, second.effective_views, new),
-            inferred=_either(first.inferred, second.inferred, new),
+            **_rows_of_both(first, second, new),
             info=_with_new_ids(own.info, table),
         ),
     )
@@ -334,13 +331,7 @@ def _joined_labels(own: Labels, other: Labels, edited: Edited, behind: Edited) -
     new = edited.rows < 0
     return replace(
         first,
-        ids=torch.where(new, second.ids, first.ids),
-        confidence=torch.where(new, second.confidence, first.confidence),
-        candidates=_either(first.candidates, second.candidates, new),
-        shares=_either(first.shares, second.shares, new),
-        evidence=_either(first.evidence, second.evidence, new),
-        effective_views=_either(first.effective_views, second.effective_views, new),
-        inferred=_either(first.inferred, second.inferred, new),
+        **_rows_of_both(first, second, new, *_CANDIDATES),
         info=_with_new_ids(replace(own.info, names=names), table),
     )
 
@@ -406,6 +397,16 @@ def _widened(labels: Labels, width: int) -> Labels:
         candidates=torch.nn.functional.pad(candidates, (0, missing), value=UNLABELLED),
         shares=torch.nn.functional.pad(shares, (0, missing)),
     )
+
+
+_COLUMNS = ("ids", "confidence", "evidence", "effective_views", "inferred")
+_CANDIDATES = ("candidates", "shares")
+
+
+def _rows_of_both(first: Labels, second: Labels, new: Tensor, *columns: str) -> dict[str, Any]:
+    """Columns of labels with the rows of the second where new."""
+    names = (*_COLUMNS, *columns)
+    return {name: _either(getattr(first, name), getattr(second, name), new) for name in names}
 
 
 def _either(first: Tensor | None, second: Tensor | None, new: Tensor) -> Tensor | None:
